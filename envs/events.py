@@ -16,7 +16,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import clearance_profile
 from viapoint.envs.outcome import SETTLING
-from viapoint.envs.plans import Motion, Plan
+from viapoint.envs.plans import MAX_START_OFFSET, Motion, Plan
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.spaces import Space
 
@@ -127,7 +127,8 @@ class EventPredictor:
         jump, turn = self.steps(scenes.jump_times), self.steps(scenes.turn_time)
         moving_until = began + self.steps(plan.duration)
         arrival = np.maximum(began + self.steps(plan.duration + SETTLING), now + 1)
-        there = (plan.waypoints[:, -1] == goal(arrival * self.timestep)).all(axis=-1)
+        away = np.abs(plan.waypoints[:, -1] - goal(arrival * self.timestep)).max(axis=-1)
+        there = away < MAX_START_OFFSET  # a plan of a user may have rounded its end
         after_jump, after_turn = _next(jump, arrival), _next(turn, arrival)
         # At rest at the goal, the arm waits for what is still to come.
         waits = there & (np.minimum(after_jump, after_turn) < NEVER) & (len(self.triggers) > 0)

@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from viapoint.training.config.configs import TrainConfig
     from viapoint.training.evaluation.evaluator import EvaluationResult, evaluate
     from viapoint.training.live.page import LivePage
+    from viapoint.training.planning.motion_plan import MotionPlan, UnsafePlanError
     from viapoint.training.planning.observe_candidates import ObserveCandidates, VectorObserveCandidates
+    from viapoint.training.planning.plan_motion import plan_motion, plan_motions
     from viapoint.training.planning.search import GeometrySearch
     from viapoint.training.rollouts.vec_env import ViaVecEnv
     from viapoint.training.runs.run_dir import Run
@@ -38,16 +40,20 @@ __all__ = [
     "EvaluationResult",
     "GeometrySearch",
     "LivePage",
+    "MotionPlan",
     "ObserveCandidates",
     "Run",
     "SceneExtractor",
     "Study",
     "TrainConfig",
+    "UnsafePlanError",
     "VectorObserveCandidates",
     "ViaQ",
     "ViaVecEnv",
     "evaluate",
     "load_agent",
+    "plan_motion",
+    "plan_motions",
     "run_study",
     "train",
 ]

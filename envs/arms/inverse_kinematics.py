@@ -31,7 +31,7 @@ REACHED = 1e-9
 
 
 @compiled
-def _solve(matrix: Float, vector: Float, number: int) -> None:
+def solve_symmetric(matrix: Float, vector: Float, number: int) -> None:
     """Replace a vector by the solution of a symmetric positive definite system, in place (Cholesky)."""
     for j in range(number):
         for k in range(j):
@@ -126,7 +126,7 @@ def _descend(
                 for j in range(last):
                     total += jacobian[i, j] * jacobian[k, j]
                 square[i, k] = total + (damping if i == k else 0.0)
-        _solve(square, error, rows)
+        solve_symmetric(square, error, rows)
         moved = 0.0
         for j in range(last):
             step = 0.0

@@ -7,6 +7,7 @@ of spheres comes first, and the spheres of a group are only placed where its bal
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -86,6 +87,40 @@ def place_group(spheres: Spheres, group: int, placed: Placed) -> None:
                 )
 
 
+@inlined
+def group_clearance(
+    spheres: Spheres,
+    placed: Placed,
+    group: int,
+    obstacles: Obstacles,
+    scene: int,
+    row: int,
+    time: float,
+    least: float,
+    floor: float,
+) -> tuple[float, int]:
+    """Return the clearance of a group of spheres from an obstacle, at most `least`, [m], and the sphere that has it.
+
+    The sphere is -1 if none is nearer than `least`. The arguments are those of :func:`obstacle_clearance`.
+    """
+    nearest = -1
+    size = spheres.ball_radius[group]
+    x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
+    away = point_distance(obstacles, scene, row, x, y, z, time, least + size)
+    if away - size < least:
+        place_group(spheres, group, placed)
+        for sphere in range(spheres.first[group], spheres.first[group + 1]):
+            radius = spheres.radius[sphere]
+            x, y, z = placed.centre[sphere, 0], placed.centre[sphere, 1], placed.centre[sphere, 2]
+            distance = point_distance(obstacles, scene, row, x, y, z, time, least + radius) - radius
+            if distance < least:
+                least = distance
+                nearest = sphere
+                if least < floor:
+                    break
+    return least, nearest
+
+
 @kernel
 def obstacle_clearance(
     spheres: Spheres,
@@ -112,57 +147,64 @@ def obstacle_clearance(
     for group in range(len(spheres.link)):
         if spheres.link[group] == 0:
             continue
-        x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
-        size = spheres.ball_radius[group]
         for row in range(obstacles.kind.shape[1]):
-            if obstacles.kind[scene, row] == ABSENT:
-                continue
-            if point_distance(obstacles, scene, row, x, y, z, time, least + size) - size >= least:
-                continue
-            place_group(spheres, group, placed)
-            for sphere in range(spheres.first[group], spheres.first[group + 1]):
-                radius = spheres.radius[sphere]
-                u, v, w = placed.centre[sphere, 0], placed.centre[sphere, 1], placed.centre[sphere, 2]
-                distance = point_distance(obstacles, scene, row, u, v, w, time, least + radius)
-                if distance - radius < least:
-                    least = distance - radius
-                    if least < floor:
-                        return least
+            if obstacles.kind[scene, row] != ABSENT:
+                least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
+                if least < floor:
+                    return least
     return least
+
+
+@kernel
+def nearest_spheres(
+    spheres: Spheres, placed: Placed, pair: int, least: float, floor: float
+) -> tuple[float, int, int]:
+    """Return the clearance of a pair of groups, at most `least`, [m], and the spheres that have it, -1 for none."""
+    first, second = spheres.pairs[pair, 0], spheres.pairs[pair, 1]
+    nearest, partner = -1, -1
+    sizes = spheres.ball_radius[first] + spheres.ball_radius[second]
+    if _are_apart(placed.ball, first, placed.ball, second, sizes + least):
+        return least, nearest, partner
+    place_group(spheres, first, placed)
+    place_group(spheres, second, placed)
+    for one in range(spheres.first[first], spheres.first[first + 1]):
+        # The ball of the second group excludes most spheres of the first.
+        size = spheres.radius[one]
+        if _are_apart(placed.centre, one, placed.ball, second, size + spheres.ball_radius[second] + least):
+            continue
+        for other in range(spheres.first[second], spheres.first[second + 1]):
+            sizes = size + spheres.radius[other]
+            if not _are_apart(placed.centre, one, placed.centre, other, sizes + least):
+                least = math.sqrt(_square(placed.centre, one, placed.centre, other)) - sizes
+                nearest, partner = one, other
+                if least < floor:
+                    return least, nearest, partner
+    return least, nearest, partner
 
 
 @kernel
 def self_clearance(spheres: Spheres, placed: Placed, least: float, floor: float) -> float:
     """Return the clearance of a placed arm from itself, at most `least`, [m]; see :func:`obstacle_clearance`."""
     for pair in range(len(spheres.pairs)):
-        first, second = spheres.pairs[pair, 0], spheres.pairs[pair, 1]
-        apart = _apart(placed.ball, first, placed.ball, second)
-        if apart - spheres.ball_radius[first] - spheres.ball_radius[second] >= least:
-            continue
-        place_group(spheres, first, placed)
-        place_group(spheres, second, placed)
-        for one in range(spheres.first[first], spheres.first[first + 1]):
-            # The ball of the second group excludes most spheres of the first.
-            away = _apart(placed.centre, one, placed.ball, second)
-            if away - spheres.radius[one] - spheres.ball_radius[second] >= least:
-                continue
-            for other in range(spheres.first[second], spheres.first[second + 1]):
-                distance = _apart(placed.centre, one, placed.centre, other)
-                distance -= spheres.radius[one] + spheres.radius[other]
-                if distance < least:
-                    least = distance
-                    if least < floor:
-                        return least
+        least, _, _ = nearest_spheres(spheres, placed, pair, least, floor)
+        if least < floor:
+            return least
     return least
 
 
 @inlined
-def _apart(first: Float, i: int, second: Float, j: int) -> float:
-    """Return the distance of two points of tables, [m]."""
+def _square(first: Float, i: int, second: Float, j: int) -> float:
+    """Return the squared distance of two points of tables, [m^2]."""
     x = first[i, 0] - second[j, 0]
     y = first[i, 1] - second[j, 1]
     z = first[i, 2] - second[j, 2]
-    return float(np.sqrt(x * x + y * y + z * z))
+    return float(x * x + y * y + z * z)
+
+
+@inlined
+def _are_apart(first: Float, i: int, second: Float, j: int, distance: float) -> bool:
+    """Return True if two points of tables are a distance apart or more, [m], as always if it is negative."""
+    return distance <= 0.0 or _square(first, i, second, j) >= distance * distance
 
 
 @kernel

@@ -100,6 +100,13 @@ class Obstacles(NamedTuple):
             self.clouds,
         )
 
+    def with_rows(self, rows: int) -> Obstacles:
+        """Return the obstacles with room for more of them in each scene."""
+        wide = no_obstacles(len(self.kind), rows)
+        for mine, theirs in zip(wide[:5], self[:5], strict=True):
+            mine[:, : theirs.shape[1]] = theirs
+        return wide._replace(meshes=self.meshes, clouds=self.clouds)
+
     def put(self, scenes: Any, others: Obstacles) -> Obstacles:
         """Return the obstacles after scenes were overwritten in place; only tables of shapes are new.
 
@@ -185,7 +192,10 @@ def pack(scenes: Sequence[Iterable[Shape | Mapping[str, Any]]], rows: int | None
             if shape.cloud is not None:
                 found.size[scene, row, 0] = len(clouds)
                 clouds.append(shape.cloud)
+    if not meshes and not clouds:
+        return found
     found = found._replace(meshes=join_meshes(meshes), clouds=join_clouds(clouds))
+    # Each different table is kept once.
     return no_obstacles(len(shapes), rows).put(slice(None), found)
 
 

@@ -12,6 +12,7 @@ Everything else follows: dictionaries, JSON, packed obstacles, rows of observati
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -241,10 +242,11 @@ class Shape:
         """Return the names of the parameters, those of all shapes last."""
         return [each.name for each in sorted(fields(cls), key=lambda each: bool(each.kw_only)) if each.init]
 
-    @property
+    @functools.cached_property
     def rotation(self) -> Float:
         """Axes of the shape's frame as columns, shape (3, 3)."""
-        return np.array(frame_axes(self.quaternion)).T.copy()
+        rotation: Float = frozen(np.array(frame_axes(self.quaternion)).T.copy())
+        return rotation
 
     def distance(self, points: Any, radius: Any = 0.0) -> Any:
         """Return the signed distance of points, or of spheres around them, at time 0, shape (...,), [m].

@@ -14,6 +14,7 @@ from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
+from viapoint.envs.geometry.clearance import FAR
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, pack, unpack
 from viapoint.envs.geometry.shapes import (
     REGISTERED_MESHES,
@@ -219,7 +220,7 @@ def _solution(label: str, pose: Pose, arm: Arm, obstacles: Obstacles) -> Float:
     except ValueError as error:
         raise ValueError(f"{label}: {error}") from None
     many = obstacles.take(np.zeros(len(found), np.int64))
-    rows, own = row_clearances(arm.chain, arm.spheres, found, many)
+    rows, own = row_clearances(arm.chain, arm.spheres, found, many, FAR)
     free = np.minimum(rows.min(axis=-1, initial=1.0), own) > 0.0
     # If none is free, the check of the scene says why.
     return np.asarray(found[int(free.argmax())])

@@ -12,10 +12,9 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.geometry.clearance import FAR, Placed, memory, place, place_group, self_clearance
+from viapoint.envs.geometry.clearance import FAR, Placed, group_clearance, memory, place, self_clearance
 from viapoint.envs.geometry.clouds import Clouds
 from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.distance import point_distance
 from viapoint.envs.geometry.meshes import Meshes
 from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, MESH, Obstacles, no_obstacles
 
@@ -171,18 +170,8 @@ def row_clearance(
     if obstacles.kind[scene, row] == ABSENT:
         return least
     for group in range(len(spheres.link)):
-        if spheres.link[group] < link:
-            continue
-        ball = placed.ball[group]
-        size = spheres.ball_radius[group]
-        away = point_distance(obstacles, scene, row, ball[0], ball[1], ball[2], time, least + size)
-        if away - size >= least:
-            continue
-        place_group(spheres, group, placed)
-        for sphere in range(spheres.first[group], spheres.first[group + 1]):
-            here, radius = placed.centre[sphere], spheres.radius[sphere]
-            away = point_distance(obstacles, scene, row, here[0], here[1], here[2], time, least + radius)
-            least = min(least, away - radius)
+        if spheres.link[group] >= link:
+            least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
             if least < floor:
                 return least
     return least
@@ -190,7 +179,7 @@ def row_clearance(
 
 @compiled
 def row_clearances(
-    chain: Chain, spheres: Spheres, joints: Float, obstacles: Obstacles
+    chain: Chain, spheres: Spheres, joints: Float, obstacles: Obstacles, most: float
 ) -> tuple[Float, Float]:
     """Return the clearances of N arms from n obstacles at time 0, shape (N, n), and from themselves, shape (N,), [m].
 
@@ -199,15 +188,16 @@ def row_clearances(
         spheres: Spheres of the arm.
         joints: Joint positions, shape (N, J).
         obstacles: Obstacles of N scenes.
+        most: Greatest clearance of interest, [m].
     """
     placed = memory(chain, spheres)
     number, rows = obstacles.kind.shape
     found, own = np.empty((number, rows)), np.empty(number)
     for scene in range(number):
         place(chain, spheres, joints[scene], placed)
-        own[scene] = self_clearance(spheres, placed, FAR, -FAR)
+        own[scene] = self_clearance(spheres, placed, most, -FAR)
         for row in range(rows):
-            found[scene, row] = row_clearance(spheres, placed, obstacles, scene, row, 0.0, FAR, -FAR, 1)
+            found[scene, row] = row_clearance(spheres, placed, obstacles, scene, row, 0.0, most, -FAR, 1)
     return found, own
 
 
@@ -281,7 +271,7 @@ class _Check:
             outside = (position < low - ROUNDING) | (position > high + ROUNDING)
             allowed = f"must be from {low:.4g} to {high:.4g}"
             self.refuse(there & outside, f"{name}: joint {self.arm.joint_names[joint]!r} {allowed}", position)
-        rows, own = row_clearances(self.arm.chain, self.arm.spheres, joints, obstacles)
+        rows, own = row_clearances(self.arm.chain, self.arm.spheres, joints, obstacles, FAR)
         touches = "the arm touches itself; its clearance must be over 0 m"
         self.refuse(there & (own <= 0.0), f"{name}: {touches}", own)
         touches = f"touches the arm at the {name}; its clearance must be over 0 m"

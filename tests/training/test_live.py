@@ -210,7 +210,7 @@ def test_a_dragged_end_is_where_it_was_dragged_to(env_id, shared):
 def test_methods_are_compared_in_a_scene(shared):
     some = shared(PLANAR)
     scene = drawn(some.own)
-    results = {name: result() for name, result in compare(some.own, scene, some.planner)}
+    results = {name: result() for name, result in compare(some.own, scene, some.planners)}
     assert not results["straight"].success
     assert results["geometry search"].success
     assert results["straight"].jerk_ratio == pytest.approx(1.0)
@@ -304,7 +304,7 @@ def test_an_agent_of_control_steps_moves_to_the_end_of_its_episode():
     assert len(segment.time) == len(segment.hand) == len(segment.places)
     whole, observation = begun(some, scene)
     assert some.decisions.choose(observation, whole.scenes).maker.startswith("search")
-    names = [name for name, _ in compare(some, scene, None)]
+    names = [name for name, _ in compare(some, scene, {})]
     assert names == ["agent", "straight", "geometry search"]
 
 

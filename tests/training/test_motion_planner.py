@@ -10,7 +10,9 @@ from viapoint.envs.scenes.options import draw_given
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planning import ompl_planner
 from viapoint.training.planning.baselines import make_method
+from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems
 from viapoint.training.planning.ompl_planner import points_on
+from viapoint.training.planning.plan_motion import plan_motion
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import load, shipped_path
 
@@ -19,6 +21,7 @@ PLANE = "viapoint/PlanarObstacles-v0"
 
 def test_without_the_library_its_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl.base", None)
+    ompl_planner.import_ompl.cache_clear()
     with pytest.raises(ValueError, match=r"pip install 'viapoint\[planning\]'"):
         make_method("ompl", PLANE)
 
@@ -33,7 +36,9 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
     summary = result.summary()
     assert summary["success"]["rate"] >= 0.9
     assert summary["collision"]["rate"] <= 0.1
-    np.testing.assert_allclose(result.outcomes["duration"], result.actions[:, 1])
+    counts = result.actions[:, 0].astype(int)
+    durations = [row[1 : 2 + count].sum() for row, count in zip(result.actions, counts, strict=True)]
+    np.testing.assert_allclose(result.outcomes["duration"], durations)
 
 
 def test_every_link_of_the_whole_arm_clears():
@@ -57,27 +62,35 @@ def test_where_there_is_no_way_it_gives_up(monkeypatch):
     simulation = SceneSimulation(PLANE, 1)
     given = {"start": (x, y), "goal": (0.15, 0.35), "obstacles": [*across, *along]}
     scenes = draw_given(given, simulation.task.sampler(), [np.random.default_rng(0)])
-    planner = ompl_planner.MotionPlanner(simulation)
-    assert planner._path(scenes, 0.001) is None
-    assert not planner.execute(scenes, planner.decide({}, scenes)).success.any()
+    method = make_method("ompl", PLANE)
+    assert not method.plan(scenes).success
+    assert not method.execute(scenes, method.decide({}, scenes)).success.any()
 
 
+@pytest.mark.parametrize("name", ["ompl", "plan_motion"])
 @pytest.mark.parametrize("env_id", [PLANE, "viapoint/PandaObstacles-v0"])
-def test_plans_are_as_clear_as_they_are_said_to_be(env_id):
-    pytest.importorskip("ompl")
-    simulation = SceneSimulation(env_id, 12)
+def test_plans_are_as_clear_as_they_are_said_to_be(env_id, name):
+    if name == "ompl":
+        pytest.importorskip("ompl")
     scenes = load(shipped_path("validation", env_id)).scenes.take(np.arange(0, 240, 20))
-    planner, clear = ompl_planner.MotionPlanner(simulation), 0
-    for row in range(12):
-        scene = scenes.take([row])
-        plan = planner.plan(scene)
-        done = simulation.execute_plan(scene, plan)
-        said = planner._clearance(plan, scene)
-        if said > 0.002:
-            clear += 1
-            assert done.success[0]
-            assert done.info["min_clearance"][0] > said - 0.002
-    assert clear > 6
+    method = make_method(name, env_id)
+    plans = [method.plan(scenes.take([row])) for row in range(12)]
+    for plan in plans:
+        done = plan.execute(force=True)
+        assert done.is_success[0] or plan.clearance < 0.002
+        assert done.min_clearance[0] > plan.clearance - 0.002
+    assert sum(plan.success for plan in plans) > 6
+
+
+def test_where_no_seed_is_free_a_path_is_followed():
+    pytest.importorskip("ompl")
+    arm = benchmark_panda()
+    problem = next(each for each in benchmark_problems() if each.name == "cage 1")
+    plan = plan_motion(arm, problem.start, problem.goal, problem.obstacles, seeds=0, n_via=1)
+    assert (plan.success, plan.source) == (True, "ompl")
+    assert not plan_motion(
+        arm, problem.start, problem.goal, problem.obstacles, seeds=0, n_via=1, ompl=False
+    ).success
 
 
 def test_points_lie_on_the_path_and_keep_its_corners():

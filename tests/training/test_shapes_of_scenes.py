@@ -7,8 +7,7 @@ from stable_baselines3 import PPO, SAC
 
 from viapoint.envs import Box, Cylinder
 from viapoint.training import GeometrySearch, SceneExtractor, ViaQ, ViaVecEnv
-from viapoint.training.planning.ompl_planner import MotionPlanner
-from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.planning.baselines import make_method
 
 PLANE, MOVING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
 SHAPES = ("capsule", "box", "cylinder")
@@ -39,12 +38,11 @@ def test_plans_without_an_environment_are_those_of_an_environment():
 
 def test_the_motion_planner_solves_a_scene_with_a_box():
     pytest.importorskip("ompl")
-    simulation = SceneSimulation(PLANE, 1, shapes=SHAPES, threads=1)
     env = gym.make(PLANE, shapes=SHAPES).unwrapped
     env.reset(options={**ENDS, "obstacles": OBSTACLES})
     scenes = env.batch.scenes
-    assert simulation.execute_plan(scenes, MotionPlanner(simulation).plan(scenes)).success.all()
-    simulation.close()
+    method = make_method("ompl", PLANE, shapes=SHAPES)
+    assert method.execute(scenes, method.decide({}, scenes)).success.all()
     env.close()
 
 

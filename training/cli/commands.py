@@ -7,14 +7,17 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 
 from viapoint.training.agents.agent import load_agent
-from viapoint.training.config.configs import EvaluateConfig, PlayConfig, TrainConfig
+from viapoint.training.config.configs import USUAL_BASELINES, EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import check_baselines, environment_of, evenly_spread
 from viapoint.training.evaluation.evaluator import evaluate as measure
 from viapoint.training.io.files import read_json, write_json
+from viapoint.training.planning import benchmark_report
 from viapoint.training.planning.baselines import agent_method
+from viapoint.training.planning.benchmark import benchmark_problems, read_problems
 from viapoint.training.planning.search import registered_task
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
@@ -44,6 +47,9 @@ def train(config: TrainConfig) -> None:
 
 def evaluate(config: EvaluateConfig) -> None:
     """Evaluate, print the table, and write the results."""
+    if config.of_planners:
+        _measure_planners(config)
+        return
     agent = None if config.agent is None else load_agent(config.agent)
     run = (
         Run(str(config.agent))
@@ -69,6 +75,21 @@ def evaluate(config: EvaluateConfig) -> None:
         print(f"results, scene by scene: {config.json}")
     if result.partial:
         raise EvaluationStoppedError("stopped: the results are partial")
+
+
+def _measure_planners(config: EvaluateConfig) -> None:
+    """Measure planners on the problems of MotionBenchMaker, print the table, and write one line for each problem."""
+    problems = benchmark_problems() if config.problems is None else read_problems(config.problems)
+    problems = [problems[row] for row in evenly_spread(len(problems), config.n_scenes)]
+    names = ("plan_motion",) if config.baselines == USUAL_BASELINES else config.baselines
+    for name in names:
+        benchmark_report.benchmark_planner(name)  # an unknown name is told before anything is measured
+    with report.progress_bar() as progress:
+        lines = [benchmark_report.measure_planner(name, problems, progress=progress) for name in names]
+    print(f"{benchmark_report.markdown(pd.concat(lines))}\n\n{benchmark_report.NOTES}")
+    if config.json is not None:
+        write_json(config.json, pd.concat(lines).to_dict("records"))
+        print(f"results, problem by problem: {config.json}")
 
 
 def _evaluation_name(scenes: str, whole: FrozenScenes, number: int, *, partial: bool) -> str:

@@ -21,6 +21,7 @@ from viapoint.training.config.configs import (
     EvaluateConfig,
     LiveConfig,
     PaperConfig,
+    PlanConfig,
     PlayConfig,
     StudyConfig,
     TrainConfig,
@@ -46,6 +47,7 @@ class Command(NamedTuple):
 COMMANDS: dict[str, Command] = {
     "train": Command(TrainConfig, "viapoint.training.cli.commands", "train"),
     "evaluate": Command(EvaluateConfig, "viapoint.training.cli.commands", "evaluate"),
+    "plan": Command(PlanConfig, "viapoint.training.cli.plan", "run"),
     "play": Command(PlayConfig, "viapoint.training.cli.commands", "play"),
     "paper": Command(PaperConfig, "viapoint.training.paper.run", "run"),
     "demo": Command(DemoConfig, "viapoint.training.cli.demo", "run"),

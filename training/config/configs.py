@@ -105,6 +105,12 @@ NamedValues = Annotated[
 """Dictionary that the command line writes as NAME=VALUE NAME=VALUE ..."""
 
 
+BENCHMARK = "motionbenchmaker"
+"""Name of the scene set that measures planners."""
+USUAL_BASELINES = ("straight", "random", "search512")
+"""Baselines of an evaluation."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Config:
     """Configuration of a command; paths may be given as strings."""
@@ -330,14 +336,17 @@ class EvaluateConfig(AgentConfig):
     Example: viapoint evaluate runs/first --baselines straight search512 --scenes test
     """
 
-    baselines: tuple[str, ...] = ("straight", "random", "search512")
+    baselines: tuple[str, ...] = USUAL_BASELINES
     """Some of straight, random, random16, random80, ompl, search512 or another number (the best of that many computed
     plans), sobol512 (of fixed plans); with an agent, untrained (its network before training); in tasks with replanning,
     unrevised (the first plan alone)."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
     scenes: str = "test"
-    """Scene set: validation, test, hard, uniform, or a scene file."""
+    """Scene set: validation, test, hard, uniform, or a scene file; motionbenchmaker for the problems of that benchmark,
+    on which planners are measured: straight, plan_motion, plan_motion+ompl, ompl, search512."""
+    problems: Path | None = None
+    """Folder of MotionBenchMaker's own files, in place of the problems that are shipped."""
     n_scenes: int | None = None
     """Number of scenes, evenly spread over the set; all if not given."""
     json: Path | None = None
@@ -347,13 +356,23 @@ class EvaluateConfig(AgentConfig):
 
     least: ClassVar = {"n_scenes": 1}
 
+    @property
+    def of_planners(self) -> bool:
+        """True if planners are measured on the problems of MotionBenchMaker."""
+        return self.problems is not None or self.scenes == BENCHMARK
+
     def _check(self) -> None:
         super()._check()
         if len(set(self.baselines)) < len(self.baselines):
             raise ValueError(f"baselines must differ, got {', '.join(self.baselines)}")
         if self.env is not None:
             check_env(self.env)
-        if self.agent is None and self.env is None:
+        if self.of_planners:
+            if self.agent is not None or self.env is not None:
+                raise ValueError(
+                    "motionbenchmaker measures planners: name neither an agent nor an environment"
+                )
+        elif self.agent is None and self.env is None:
             raise ValueError("name an agent (run folder, model folder or id), or an environment with --env")
         for number in self.checks:
             check_whole("checks", number, 0)
@@ -387,6 +406,61 @@ class PlayConfig(AgentConfig):
         if self.agent is None:
             raise ValueError("name an agent: run folder, model folder or id")
         check_file("video", self.video, ".mp4")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanConfig(Config):
+    """Plan a smooth movement of an arm around known obstacles, and write it for a controller.
+
+    Example: viapoint plan --arm panda --position 0.5 0.3 0.4 --scene scene.json --out plan.csv --video plan.mp4
+    """
+
+    arm: str = "panda"
+    """Name of an arm, or MJCF file of one, which needs --tool and --joints."""
+    start: tuple[float, ...] = ()
+    """Joint positions at the start, [rad]; by default those of the scene file, or home."""
+    goal: tuple[float, ...] = ()
+    """Joint positions at the goal, [rad]; by default those of the scene file."""
+    position: tuple[float, ...] = ()
+    """Place of the tool at the goal, x y z, [m], in place of joint positions."""
+    quaternion: tuple[float, ...] = ()
+    """Orientation of the tool there, w x y z; any if not given."""
+    scene: Path | None = None
+    """JSON file of a scene, or of a list of obstacles."""
+    tool: str = ""
+    """Site of the tool of an arm of a file."""
+    joints: tuple[str, ...] = ()
+    """Names of its joints from the base to the tool."""
+    velocity_limit: float | None = None
+    """Velocity limit of its joints, [rad/s]; by default that of the file."""
+    n_via: int = 2
+    """Number of via-points, 1 to 3."""
+    margin: float = 0.0
+    """Least clearance, [m]."""
+    duration: float | None = None
+    """Duration, [s]; by default the shortest that the limits allow."""
+    time_limit: float = 1.0
+    """Time after which no further seed is tried, [s]."""
+    rate: float = 100.0
+    """Instants per second of the file, [Hz]."""
+    out: Path | None = None
+    """File to write: .csv, or .yaml for a message trajectory_msgs/JointTrajectory of ROS 2."""
+    video: Path | None = None
+    """MP4 file to write."""
+    seed: int = 0
+    """Seed of the random numbers."""
+    force: bool = False
+    """True to write plans that touch something, too."""
+
+    least: ClassVar = {"n_via": 1, "seed": 0}
+
+    def _check(self) -> None:
+        super()._check()
+        check_file("video", self.video, ".mp4")
+        for name, length in (("position", 3), ("quaternion", 4)):
+            given = len(getattr(self, name))
+            if given not in (0, length):
+                raise ValueError(f"{name} has {length} numbers, got {given}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from viapoint.training.live.movements import play_episode
 if TYPE_CHECKING:
     from viapoint.training.live.scene import LiveScene
     from viapoint.training.live.setting import Setting
-    from viapoint.training.planning.ompl_planner import MotionPlanner
+    from viapoint.training.planning.baselines import PlannerMethod
 
 
 class MethodResult(NamedTuple):
@@ -36,14 +37,14 @@ Compared = tuple[str, Callable[[], MethodResult]]
 
 
 def compare(
-    setting: Setting, scene: LiveScene, planner: MotionPlanner | None, checks: int = 0
+    setting: Setting, scene: LiveScene, planners: Mapping[str, PlannerMethod], checks: int = 0
 ) -> Generator[Compared, None, None]:
-    """Yield the methods that are compared in a scene: agent, straight movement, geometry search and motion planner.
+    """Yield the methods that are compared in a scene: agent, straight movement, geometry search and planners.
 
     Args:
         setting: Task and agent.
         scene: Scene.
-        planner: Motion planner; None if there is none for the task.
+        planners: Planners by their names.
         checks: Proposals that the agent checks with computed geometry.
     """
     task, decisions, step_env = setting.task, setting.decisions, setting.make_step_env()
@@ -57,8 +58,8 @@ def compare(
         straight = np.zeros((1, task.action.size))
         yield "straight", lambda: _result("straight", env, scene, lambda seen: straight)
         yield "geometry search", lambda: _result("geometry search", env, scene, decisions.search)
-        if planner is not None:
-            yield "motion planner", lambda: _planned("motion planner", env, scene, planner)
+        for name, planner in planners.items():
+            yield name, functools.partial(_planned, name, env, scene, planner)
     finally:
         for each in (env, step_env):
             if each is not None:
@@ -81,14 +82,14 @@ def _result(
     return _as_result(name, info, reward, seconds[0])
 
 
-def _planned(name: str, env: ReachVectorEnv, scene: LiveScene, planner: MotionPlanner) -> MethodResult:
+def _planned(name: str, env: ReachVectorEnv, scene: LiveScene, planner: PlannerMethod) -> MethodResult:
     """Return the result of a planner whose movements have any number of via-points."""
     env.reset(options=scene.options())
     assert env.scenes is not None
     begin = time.perf_counter()
-    plan: Plan = planner.plan(env.scenes)
+    plan = planner.plan(env.scenes)
     seconds = time.perf_counter() - begin
-    decision = env.execute_plan(plan)
+    decision = env.execute_plan(Plan.at_rest(plan.waypoints[None], plan.durations[None]))
     return _as_result(name, decision.info, float(decision.reward[0]), seconds)
 
 

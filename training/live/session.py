@@ -514,7 +514,7 @@ class Session:
         scene, results = self._scene, list[MethodResult]()
         if self._scenes is None:
             raise ValueError("methods are compared in possible scenes: move what stands in the way first")
-        methods = compare(self._setting, scene, self._shared.planner, self._checks)
+        methods = compare(self._setting, scene, self._shared.planners, self._checks)
 
         def step() -> None:
             if scene is not self._scene:

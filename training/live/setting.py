@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -24,7 +25,7 @@ from viapoint.training.live.drawing import ArmDrawing
 from viapoint.training.live.movements import DECISION_INTERVAL
 from viapoint.training.live.scene import LiveScene
 from viapoint.training.paper.lights import rows_of_lights
-from viapoint.training.planning.ompl_planner import MotionPlanner
+from viapoint.training.planning.baselines import PLANNERS, PlannerMethod
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import load, shipped_set
 
@@ -172,14 +173,16 @@ class Shared:
         return ArmDrawing(self.own.task.arm, self.model, self._model_file)
 
     @functools.cached_property
-    def planner(self) -> MotionPlanner | None:
-        """Motion planner; None where plans are revised, and without its library."""
+    def planners(self) -> dict[str, PlannerMethod]:
+        """Planners by their names; none where plans are revised, and that of OMPL only with its library."""
+        found: dict[str, PlannerMethod] = {}
         if self.own.task.replanning:
-            return None
-        try:
-            return MotionPlanner(SceneSimulation(self.env_id, 1, **self._env_kwargs))
-        except ValueError:
-            return None
+            return found
+        simulation = SceneSimulation(self.env_id, 1, **self._env_kwargs)
+        for name, method in (("plan_motion", "plan_motion"), ("motion planner", "ompl")):
+            with contextlib.suppress(ValueError):
+                found[name] = PLANNERS[method](simulation)
+        return found
 
     def arguments(self, setting: Setting) -> dict[str, Any]:
         """Return the arguments of an environment that has the scenes of a setting."""

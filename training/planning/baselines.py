@@ -8,12 +8,16 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.config.checks import unknown_name
-from viapoint.training.planning.ompl_planner import MotionPlanner
+from viapoint.training.planning.motion_plan import MotionPlan
+from viapoint.training.planning.ompl_planner import VIA_COUNTS, import_ompl, ompl_motion
+from viapoint.training.planning.plan_motion import plan_motion
 from viapoint.training.planning.search import GeometrySearch, registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults, StepAgentMethod
 from viapoint.training.rollouts.vec_env import env_arguments
@@ -70,6 +74,69 @@ class RandomVias:
         simulation = self._for_one_scene if number == 1 else self._simulation
         reward = simulation(every, actions.reshape(-1, size)).reward.reshape(number, self._count)
         return np.asarray(actions[np.arange(number), reward.argmax(axis=-1)])
+
+
+class PlannerMethod:
+    """Planner whose movements have as many via-points as they need, and durations of their own.
+
+    A decision is a row: number of via-points, durations of the segments [s], via-points, then zeros.
+
+    Args:
+        simulation: Simulation of the task.
+        name: Name in tables of results.
+        planner: Function of arm, start, goal and obstacles, and `space`, that returns a plan.
+    """
+
+    def __init__(self, simulation: SceneSimulation, name: str, planner: Callable[..., MotionPlan]) -> None:
+        self.name, self._simulation, self._planner = name, simulation, planner
+
+    def plan(self, scene: Scenes) -> MotionPlan:
+        """Return the plan of one scene."""
+        task = self._simulation.task
+        start, goal = task.space.coordinates(scene.start)[0], task.space.coordinates(scene.goal)[0]
+        return self._planner(task.arm, start, goal, scene.obstacles, space=task.space_name)
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """Return plans as rows, see :class:`Method`."""
+        most = VIA_COUNTS[-1]
+        rows = np.zeros((len(scenes.start), 2 + most * (1 + self._simulation.task.space.dimension)))
+        for i, row in enumerate(rows):
+            plan = self.plan(scenes.take([i]))
+            vias = plan.waypoints[1:-1]
+            row[0] = len(vias)
+            row[1 : 2 + len(vias)] = plan.durations
+            row[2 + len(vias) : 2 + len(vias) + vias.size] = vias.ravel()
+        return rows
+
+    def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
+        """Simulate the plans; those with equally many via-points run together."""
+        space = self._simulation.task.space
+        counts = decisions[:, 0].astype(np.int64)
+        reward, info = np.zeros(len(decisions)), dict[str, NDArray[Any]]()
+        for count in np.unique(counts):
+            rows = np.flatnonzero(counts == count)
+            some = scenes.take(rows)
+            waypoints = np.empty((len(rows), count + 2, space.dimension))
+            waypoints[:, 0], waypoints[:, -1] = space.coordinates(some.start), space.coordinates(some.goal)
+            vias = decisions[rows, 2 + count : 2 + count * (1 + space.dimension)]
+            waypoints[:, 1:-1] = vias.reshape(len(rows), count, space.dimension)
+            result = self._simulation.execute_plan(
+                some, Plan.at_rest(waypoints, decisions[rows, 1 : 2 + count])
+            )
+            reward[rows] = result.reward
+            for name, values in result.info.items():
+                info.setdefault(name, np.zeros(len(decisions), dtype=values.dtype))[rows] = values
+        return SimulationResults(reward, info)
+
+
+def ompl_method(simulation: SceneSimulation) -> PlannerMethod:
+    """Return the motion planner of the library OMPL.
+
+    Raises:
+        ValueError: The library is not installed.
+    """
+    import_ompl()
+    return PlannerMethod(simulation, "motion planner (OMPL)", ompl_motion)
 
 
 class OpenLoopBaseline:
@@ -143,12 +210,18 @@ COUNTED: dict[str, Callable[[SceneSimulation, int], Method]] = {
 """Factories of baselines whose names end in the number of plans that they check, such as `search512`."""
 FEWEST_CHECKS = {"search": 4, "sobol": 1}
 
+PLANNERS: dict[str, Callable[[SceneSimulation], PlannerMethod]] = {
+    "plan_motion": lambda simulation: PlannerMethod(simulation, "plan_motion", plan_motion),
+    "ompl": ompl_method,
+}
+"""Factories of the planners for known obstacles."""
+
 METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "straight": Straight,
     "random": lambda simulation: RandomVias(simulation, 1),
     "random16": lambda simulation: RandomVias(simulation, 16),
     "random80": lambda simulation: RandomVias(simulation, 80),
-    "ompl": MotionPlanner,
+    **PLANNERS,
 }
 """Factories of baselines by their names on the command line."""
 

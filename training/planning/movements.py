@@ -57,6 +57,8 @@ class MovementTable(NamedTuple):
     """Influence of each offset on the position at each instant, shape (M, N, K + 3)."""
     rate: Float
     """Influence of each offset on the velocity at each instant, shape (M, N, K + 3)."""
+    bend: Float
+    """Influence of each offset on the acceleration at each instant, shape (M, N, K + 3)."""
     cost: Float
     """Matrices of the jerk cost, half the integral of the squared jerk, shape (M, K + 3, K + 3)."""
     order: Int
@@ -73,6 +75,8 @@ class Setting(NamedTuple):
     """Shape (J, 2), [rad]."""
     of_hand: bool
     """True if movements are of the hand in the plane, False if they are of the joints."""
+    reach: Float
+    """Reach of the joints, see :func:`~viapoint.envs.geometry.clearance.travel`, shape (J,), [m]."""
     hand_alone: bool
     """True if the only sphere is the one around the hand of an arm in the plane."""
 
@@ -98,8 +102,9 @@ def table_with(durations: Float, number_of_instants: int = INSTANTS) -> Movement
     each = np.repeat(durations[:, None], columns, axis=1)
     movements = primitives.through(waypoints, each, start_velocity=velocity, start_acceleration=acceleration)
     instants = np.linspace(0.0, 1.0, number_of_instants)
-    basis = np.ascontiguousarray(movements(instants)[..., 0].transpose(0, 2, 1))
-    rate = np.ascontiguousarray(movements(instants, 1)[..., 0].transpose(0, 2, 1))
+    basis, rate, bend = (
+        np.ascontiguousarray(part[..., 0].transpose(0, 2, 1)) for part in movements.sample(instants)
+    )
     # The square of the jerk has degree four in each segment: three Gauss-Legendre nodes are exact.
     nodes, weights = np.polynomial.legendre.leggauss(3)
     begin = np.cumsum(durations, axis=-1) - durations
@@ -109,7 +114,7 @@ def table_with(durations: Float, number_of_instants: int = INSTANTS) -> Movement
     cost = 0.5 * np.einsum("mit,mjt,mt->mij", jerk, jerk, share)
     bits = number_of_instants.bit_length() - 1
     order = np.array([int(f"{k:0{bits}b}"[::-1], 2) for k in range(number_of_instants)])
-    return MovementTable(durations, basis, rate, cost, order)
+    return MovementTable(durations, basis, rate, bend, cost, order)
 
 
 @kernel

@@ -219,7 +219,7 @@ def setting_of(task: Task, obstacles: Obstacles, *, exact: bool = False) -> Sett
     if task.space.of_hand:
         spheres = _within_height(spheres, arm.chain.origin[:, 2], obstacles)
         alone = len(spheres.radius) == 1 and bool(np.allclose(spheres.centre[0], arm.chain.tool_origin))
-    return Setting(arm.chain, spheres, ranges, task.space.of_hand, alone)
+    return Setting(arm.chain, spheres, ranges, task.space.of_hand, arm.reach, alone)
 
 
 def _within_height(spheres: Spheres, heights: Float, obstacles: Obstacles) -> Spheres:

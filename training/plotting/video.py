@@ -20,9 +20,10 @@ from PIL import Image, ImageDraw, ImageFont
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Frame
 from viapoint.envs.episodes import Recorded
-from viapoint.envs.rendering.renderer import GLUnavailableError, frame_steps
+from viapoint.envs.rendering.renderer import EpisodeRenderer, GLUnavailableError, frame_steps
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.io.files import MARK, check_ours
+from viapoint.training.planning.motion_plan import MotionPlan, executed
 from viapoint.training.plotting.top_view import draw_movement, view_of
 from viapoint.training.rollouts.rollout import Decide
 
@@ -32,6 +33,8 @@ BLOCK = 16
 """Encoders need sides that are multiples of this, [pixels]."""
 SPEED = 0.5
 """Speed of videos relative to real time."""
+PLAN_SIZE, PLAN_FPS = (640, 480), 50
+"""Size of the pictures of a plan, [pixels], and pictures per second of its movement."""
 PAUSE = 0.8
 """Time for which each result stays, [s]."""
 
@@ -72,6 +75,33 @@ def record_video(
     finally:
         part.unlink(missing_ok=True)
     return count
+
+
+def record_plan(path: str | Path, plan: MotionPlan) -> int:
+    """Record the execution of a plan as an MP4, and return the number of frames.
+
+    Args:
+        path: MP4 file; its folder must exist.
+        plan: Plan.
+
+    Raises:
+        ValueError: The path has another suffix or is a file of something else.
+        GLUnavailableError: There is no OpenGL library.
+    """
+    path = Path(path).expanduser()
+    check_ours(path)
+    if path.suffix.lower() != ".mp4":
+        raise ValueError(f"path must end in .mp4, got {path}")
+    outcome, episodes = executed([plan])
+    info = {name: value[0] for name, value in outcome._asdict().items()}
+    film = EpisodeRenderer(episodes, 0, "rgb_array_list", *PLAN_SIZE, PLAN_FPS)
+    left = f"{plan.source}   {plan.duration:.2f} s   planned in {plan.milliseconds:.0f} ms"
+    hold = round(PAUSE * SPEED * PLAN_FPS)
+    try:
+        frames = _with_captions(iter(film.render()), left, *describe_outcome(info), hold=hold)
+        return _write_mp4(path, frames, PLAN_FPS * SPEED)
+    finally:
+        film.close()
 
 
 def _scenes(camera: Camera, scenes: Scenes, decide: Decide, name: str) -> Iterator[Frame]:

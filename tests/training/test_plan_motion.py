@@ -1,0 +1,334 @@
+"""Laws of planning around known obstacles."""
+
+import numpy as np
+import pytest
+
+from viapoint.envs import Box, Capsule, Cylinder, Pose, Sphere, Task, arm_of, obstacles_to_json
+from viapoint.envs.arms.kinematics import torques
+from viapoint.envs.geometry.obstacles import pack
+from viapoint.training import plan_motion, plan_motions
+from viapoint.training.cli.main import main
+from viapoint.training.planning import plan_motion as module
+from viapoint.training.planning import refine
+from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems, read_problems
+from viapoint.training.planning.export import read_motion, write_motion
+from viapoint.training.planning.motion_plan import UnsafePlanError, execute_plans
+from viapoint.training.planning.movements import movement_table
+
+PANDA = arm_of("panda")
+GOAL = PANDA.home + np.array([0.8, 0.5, 0.0, 0.6, 0.0, 0.3, 0.0])
+POST = Box((0.05, 0.05, 0.4), position=(0.5, 0.15, 0.4))
+"""Obstacle in the way from home to GOAL."""
+WALL = [Box((0.02, 2.0, 2.0), position=(0.45, 0.2, 0.0), quaternion=(0.924, 0.0, 0.0, 0.383))]
+"""Obstacle that nothing leads around."""
+
+
+def drawn(n: int, **kwargs):
+    """Problems of drawn scenes: task, starts, goals and obstacles."""
+    task = Task.of(**kwargs)
+    scenes = task.sampler()([np.random.default_rng((3, i)) for i in range(n)])
+    ends = task.space.coordinates(scenes.start), task.space.coordinates(scenes.goal)
+    return task, *ends, [scenes.obstacles.take([i]) for i in range(n)]
+
+
+@pytest.mark.parametrize(
+    "kwargs", [{"arm": "panda"}, {"arm": "planar"}, {"arm": "planar", "space": "joints"}], ids=str
+)
+def test_successful_plans_succeed_in_physics(kwargs) -> None:
+    task, starts, goals, obstacles = drawn(40, **kwargs)
+    plans = plan_motions(task.arm, starts, goals, obstacles, space=task.space_name)
+    good = [plan for plan in plans if plan.success and len(plan.durations) == 3]
+    assert len(good) >= 30
+    outcome = execute_plans(good)
+    assert outcome.is_success.all()
+    assert (outcome.stretch < 1.001).all()
+    assert np.abs(outcome.planned_clearance - [plan.clearance for plan in good]).max() < 2e-3
+
+
+def test_plans_keep_the_limits_and_use_them() -> None:
+    plan = plan_motion(PANDA, PANDA.home, GOAL, [POST])
+    motion = plan.joints(rate=1000)
+    shares = np.abs(motion.velocity) / PANDA.velocity_limit, np.abs(motion.torque) / PANDA.torque_limit
+    assert 0.9 < max(share.max() for share in shares) <= 1.0
+    assert np.allclose(max(plan.limits), max(share.max() for share in shares), atol=0.01)
+    assert np.allclose(motion.position[[0, -1]], [PANDA.home, GOAL])
+    assert np.allclose(motion.velocity[[0, -1]], 0.0, atol=1e-9)
+    assert np.allclose(
+        np.gradient(motion.position, motion.time, axis=0)[5:-5], motion.velocity[5:-5], atol=1e-3
+    )
+
+
+def test_what_is_free_stays_straight() -> None:
+    plan = plan_motion(PANDA, PANDA.home, GOAL, time_limit=0.0)
+    assert (plan.success, plan.source, plan.seeds) == (True, "straight", 0)
+    assert plan.jerk == pytest.approx(1.0)
+    assert len(plan.durations) == 1
+
+
+@pytest.mark.parametrize("arguments", [{"time_limit": 0.0}, {"seeds": 4}])
+def test_plans_never_lie(arguments) -> None:
+    plan = plan_motion(PANDA, PANDA.home, GOAL, WALL, **arguments)
+    assert not plan.success
+    assert plan.clearance < 0.0
+    assert "clearance" in plan.reason
+    for use in (plan.joints, plan.execute):
+        with pytest.raises(UnsafePlanError, match="force=True"):
+            use()
+    assert plan.joints(force=True).time[-1] == plan.duration
+    assert plan.execute(force=True).collision.all()
+
+
+def test_ends_in_contact_and_outside_limits_are_told() -> None:
+    there = Sphere(0.1, position=PANDA.hand(GOAL))
+    assert "goal is in contact with obstacle 1" in plan_motion(PANDA, PANDA.home, GOAL, [POST, there]).reason
+    outside = GOAL + 9.0 * np.eye(7)[2]
+    assert "joint 'joint3' must be from -2.897 to 2.897" in plan_motion(PANDA, PANDA.home, outside).reason
+    assert "out of reach" in plan_motion("planar", (0.0, 0.3), (0.0, 0.9)).reason
+
+
+def test_given_duration_stays_or_fails() -> None:
+    slow = plan_motion(PANDA, PANDA.home, GOAL, [POST], duration=4.0)
+    assert slow.success
+    assert slow.duration == pytest.approx(4.0)
+    fast = plan_motion(PANDA, PANDA.home, GOAL, [POST], duration=0.3)
+    assert not fast.success
+    assert "limit" in fast.reason
+
+
+def test_margin_is_kept() -> None:
+    for margin in (0.01, 0.03):
+        plan = plan_motion(PANDA, PANDA.home, GOAL, [POST], margin=margin)
+        assert plan.success
+        assert plan.clearance >= margin
+
+
+def test_movements_in_motion_begin_as_given_and_keep_the_limits() -> None:
+    velocity, acceleration = np.full(7, 0.3), np.full(7, -0.5)
+    plan = plan_motion(PANDA, PANDA.home, GOAL, [POST], velocity=velocity, acceleration=acceleration)
+    assert plan.success
+    motion = plan.joints(rate=500)
+    assert np.allclose(motion.velocity[0], velocity)
+    assert np.allclose(motion.acceleration[0], acceleration)
+    assert (np.abs(motion.velocity) <= PANDA.velocity_limit).all()
+
+
+def test_moving_obstacles_are_avoided_where_they_are_then() -> None:
+    # It starts out of the way, and crosses the straight movement; where it will be later is free now.
+    ball = Sphere(0.1, position=(0.75, 0.15, 0.5), velocity=(-0.3, 0.0, 0.0))
+    plan = plan_motion(PANDA, PANDA.home, GOAL, [ball])
+    assert plan.success
+    assert plan.execute().is_success.all()
+    straight = plan_motion(PANDA, PANDA.home, GOAL, [ball], time_limit=0.0)
+    assert not straight.success or straight.source == "straight"
+
+
+def test_poses_and_several_goals() -> None:
+    pose = Pose(position=(0.45, 0.35, 0.35), quaternion=(0.0, 1.0, 0.0, 0.0))
+    plan = plan_motion(PANDA, PANDA.home, pose, [POST])
+    assert plan.success
+    assert np.allclose(PANDA.hand(plan.waypoints[-1]), pose.position, atol=1e-5)
+    far = GOAL + 1.5 * np.eye(7)[4]
+    several = plan_motion(PANDA, PANDA.home, [far, GOAL], [POST])
+    assert np.array_equal(several.waypoints[-1], GOAL)
+    with pytest.raises(ValueError, match="cannot be reached"):
+        plan_motion(PANDA, PANDA.home, Pose(position=(2.0, 0.0, 0.3)))
+
+
+def test_given_seeds_come_first() -> None:
+    found = plan_motion(PANDA, PANDA.home, GOAL, [POST])
+    again = plan_motion(PANDA, PANDA.home, GOAL, [POST], seeds=found.waypoints[None, 1:-1])
+    assert (again.source, again.seeds) == ("given", 1)
+    assert again.jerk <= 1.05 * found.jerk
+
+
+def test_results_depend_on_neither_threads_nor_the_form_of_obstacles() -> None:
+    task, starts, goals, obstacles = drawn(6, arm="panda")
+    alone = [plan_motion(task.arm, *each, rng=5) for each in zip(starts, goals, obstacles, strict=True)]
+    for threads in (1, 3):
+        together = plan_motions(task.arm, starts, goals, obstacles, threads=threads, rng=5)
+        for one, other in zip(alone, together, strict=True):
+            assert np.array_equal(one.waypoints, other.waypoints)
+            assert np.array_equal(one.durations, other.durations)
+    forms = [POST], [POST.to_dict()], pack([[POST]])
+    first, *others = (plan_motion(PANDA, PANDA.home, GOAL, form) for form in forms)
+    assert all(np.array_equal(first.waypoints, other.waypoints) for other in others)
+
+
+@pytest.mark.parametrize("kwargs", [{"arm": "panda"}, {"arm": "planar", "whole_arm": True}], ids=str)
+def test_gradient_of_the_objective(kwargs) -> None:
+    task, starts, goals, obstacles = drawn(5, **kwargs)
+    aim = module.AIMS[0]._replace(clearance=0.2)  # many residuals
+    setting, table = module._setting(task.arm, task.space.of_hand), movement_table(2)
+    dimension = task.space.dimension
+    generator = np.random.default_rng(0)
+    hessian, gradient = np.empty((2 * dimension, 2 * dimension)), np.empty(2 * dimension)
+    work = refine._work(setting, 5, dimension)
+
+    def objective(problem, offsets) -> float:
+        start, scene = problem
+        return refine._assemble(
+            setting, table, 80, start, offsets, 1.0, scene, 0, aim, hessian, gradient, work
+        )[0]
+
+    for start, goal, scene in zip(starts, goals, obstacles, strict=True):
+        line = goal - start
+        offsets = np.concatenate(([line / 3, 2 * line / 3, line], np.zeros((2, dimension))))
+        offsets[:2] += generator.uniform(-0.02, 0.02, (2, dimension))
+        objective((start, scene), offsets)
+        computed = 2.0 * gradient.copy()
+        measured = np.empty(2 * dimension)
+        for i in range(2 * dimension):
+            change = np.zeros_like(offsets)
+            change[i // dimension, i % dimension] = 1e-6
+            more = objective((start, scene), offsets + change)
+            measured[i] = (more - objective((start, scene), offsets - change)) / 2e-6
+        # The nearest sphere changes here and there, where the objective has a kink.
+        assert np.abs(computed - measured).max() < 0.03 * np.abs(measured).max()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"start": PANDA.home[:6]}, "start"),
+        ({"goal": np.full(7, np.nan)}, "goal"),
+        ({"n_via": 4}, "n_via"),
+        ({"seeds": -1}, "seeds"),
+        ({"seeds": np.zeros((2, 3, 7))}, "seeds"),
+        ({"margin": -0.1}, "margin"),
+        ({"time_limit": np.nan}, "time_limit"),
+        ({"duration": 0.0}, "duration"),
+        ({"velocity": np.zeros(3)}, "velocity"),
+        ({"obstacles": [{"shape": "box"}]}, "obstacle 0: box: .* missing is size"),
+        ({"obstacles": pack([[POST], [POST]])}, "one scene"),
+        ({"arm": "robot"}, "arm must be"),
+    ],
+)
+def test_bad_input(arguments, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        plan_motion(**{"arm": PANDA, "start": PANDA.home, "goal": GOAL, "obstacles": [POST], **arguments})
+
+
+def test_batches_name_the_problem() -> None:
+    with pytest.raises(ValueError, match="problem 1: goal"):
+        plan_motions(PANDA, [PANDA.home] * 2, [GOAL, GOAL[:3]], [[], []])
+    with pytest.raises(ValueError, match="equally many"):
+        plan_motions(PANDA, [PANDA.home] * 2, [GOAL], [[], []])
+
+
+def test_capsules_and_cylinders_stand_for_one_another() -> None:
+    for shape in (
+        Capsule(0.05, 0.4, position=(0.5, 0.15, 0.4)),
+        Cylinder(0.05, 0.4, position=(0.5, 0.15, 0.4)),
+    ):
+        assert plan_motion(PANDA, PANDA.home, GOAL, [shape]).success
+
+
+def test_the_benchmark_is_that_of_the_literature() -> None:
+    arm, problems = benchmark_panda(), benchmark_problems()
+    assert len(problems) == 700
+    assert len(arm.spheres.radius) == 59
+    faults = []
+    for each in problems:
+        plan = plan_motion(arm, each.start, each.goal, each.obstacles, time_limit=0.0)
+        if plan.reason.startswith(("the start", "the goal", "the arm")):
+            faults.append(each.name)
+    assert faults == ["table_pick 41"]
+
+
+def test_first_problems_of_the_benchmark() -> None:
+    arm = benchmark_panda()
+    problems = [problem for problem in benchmark_problems() if problem.number <= 3]
+    plans = [plan_motion(arm, problem.start, problem.goal, problem.obstacles) for problem in problems]
+    assert all(plan.success for plan in plans)
+    assert execute_plans([plan for plan in plans if len(plan.durations) == 3]).is_success.all()
+
+
+@pytest.mark.parametrize("file", ["plan.csv", "plan.yaml"])
+def test_files_hold_the_movement(tmp_path, file) -> None:
+    plan = plan_motion(PANDA, PANDA.home, GOAL, [POST])
+    written = write_motion(plan, tmp_path / file, rate=250)
+    names, again = read_motion(tmp_path / file)
+    assert names == PANDA.joint_names
+    for one, other in zip(written, again, strict=True):
+        assert np.allclose(one, other, rtol=1e-9, atol=1e-8)
+    assert np.allclose(again.torque, torques(PANDA.chain, again.position, again.velocity, again.acceleration))
+
+
+def test_files_of_other_forms_are_refused(tmp_path) -> None:
+    plan = plan_motion(PANDA, PANDA.home, GOAL, [POST])
+    with pytest.raises(ValueError, match=r"\.csv or \.yaml"):
+        write_motion(plan, tmp_path / "plan.txt")
+    for name, text in (("a.csv", "time,x\n1,2\n"), ("b.yaml", "points: 3\n"), ("c.csv", "")):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(ValueError, match="no movement of joints"):
+            read_motion(tmp_path / name)
+    unsafe = plan_motion(PANDA, PANDA.home, GOAL, WALL, time_limit=0.0)
+    with pytest.raises(UnsafePlanError):
+        write_motion(unsafe, tmp_path / "plan.csv")
+    assert not (tmp_path / "plan.csv").exists()
+
+
+def test_command_line_plans_and_measures(tmp_path, capsys) -> None:
+    scene = tmp_path / "scene.json"
+    scene.write_text(obstacles_to_json([POST]))
+    words = ["plan", "--scene", str(scene), "--goal", *map(str, GOAL), "--out", str(tmp_path / "plan.csv")]
+    main(words)
+    assert "success" in capsys.readouterr().out
+    assert np.allclose(read_motion(tmp_path / "plan.csv")[1].position[-1], GOAL)
+    scene.write_text(obstacles_to_json(WALL))
+    with pytest.raises(SystemExit):
+        main([*words, "--time-limit", "0"])
+    assert "not safe" in capsys.readouterr().err
+    main(
+        [
+            "evaluate",
+            "--scenes",
+            "motionbenchmaker",
+            "--n-scenes",
+            "3",
+            "--json",
+            str(tmp_path / "lines.json"),
+        ]
+    )
+    assert "| plan_motion | all" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["evaluate", "--scenes", "motionbenchmaker", "--baselines", "nothing"])
+    assert "plan_motion+ompl" in capsys.readouterr().err
+
+
+def test_problems_are_read_from_the_original_files(tmp_path) -> None:
+    folder = tmp_path / "cage_panda"
+    folder.mkdir()
+    half = 0.5**0.5
+    (folder / "scene0007.yaml").write_text(
+        f"""
+world:
+  collision_objects:
+    - id: shelf
+      pose: {{position: [0.5, 0, 0], orientation: [0, 0, {half}, {half}]}}
+      primitive_poses:
+        - {{position: [0.1, 0, 0.2], orientation: [0, 0, 0, 1]}}
+        - {{position: [0, 0, 0.4], orientation: [0, 0, 0, 1]}}
+      primitives:
+        - {{type: box, dimensions: [0.2, 0.4, 0.6]}}
+        - {{type: cylinder, dimensions: [0.3, 0.05]}}
+"""
+    )
+    names = ", ".join(f"panda_joint{j}" for j in range(1, 8))
+    goals = "".join(f"    - {{joint_name: panda_joint{j}, position: 0.{j}}}\n" for j in range(1, 8))
+    (folder / "request0007.yaml").write_text(
+        f"start_state:\n  joint_state: {{name: [{names}], position: [0, 0, 0, -1, 0, 1, 0]}}\n"
+        f"goal_constraints:\n  - joint_constraints:\n{goals}"
+    )
+    [problem] = read_problems(tmp_path)
+    assert problem.name == "cage 7"
+    assert np.allclose(problem.goal, np.arange(1, 8) / 10)
+    box, can = problem.obstacles
+    assert np.allclose(box.position, (0.5, 0.1, 0.2))  # turned by a quarter of a turn about z
+    assert np.allclose(box.size, (0.1, 0.2, 0.3))
+    assert (can.radius, can.half_length) == (0.05, 0.15)
+    (folder / "request0007.yaml").write_text("start_state: {}\n")
+    with pytest.raises(ValueError, match=r"scene0007\.yaml"):
+        read_problems(tmp_path)
+    with pytest.raises(ValueError, match=r"holds no scene"):
+        read_problems(tmp_path / "nothing")

@@ -1,0 +1,82 @@
+"""Command `plan`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.load import load_arm
+from viapoint.envs.arms.registry import arm_names, arm_of
+from viapoint.envs.geometry.shapes import obstacles_from_json
+from viapoint.envs.scenes.options import Pose, scene_from_json
+from viapoint.training.config.configs import PlanConfig
+from viapoint.training.planning.export import write_motion
+from viapoint.training.planning.plan_motion import plan_motion
+
+
+def run(config: PlanConfig) -> None:
+    """Plan a movement, print what is known of it, and write it."""
+    arm = arm_for(config)
+    scene = _scene(config.scene)
+    start = config.start or scene.get("start")
+    if start is None:
+        start = arm.hand(arm.home)[:2] if arm.space == "hand" else arm.home
+    plan = plan_motion(
+        arm,
+        start,
+        _goal(config, scene),
+        scene.get("obstacles", ()),
+        n_via=config.n_via,
+        margin=config.margin,
+        duration=config.duration,
+        time_limit=config.time_limit,
+        rng=config.seed,
+    )
+    print(plan)
+    if config.out is not None:
+        motion = write_motion(plan, config.out, config.rate, force=config.force)
+        print(f"{len(motion.time)} instants at {config.rate:g} Hz: {config.out}")
+    if config.video is not None:
+        from viapoint.training.plotting.video import record_plan
+
+        plan.refuse_unsafe(config.force)
+        config.video.parent.mkdir(parents=True, exist_ok=True)
+        print(f"{record_plan(config.video, plan)} frames: {config.video}")
+    if not plan.success and not config.force:
+        raise ValueError(f"no plan is safe: {plan.reason}")
+
+
+def arm_for(config: PlanConfig) -> Arm:
+    """Return the arm of a name or of a file."""
+    if config.arm in arm_names():
+        return arm_of(config.arm)
+    if not Path(config.arm).expanduser().is_file():
+        raise ValueError(f"arm must be {', '.join(arm_names())} or an MJCF file, got {config.arm}")
+    if not config.tool or not config.joints:
+        raise ValueError("an arm of a file needs --tool SITE and --joints NAMES, from the base to the tool")
+    path = Path(config.arm).expanduser()
+    return load_arm(path, hand_site=config.tool, joints=config.joints, velocity_limit=config.velocity_limit)
+
+
+def _scene(path: Path | None) -> dict[str, Any]:
+    """Return start, goal and obstacles of a scene file, or of a list of obstacles."""
+    if path is None:
+        return {}
+    text = path.expanduser().read_text(encoding="utf-8")
+    if text.lstrip().startswith("["):
+        return {"obstacles": obstacles_from_json(text)}
+    return scene_from_json(text)
+
+
+def _goal(config: PlanConfig, scene: dict[str, Any]) -> Any:
+    """Return the goal: coordinates, or a pose."""
+    if config.goal:
+        return config.goal
+    if config.position:
+        return Pose(np.array(config.position), config.quaternion or None)
+    if "goal" in scene:
+        return scene["goal"]
+    raise ValueError("name a goal: --goal JOINTS, or --position X Y Z, or a scene file that has one")

@@ -1,0 +1,134 @@
+"""Files of joint movements for controllers: tables of numbers, and messages of ROS 2."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array
+from viapoint.training.io.files import write_bytes
+from viapoint.training.planning.motion_plan import JointMotion, MotionPlan
+
+PARTS = ("position", "velocity", "acceleration", "torque")
+"""Quantities of a table, each of which has a column for each joint."""
+ROS_PARTS = ("positions", "velocities", "accelerations", "effort")
+"""Names of the same quantities in a point of `trajectory_msgs/JointTrajectory`."""
+
+
+def write_motion(
+    plan: MotionPlan, path: str | Path, rate: float = 100.0, *, force: bool = False
+) -> JointMotion:
+    """Write the movement of the joints, and return it.
+
+    A `.csv` file has the columns `time` [s] and, for each joint, `position:NAME`, `velocity:NAME`, `acceleration:NAME`
+    and `torque:NAME`, in rad or m and their derivatives, and N m or N. A `.yaml` file is a message
+    `trajectory_msgs/JointTrajectory` of ROS 2.
+
+    Args:
+        plan: Plan.
+        path: File that ends in .csv, .yaml or .yml.
+        rate: Instants per second, [Hz].
+        force: True for plans without success, too.
+
+    Raises:
+        UnsafePlanError: The plan has no success.
+        ValueError: The file has another suffix.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.envs import arm_of
+        >>> from viapoint.training import plan_motion
+        >>> from viapoint.training.planning.export import read_motion, write_motion
+        >>> arm = arm_of("panda")
+        >>> motion = write_motion(plan_motion(arm, arm.home, np.zeros(7) + [0, 0, 0, -1, 0, 1, 0]), "runs/plan.csv")
+        >>> names, again = read_motion("runs/plan.csv")
+        >>> names == arm.joint_names, np.abs(again.position - motion.position).max() < 1e-9
+        (True, True)
+    """
+    path = Path(path).expanduser()
+    form = _form(path)
+    motion = plan.joints(rate, force=force)
+    names = plan.arm.joint_names
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, (_table(names, motion) if form == "csv" else _message(names, motion)).encode())
+    return motion
+
+
+def read_motion(path: str | Path) -> tuple[tuple[str, ...], JointMotion]:
+    """Return the names of the joints and the movement of a file of :func:`write_motion`.
+
+    Raises:
+        ValueError: The file is no such file.
+    """
+    path = Path(path).expanduser()
+    form = _form(path)
+    text = path.read_text(encoding="utf-8")
+    try:
+        names, time, parts = _read_table(text) if form == "csv" else _read_message(text)
+        shape = (len(time), len(names))
+        return names, JointMotion(time, *(finite_array("motion", part, shape) for part in parts))
+    except (KeyError, IndexError, StopIteration, TypeError, ValueError, yaml.YAMLError) as error:
+        raise ValueError(f"{path} is no movement of joints ({error!r:.80})") from None
+
+
+def _form(path: Path) -> str:
+    """Return the form of a file by its suffix."""
+    forms = {".csv": "csv", ".yaml": "yaml", ".yml": "yaml"}
+    if path.suffix.lower() not in forms:
+        raise ValueError(f"a movement is written as .csv or .yaml, got {path}")
+    return forms[path.suffix.lower()]
+
+
+def _table(names: tuple[str, ...], motion: JointMotion) -> str:
+    """Return a movement as comma-separated values."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["time", *(f"{part}:{name}" for part in PARTS for name in names)])
+    for row in np.column_stack(motion):
+        writer.writerow([f"{value:.12g}" for value in row])
+    return text.getvalue()
+
+
+def _read_table(text: str) -> tuple[tuple[str, ...], Float, list[Float]]:
+    """Return joints, times and quantities of a table."""
+    rows = csv.reader(io.StringIO(text))
+    head = next(rows)
+    names = tuple(column.removeprefix("position:") for column in head if column.startswith("position:"))
+    if head != ["time", *(f"{part}:{name}" for part in PARTS for name in names)]:
+        raise ValueError("its columns are others")
+    numbers = np.array([[float(value) for value in row] for row in rows])
+    return names, numbers[:, 0], np.split(numbers[:, 1:], len(PARTS), axis=1)
+
+
+def _message(names: tuple[str, ...], motion: JointMotion) -> str:
+    """Return a movement as a message of ROS 2."""
+    points = []
+    for time, *values in zip(*motion, strict=True):
+        # Whole nanoseconds, which carry over into seconds.
+        seconds, rest = divmod(round(1e9 * float(time)), 1_000_000_000)
+        point: dict[str, Any] = {
+            name: [float(f"{number:.12g}") for number in value]
+            for name, value in zip(ROS_PARTS, values, strict=True)
+        }
+        points.append({**point, "time_from_start": {"sec": seconds, "nanosec": rest}})
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+    message = {"header": header, "joint_names": list(names), "points": points}
+    return yaml.dump(
+        message, Dumper=yaml.CSafeDumper, sort_keys=False, default_flow_style=None, width=100_000
+    )
+
+
+def _read_message(text: str) -> tuple[tuple[str, ...], Float, list[Float]]:
+    """Return joints, times and quantities of a message of ROS 2."""
+    message = yaml.load(text, yaml.CSafeLoader)
+    points = message["points"]
+    times = [point["time_from_start"] for point in points]
+    time = np.array([each["sec"] + 1e-9 * each["nanosec"] for each in times])
+    parts = [np.array([point[name] for point in points], dtype=np.float64) for name in ROS_PARTS]
+    return tuple(message["joint_names"]), time, parts

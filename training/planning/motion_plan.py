@@ -1,0 +1,201 @@
+"""Motion plans: movements of an arm among obstacles, with what was checked of them, for controllers and for MuJoCo."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from viapoint import primitives
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.kinematics import torques
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import number_of_at_least
+from viapoint.envs.episodes import Episodes
+from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
+from viapoint.envs.outcome import Outcome
+from viapoint.envs.plans import Motion, Plan, SpaceName
+from viapoint.envs.scenes.scene import resting
+from viapoint.envs.spaces import Space, space_of
+from viapoint.envs.task import Task
+
+
+class Limits(NamedTuple):
+    """Greatest shares of the limits of the joints that a movement uses; more than 1 is beyond a limit."""
+
+    velocity: float
+    """Share of a velocity limit."""
+    torque: float
+    """Share of a torque or force limit."""
+
+
+class JointMotion(NamedTuple):
+    """Movement of the joints at N instants."""
+
+    time: Float
+    """Shape (N,), [s]."""
+    position: Float
+    """Shape (N, J), [rad] or [m]."""
+    velocity: Float
+    """Shape (N, J), [rad/s] or [m/s]."""
+    acceleration: Float
+    """Shape (N, J), [rad/s^2] or [m/s^2]."""
+    torque: Float
+    """Torques or forces by inverse dynamics, shape (N, J), [N m] or [N]."""
+
+
+class UnsafePlanError(ValueError):
+    """A plan that touches something, or that breaks a limit, was to be executed or exported."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MotionPlan:
+    """Movement of an arm from a start to a goal, and what is known of it.
+
+    Example:
+        >>> from viapoint.envs import Box, arm_of
+        >>> from viapoint.training.planning.plan_motion import plan_motion
+        >>> arm = arm_of("panda")
+        >>> goal = arm.home + [0.8, 0.5, 0.0, 0.6, 0.0, 0.3, 0.0]
+        >>> plan = plan_motion(arm, arm.home, goal, [Box((0.1, 0.1, 0.3), position=(0.5, 0.15, 0.3))])
+        >>> plan.success, plan.waypoints.shape
+        (True, (4, 7))
+        >>> motion = plan.joints(rate=1000)  # at 1 kHz, for a controller
+        >>> motion.position.shape == motion.torque.shape == (len(motion.time), 7)
+        True
+    """
+
+    arm: Arm
+    """Arm."""
+    space: SpaceName
+    """Space of the coordinates."""
+    waypoints: Float
+    """Start, via-points and goal, shape (K + 2, D), [rad] of joints or [m] of the hand."""
+    durations: Float
+    """Durations of the segments, shape (K + 1,), [s]."""
+    velocity: Float
+    """Initial velocity, shape (D,)."""
+    acceleration: Float
+    """Initial acceleration, shape (D,)."""
+    obstacles: Obstacles
+    """Obstacles of the scene, as one scene of packed arrays."""
+    success: bool
+    """True if the movement touches nothing and keeps all limits."""
+    clearance: float
+    """Least clearance from obstacles and of the arm from itself, [m]; negative in contact, at most 0.1."""
+    limits: Limits
+    """Shares of the velocity and torque limits."""
+    jerk: float
+    """Jerk cost relative to that of the straight movement of the same duration."""
+    source: str
+    """Origin of the via-points: `straight`, `straight, refined`, `given`, `random`, `ompl`, or another planner."""
+    reason: str = ""
+    """Reason why there is no better plan; empty for success."""
+    seeds: int = 0
+    """Number of seeds that were refined."""
+    milliseconds: float = 0.0
+    """Time that planning took, [ms]."""
+
+    def __repr__(self) -> str:
+        """Return what matters."""
+        state = "success" if self.success else f"no success: {self.reason}"
+        return (
+            f"MotionPlan({self.arm.name!r}, {state}, n_via={len(self.durations) - 1}, duration={self.duration:.3f} s, "
+            f"clearance={1e3 * self.clearance:.1f} mm, jerk={self.jerk:.2f}, source={self.source!r}, "
+            f"seeds={self.seeds}, milliseconds={self.milliseconds:.1f})"
+        )
+
+    @property
+    def duration(self) -> float:
+        """Total duration, [s]."""
+        return float(self.durations.sum())
+
+    @property
+    def plan(self) -> Plan:
+        """The movement alone, as environments take it."""
+        return Plan(self.waypoints, self.durations, self.velocity, self.acceleration)
+
+    def trajectory(self) -> primitives.Trajectory:
+        """Return the minimum-jerk movement through the waypoints, in coordinates of the space."""
+        return self.plan.trajectory()
+
+    def joints(self, rate: float = 1000.0, *, force: bool = False) -> JointMotion:
+        """Return the movement of the joints at a rate, from the start to the goal.
+
+        Args:
+            rate: Instants per second, [Hz]; the last interval may be shorter.
+            force: True for plans without success, too.
+
+        Raises:
+            UnsafePlanError: The plan has no success.
+        """
+        self.refuse_unsafe(force)
+        number_of_at_least("rate", rate, 1e-3)
+        last = int(np.floor(self.duration * rate * (1.0 - 1e-12)))
+        time = np.append(np.arange(last + 1) / rate, self.duration)
+        motion = joint_motion(space_of(self.arm, self.space), self.trajectory(), time)
+        return JointMotion(time, *motion, torques(self.arm.chain, *motion))
+
+    def execute(self, *, force: bool = False) -> Outcome:
+        """Execute the movement in MuJoCo among its obstacles, and return the metrics, shape (1,) each.
+
+        Args:
+            force: True for plans without success, too.
+
+        Raises:
+            UnsafePlanError: The plan has no success.
+            ValueError: The movement does not begin at rest.
+        """
+        self.refuse_unsafe(force)
+        if self.velocity.any() or self.acceleration.any():
+            raise ValueError("a movement that begins in motion cannot be executed from rest")
+        return execute_plans([self])
+
+    def refuse_unsafe(self, force: bool) -> None:
+        """Raise UnsafePlanError for a plan without success, unless `force` is True."""
+        if not self.success and not force:
+            raise UnsafePlanError(f"the plan is not safe: {self.reason}; force=True takes it nevertheless")
+
+    def replaced(self, **changes: Any) -> MotionPlan:
+        """Return the plan with some fields changed."""
+        return dataclasses.replace(self, **changes)
+
+
+def joint_motion(space: Space, trajectory: primitives.Trajectory, time: Float) -> Motion:
+    """Return positions, velocities and accelerations of the joints at instants, shape (N, J) each."""
+    sampled = Motion(*(part[None] for part in trajectory.sample(time)))
+    return Motion(*(np.ascontiguousarray(part[0]) for part in space.joint_motion(sampled)))
+
+
+def execute_plans(plans: Sequence[MotionPlan]) -> Outcome:
+    """Execute plans of one arm in MuJoCo, each among its obstacles, and return the metrics, shape (N,) each.
+
+    All plans must have equally many via-points; plans without success are executed, too.
+    """
+    return executed(plans)[0]
+
+
+def executed(plans: Sequence[MotionPlan]) -> tuple[Outcome, Episodes]:
+    """Return the metrics of :func:`execute_plans`, and the simulations, which hold the records until the next ones."""
+    first, number = plans[0], len(plans)
+    rows = max(plan.obstacles.kind.shape[1] for plan in plans)
+    episodes = _episodes(first.arm, first.space, len(first.durations) - 1, rows, number)
+    space = episodes.task.space
+    waypoints = np.stack([plan.waypoints for plan in plans])
+    start, goal = (np.ascontiguousarray(space.joints(waypoints[:, end])) for end in (0, -1))
+    obstacles = no_obstacles(number, rows)
+    for i, plan in enumerate(plans):
+        obstacles = obstacles.put([i], plan.obstacles.with_rows(rows))
+    episodes.start(np.arange(number), resting(start, goal, obstacles))
+    decision = episodes.execute(Plan.at_rest(waypoints, np.stack([plan.durations for plan in plans])))
+    return Outcome(**{name: decision.info[name] for name in Outcome._fields}), episodes
+
+
+@functools.lru_cache(maxsize=4)
+def _episodes(arm: Arm, space: SpaceName, n_via: int, rows: int, number: int) -> Episodes:
+    """Return simulations of an arm among up to some obstacles."""
+    return Episodes(Task.of(arm=arm, space=space, n_via=n_via, n_obstacles=(0, rows)), number)

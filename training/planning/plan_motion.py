@@ -1,0 +1,619 @@
+"""Planner for known obstacles: seeds of via-points, refined by the gradient of clearance, checked, and polished.
+
+It needs an arm and obstacles, but no environment and no network.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from viapoint import primitives
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.inverse_kinematics import inverse_kinematics
+from viapoint.envs.arms.kinematics import torques
+from viapoint.envs.arms.registry import arm_of
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array, number_of_at_least, whole_number
+from viapoint.envs.geometry.obstacles import Obstacles, pack
+from viapoint.envs.geometry.shapes import Shape
+from viapoint.envs.limits import slowdown
+from viapoint.envs.plans import Motion, Plan, SpaceName
+from viapoint.envs.scenes.options import Pose
+from viapoint.envs.scenes.scene import row_clearances
+from viapoint.envs.spaces import Space, space_of
+from viapoint.training.planning.motion_plan import Limits, MotionPlan
+from viapoint.training.planning.movements import (
+    FINE_INSTANTS,
+    OUTSIDE,
+    MovementTable,
+    Setting,
+    movement_table,
+    table_with,
+)
+from viapoint.training.planning.refine import STRAIGHT_COST, Aim, exact_clearance, is_free, refine_seeds
+
+AIMS = (
+    Aim(clearance=0.04, jerk=0.1, iterations=20, gain=1.0, stride=2),
+    Aim(clearance=0.02, jerk=1.0, iterations=20, gain=0.02, stride=2),
+    Aim(clearance=0.02, jerk=0.3, iterations=20, gain=0.01, stride=2),
+    Aim(clearance=0.015, jerk=1.5, iterations=20, gain=0.01, stride=2),
+)
+"""Aims of the refinements. The first one, of a seed, has little weight of jerk, and ends as soon as the movement is
+free; the others polish free movements."""
+SMOOTH = 1.5
+"""Relative jerk cost with which a movement is polished no more."""
+ROUGH, MORE = 2.0, 4
+"""Relative jerk cost above which more seeds are tried after a free movement, and how many of them."""
+SPREADS = 0.8, 1.0
+"""Spread of the first random seeds around the straight line, and of later ones, [rad]."""
+HAND_SPREADS = 0.15, 0.3
+"""Spreads of the same seeds in hand space, [m]."""
+NARROW = 8
+"""Number of seeds with the first spread."""
+SEEDS = 256
+"""Greatest number of random seeds."""
+CHUNKS = 1, 1, 2, 4
+"""Numbers of seeds between two looks at the clock; the last one repeats."""
+LONGEST_SEARCH = 1.0
+"""Default of the time limit, [s]."""
+RANGE_TOLERANCE = 1e-6
+"""Way beyond a joint limit that counts as rounding, [rad]."""
+UNLIMITED = 0.85
+"""Shortest duration that is chosen for an arm without velocity limits, [s]."""
+LIMIT_STRIDE = 4
+"""Step between the instants at which limits are looked at."""
+ROUNDS = 6
+"""Greatest number of times that a movement is planned again because it must take longer."""
+LONGER = 1.3
+"""Duration relative to that of the straight movement with which planning among moving obstacles begins."""
+SPARE = 1e-3
+"""Clearance that movements keep beyond the margin where their ends have it, [m]."""
+ROUNDING = 1e-6
+"""Rounding error of clearances, [m]."""
+GOALS = 8
+"""Greatest number of configurations that are tried for a pose."""
+
+
+class _Problem(NamedTuple):
+    """One planning problem in coordinates of a space."""
+
+    arm: Arm
+    space: Space
+    start: Float
+    velocity: Float
+    acceleration: Float
+    goal: Float
+    obstacles: Obstacles
+    duration: float | None
+    margin: float
+
+    @property
+    def setting(self) -> Setting:
+        """Arm and space for compiled functions."""
+        return _setting(self.arm, self.space.of_hand)
+
+    @property
+    def moves(self) -> bool:
+        """True if the clearance of a movement depends on its duration."""
+        return bool(self.velocity.any() or self.acceleration.any() or self.obstacles.velocity.any())
+
+    def offsets(self, vias: Float, duration: float) -> Float:
+        """Return the offsets of a movement, shape (K + 3, D), from its via-points relative to the start."""
+        offsets = np.empty((len(vias) + 3, len(self.start)))
+        offsets[:-3] = vias
+        offsets[-3] = self.goal - self.start
+        offsets[-2] = self.velocity * duration
+        offsets[-1] = self.acceleration * duration**2
+        return offsets
+
+
+class _Movement(NamedTuple):
+    """Movement with passage times from a table."""
+
+    vias: Float
+    """Via-points relative to the start, shape (K, D)."""
+    table: MovementTable
+    """Table with many instants."""
+    times: int
+    """Index of the passage times."""
+    duration: float
+    """Duration for which it was planned, [s]."""
+    source: str
+    """Origin of the via-points."""
+    clearance: float | None = None
+    """Its least clearance, [m]; None if it is not known yet."""
+
+
+def plan_motion(
+    arm: Arm | str,
+    start: Any,
+    goal: Any,
+    obstacles: Iterable[Shape | Mapping[str, Any]] | Obstacles = (),
+    *,
+    n_via: int = 2,
+    seeds: Any = SEEDS,
+    enough: int = 1,
+    time_limit: float = LONGEST_SEARCH,
+    margin: float = 0.0,
+    duration: float | None = None,
+    space: SpaceName | None = None,
+    velocity: Any = None,
+    acceleration: Any = None,
+    ompl: bool = True,
+    rng: np.random.Generator | int | None = None,
+) -> MotionPlan:
+    """Plan a minimum-jerk movement through via-points from a start to a goal around obstacles.
+
+    The straight movement is taken if it is free. Otherwise via-points are refined by the gradient of clearance and jerk
+    (see :mod:`viapoint.training.planning.refine`), from the straight line first, and then from random seeds, until
+    `enough` free movements are found. Each is checked at 256 instants and polished; the one with the least jerk is
+    taken. The duration is the shortest that keeps 97 % of the velocity and torque limits, if none is given.
+
+    Args:
+        arm: Arm, or name of one.
+        start: Joint positions, shape (J,), [rad]; in hand space a position of the hand, shape (2,), [m].
+        goal: The same; or several of them, shape (G, D), of which the cheapest to reach is taken; or a
+            :class:`~viapoint.envs.scenes.options.Pose` of the tool.
+        obstacles: Shapes or dictionaries at time 0, with their velocities, or packed obstacles of one scene.
+        n_via: Number of via-points, 1 to 3.
+        seeds: Greatest number of random seeds, for all goals together; or via-points that are tried before them, shape
+            (S, n_via, D).
+        enough: Number of free movements among which the one with the least jerk is chosen.
+        time_limit: Time after which no further seed is tried, [s]; with 0, only the straight movement is looked at.
+        margin: Least clearance of the movement, [m].
+        duration: Duration, [s]; None for the shortest.
+        space: `joints` or `hand`; that of the arm by default.
+        velocity: Initial velocity, shape (D,); 0 by default.
+        acceleration: Initial acceleration, shape (D,); 0 by default.
+        ompl: True to follow a path of OMPL's RRT-Connect where no seed becomes free, if the extra `planning` is
+            installed.
+        rng: Random generator of the seeds, or its seed.
+
+    Returns:
+        The best movement found. `success` tells whether it is free and keeps all limits, and `reason` why not.
+
+    Raises:
+        ValueError: An argument has another shape or is not finite, or a pose cannot be reached.
+
+    Example:
+        >>> from viapoint.envs import Box, arm_of
+        >>> from viapoint.training import plan_motion
+        >>> arm = arm_of("panda")
+        >>> goal = arm.home + [0.8, 0.5, 0.0, 0.6, 0.0, 0.3, 0.0]
+        >>> wall = Box((0.1, 0.1, 0.3), position=(0.5, 0.15, 0.3))
+        >>> plan = plan_motion(arm, arm.home, goal, [wall])
+        >>> plan.success, plan.clearance > 0.0, plan.source
+        (True, True, 'straight, refined')
+    """
+    whole_number("n_via", n_via, 1, 3)
+    whole_number("enough", enough, 1)
+    number_of_at_least("time_limit", time_limit, 0.0)
+    number_of_at_least("margin", margin, 0.0)
+    if duration is not None:
+        number_of_at_least("duration", duration, 1e-3)
+    arm = arm_of(arm)
+    where = space_of(arm, arm.space if space is None else space)
+    _warm_up(arm, where.of_hand, n_via)
+    began = time.perf_counter()
+    packed = obstacles if isinstance(obstacles, Obstacles) else pack([obstacles])
+    if len(packed.kind) != 1:
+        raise ValueError(f"obstacles must be those of one scene, got {len(packed.kind)} scenes")
+    shape = (where.dimension,)
+    rest = np.zeros(shape)
+    problem = _Problem(
+        arm=arm,
+        space=where,
+        start=np.array(finite_array("start", start, shape)),
+        velocity=np.array(finite_array("velocity", rest if velocity is None else velocity, shape)),
+        acceleration=np.array(
+            finite_array("acceleration", rest if acceleration is None else acceleration, shape)
+        ),
+        goal=rest,
+        obstacles=packed,
+        duration=duration,
+        margin=margin,
+    )
+    goals = _goals(problem, goal)
+    given, number = _seeds(seeds, n_via, where.dimension)
+    generator = np.random.default_rng(rng if rng is not None else 0)
+    best: MotionPlan | None = None
+    number = -(-number // len(goals))
+    until = time.perf_counter() + time_limit
+    for each in goals:
+        plan = _plan(problem._replace(goal=each), n_via, given, number, enough, until, generator, ompl)
+        if best is None or _worth(plan) > _worth(best):
+            best = plan
+        if time.perf_counter() > until:
+            break
+    assert best is not None
+    return best.replaced(milliseconds=1e3 * (time.perf_counter() - began))
+
+
+def plan_motions(
+    arm: Arm | str,
+    starts: Sequence[Any],
+    goals: Sequence[Any],
+    obstacles: Sequence[Any],
+    *,
+    threads: int | None = None,
+    **kwargs: Any,
+) -> list[MotionPlan]:
+    """Plan N movements on threads; the other arguments are those of :func:`plan_motion`.
+
+    Each movement is planned as :func:`plan_motion` plans it alone, whatever the number of threads is, except where the
+    time limit is reached.
+
+    Args:
+        arm: Arm, or name of one.
+        starts: N starts.
+        goals: N goals.
+        obstacles: Obstacles of the N problems, each as :func:`plan_motion` takes them.
+        threads: Number of threads; as many as the machine has processors by default.
+        **kwargs: Arguments of :func:`plan_motion`.
+
+    Raises:
+        ValueError: The problems are not equally many, or an argument of one is not allowed; the message names it.
+    """
+    arm = arm_of(arm)
+    if not len(starts) == len(goals) == len(obstacles):
+        raise ValueError(
+            f"starts, goals and obstacles must be equally many, got {len(starts)}, {len(goals)}, {len(obstacles)}"
+        )
+
+    def plan(number: int) -> MotionPlan:
+        try:
+            return plan_motion(arm, starts[number], goals[number], obstacles[number], **kwargs)
+        except ValueError as error:
+            raise ValueError(f"problem {number}: {error}") from None
+
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(plan, range(len(starts))))
+
+
+def checked_motion(
+    arm: Arm, space: SpaceName, plan: Plan, obstacles: Obstacles, source: str, *, shortest: bool = False
+) -> MotionPlan:
+    """Return a plan of any planner, of one movement, with its clearance and its limits.
+
+    Args:
+        arm: Arm.
+        space: Space of its coordinates.
+        plan: Plan of one movement.
+        obstacles: Obstacles of one scene.
+        source: Name of the planner.
+        shortest: True for the shortest duration that the limits allow, False for that of the plan.
+    """
+    waypoints, durations = np.asarray(plan.waypoints), np.asarray(plan.durations)
+    duration = float(durations.sum())
+    zero = np.zeros(waypoints.shape[1])
+    problem = _Problem(
+        arm=arm,
+        space=space_of(arm, space),
+        start=waypoints[0],
+        velocity=zero if plan.velocity is None else np.asarray(plan.velocity),
+        acceleration=zero if plan.acceleration is None else np.asarray(plan.acceleration),
+        goal=waypoints[-1],
+        obstacles=obstacles,
+        duration=None if shortest else duration,
+        margin=0.0,
+    )
+    table = table_with(durations[None] / duration, FINE_INSTANTS)
+    movement = _Movement(waypoints[1:-1] - waypoints[0], table, 0, duration, source)
+    return _result(problem, movement, _fault(problem)[0])
+
+
+@functools.lru_cache(maxsize=64)
+def _setting(arm: Arm, of_hand: bool) -> Setting:
+    """Return arm and space for compiled functions; rounding errors at the joint limits do not count."""
+    ranges = arm.joint_range + RANGE_TOLERANCE * np.array([-1.0, 1.0])
+    return Setting(arm.chain, arm.spheres, ranges, of_hand, arm.reach, hand_alone=False)
+
+
+@functools.cache
+def _fine_table(n_via: int) -> MovementTable:
+    """Return the table of movements at many instants."""
+    return table_with(movement_table(n_via).durations, FINE_INSTANTS)
+
+
+@functools.cache
+def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
+    """Make tables, and load or compile the machine code, so that no time limit is spent on them."""
+    space = space_of(arm, "hand" if of_hand else "joints")
+    start = np.array(space.coordinates(arm.home))
+    still = np.zeros_like(start)
+    problem = _Problem(arm, space, start, still, still, start + 0.01, pack([[]]), None, 0.0)
+    straight = _straight(problem)
+    _is_free(problem, straight, 0.0)
+    _result(problem, straight, _fault(problem)[0])
+    fixed, nothing = problem.offsets(np.zeros((0, len(start))), 1.0), np.zeros((0, n_via, len(start)))
+    refine_seeds(
+        problem.setting, movement_table(n_via), _fine_table(n_via), start, fixed, nothing, 1.0, problem.obstacles, 0,
+        0.0, AIMS, 0.0, 1,
+    )  # fmt: skip
+
+
+def _goals(problem: _Problem, goal: Any) -> Float:
+    """Return the goals that are tried, nearest first, shape (G, D)."""
+    if isinstance(goal, Pose | Mapping):
+        pose = goal if isinstance(goal, Pose) else Pose(**goal)
+        near = problem.space.joints(problem.start)
+        found = inverse_kinematics(problem.arm, pose.position, pose.quaternion, seed=near)
+        return problem.space.coordinates(found[:GOALS])
+    several = np.ndim(goal) > 1
+    goals = finite_array("goal", goal if several else [goal], (None, len(problem.start)))
+    away = np.abs(goals - problem.start).max(axis=-1)
+    # Copies are contiguous and writable, which compiled functions depend on.
+    return np.array(goals[np.argsort(away, kind="stable")])
+
+
+def _seeds(seeds: Any, n_via: int, dimension: int) -> tuple[Float, int]:
+    """Return the via-points that are given, shape (S, K, D), and the number of random seeds."""
+    if np.ndim(seeds) == 0:
+        return np.zeros((0, n_via, dimension)), whole_number("seeds", seeds, 0)
+    return finite_array("seeds", seeds, (None, n_via, dimension)), SEEDS
+
+
+def _worth(plan: MotionPlan) -> tuple[bool, float]:
+    """Return by what plans to several goals are compared: success, then motion time, or clearance."""
+    return plan.success, -plan.duration if plan.success else plan.clearance
+
+
+def _fault(problem: _Problem) -> tuple[str, float]:
+    """Return what is wrong with start or goal, empty for nothing, and the clearance that movements are to keep, [m].
+
+    It is a little more than the margin, for what happens between the instants and in physics, unless an end is nearer.
+    """
+    arm, space = problem.arm, problem.space
+    ends = np.stack((problem.start, problem.goal))
+    joints = np.ascontiguousarray(space.joints(ends))
+    inside = space.inside(ends)
+    # Where moving obstacles are in the end depends on the duration.
+    resting = ~problem.obstacles.velocity[0].any(axis=-1)
+    both = problem.obstacles.take([0, 0])
+    most = problem.margin + SPARE
+    rows, own = row_clearances(arm.chain, arm.spheres, joints, both, most)
+    for end, name in enumerate(("start", "goal")):
+        beyond = np.maximum(arm.joint_range[:, 0] - joints[end], joints[end] - arm.joint_range[:, 1])
+        worst = int(beyond.argmax())
+        if not inside[end] and (space.of_hand or beyond[worst] <= 0.0):
+            return f"the {name} is out of reach", most
+        if not inside[end]:
+            low, high = arm.joint_range[worst]
+            text = (
+                f"the {name} is outside the limits: joint {arm.joint_names[worst]!r} must be from {low:.4g} to "
+                f"{high:.4g}, got {joints[end, worst]:.4g}"
+            )
+            return text, most
+        if own[end] < problem.margin:
+            return f"the arm touches itself at the {name}, clearance {1e3 * own[end]:.1f} mm", most
+        near = both.present[end] & (rows[end] < problem.margin) & (resting | (end == 0))
+        if near.any():
+            row = int(near.argmax())
+            text = f"the {name} is in contact with obstacle {row}, clearance {1e3 * rows[end, row]:.1f} mm"
+            return text, most
+    counted = both.present & (resting | np.array([[True], [False]]))
+    nearest = min(float(own.min()), float(rows.min(where=counted, initial=most)))
+    return "", max(problem.margin, min(most, nearest - ROUNDING))
+
+
+def _plan(
+    problem: _Problem,
+    n_via: int,
+    given: Float,
+    number: int,
+    enough: int,
+    until: float,
+    generator: np.random.Generator,
+    ompl: bool,
+) -> MotionPlan:
+    """Return the best movement to one goal."""
+    fault, kept = _fault(problem)
+    straight = _straight(problem)
+    coarse = straight._replace(table=movement_table(0))
+    if fault or _is_free(problem, coarse, kept):
+        plan = _result(problem, straight, fault)
+        if plan.success or fault or problem.duration is not None:
+            return plan
+    duration, tried, found = straight.duration, 0, straight
+    seeds = given
+    for _ in range(ROUNDS):
+        best, more = _search(problem, kept, n_via, seeds, number, enough, until, generator, duration)
+        tried += more
+        if best is None and ompl and not problem.moves:
+            best = _along_path(problem, kept, duration, until)
+        if best is None:
+            break
+        found = best
+        plan = _result(problem, found, "")
+        if plan.success or problem.duration is not None:
+            return plan.replaced(seeds=tried)
+        # In motion, and among moving obstacles, a longer movement is another one.
+        duration *= LONGER
+        seeds = (found.vias + problem.start)[None]
+    plan = _result(problem, found, "")
+    ended = "the time limit was reached" if time.perf_counter() >= until else "no free one was found"
+    return plan.replaced(success=False, seeds=tried, reason=f"{plan.reason}; {ended} from {tried} seeds")
+
+
+def _straight(problem: _Problem) -> _Movement:
+    """Return the straight movement, without via-points."""
+    nothing = np.zeros((0, len(problem.start)))
+    movement = _Movement(nothing, _fine_table(0), 0, problem.duration or 1.0, "straight")
+    if problem.duration is None and problem.moves:
+        still = np.zeros_like(problem.start)
+        resting = problem._replace(velocity=still, acceleration=still)
+        duration = _timed(resting, movement, free=True)[0]
+        movement = movement._replace(duration=LONGER * duration)
+    return movement
+
+
+def _search(
+    problem: _Problem,
+    kept: float,
+    n_via: int,
+    given: Float,
+    number: int,
+    enough: int,
+    until: float,
+    generator: np.random.Generator,
+    duration: float,
+) -> tuple[_Movement | None, int]:
+    """Refine seeds until enough movements are free; return the one with the least jerk, and the number of seeds."""
+    share = np.arange(1, n_via + 1)[:, None] / (n_via + 1)
+    straight = share * (problem.goal - problem.start)
+    fixed = problem.offsets(straight, duration)[n_via:]
+    straight_cost = STRAIGHT_COST * float(fixed[0] @ fixed[0])
+    near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
+    table, fine = movement_table(n_via), _fine_table(n_via)
+    best, least = None, np.inf
+    tried = free = first_free = 0
+    total = len(given) + 1 + number
+    while tried < total and time.perf_counter() < until:
+        if free >= enough and (least <= ROUGH * straight_cost or tried >= first_free + MORE):
+            break
+        seeds = np.empty((min(CHUNKS[min(tried, len(CHUNKS) - 1)], total - tried), *straight.shape))
+        for k in range(len(seeds)):
+            rank = tried + k - len(given)
+            if rank < 0:
+                seeds[k] = given[tried + k] - problem.start
+                continue
+            spread = 0.0 if rank == 0 else near if rank < NARROW else far
+            seeds[k] = straight + spread * generator.uniform(-1.0, 1.0, straight.shape)
+        done, found = refine_seeds(
+            problem.setting, table, fine, problem.start, fixed, seeds, duration, problem.obstacles, 0,
+            kept, AIMS, SMOOTH * straight_cost, max(enough - free, 1),
+        )  # fmt: skip
+        for k in range(done):
+            if found.clearance[k] < kept:
+                continue
+            free += 1
+            first_free = first_free or tried
+            if found.cost[k] < least:
+                rank = tried + k - len(given)
+                least = float(found.cost[k])
+                source = "given" if rank < 0 else "random" if rank else "straight, refined"
+                clearance = float(found.clearance[k])
+                best = _Movement(found.vias[k], fine, int(found.times[k]), duration, source, clearance)
+        tried += done
+    return best, tried
+
+
+def _along_path(problem: _Problem, kept: float, duration: float, until: float) -> _Movement | None:
+    """Return a movement along a path of OMPL, with as many via-points as it needs; None if there is none."""
+    from viapoint.training.planning.ompl_planner import VIA_COUNTS, import_ompl, path_around, points_on
+
+    patience = until - time.perf_counter()
+    try:
+        import_ompl()
+    except ValueError:
+        return None
+    ends = np.ascontiguousarray(problem.space.joints(np.stack((problem.start, problem.goal))))
+    path = None
+    if patience > 0.0:
+        path = path_around(problem.arm, ends, problem.obstacles, kept, patience)
+    if path is None:
+        return None
+    for count in VIA_COUNTS:
+        points = problem.space.coordinates(points_on(path, count))
+        durations = np.asarray(primitives.passage_durations(points, 1.0))[None]
+        table, fine = table_with(durations), table_with(durations, FINE_INSTANTS)
+        vias = points[None, 1:-1] - problem.start
+        fixed = problem.offsets(vias[0], duration)[count:]
+        _, found = refine_seeds(
+            problem.setting,
+            table,
+            fine,
+            problem.start,
+            fixed,
+            vias,
+            duration,
+            problem.obstacles,
+            0,
+            kept,
+            AIMS,
+            0.0,
+            1,
+        )
+        if found.clearance[0] >= kept:
+            return _Movement(found.vias[0], fine, 0, duration, "ompl", float(found.clearance[0]))
+    return None
+
+
+def _timed(problem: _Problem, movement: _Movement, *, free: bool) -> tuple[float, Limits]:
+    """Return the duration of a movement and the shares of the limits that it then uses.
+
+    Args:
+        problem: Problem.
+        movement: Movement.
+        free: True to choose the shortest duration; False to keep that of the movement.
+    """
+    arm, duration = problem.arm, movement.duration
+    offsets = problem.offsets(movement.vias, duration)
+    position = problem.start + movement.table.basis[movement.times, ::LIMIT_STRIDE] @ offsets
+    velocity = movement.table.rate[movement.times, ::LIMIT_STRIDE] @ offsets / duration
+    acceleration = movement.table.bend[movement.times, ::LIMIT_STRIDE] @ offsets / duration**2
+    sampled = Motion(position[None], velocity[None], acceleration[None])
+    motion = Motion(*(np.ascontiguousarray(part[0]) for part in problem.space.joint_motion(sampled)))
+    factor = 1.0
+    if free:
+        factor = slowdown(arm.chain, arm.velocity_limit, arm.torque_limit, *motion)
+        if not np.isfinite(arm.velocity_limit).all():
+            factor = max(factor, UNLIMITED / duration)
+    rate, change = motion.velocity / factor, motion.acceleration / factor**2
+    torque = torques(arm.chain, motion.position, rate, change)
+    shares = np.abs(rate) / arm.velocity_limit, np.abs(torque) / arm.torque_limit
+    return factor * duration, Limits(float(shares[0].max()), float(shares[1].max()))
+
+
+def _is_free(problem: _Problem, movement: _Movement, kept: float) -> bool:
+    """Return True if a movement keeps a clearance at the instants of its table."""
+    return is_free(*_arguments(problem, movement), kept)
+
+
+def _arguments(
+    problem: _Problem, movement: _Movement
+) -> tuple[Setting, MovementTable, int, Float, Float, float, Obstacles, int]:
+    """Return the arguments of :func:`~viapoint.training.planning.refine.exact_clearance` and `is_free`."""
+    offsets = problem.offsets(movement.vias, movement.duration)
+    start, duration = problem.start, movement.duration
+    return problem.setting, movement.table, movement.times, start, offsets, duration, problem.obstacles, 0
+
+
+def _result(problem: _Problem, movement: _Movement, fault: str) -> MotionPlan:
+    """Return a movement with what is known of it; it gets the shortest duration if that changes nothing else."""
+    duration, limits = _timed(problem, movement, free=problem.duration is None and not problem.moves)
+    movement = movement._replace(duration=duration)
+    clearance = movement.clearance
+    if clearance is None:
+        clearance = exact_clearance(*_arguments(problem, movement))
+    offsets = problem.offsets(movement.vias, duration)
+    cost = np.einsum("ij,id,jd->", movement.table.cost[movement.times], offsets, offsets)
+    line = problem.goal - problem.start
+    reason = fault
+    if not reason and clearance == OUTSIDE:
+        reason = "it leaves the joint limits or the reach"
+    elif not reason and clearance < problem.margin:
+        reason = f"its clearance is {1e3 * clearance:.1f} mm, less than {1e3 * problem.margin:g} mm"
+    elif not reason and max(limits) > 1.0:
+        reason = f"it needs {limits.velocity:.2f} of a velocity and {limits.torque:.2f} of a torque limit"
+    return MotionPlan(
+        arm=problem.arm,
+        space=problem.space.name,
+        waypoints=np.concatenate((problem.start[None], problem.start + movement.vias, problem.goal[None])),
+        durations=movement.table.durations[movement.times] * duration,
+        velocity=problem.velocity,
+        acceleration=problem.acceleration,
+        obstacles=problem.obstacles,
+        success=not reason,
+        clearance=clearance,
+        limits=limits,
+        jerk=max(float(cost) / max(360.0 * float(line @ line), 1e-12), 1.0),
+        source=movement.source,
+        reason=reason,
+    )

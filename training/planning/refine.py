@@ -1,0 +1,513 @@
+"""Refinement of via-points by the gradient of clearance and jerk, compiled.
+
+The via-points of a movement are moved by damped least squares (K. Levenberg 1944, D. W. Marquardt 1963). The residuals
+are, at every second instant, what is missing to a wanted clearance, for the deepest sphere of each body and obstacle
+and of each pair of bodies, and what is missing to a margin from the joint limits. To the sum of their squares comes the
+jerk cost relative to that of the straight movement, which is a quadratic form of the via-points.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from viapoint.envs.arms.inverse_kinematics import solve_symmetric
+from viapoint.envs.arms.kinematics import point_jacobian
+from viapoint.envs.common.types import Float, Int
+from viapoint.envs.geometry.clearance import (
+    Placed,
+    group_clearance,
+    memory,
+    movement_clearance,
+    nearest_spheres,
+    place,
+)
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.distance import point_distance_and_normal
+from viapoint.envs.geometry.kernels import kernel
+from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
+from viapoint.training.planning.movements import (
+    OUTSIDE,
+    MovementTable,
+    Setting,
+    best_times,
+    joints_at,
+    least_clearance,
+)
+
+CONTACT_WEIGHT = 400.0
+"""Weight of the square of a missing distance, [1/m^2] and [1/rad^2]."""
+OWN_CLEARANCE = 0.01
+"""Wanted clearance of the arm from itself, [m]; some bodies are never much farther from one another."""
+RANGE_MARGIN = 0.01
+"""Wanted distance of joints from their limits, [rad]."""
+DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-4, 1e3
+"""Damping at first, and its bounds."""
+SLOW = 4
+"""Instants near the ends in which a movement from rest or to rest goes less than a hundredth of its way."""
+FREE = 0.005
+"""Least clearance at the instants that are looked at with which a refinement may end early, [m] and [rad]."""
+EASIER, HARDER = 0.3, 5.0
+"""Factors on the damping after a step that was better, and after one that was not."""
+FLAT = 0.02
+"""Share of CONTACT_WEIGHT that damps directions in which nothing is known."""
+LONGEST_STEP = 0.6, 0.15
+"""Longest step of a coordinate in joint space, [rad], and in hand space, [m]."""
+SHORTEST_WAY = 0.2
+"""Way of a straight movement whose jerk cost is the unit for shorter ones, too, [rad] or [m]."""
+STRAIGHT_COST = 360.0
+"""Jerk cost of a straight minimum-jerk movement of the way 1 in unit time."""
+SINGULAR = 1e-3
+"""Least determinant of the arm's Jacobian in the plane that is believed, [m^2]."""
+
+
+class Aim(NamedTuple):
+    """Aim of a refinement."""
+
+    clearance: float
+    """Wanted clearance from obstacles, [m]."""
+    jerk: float
+    """Weight of the relative jerk cost."""
+    iterations: int
+    """Greatest number of iterations."""
+    gain: float
+    """Relative gain of the objective below which a free movement is good enough."""
+    stride: int
+    """Step between the instants that are looked at."""
+
+
+class Found(NamedTuple):
+    """Movements that were found from S seeds."""
+
+    vias: Float
+    """Via-points as offsets from the start, shape (S, K, D)."""
+    times: Int
+    """Indices of passage times in the table, shape (S,)."""
+    cost: Float
+    """Jerk cost relative to that of the straight movement, shape (S,)."""
+    clearance: Float
+    """Least clearance at many instants, shape (S,), [m]; -1 for movements that are not free."""
+
+
+class _Work(NamedTuple):
+    """Memory of a refinement in a space of D dimensions, with J joints and K via-points."""
+
+    position: Float
+    joints: Float
+    placed: Placed
+    pull: Float
+    """Derivative of a residual by the joints, shape (J,)."""
+    row: Float
+    """Derivative of a residual by the coordinates, shape (D,)."""
+    jacobian: Float
+    square: Float
+    """Sum of the products of rows at one instant, shape (D, D)."""
+    force: Float
+    """Sum of residual times row at one instant, shape (D,)."""
+    gram: Float
+
+
+@compiled
+def _work(setting: Setting, columns: int, dimension: int) -> _Work:
+    """Return memory for a refinement."""
+    joints = len(setting.joint_range)
+    return _Work(
+        np.empty(dimension),
+        np.empty(joints),
+        memory(setting.chain, setting.spheres),
+        np.empty(joints),
+        np.empty(dimension),
+        np.empty((3, joints)),
+        np.empty((dimension, dimension)),
+        np.empty(dimension),
+        np.empty((columns, columns)),
+    )
+
+
+@kernel
+def _add_residual(setting: Setting, missing: float, work: _Work) -> None:
+    """Add a residual, whose derivative by the joints is in `work.pull`, to those of an instant."""
+    row, dimension = work.row, len(work.row)
+    if setting.of_hand:
+        # Joints q and hand x of the plane: dq = J^-1 dx, so the derivative by x is J^-T times that by q.
+        chain, placed = setting.chain, work.placed
+        point_jacobian(
+            chain, placed.rotation, placed.origin, 2, work.position[0], work.position[1], 0.0, work.jacobian
+        )
+        a, b = work.jacobian[0, 0], work.jacobian[0, 1]
+        c, d = work.jacobian[1, 0], work.jacobian[1, 1]
+        determinant = a * d - b * c
+        if abs(determinant) < SINGULAR:
+            determinant = SINGULAR if determinant >= 0.0 else -SINGULAR
+        row[0] = (d * work.pull[0] - c * work.pull[1]) / determinant
+        row[1] = (a * work.pull[1] - b * work.pull[0]) / determinant
+    else:
+        for j in range(dimension):
+            row[j] = work.pull[j]
+    for i in range(dimension):
+        if row[i] != 0.0:
+            work.force[i] += CONTACT_WEIGHT * missing * row[i]
+            for j in range(i + 1):
+                work.square[i, j] += CONTACT_WEIGHT * row[i] * row[j]
+
+
+@kernel
+def _pull(
+    setting: Setting, work: _Work, sphere: int, link: int, x: float, y: float, z: float, sign: float
+) -> None:
+    """Add to `work.pull` the derivative of the way of a sphere in a direction (x, y, z) by the joints, times a sign."""
+    placed, sliding = work.placed, setting.chain.sliding
+    u, v, w = placed.centre[sphere, 0], placed.centre[sphere, 1], placed.centre[sphere, 2]
+    for j in range(link):
+        a, b, c = placed.rotation[j + 1, 0, 2], placed.rotation[j + 1, 1, 2], placed.rotation[j + 1, 2, 2]
+        if sliding[j]:
+            way = a * x + b * y + c * z
+        else:
+            p, q, r = u - placed.origin[j + 1, 0], v - placed.origin[j + 1, 1], w - placed.origin[j + 1, 2]
+            way = x * (b * r - c * q) + y * (c * p - a * r) + z * (a * q - b * p)
+        work.pull[j] += sign * way
+
+
+@kernel
+def _add_obstacles(
+    setting: Setting, obstacles: Obstacles, scene: int, time: float, wanted: float, work: _Work
+) -> tuple[float, float]:
+    """Add the residuals of the placed arm from the obstacles; return their sum of squares, and the least clearance."""
+    spheres, placed, total, nearest = setting.spheres, work.placed, 0.0, wanted
+    for group in range(len(spheres.link)):
+        if spheres.link[group] == 0:
+            continue
+        for row in range(obstacles.kind.shape[1]):
+            if obstacles.kind[scene, row] == ABSENT:
+                continue
+            least, sphere = group_clearance(spheres, placed, group, obstacles, scene, row, time, wanted, -1e9)
+            if sphere < 0:
+                continue
+            x, y, z = placed.centre[sphere, 0], placed.centre[sphere, 1], placed.centre[sphere, 2]
+            _, u, v, w = point_distance_and_normal(obstacles, scene, row, x, y, z, time, 1e9)
+            work.pull[:] = 0.0
+            _pull(setting, work, sphere, spheres.link[group], u, v, w, -1.0)
+            nearest = min(nearest, least)
+            missing = wanted - least
+            total += missing * missing
+            _add_residual(setting, missing, work)
+    return total, nearest
+
+
+@kernel
+def _add_own(setting: Setting, wanted: float, work: _Work) -> tuple[float, float]:
+    """Add the residuals of the placed arm from itself; return their sum of squares, and the least clearance."""
+    spheres, placed, total, nearest = setting.spheres, work.placed, 0.0, wanted
+    for pair in range(len(spheres.pairs)):
+        least, one, other = nearest_spheres(spheres, placed, pair, wanted, -1e9)
+        if one < 0:
+            continue
+        x = placed.centre[one, 0] - placed.centre[other, 0]
+        y = placed.centre[one, 1] - placed.centre[other, 1]
+        z = placed.centre[one, 2] - placed.centre[other, 2]
+        length = math.sqrt(x * x + y * y + z * z) + 1e-9
+        x, y, z = x / length, y / length, z / length
+        work.pull[:] = 0.0
+        _pull(setting, work, one, spheres.link[spheres.pairs[pair, 0]], x, y, z, -1.0)
+        _pull(setting, work, other, spheres.link[spheres.pairs[pair, 1]], x, y, z, 1.0)
+        nearest = min(nearest, least)
+        missing = wanted - least
+        total += missing * missing
+        _add_residual(setting, missing, work)
+    return total, nearest
+
+
+@kernel
+def _add_ranges(setting: Setting, reached: bool, work: _Work) -> tuple[float, float]:
+    """Add what is missing to the margin from the joint limits; return the sum of squares, and the least distance."""
+    total, nearest, joints, limits = 0.0, RANGE_MARGIN, work.joints, setting.joint_range
+    for j in range(len(joints)):
+        low, high = limits[j, 0] + RANGE_MARGIN - joints[j], joints[j] - limits[j, 1] + RANGE_MARGIN
+        missing = max(low, high)
+        if missing > 0.0 and (reached or j == 0):
+            work.pull[:] = 0.0
+            work.pull[j] = -1.0 if low > high else 1.0
+            total += missing * missing
+            nearest = min(nearest, RANGE_MARGIN - missing)
+            _add_residual(setting, missing, work)
+    if not reached:
+        # The hand is beyond the reach: a pull towards where the straight or bent arm has it.
+        chain, placed = setting.chain, work.placed
+        x = y = 0.0
+        last = len(joints)
+        for a in range(3):
+            x += placed.rotation[last, 0, a] * chain.tool_origin[a]
+            y += placed.rotation[last, 1, a] * chain.tool_origin[a]
+        x = work.position[0] - placed.origin[last, 0] - x
+        y = work.position[1] - placed.origin[last, 1] - y
+        missing = math.sqrt(x * x + y * y) + 1e-9
+        x, y = x / missing, y / missing
+        missing += RANGE_MARGIN
+        total += missing * missing
+        work.force[0] += CONTACT_WEIGHT * missing * x
+        work.force[1] += CONTACT_WEIGHT * missing * y
+        work.square[0, 0] += CONTACT_WEIGHT * x * x
+        work.square[1, 0] += CONTACT_WEIGHT * x * y
+        work.square[1, 1] += CONTACT_WEIGHT * y * y
+        nearest = -missing
+    return total, nearest
+
+
+@kernel
+def _assemble(
+    setting: Setting,
+    table: MovementTable,
+    times: int,
+    start: Float,
+    offsets: Float,
+    duration: float,
+    obstacles: Obstacles,
+    scene: int,
+    aim: Aim,
+    hessian: Float,
+    gradient: Float,
+    work: _Work,
+) -> tuple[float, float]:
+    """Fill in matrix and gradient of the objective; return the objective, and the least clearance, [m] or [rad]."""
+    columns, dimension = offsets.shape
+    vias = columns - 3
+    way = 0.0
+    for d in range(dimension):
+        way += offsets[vias, d] * offsets[vias, d]
+    weight = aim.jerk * 2.0 / aim.stride / (STRAIGHT_COST * max(way, SHORTEST_WAY**2))
+    hessian[:] = 0.0
+    gradient[:] = 0.0
+    objective = 0.0
+    for a in range(columns):
+        for b in range(columns):
+            factor = weight * table.cost[times, a, b]
+            for d in range(dimension):
+                objective += factor * offsets[a, d] * offsets[b, d]
+                if a < vias:
+                    gradient[a * dimension + d] += factor * offsets[b, d]
+                    if b < vias:
+                        hessian[a * dimension + d, b * dimension + d] += factor
+    contact, nearest, last = 0.0, 1.0, len(table.order) - 1
+    resting = True
+    for d in range(dimension):
+        resting = resting and offsets[vias + 1, d] == 0.0 and offsets[vias + 2, d] == 0.0
+    begin = aim.stride // 2 + (SLOW if resting else 0)
+    for k in range(begin, last + 1 - SLOW, aim.stride):
+        reached = joints_at(setting, table, times, k, start, offsets, work.position, work.joints)
+        place(setting.chain, setting.spheres, work.joints, work.placed)
+        work.square[:] = 0.0
+        work.force[:] = 0.0
+        time = duration * k / last
+        from_obstacles, first = _add_obstacles(setting, obstacles, scene, time, aim.clearance, work)
+        from_itself, second = _add_own(setting, OWN_CLEARANCE, work)
+        from_ranges, third = _add_ranges(setting, reached or not setting.of_hand, work)
+        missing = from_obstacles + from_itself + from_ranges
+        if missing == 0.0:
+            continue
+        contact += missing
+        nearest = min(nearest, first, second, third)
+        for a in range(vias):
+            share = table.basis[times, k, a]
+            for i in range(dimension):
+                gradient[a * dimension + i] += share * work.force[i]
+            for b in range(a + 1):
+                factor = share * table.basis[times, k, b]
+                for i in range(dimension):
+                    for j in range(dimension):
+                        value = work.square[i, j] if i >= j else work.square[j, i]
+                        hessian[a * dimension + i, b * dimension + j] += factor * value
+    return objective + CONTACT_WEIGHT * contact, nearest
+
+
+@compiled
+def _refine(
+    setting: Setting,
+    table: MovementTable,
+    start: Float,
+    offsets: Float,
+    duration: float,
+    obstacles: Obstacles,
+    scene: int,
+    aim: Aim,
+    work: _Work,
+) -> int:
+    """Move the via-points of a movement, the first rows of its offsets, and return the index of its passage times."""
+    columns, dimension = offsets.shape
+    vias = columns - 3
+    size = vias * dimension
+    hessian, other_hessian = np.empty((size, size)), np.empty((size, size))
+    gradient, other_gradient = np.empty(size), np.empty(size)
+    system, step, trial = np.empty((size, size)), np.empty(size), offsets.copy()
+    longest = LONGEST_STEP[1] if setting.of_hand else LONGEST_STEP[0]
+    times, _ = best_times(table, offsets, work.gram)
+    objective, _ = _assemble(
+        setting, table, times, start, offsets, duration, obstacles, scene, aim, hessian, gradient, work
+    )
+    damping = DAMPING
+    for _ in range(aim.iterations):
+        largest = 0.0
+        for i in range(size):
+            step[i] = -gradient[i]
+            for j in range(i + 1):
+                system[i, j] = hessian[i, j]
+            system[i, i] += damping * (FLAT * CONTACT_WEIGHT + hessian[i, i])
+        solve_symmetric(system, step, size)
+        for i in range(size):
+            largest = max(largest, abs(step[i]))
+        factor = min(1.0, longest / max(largest, 1e-12))
+        for a in range(vias):
+            for d in range(dimension):
+                trial[a, d] = offsets[a, d] + factor * step[a * dimension + d]
+                if not setting.of_hand:
+                    low, high = setting.joint_range[d, 0] - start[d], setting.joint_range[d, 1] - start[d]
+                    trial[a, d] = min(max(trial[a, d], low), high)
+        other, _ = best_times(table, trial, work.gram)
+        value, nearest = _assemble(
+            setting, table, other, start, trial, duration, obstacles, scene, aim,
+            other_hessian, other_gradient, work,
+        )  # fmt: skip
+        if value < objective:
+            done = objective - value < aim.gain * objective and nearest >= FREE
+            offsets[:vias] = trial[:vias]
+            hessian, other_hessian = other_hessian, hessian
+            gradient, other_gradient = other_gradient, gradient
+            times, objective = other, value
+            damping = max(EASIER * damping, LEAST_DAMPING)
+            if done:
+                break
+        else:
+            damping = HARDER * damping
+            if damping > MOST_DAMPING:
+                break
+    return int(times)
+
+
+@compiled
+def refine_seeds(
+    setting: Setting,
+    table: MovementTable,
+    fine: MovementTable,
+    start: Float,
+    fixed: Float,
+    seeds: Float,
+    duration: float,
+    obstacles: Obstacles,
+    scene: int,
+    margin: float,
+    aims: tuple[Aim, ...],
+    smooth: float,
+    enough: int,
+) -> tuple[int, Found]:
+    """Refine movements from seeds one after the other, and return how many were tried, and what was found.
+
+    Args:
+        setting: Arm and space.
+        table: Table of movements.
+        fine: The same with more instants, for the last check.
+        start: Start, shape (D,).
+        fixed: Offsets of the goal, initial velocity and acceleration, shape (3, D).
+        seeds: Via-points as offsets from the start, shape (S, K, D).
+        duration: Duration during which obstacles move, [s].
+        obstacles: Obstacles of some scenes.
+        scene: Index of the scene.
+        margin: Least clearance of movements that count as free, [m].
+        aims: What the first refinement of each seed aims at, and those that polish a free movement.
+        smooth: Jerk cost in unit time with which a movement that was polished once is smooth enough.
+        enough: Number of free movements after which to stop.
+    """
+    number, vias, dimension = seeds.shape
+    work = _work(setting, vias + 3, dimension)
+    found = Found(seeds.copy(), np.zeros(number, np.int64), np.full(number, np.inf), np.full(number, -1.0))
+    # The refined movement, and the polished ones, each of which is smoother than the one before.
+    stages = len(aims)
+    offsets = np.empty((stages, vias + 3, dimension))
+    offsets[:, vias:] = fixed
+    times, trial = np.empty(stages, np.int64), np.empty((vias + 3, dimension))
+    free, tried = 0, 0
+    for each in range(number):
+        tried += 1
+        offsets[0, :vias] = seeds[each]
+        times[0] = _refine(setting, table, start, offsets[0], duration, obstacles, scene, aims[0], work)
+        found.vias[each] = offsets[0, :vias]
+        found.times[each] = times[0]
+        if not is_free(setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin):
+            continue
+        stage = 0
+        _, cost = best_times(table, offsets[0], work.gram)
+        for later in range(1, stages):
+            if later > 1 and cost < smooth:
+                break
+            trial[:] = offsets[stage]
+            other = _refine(setting, table, start, trial, duration, obstacles, scene, aims[later], work)
+            _, less = best_times(table, trial, work.gram)
+            if less < cost and is_free(
+                setting, table, other, start, trial, duration, obstacles, scene, margin
+            ):
+                stage += 1
+                offsets[stage] = trial
+                times[stage], cost = other, less
+        while stage >= 0:
+            clearance = exact_clearance(
+                setting, fine, times[stage], start, offsets[stage], duration, obstacles, scene
+            )
+            if clearance >= margin:
+                break
+            stage -= 1
+        if stage < 0:
+            continue
+        found.vias[each] = offsets[stage, :vias]
+        found.times[each] = times[stage]
+        found.clearance[each] = clearance
+        _, found.cost[each] = best_times(table, offsets[stage], work.gram)
+        free += 1
+        if free >= enough:
+            break
+    return tried, found
+
+
+@compiled
+def is_free(
+    setting: Setting,
+    table: MovementTable,
+    times: int,
+    start: Float,
+    offsets: Float,
+    duration: float,
+    obstacles: Obstacles,
+    scene: int,
+    margin: float,
+) -> bool:
+    """Return True if a movement keeps a margin at the instants of a table; it stops at the first that does not."""
+    work = _work(setting, len(offsets), len(start))
+    least = least_clearance(
+        setting, table, times, start, offsets, duration, obstacles, scene, margin, margin, 1e9,
+        work.position, work.joints, work.placed,
+    )  # fmt: skip
+    return bool(least >= margin)
+
+
+@compiled
+def exact_clearance(
+    setting: Setting,
+    table: MovementTable,
+    times: int,
+    start: Float,
+    offsets: Float,
+    duration: float,
+    obstacles: Obstacles,
+    scene: int,
+) -> float:
+    """Return the least clearance of a movement at the instants of a table, at most 1, [m]; OUTSIDE out of reach."""
+    number = len(table.order)
+    position, path = np.empty(len(start)), np.empty((number, len(setting.joint_range)))
+    for k in range(number):
+        if not joints_at(setting, table, times, k, start, offsets, position, path[k]):
+            return OUTSIDE
+    placed = memory(setting.chain, setting.spheres)
+    step = duration / (number - 1)
+    apart, own = movement_clearance(
+        setting.chain, setting.spheres, setting.reach, path, obstacles, scene, 0.0, step, placed
+    )
+    return min(apart, own)
