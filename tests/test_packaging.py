@@ -12,7 +12,19 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("primitives", "envs", "training")
-SHIPPED = (".py", ".xml", "py.typed", ".npz", ".safetensors", ".json", ".j2")
+SHIPPED = (
+    ".py",
+    ".xml",
+    "py.typed",
+    ".npz",
+    ".csv",
+    ".motionbenchmaker",
+    ".vamp",
+    "data/README.md",
+    ".safetensors",
+    ".json",
+    ".j2",
+)
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
 
 

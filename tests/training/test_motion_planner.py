@@ -8,10 +8,10 @@ import pytest
 from viapoint.envs import Box
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.planning import ompl_planner
+from viapoint.training.planning import ompl_paths, ompl_planner
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems
-from viapoint.training.planning.ompl_planner import points_on
+from viapoint.training.planning.ompl_paths import points_on
 from viapoint.training.planning.plan_motion import plan_motion
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import load, shipped_path
@@ -21,7 +21,7 @@ PLANE = "viapoint/PlanarObstacles-v0"
 
 def test_without_the_library_its_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl.base", None)
-    ompl_planner.import_ompl.cache_clear()
+    ompl_paths.import_ompl.cache_clear()
     with pytest.raises(ValueError, match=r"pip install 'viapoint\[planning\]'"):
         make_method("ompl", PLANE)
 

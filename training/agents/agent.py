@@ -13,12 +13,13 @@ import stable_baselines3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training.agents.model_io import ALGORITHMS, load_model, save_model
 from viapoint.training.config.checks import SHIPPED, SHIPPED_IDS
 from viapoint.training.io.files import BadFileError, write_folder
+from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.observe_candidates import with_candidates
+from viapoint.training.planning.plan_motion import checked_motion
 from viapoint.training.rollouts.vec_env import env_arguments, observed_candidates
 
 
@@ -34,8 +35,8 @@ class Agent(BaseAlgorithm):
         >>> agent = load_agent("viapoint/PlanarObstacles-v0")
         >>> post = {"shape": "cylinder", "radius": 0.03, "half_length": 0.04, "position": (-0.05, 0.35, 0.0)}
         >>> plan = agent.plan(start=(-0.2, 0.3), goal=(0.1, 0.4), obstacles=[post])
-        >>> plan.waypoints.shape  # start, via-point and goal, [m]
-        (3, 2)
+        >>> plan.success, plan.waypoints.shape  # start, via-point and goal, [m]
+        (True, (3, 2))
         >>> plan.trajectory()(np.linspace(0.0, plan.durations.sum(), 50)).shape  # positions of the hand, [m]
         (50, 2)
     """
@@ -64,10 +65,11 @@ class Agent(BaseAlgorithm):
             observation = with_candidates(observation, task, number)
         return super().predict(observation, *args, **kwargs)
 
-    def plan(self, start: Any, goal: Any, obstacles: Any = ()) -> Plan:
+    def plan(self, start: Any, goal: Any, obstacles: Any = ()) -> MotionPlan:
         """Return the plan of a movement from rest to rest among obstacles that stand still, without an environment.
 
-        The plan is the one that an environment with this scene would execute after `predict`.
+        The plan is the one that an environment with this scene would execute after `predict`. Its `success` tells
+        whether it touches nothing and keeps the limits.
 
         Args:
             start: Start, as `reset` takes it: a position of the hand, joint positions, or a pose.
@@ -91,8 +93,8 @@ class Agent(BaseAlgorithm):
         seen = task.observation.observe(scenes.start, arm.hand(scenes.start), goals, scenes.obstacles)
         actions, _ = self.predict(seen, deterministic=True)
         ends = task.space.coordinates(scenes.start), task.space.coordinates(scenes.goal)
-        plan: Plan = task.action.decode(np.asarray(actions, dtype=np.float64), *ends)
-        return plan.take(0)
+        plan = task.action.decode(np.asarray(actions, dtype=np.float64), *ends).take(0)
+        return checked_motion(arm, task.space_name, plan, scenes.obstacles, "agent")
 
     def save(self, path: str | Path) -> None:  # type: ignore[override]
         """Write the agent as a folder of `model.json` and `weights.safetensors`.

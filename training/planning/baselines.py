@@ -16,7 +16,8 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.config.checks import unknown_name
 from viapoint.training.planning.motion_plan import MotionPlan
-from viapoint.training.planning.ompl_planner import VIA_COUNTS, import_ompl, ompl_motion
+from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl
+from viapoint.training.planning.ompl_planner import ompl_motion
 from viapoint.training.planning.plan_motion import plan_motion
 from viapoint.training.planning.search import GeometrySearch, registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults, StepAgentMethod

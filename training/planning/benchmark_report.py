@@ -18,7 +18,8 @@ from viapoint.envs.task import Task
 from viapoint.training.config.checks import unknown_name
 from viapoint.training.planning.benchmark import BenchmarkProblem, benchmark_panda
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
-from viapoint.training.planning.ompl_planner import import_ompl, ompl_motion
+from viapoint.training.planning.ompl_paths import import_ompl
+from viapoint.training.planning.ompl_planner import ompl_motion
 from viapoint.training.planning.plan_motion import checked_motion, plan_motion
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import GeometrySearch

@@ -49,7 +49,19 @@ class JointMotion(NamedTuple):
 
 
 class UnsafePlanError(ValueError):
-    """A plan that touches something, or that breaks a limit, was to be executed or exported."""
+    """Error of a plan that touches something, or breaks a limit, and was to be executed or exported.
+
+    Example:
+        >>> from viapoint.envs import Box
+        >>> from viapoint.training import UnsafePlanError, plan_motion
+        >>> wall = Box((0.01, 0.5, 0.04), position=(0.0, 0.4, 0.0))
+        >>> plan = plan_motion("planar", (-0.2, 0.3), (0.2, 0.3), [wall], time_limit=0.0)
+        >>> try:
+        ...     plan.joints()
+        ... except UnsafePlanError:
+        ...     print(plan.success, plan.clearance < 0.0)
+        False True
+    """
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

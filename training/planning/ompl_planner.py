@@ -1,57 +1,26 @@
-"""Sampling-based motion planner of the library OMPL, the usual method of robotics, as a baseline.
+"""Motion planner of the library OMPL, the usual method of robotics, as a baseline.
 
-RRT-Connect (Kuffner & LaValle 2000) finds a clear path of straight pieces in joint space, and OMPL's shortcuts simplify
-it. The minimum-jerk movement through as few points of the path as stay clear makes it smooth.
+The minimum-jerk movement through as few points of a path of RRT-Connect as stay clear makes it smooth.
 """
 
 from __future__ import annotations
-
-import functools
-from typing import Any
 
 import numpy as np
 
 from viapoint import primitives
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.chain import Chain, Spheres
-from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.clearance import memory, obstacle_clearance, place, self_clearance
-from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import Plan, SpaceName
 from viapoint.envs.spaces import space_of
 from viapoint.training.planning.motion_plan import MotionPlan
+from viapoint.training.planning.ompl_paths import VIA_COUNTS, path_around, points_on
 from viapoint.training.planning.plan_motion import checked_motion
 
 MARGINS = (0.010, 0.004, 0.001, 0.001)
 """Required clearances of a path in each attempt, until one can be made smooth, [m]."""
 PATIENCE = 1.0
 """Time limit for each path, [s]."""
-CHECK_SPACING = 0.05
-"""Spacing of collision checks along a line, [rad]."""
-VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12)
-"""Numbers of via-points, tried in this order."""
-
-
-@functools.cache
-def import_ompl() -> Any:
-    """Import the library `ompl`.
-
-    Raises:
-        ValueError: The library is not installed.
-    """
-    try:
-        import ompl.base
-        import ompl.geometric
-        import ompl.util
-    except ImportError:
-        raise ValueError(
-            "the method ompl needs the library of that name: pip install 'viapoint[planning]'"
-        ) from None
-    ompl.util.setLogLevel(ompl.util.LogLevel.LOG_ERROR)
-    ompl.util.RNG.setSeed(1)
-    return ompl
 
 
 def ompl_motion(
@@ -89,88 +58,3 @@ def _smooth(arm: Arm, space: SpaceName, configurations: Float, obstacles: Obstac
     points = space_of(arm, space).coordinates(configurations)
     durations = np.asarray(primitives.passage_durations(points, 1.0))
     return checked_motion(arm, space, Plan(points, durations), obstacles, "ompl", shortest=True)
-
-
-def path_around(arm: Arm, ends: Float, obstacles: Obstacles, margin: float, patience: float) -> Float | None:
-    """Return corners of a clear path with start and goal, shape (P, J), [rad]; None if none is found in time.
-
-    Args:
-        arm: Arm.
-        ends: Joint positions of start and goal, shape (2, J).
-        obstacles: Obstacles of one scene, at rest.
-        margin: Clearance of the path, [m].
-        patience: Time limit of the search, [s].
-    """
-
-    def is_clear(first: Float, second: Float) -> bool:
-        count = max(2, int(np.ceil(np.abs(second - first).max() / CHECK_SPACING)) + 1)
-        line = np.ascontiguousarray(np.linspace(first, second, count))
-        return bool(line_is_clear(arm.chain, arm.spheres, line, obstacles, margin))
-
-    corners = _search(import_ompl(), ends, arm.joint_range, is_clear, patience)
-    return corners if corners is None else np.concatenate((ends[:1], corners[1:-1], ends[1:]))
-
-
-@compiled
-def line_is_clear(chain: Chain, spheres: Spheres, line: Float, obstacles: Obstacles, margin: float) -> bool:
-    """Return True if all configurations of shape (T, J) have more than a margin in scene 0."""
-    placed = memory(chain, spheres)
-    for k in range(len(line)):
-        place(chain, spheres, line[k], placed)
-        if obstacle_clearance(spheres, placed, obstacles, 0, 0.0, margin, margin) < margin:
-            return False
-        if self_clearance(spheres, placed, margin, margin) < margin:
-            return False
-    return True
-
-
-def points_on(path: Float, count: int) -> Float:
-    """Return start, `count` points and goal of a path of straight pieces.
-
-    The points are the corners if there are as many, otherwise they are evenly spaced along the path. If there are more
-    points than corners, each corner replaces the nearest point.
-    """
-    if count == len(path) - 2:
-        return path
-    along = np.concatenate(([0.0], np.cumsum(norm(np.diff(path, axis=0)))))
-    places = along[-1] * np.arange(1, count + 1) / (count + 1)
-    if count > len(path) - 2:
-        for corner in along[1:-1]:
-            places[np.abs(places - corner).argmin()] = corner
-    places = np.concatenate(([0.0], np.sort(places), along[-1:]))
-    return np.stack([np.interp(places, along, path[:, i]) for i in range(path.shape[1])], axis=-1)
-
-
-def _search(ompl: Any, ends: Float, joint_range: Float, is_clear: Any, patience: float) -> Float | None:
-    """Run RRT-Connect and shortcuts within the joint ranges; return corners, shape (P, J), or None."""
-    base, geometric, number = ompl.base, ompl.geometric, ends.shape[-1]
-
-    def place(state: Any) -> Float:
-        return np.array([state[i] for i in range(number)])
-
-    class Lines(base.MotionValidator):  # type: ignore[misc, name-defined]
-        def checkMotion(self, first: Any, second: Any) -> bool:  # noqa: N802 - OMPL's name
-            return bool(is_clear(place(first), place(second)))
-
-    space, bounds = base.RealVectorStateSpace(number), base.RealVectorBounds(number)
-    for i in range(number):
-        bounds.setLow(i, float(joint_range[i, 0]))
-        bounds.setHigh(i, float(joint_range[i, 1]))
-    space.setBounds(bounds)
-    information = base.SpaceInformation(space)
-    information.setStateValidityChecker(lambda state: True)  # the motion validator checks whole lines
-    information.setMotionValidator(Lines(information))
-    information.setup()
-    problem = base.ProblemDefinition(information)
-    start, goal = space.allocState(), space.allocState()
-    for i in range(number):
-        start[i], goal[i] = float(ends[0, i]), float(ends[1, i])
-    problem.setStartAndGoalStates(start, goal)
-    planner = geometric.RRTConnect(information)
-    planner.setProblemDefinition(problem)
-    planner.setup()
-    if not planner.solve(patience) or not problem.hasExactSolution():
-        return None
-    path = problem.getSolutionPath()
-    geometric.PathSimplifier(information).simplify(path, patience)
-    return np.stack([place(path.getState(i)) for i in range(path.getStateCount())])

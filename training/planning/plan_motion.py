@@ -36,6 +36,7 @@ from viapoint.training.planning.movements import (
     movement_table,
     table_with,
 )
+from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl, path_around, points_on
 from viapoint.training.planning.refine import STRAIGHT_COST, Aim, exact_clearance, is_free, refine_seeds
 
 AIMS = (
@@ -259,6 +260,12 @@ def plan_motions(
 
     Raises:
         ValueError: The problems are not equally many, or an argument of one is not allowed; the message names it.
+
+    Example:
+        >>> from viapoint.training import plan_motions
+        >>> plans = plan_motions("planar", [(-0.2, 0.3), (-0.2, 0.4)], [(0.1, 0.4), (0.2, 0.3)], [[], []])
+        >>> [plan.success for plan in plans]
+        [True, True]
     """
     arm = arm_of(arm)
     if not len(starts) == len(goals) == len(obstacles):
@@ -287,7 +294,8 @@ def checked_motion(
         plan: Plan of one movement.
         obstacles: Obstacles of one scene.
         source: Name of the planner.
-        shortest: True for the shortest duration that the limits allow, False for that of the plan.
+        shortest: True for the shortest duration that the limits allow; False for that of the plan, or a longer one if
+            the limits need it.
     """
     waypoints, durations = np.asarray(plan.waypoints), np.asarray(plan.durations)
     duration = float(durations.sum())
@@ -300,12 +308,12 @@ def checked_motion(
         acceleration=zero if plan.acceleration is None else np.asarray(plan.acceleration),
         goal=waypoints[-1],
         obstacles=obstacles,
-        duration=None if shortest else duration,
+        duration=None,
         margin=0.0,
     )
     table = table_with(durations[None] / duration, FINE_INSTANTS)
     movement = _Movement(waypoints[1:-1] - waypoints[0], table, 0, duration, source)
-    return _result(problem, movement, _fault(problem)[0])
+    return _known(problem, movement, _fault(problem)[0], 0.0 if shortest else 1.0)
 
 
 @functools.lru_cache(maxsize=64)
@@ -448,7 +456,7 @@ def _straight(problem: _Problem) -> _Movement:
     if problem.duration is None and problem.moves:
         still = np.zeros_like(problem.start)
         resting = problem._replace(velocity=still, acceleration=still)
-        duration = _timed(resting, movement, free=True)[0]
+        duration = _timed(resting, movement, 0.0)[0]
         movement = movement._replace(duration=LONGER * duration)
     return movement
 
@@ -506,8 +514,6 @@ def _search(
 
 def _along_path(problem: _Problem, kept: float, duration: float, until: float) -> _Movement | None:
     """Return a movement along a path of OMPL, with as many via-points as it needs; None if there is none."""
-    from viapoint.training.planning.ompl_planner import VIA_COUNTS, import_ompl, path_around, points_on
-
     patience = until - time.perf_counter()
     try:
         import_ompl()
@@ -545,13 +551,13 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
     return None
 
 
-def _timed(problem: _Problem, movement: _Movement, *, free: bool) -> tuple[float, Limits]:
+def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple[float, Limits]:
     """Return the duration of a movement and the shares of the limits that it then uses.
 
     Args:
         problem: Problem.
         movement: Movement.
-        free: True to choose the shortest duration; False to keep that of the movement.
+        least: Least factor on its duration; limits may need a greater one. None to keep the duration as it is.
     """
     arm, duration = problem.arm, movement.duration
     offsets = problem.offsets(movement.vias, duration)
@@ -561,9 +567,9 @@ def _timed(problem: _Problem, movement: _Movement, *, free: bool) -> tuple[float
     sampled = Motion(position[None], velocity[None], acceleration[None])
     motion = Motion(*(np.ascontiguousarray(part[0]) for part in problem.space.joint_motion(sampled)))
     factor = 1.0
-    if free:
-        factor = slowdown(arm.chain, arm.velocity_limit, arm.torque_limit, *motion)
-        if not np.isfinite(arm.velocity_limit).all():
+    if least is not None:
+        factor = max(slowdown(arm.chain, arm.velocity_limit, arm.torque_limit, *motion), least)
+        if least == 0.0 and not np.isfinite(arm.velocity_limit).all():
             factor = max(factor, UNLIMITED / duration)
     rate, change = motion.velocity / factor, motion.acceleration / factor**2
     torque = torques(arm.chain, motion.position, rate, change)
@@ -587,7 +593,12 @@ def _arguments(
 
 def _result(problem: _Problem, movement: _Movement, fault: str) -> MotionPlan:
     """Return a movement with what is known of it; it gets the shortest duration if that changes nothing else."""
-    duration, limits = _timed(problem, movement, free=problem.duration is None and not problem.moves)
+    return _known(problem, movement, fault, 0.0 if problem.duration is None and not problem.moves else None)
+
+
+def _known(problem: _Problem, movement: _Movement, fault: str, least: float | None) -> MotionPlan:
+    """Return a movement with what is known of it; see :func:`_timed` for its duration."""
+    duration, limits = _timed(problem, movement, least)
     movement = movement._replace(duration=duration)
     clearance = movement.clearance
     if clearance is None:

@@ -13,13 +13,14 @@ from viapoint.envs.common.validation import whole_number
 from viapoint.envs.geometry.clearance import memory
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
-from viapoint.envs.plans import Plan
 from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.task import Task
 from viapoint.training.planning.candidates import candidate_actions, sobol_actions
+from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.movements import MovementTable, Setting, least_clearance
+from viapoint.training.planning.plan_motion import checked_motion
 from viapoint.training.planning.problem import (
     Moves,
     Numbers,
@@ -71,8 +72,8 @@ class GeometrySearch:
         >>> from viapoint.training import GeometrySearch
         >>> search = GeometrySearch("viapoint/PlanarObstacles-v0", n_checks=64)
         >>> plan = search.plan((-0.2, 0.3), (0.1, 0.4), [Cylinder(0.03, 0.04, position=(-0.05, 0.35, 0.0))])
-        >>> plan.waypoints.shape, plan.durations.shape
-        ((3, 2), (2,))
+        >>> plan.success, plan.waypoints.shape, plan.durations.shape
+        (True, (3, 2), (2,))
     """
 
     def __init__(
@@ -140,10 +141,10 @@ class GeometrySearch:
             return self.decide(parts).astype(np.float32), None
         return self.decide({name: part[None] for name, part in parts.items()})[0].astype(np.float32), None
 
-    def plan(self, start: Any, goal: Any, obstacles: Any = ()) -> Plan:
+    def plan(self, start: Any, goal: Any, obstacles: Any = ()) -> MotionPlan:
         """Return the best plan from rest at `start` to rest at `goal` among obstacles that stand still.
 
-        Where no candidate stays clear and in reach, the plan is the one with the least violation.
+        Where no candidate stays clear and in reach, the plan is the one with the least violation, and has no success.
 
         Args:
             start: Start, as `reset` takes it.
@@ -156,7 +157,8 @@ class GeometrySearch:
         given = {"start": start, "goal": goal, "obstacles": obstacles}
         scenes = draw_given(given, self.task.sampler(), [np.random.default_rng(0)])
         problem = Problem.of_scenes(scenes, self.task)
-        return self.task.action.decode(self.solve(problem), problem.start, problem.goal).take(0)
+        plan = self.task.action.decode(self.solve(problem), problem.start, problem.goal).take(0)
+        return checked_motion(self.task.arm, self.task.space_name, plan, problem.obstacles, self.name)
 
     def _steps(self, moving: bool) -> Single:
         """Return steps of a round of refinement, shape (per_round, m); from rest the duration stays as it is."""

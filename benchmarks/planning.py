@@ -1,0 +1,110 @@
+"""Planners on the problems of MotionBenchMaker: the table of docs/planning.md, and the curves of its figure.
+
+python benchmarks/planning.py table   # problems 21 to 100 of each set, about five minutes
+python benchmarks/planning.py curves  # problems 1 to 20, about twelve minutes
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+
+from viapoint.envs.geometry.obstacles import pack
+from viapoint.training.planning import benchmark_report
+from viapoint.training.planning.benchmark import BenchmarkProblem, benchmark_panda, benchmark_problems
+from viapoint.training.planning.plan_motion import plan_motion
+
+DOCS = Path(__file__).parents[1] / "docs"
+TABLE = DOCS / "planning.csv"
+FIGURE = DOCS / "figures" / "planning.png"
+DEVELOPED_ON = 20
+"""Greatest number of the problems that were looked at during development."""
+PLANNERS = ("straight", "plan_motion", "plan_motion+ompl", "search512", "ompl")
+LIMITS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+"""Time limits of plan_motion, [ms]."""
+CHECKS = (16, 64, 256, 1024, 4096, 16384)
+"""Numbers of plans that the search checks."""
+COLOURS = {"plan_motion": "#1f6fb2", "search": "#d1812f", "OMPL": "#4f8f4f"}
+
+
+def main() -> None:
+    """Measure what the command line names."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=("table", "curves"))
+    asked = parser.parse_args().what
+    problems = benchmark_problems()
+    if asked == "table":
+        write_table([each for each in problems if each.number > DEVELOPED_ON])
+    else:
+        draw_curves([each for each in problems if each.number <= DEVELOPED_ON])
+
+
+def write_table(problems: list[BenchmarkProblem]) -> None:
+    """Measure all planners, print the table, and write it."""
+    lines = pd.concat([benchmark_report.measure_planner(name, problems) for name in PLANNERS])
+    print(benchmark_report.markdown(lines))
+    benchmark_report.summary(lines).to_csv(TABLE, index=False, float_format="%.4g", lineterminator="\n")
+    unsolved = lines[
+        lines.planner.str.startswith("plan_motion") & ~lines.refused & ~(lines.solved & lines.physics)
+    ]
+    print(unsolved[["planner", "set", "number", "solved", "physics", "clearance", "seeds"]].to_string())
+
+
+def draw_curves(problems: list[BenchmarkProblem]) -> None:
+    """Draw share solved and jerk against the time that planners are given."""
+    arm, scenes = benchmark_panda(), [pack([each.obstacles]) for each in problems]
+    curves: dict[str, list[tuple[float, float, float]]] = {name: [] for name in COLOURS}
+    for limit in LIMITS:
+        plans = [
+            plan_motion(
+                arm,
+                each.start,
+                each.goal,
+                scene,
+                seeds=10**5,
+                enough=10**5,
+                time_limit=1e-3 * limit,
+                ompl=False,
+            )
+            for each, scene in zip(problems, scenes, strict=True)
+        ]
+        solved = [plan.jerk for plan in plans if plan.success]
+        taken = float(np.median([plan.milliseconds for plan in plans]))
+        curves["plan_motion"].append((taken, len(solved) / len(plans), float(np.median(solved))))
+        print(f"plan_motion {limit} ms", curves["plan_motion"][-1], file=sys.stderr)
+    for checks in CHECKS:
+        lines = benchmark_report.measure_planner(f"search{checks}", problems, physics=False)
+        curves["search"].append(
+            (lines.milliseconds.median(), lines.solved.mean(), lines[lines.solved].jerk.median())
+        )
+    # A path is found or not: the curve is the share of those that took less than a time.
+    lines = benchmark_report.measure_planner("ompl", problems, physics=False)
+    for limit in LIMITS:
+        found = lines[lines.solved & (lines.milliseconds <= limit)]
+        if len(found):
+            curves["OMPL"].append((limit, len(found) / len(lines), found.jerk.median()))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8.0, 3.2), layout="constrained")
+    for name, points in curves.items():
+        time, share, jerk = np.array(points).T
+        left.plot(time, 100.0 * share, "o-", color=COLOURS[name], label=name, markersize=4)
+        right.plot(time, jerk, "o-", color=COLOURS[name], markersize=4)
+    left.set(xscale="log", xlabel="time [ms]", ylabel="solved [%]", ylim=(0, 103))
+    right.set(xscale="log", yscale="log", xlabel="time [ms]", ylabel="jerk, relative to straight")
+    right.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])
+    right.minorticks_off()
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    left.legend(frameon=False)
+    figure.savefig(FIGURE, dpi=130)
+
+
+if __name__ == "__main__":
+    main()
