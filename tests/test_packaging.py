@@ -20,7 +20,7 @@ SHIPPED = (
     ".csv",
     ".motionbenchmaker",
     ".vamp",
-    "data/README.md",
+    "README.md",
     ".safetensors",
     ".json",
     ".j2",

@@ -12,8 +12,9 @@ import numpy as np
 
 from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.arms.kinematics import forward, inverse_dynamics
-from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, touching_at_home
-from viapoint.envs.common.types import Float
+from viapoint.envs.arms.spheres import Capsule, Cover, LeftOut, cover, touching_at_home
+from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.geometry.clearance import memory, nearest_spheres, place
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import add_to_model
 from viapoint.envs.geometry.shapes import as_obstacle
@@ -21,6 +22,8 @@ from viapoint.envs.plans import SpaceName
 
 HIDDEN_GROUP = 5
 """Group of geoms that MuJoCo does not draw."""
+COMPARED = 100_000
+"""Number of configurations in which bodies that never touch are looked for."""
 SAMPLED = 64
 """Configurations at which the greatest inertia of the joints is looked for."""
 OBSTACLE_COLOUR = (0.83, 0.52, 0.30, 1.0)
@@ -76,6 +79,22 @@ class Arm:
     """Space in which movements are planned by default."""
     timestep: float
     """Length of a physics step, [s]."""
+    notes: tuple[str, ...] = ()
+    """Choices that were made for the arm when it was loaded, and parts that were left out."""
+
+    def report(self) -> str:
+        """Return what the arm is, and what was chosen for it, as a text of several lines."""
+        lines = [repr(self)]
+        for name, (low, high), velocity, torque, home in zip(
+            self.joint_names, self.joint_range, self.velocity_limit, self.torque_limit, self.home, strict=True
+        ):
+            lines.append(
+                f"{name}: {low:.4g} to {high:.4g}, at most {velocity:.4g}/s and {torque:.4g} N m, home {home:.4g}"
+            )
+        lines += self.notes
+        lines += [f"{pair.first} and {pair.second} are not compared: {pair.reason}" for pair in self.left_out]
+        lines.append(f"spheres reach up to {1e3 * self.excess:.1f} mm beyond the geoms")
+        return "\n".join(lines)
 
     def __repr__(self) -> str:
         """Return name, joints and size."""
@@ -181,6 +200,7 @@ def arm_from_xml(
     capsules = _capsules(model, chain, tuple(joints), links)
     covered = cover(chain, capsules, links, home, touching, {frozenset(pair) for pair in exclude})
     ranges = np.array([model.joint(each).range for each in joints])
+    covered = _without_distant_pairs(chain, covered, ranges)
     inertia = _greatest_inertia(model, data, tuple(joints))
     stiffness = inertia * bandwidth**2
     return Arm(
@@ -202,6 +222,34 @@ def arm_from_xml(
         space=space,
         timestep=float(model.opt.timestep),
     )
+
+
+def _without_distant_pairs(chain: Chain, covered: Cover, ranges: Float) -> Cover:
+    """Return the spheres without the pairs of bodies that touch in none of many configurations."""
+    spheres, names = covered.spheres, covered.names
+    low, high = ranges.T
+    random = np.random.default_rng(0).uniform(low, high, (COMPARED, len(ranges)))
+    touching = _touching(chain, spheres, random)
+    left_out = [
+        LeftOut(names[first], names[second], f"in contact in none of {COMPARED:,} configurations")
+        for first, second in spheres.pairs[~touching]
+    ]
+    spheres = spheres._replace(pairs=spheres.pairs[touching])
+    return covered._replace(spheres=spheres, left_out=(*covered.left_out, *left_out))
+
+
+@compiled
+def _touching(chain: Chain, spheres: Spheres, joints: Float) -> Bool:
+    """Return True for pairs of groups that overlap in one of N configurations, shape (P,)."""
+    found = np.zeros(len(spheres.pairs), np.bool_)
+    placed = memory(chain, spheres)
+    for n in range(len(joints)):
+        place(chain, spheres, joints[n], placed)
+        for pair in range(len(found)):
+            if not found[pair]:
+                least, _, _ = nearest_spheres(spheres, placed, pair, 0.0, 0.0)
+                found[pair] = least < 0.0
+    return found
 
 
 def asset(file: str) -> str:

@@ -1,4 +1,4 @@
-"""Arms from MJCF files."""
+"""Arms from MJCF and URDF files."""
 
 from __future__ import annotations
 
@@ -15,12 +15,22 @@ import numpy as np
 
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
 from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
+from viapoint.envs.arms.choices import arm_joints, chain_joints, choose_home, choose_tool, known_velocities
 from viapoint.envs.arms.kinematics import torques
+from viapoint.envs.arms.urdf import Urdf, read_urdf
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least
 
 DEFAULT_VELOCITY_LIMIT = 2.0
 """Velocity limit of joints without one, [rad/s] or [m/s]."""
+WEIGHTS, LEAST_TORQUE = 3.0, 1.0
+"""Torque limit of joints without one, as a multiple of the torque that gravity needs, and at least, [N m] or [N]."""
+WEIGHED = 200
+"""Number of configurations in which the arm is weighed."""
+LOOKED_AT = 16
+"""Number of configurations in which bodies that always touch are looked for."""
+TOOL = "viapoint_tool"
+"""Name of the site that is added for the tool."""
 MIN_JOINTS = 2
 """Least number of joints."""
 MIN_TOLERANCE, MAX_TOLERANCE = 0.005, 1.0
@@ -72,8 +82,11 @@ class Fit(NamedTuple):
 def load_arm(
     file: str | Path | mujoco.MjSpec,
     *,
-    hand_site: str,
-    joints: Sequence[str],
+    tool: Any = None,
+    joints: Sequence[str] | None = None,
+    base: str | None = None,
+    packages: Sequence[str | Path] = (),
+    hand_site: str | None = None,
     name: str | None = None,
     home: Any = None,
     origin: Any = None,
@@ -82,24 +95,31 @@ def load_arm(
     velocity_limit: Any = None,
     tolerance: float = 0.025,
 ) -> Arm:
-    """Load an arm from an MJCF file.
+    """Load an arm from an MJCF or URDF file.
 
     The arm keeps the file's joints, inertias, damping and limits, and the spheres and capsules of its bodies. Capsules
     cover the other geoms: nothing sticks out of them. Other joints are fixed as in the file's first keyframe. The base
-    is what is fixed to the world and carries the arm; everything else is left out.
+    is what is fixed to the world and carries the arm; everything else is left out. `arm.notes` tells what was chosen
+    where no argument was given.
 
     Args:
-        file: MJCF file, the text of one, or a specification.
-        hand_site: Site of the tool, which moves with the last joint.
-        joints: Names of the limited hinges and slides from the base to the tool, two or more.
+        file: MJCF or URDF file, the text of an MJCF file, or a specification.
+        tool: Site or body of the tool, or a pair of body and point, (3,), [m]; by default a site or body with a usual
+            name, or else the tip of the chain.
+        joints: Names of the hinges and slides from the base to the tool, two or more; by default all of the chain.
+        base: Body that the chain begins at; needed where a file has two arms.
+        packages: Folders for `package://` in a URDF; the folders above the file are always looked in.
+        hand_site: Former name of `tool`.
         name: Name of the arm; by default that of the file or the model.
-        home: Home configuration, shape (J,); by default the file's first keyframe, or else the middle of the ranges.
-        origin: Point of the file's world that becomes the origin, [m]; by default the point below the first joint with
-            z = 0.
-        joint_range: Lowest and highest position of each joint, shape (J, 2); by default those of the file.
-        torque_limit: Torque limit of each joint or of all; by default those of the file's joints or actuators.
-        velocity_limit: Velocity limit of each joint or of all; by default the file's custom number of that name, or 2
-            with a warning.
+        home: Home configuration, shape (J,); by default the file's first keyframe if it is free, or else one that is
+            looked for.
+        origin: Point of the file's world that becomes the origin, [m]; by default its origin.
+        joint_range: Lowest and highest position of each joint, shape (J, 2); by default those of the file, and +-pi for
+            continuous joints.
+        torque_limit: Torque limit of each joint or of all; by default those of the file's joints or actuators, or
+            several times the arm's weight with a warning.
+        velocity_limit: Velocity limit of each joint or of all; by default that of the URDF, the file's custom number of
+            that name, that of a well-known arm, or 2 with a warning.
         tolerance: Greatest distance by which the capsules that cover a geom reach beyond it, 0.005 or more, [m]; for
             the base at least a tenth of the size of the geom.
 
@@ -108,19 +128,12 @@ def load_arm(
         ValueError: An argument is invalid, the file lacks something, or the arm cannot hold its weight at home.
 
     Example:
-        >>> import numpy as np
         >>> from viapoint.envs.arms.load import load_arm
-        >>> arm = load_arm(
-        ...     "docs/ur5e.xml",
-        ...     hand_site="hand",
-        ...     joints=("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"),
-        ...     home=(0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28),
-        ...     velocity_limit=np.pi,
-        ... )
-        >>> arm.hand(arm.home).round(3).tolist()  # [m]
-        [0.48, -0.001, 0.198]
+        >>> arm = load_arm("docs/ur5e.xml")
+        >>> arm.joint_names[:3], arm.notes[0]
+        (('shoulder_pan', 'shoulder_lift', 'elbow'), "tool: 'hand'")
     """
-    spec, own_name = _read(file)
+    spec, own_name, urdf = _read(file, tuple(packages))
     tolerance = number_of_at_least("tolerance", tolerance, MIN_TOLERANCE, MAX_TOLERANCE)
     name = own_name if name is None else name
     if not isinstance(name, str) or not name:
@@ -129,22 +142,29 @@ def load_arm(
         whole = spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot read the file: {error}") from None
-    names = _joint_names(joints)
-    _check_exist("site", [hand_site], [site.name for site in spec.sites])
-    _check_exist("joint", names, [joint.name for joint in spec.joints])
-    ranges = _ranges(whole, names, joint_range)
-    torque = (
-        _torques(whole, names) if torque_limit is None else _per_joint("torque_limit", torque_limit, names)
-    )
-    velocity = _velocities(whole, names, velocity_limit)
+    notes = list(urdf.notes)
+    chosen = choose_tool(whole, hand_site if tool is None else tool, base)
+    notes.insert(0, f"tool: {chosen.name!r}")
+    if joints is None:
+        names = _joint_names(arm_joints(whole, chain_joints(whole, chosen.body, base), notes))
+        notes.append(f"joints: {', '.join(names)}")
+    else:
+        names = _joint_names(joints)
+        _check_exist("joint", names, [joint.name for joint in spec.joints])
+    carrier = next(body for body in spec.bodies if body.id == chosen.body)
+    carrier.add_site(name=TOOL, pos=chosen.position, quat=chosen.quaternion)
+    whole = spec.compile()
+    ranges = _ranges(whole, names, joint_range, notes)
+    velocity = _velocities(whole, names, velocity_limit, urdf.velocity_limits, name, notes)
+    torque, stated = _torques(whole, names, torque_limit, notes)
     for what, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
         if not (limit > 0.0).all():
             raise ValueError(f"{what} must be positive, got {limit}")
-    home = _home(whole, names, ranges, home)
-    parsed = _parse(spec, whole, names, hand_site)
-    place = parsed.rest.xanchor[parsed.model.joint(names[0]).id]
-    zero = np.array((place[0], place[1], 0.0)) if origin is None else finite_array("origin", origin, (3,))
-    exclude = _excluded(parsed)
+    keyframe = _keyframe(whole, names)
+    parsed = _parse(spec, whole, names, TOOL)
+    exclude = _excluded(parsed) + [pair for pair in urdf.never_touch if set(pair) <= _names_of(parsed)]
+    home = _home(parsed, ranges, home, keyframe, exclude, notes)
+    zero = np.zeros(3) if origin is None else finite_array("origin", origin, (3,))
     xml, excess = _fitted(parsed, ranges, zero, home, exclude, tolerance)
     arm = arm_from_xml(
         name,
@@ -156,19 +176,29 @@ def load_arm(
         torque_limit=torque,
         exclude=exclude,
     )
-    weak = np.abs(torques(arm.chain, home, 0.0 * home, 0.0 * home)) > torque
-    if weak.any():
+    weight = np.abs(torques(arm.chain, home, 0.0 * home, 0.0 * home))
+    weak = weight > torque
+    if weak.any() and not stated:
+        # A spring or a counterweight may bear it, which the file does not have.
+        some = ", ".join(itertools.compress(names, weak))
+        notes.append(
+            f"torque limits of {some}: {WEIGHTS:g} times the weight at home, which those of the file do not hold"
+        )
+        warnings.warn(f"{notes[-1]}; give torque_limit", stacklevel=2)
+        arm = replace(arm, torque_limit=np.where(weak, WEIGHTS * weight, torque))
+    elif weak.any():
         some = ", ".join(itertools.compress(names, weak))
         raise ValueError(
             f"the torque limits of {some} do not hold the arm's own weight at home; raise torque_limit"
         )
-    return replace(arm, excess=arm.excess + excess)
+    return replace(arm, excess=arm.excess + excess, notes=tuple(notes))
 
 
-def _read(file: Any) -> tuple[mujoco.MjSpec, str]:
-    """Return a specification that may be changed, and its name."""
+def _read(file: Any, packages: tuple[str | Path, ...]) -> tuple[mujoco.MjSpec, str, Urdf]:
+    """Return a specification that may be changed, its name, and what MuJoCo does not take from a URDF."""
+    nothing = Urdf("", "", {}, (), ())
     if isinstance(file, mujoco.MjSpec):
-        return file.copy(), file.modelname
+        return file.copy(), file.modelname, nothing
     if not isinstance(file, str | os.PathLike) or isinstance(os.fspath(file), bytes):
         raise TypeError(f"file must be the name or the text of an MJCF file, or an MjSpec, got {file!r:.60}")
     text = os.fspath(file)
@@ -177,11 +207,15 @@ def _read(file: Any) -> tuple[mujoco.MjSpec, str]:
     path = Path(text)
     if not is_text and not path.is_file():
         raise ValueError(f"there is no file {text!r}")
+    urdf = nothing
+    if not is_text and (path.suffix.lower() == ".urdf" or b"<robot" in path.read_bytes()[:4096]):
+        urdf = read_urdf(path, packages)
     try:
-        spec = mujoco.MjSpec.from_string(text) if is_text else mujoco.MjSpec.from_file(text)
+        as_text = urdf.text or (text if is_text else "")
+        spec = mujoco.MjSpec.from_string(as_text) if as_text else mujoco.MjSpec.from_file(text)
     except ValueError as error:
-        raise ValueError(f"MuJoCo cannot read {text!r:.60} as MJCF: {error}") from None
-    return spec, spec.modelname if is_text else path.stem
+        raise ValueError(f"MuJoCo cannot read {text!r:.60} as MJCF or URDF: {error}") from None
+    return spec, urdf.name or (spec.modelname if is_text else path.stem), urdf
 
 
 def _joint_names(joints: Any) -> tuple[str, ...]:
@@ -210,26 +244,35 @@ def _per_joint(name: str, values: Any, joints: tuple[str, ...]) -> Float:
     return np.array(np.broadcast_to(numbers, (len(joints),)))
 
 
-def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any) -> Float:
+def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: list[str]) -> Float:
     """Return the range of each joint, shape (J, 2)."""
+    found = []
     for name in joints:
         joint = model.joint(name).id
         if not np.isin(model.jnt_type[joint], JOINT_TYPES):
             raise ValueError(f"joint {name!r} is neither a hinge nor a slide; leave it out to fix it")
-        if given is None and not model.jnt_limited[joint]:
+        limited = bool(model.jnt_limited[joint])
+        if given is None and not limited and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
             raise ValueError(
                 f"joint {name!r} has no limits; give it a range in the file, or give joint_range"
             )
+        if given is None and not limited:
+            notes.append(f"range of {name}, which is continuous: +-pi")
+        found.append(model.jnt_range[joint] if limited else (-np.pi, np.pi))
     if given is None:
-        return np.array([model.joint(name).range for name in joints])
+        return np.array(found)
     ranges = finite_array("joint_range", given, (len(joints), 2))
     if (ranges[:, 0] >= ranges[:, 1]).any():
         raise ValueError(f"joint_range must be pairs in increasing order, got {given!r}")
     return ranges
 
 
-def _torques(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
-    """Return the torque limit of each joint: its own, or the greatest of the actuators that drive it."""
+def _torques(
+    model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: list[str]
+) -> tuple[Float, bool]:
+    """Return the torque limit of each joint, its own, or the greatest of the actuators that drive it; True if given."""
+    if given is not None:
+        return _per_joint("torque_limit", given, joints), True
     found = []
     for name in joints:
         joint = model.joint(name).id
@@ -239,13 +282,31 @@ def _torques(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
         drives = np.isin(model.actuator_trntype, JOINT_TRANSMISSIONS) & (model.actuator_trnid[:, 0] == joint)
         limits = [_actuator_torque(model, int(index)) for index in np.flatnonzero(drives)]
         found.append(max(limits, default=0.0))
-    missing = [name for name, torque in zip(joints, found, strict=True) if torque <= 0.0]
-    if missing:
-        raise ValueError(
-            f"no actuator with a force limited to a range about 0 drives {', '.join(missing)}; add one, or give "
-            "torque_limit"
+    torque = np.array(found)
+    missing = torque <= 0.0
+    if missing.any():
+        weight = _greatest_weight(model, joints)
+        torque[missing] = np.maximum(WEIGHTS * weight[missing], LEAST_TORQUE)
+        some = ", ".join(itertools.compress(joints, missing))
+        text = (
+            f"the file has no torque limits of {some}; they get {WEIGHTS:g} times what the arm's weight needs"
         )
-    return np.array(found)
+        notes.append(text)
+        warnings.warn(f"{text}; give torque_limit", stacklevel=3)
+    return torque, False
+
+
+def _greatest_weight(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
+    """Return the greatest torques that gravity needs in random configurations, shape (J,)."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    address = [int(model.joint(name).qposadr[0]) for name in joints]
+    dofs = [int(model.joint(name).dofadr[0]) for name in joints]
+    greatest = np.zeros(len(joints))
+    for _ in range(WEIGHED):
+        data.qpos[address] = rng.uniform(-np.pi, np.pi, len(joints))
+        mujoco.mj_forward(model, data)
+        greatest = np.maximum(greatest, np.abs(data.qfrc_bias[dofs]))
+    return greatest
 
 
 def _actuator_torque(model: mujoco.MjModel, index: int) -> float:
@@ -265,30 +326,90 @@ def _symmetric_limit(limits: Float) -> float:
     return max(min(-float(limits[0]), float(limits[1])), 0.0)
 
 
-def _velocities(model: mujoco.MjModel, joints: tuple[str, ...], given: Any) -> Float:
+def _velocities(
+    model: mujoco.MjModel,
+    joints: tuple[str, ...],
+    given: Any,
+    in_urdf: dict[str, float],
+    arm: str,
+    notes: list[str],
+) -> Float:
     """Return the velocity limit of each joint, shape (J,)."""
-    if given is None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
-        given = model.numeric("velocity_limit").data
-    if given is None:
-        given = DEFAULT_VELOCITY_LIMIT
-        warnings.warn(
-            f"the file has no velocity limits, so all joints get {given:g} rad/s (slides {given:g} m/s); give "
-            "velocity_limit",
-            stacklevel=3,
-        )
-    return _per_joint("velocity_limit", given, joints)
+    if given is not None:
+        return _per_joint("velocity_limit", given, joints)
+    if all(name in in_urdf for name in joints):
+        return np.array([in_urdf[name] for name in joints])
+    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
+        return _per_joint("velocity_limit", model.numeric("velocity_limit").data, joints)
+    known = known_velocities(arm, len(joints))
+    if known is not None:
+        notes.append(f"velocity limits: those of the arm that {arm!r} is named after")
+        return known
+    text = (
+        f"the file has no velocity limits, so all joints get {DEFAULT_VELOCITY_LIMIT:g} rad/s (slides "
+        f"{DEFAULT_VELOCITY_LIMIT:g} m/s)"
+    )
+    notes.append(text)
+    warnings.warn(f"{text}; give velocity_limit", stacklevel=3)
+    return np.full(len(joints), DEFAULT_VELOCITY_LIMIT)
 
 
-def _home(model: mujoco.MjModel, joints: tuple[str, ...], ranges: Float, given: Any) -> Float:
+def _keyframe(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float | None:
+    """Return the joints in the first keyframe, shape (J,); None without one."""
+    if not model.nkey:
+        return None
+    return np.array(model.key_qpos[0, [int(model.joint(name).qposadr[0]) for name in joints]])
+
+
+def _home(
+    parsed: Parsed,
+    ranges: Float,
+    given: Any,
+    keyframe: Float | None,
+    exclude: Sequence[tuple[str, str]],
+    notes: list[str],
+) -> Float:
     """Return the home configuration, shape (J,)."""
-    if given is None:
-        address = [int(model.joint(name).qposadr[0]) for name in joints]
-        given = model.key_qpos[0, address] if model.nkey else ranges.mean(axis=1)
-    home = _per_joint("home", given, joints)
-    outside = (home < ranges[:, 0]) | (home > ranges[:, 1])
-    if outside.any():
-        raise ValueError(f"home is outside the range of {', '.join(itertools.compress(joints, outside))}")
+    joints = parsed.joints
+    if given is not None:
+        home = _per_joint("home", given, joints)
+        outside = (home < ranges[:, 0]) | (home > ranges[:, 1])
+        if outside.any():
+            raise ValueError(f"home is outside the range of {', '.join(itertools.compress(joints, outside))}")
+        return home
+    pairs = _pairs_that_move(parsed, ranges, exclude)
+
+    def apart(home: Float) -> float:
+        return min(_distances(parsed, home, pairs).values(), default=1.0)
+
+    zeros = np.zeros(len(joints))
+    candidates = [keyframe, zeros] if keyframe is not None else [np.full(len(joints), np.inf), zeros]
+    home, origin = choose_home(ranges, candidates, apart)
+    notes.append(f"home: {origin}")
     return home
+
+
+def _pairs_that_move(
+    parsed: Parsed, ranges: Float, exclude: Sequence[tuple[str, str]]
+) -> list[tuple[int, int]]:
+    """Return the pairs of bodies that are compared, without those that touch in every one of some configurations."""
+    excluded = {frozenset(pair) for pair in exclude}
+    pairs = [
+        pair
+        for pair in _distant_pairs(parsed)
+        if frozenset(_body_name(parsed, body) for body in pair) not in excluded
+    ]
+    low, high = ranges.T
+    rng = np.random.default_rng(0)
+    free: set[tuple[int, int]] = set()
+    for home in rng.uniform(low, high, (LOOKED_AT, len(ranges))):
+        free.update(pair for pair, away in _distances(parsed, home, pairs).items() if away > 0.0)
+    return [pair for pair in pairs if pair in free]
+
+
+def _names_of(parsed: Parsed) -> set[str]:
+    """Return the names of the bodies with geoms."""
+    return {_body_name(parsed, body) for body in parsed.geoms}
 
 
 def _parse(spec: mujoco.MjSpec, whole: mujoco.MjModel, joints: tuple[str, ...], hand_site: str) -> Parsed:
@@ -512,16 +633,26 @@ def _home_distances(
     parsed: Parsed, home: Float, exclude: Sequence[tuple[str, str]]
 ) -> dict[tuple[int, int], float]:
     """Return the distance at home of each pair of bodies that must stay apart, [m]; at most 0.1."""
-    data = _at(parsed.model, parsed.joints, home)
     excluded = {frozenset(pair) for pair in exclude}
+    pairs = [
+        pair
+        for pair in _distant_pairs(parsed)
+        if frozenset(_body_name(parsed, body) for body in pair) not in excluded
+    ]
+    return {pair: away for pair, away in _distances(parsed, home, pairs).items() if away > 0.0}
+
+
+def _distances(
+    parsed: Parsed, joints: Float, pairs: Sequence[tuple[int, int]]
+) -> dict[tuple[int, int], float]:
+    """Return the distances of pairs of bodies, [m]; at most 0.1."""
+    data = _at(parsed.model, parsed.joints, joints)
     found = {}
-    for first, second in _distant_pairs(parsed):
-        if frozenset((_body_name(parsed, first), _body_name(parsed, second))) in excluded:
-            continue
-        pairs = itertools.product(parsed.geoms[first], parsed.geoms[second])
-        least = min(mujoco.mj_geomDistance(parsed.model, data, a, b, 0.1, None) for a, b in pairs)
-        if least > 0.0:
-            found[first, second] = least
+    for first, second in pairs:
+        geoms = itertools.product(parsed.geoms[first], parsed.geoms[second])
+        found[first, second] = min(
+            mujoco.mj_geomDistance(parsed.model, data, a, b, 0.1, None) for a, b in geoms
+        )
     return found
 
 

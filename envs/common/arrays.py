@@ -89,6 +89,12 @@ def frame_axes(quaternion: Float) -> tuple[list[Float], list[Float], list[Float]
     )
 
 
+def frame_matrices(quaternion: Float) -> Float:
+    """Return the axes of frames as columns, shape (..., 3, 3), from their quaternions, shape (..., 4)."""
+    axes = np.stack([np.stack(axis, axis=-1) for axis in frame_axes(quaternion)], axis=-1)
+    return np.ascontiguousarray(axes)
+
+
 def quaternion_to(direction: Any) -> Float:
     """Return the quaternion that turns the z axis to a direction, shape (3,)."""
     quaternion = np.empty(4)

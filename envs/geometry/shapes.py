@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from viapoint.envs.common.arrays import frame_axes, frozen, quaternion_to
+from viapoint.envs.common.arrays import frame_matrices, frozen, quaternion_to
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least
@@ -245,7 +245,7 @@ class Shape:
     @functools.cached_property
     def rotation(self) -> Float:
         """Axes of the shape's frame as columns, shape (3, 3)."""
-        rotation: Float = frozen(np.array(frame_axes(self.quaternion)).T.copy())
+        rotation: Float = frozen(frame_matrices(self.quaternion))
         return rotation
 
     def distance(self, points: Any, radius: Any = 0.0) -> Any:

@@ -25,8 +25,8 @@ EXCHANGED = 0.25
 """Share of pairs whose start and goal are exchanged, where the layout has no places of starts."""
 JITTER = 0.3
 """Greatest deviation from home of half of the starts there, [rad]."""
-SELF_MARGIN = 0.005
-"""Least clearance of the arm from itself at ends, [m]."""
+SELF_MARGIN, HOME_SHARE = 0.005, 0.5
+"""Least clearance of the arm from itself at ends, [m], and the share of that at home that it is at most."""
 INSTANTS = 32
 """Parts of the straight movement between which it is looked at."""
 ROLL = 0.3
@@ -58,6 +58,8 @@ class Mover(NamedTuple):
     """True if movements are planned in hand space, False for joint space."""
     margin: float
     """Least clearance of ends from obstacles, [m]."""
+    self_margin: float
+    """Least clearance of ends from the arm itself, [m]."""
     least_way: float
     """Least length of the way from start to goal in joint space, [rad]."""
 
@@ -212,7 +214,8 @@ def is_end(draft: Draft, joints: Float) -> bool:
         if not low <= joints[joint] <= high:
             return False
     place(mover.chain, mover.spheres, joints, placed)
-    return bool(self_clearance(mover.spheres, placed, SELF_MARGIN, SELF_MARGIN) >= SELF_MARGIN)
+    margin = mover.self_margin
+    return bool(self_clearance(mover.spheres, placed, margin, margin) >= margin)
 
 
 @compiled

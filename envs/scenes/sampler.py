@@ -22,7 +22,16 @@ from viapoint.envs.geometry.clearance import memory
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
 from viapoint.envs.plans import SpaceName
 from viapoint.envs.scenes import families_plane, families_space
-from viapoint.envs.scenes.ends import PAIRS, Attempts, Draft, Mover, draw_ends, numbers_of_end
+from viapoint.envs.scenes.ends import (
+    HOME_SHARE,
+    PAIRS,
+    SELF_MARGIN,
+    Attempts,
+    Draft,
+    Mover,
+    draw_ends,
+    numbers_of_end,
+)
 from viapoint.envs.scenes.families_registry import Build, check_families, scene_families
 from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Layout, Room, most_rows
 from viapoint.envs.scenes.motions import (
@@ -33,7 +42,7 @@ from viapoint.envs.scenes.motions import (
     draw_jumps,
     numbers_of_jumps,
 )
-from viapoint.envs.scenes.scene import MOST_JUMPS, Scenes, resting
+from viapoint.envs.scenes.scene import MOST_JUMPS, Scenes, resting, row_clearances
 
 LOW_HALF_HEIGHT, TALL_HALF_HEIGHT = 0.04, 0.3
 """Half heights of obstacles in the plane that the hand alone must clear, and that links must clear, too, [m]."""
@@ -260,18 +269,26 @@ def mover_of(arm: Arm, space: SpaceName, plane: bool) -> Mover:
     """Return what compiled functions know of an arm."""
     width = arm.joint_range[:, 1] - arm.joint_range[:, 0]
     margin = np.minimum(LIMIT_MARGIN, 0.1 * width)
+    inner = arm.joint_range + margin[:, None] * np.array([1.0, -1.0])
+    # Joints that turn more than once are kept within half a turn from home.
+    near = arm.home[:, None] + np.pi * np.array([-1.0, 1.0])
+    several = (width > 2.0 * np.pi + 1e-3) & ~arm.chain.sliding
+    near = np.stack((np.maximum(near[:, 0], inner[:, 0]), np.minimum(near[:, 1], inner[:, 1])), axis=-1)
+    inner = np.where(several[:, None], near, inner)
     away = arm.hand(arm.home) - arm.chain.origin[0]
+    _, own = row_clearances(arm.chain, arm.spheres, arm.home[None], no_obstacles(1), SELF_MARGIN / HOME_SHARE)
     return Mover(
         chain=arm.chain,
         spheres=arm.spheres,
         joint_range=arm.joint_range,
-        inner_range=arm.joint_range + margin[:, None] * np.array([1.0, -1.0]),
+        inner_range=inner,
         velocity_limit=arm.velocity_limit,
         home=arm.home,
         bearing=math.atan2(away[1], away[0]),
         plane=plane,
         of_hand=space == "hand",
         margin=PLANE_MARGIN if plane else SPACE_MARGIN,
+        self_margin=min(SELF_MARGIN, HOME_SHARE * float(own[0])),
         least_way=0.0 if plane else LEAST_WAY,
     )
 

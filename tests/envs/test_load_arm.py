@@ -1,5 +1,6 @@
 """Arms that are loaded from MJCF files are those of the file."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from self_contact import check_contact_implies_overlap, least_pair_distance
 
 from viapoint.envs.arms.kinematics import forward, sphere_centres, torques
 from viapoint.envs.arms.load import load_arm
+from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.scenes.scene import row_clearances
 
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 TEXT = UR5E.read_text(encoding="utf-8")
@@ -144,9 +147,9 @@ def test_a_slide_is_fixed_as_in_the_keyframe_or_is_a_joint(moves):
 
 
 def test_an_arm_of_two_joints_and_a_home_in_the_middle_of_the_ranges(arm):
-    text = changed(('name="shoulder_lift"', 'name="shoulder_lift" range="0 1"'))
+    text = changed(('name="shoulder_lift"', 'name="shoulder_lift" range="0.5 1.5"'))
     two = ur5e(text, joints=JOINTS[:2], hand_site="hand", home=None, torque_limit=500.0)
-    np.testing.assert_allclose(two.home, [0.0, 0.5], atol=1e-5)
+    np.testing.assert_allclose(two.home, [0.0, 1.0], atol=1e-5)
     assert {"shoulder", "upper_arm", "wrist_3"} <= set(two.group_names)
 
 
@@ -155,7 +158,7 @@ def test_pairs_that_the_file_does_not_let_collide_are_left_out():
     exclude = ("</worldbody>", '</worldbody><contact><exclude body1="shoulder" body2="wrist_3"/></contact>')
     arm = ur5e(changed(bits, exclude))
     out = {
-        frozenset((pair.first, pair.second)) for pair in arm.left_out if pair.reason != "consecutive links"
+        frozenset((pair.first, pair.second)) for pair in arm.left_out if pair.reason == "excluded in the file"
     }
     assert out == {frozenset(("shoulder", "wrist_3"))} | {
         frozenset(("upper_arm", other)) for other in ("base_0", "wrist_1", "wrist_2", "wrist_3")
@@ -170,14 +173,14 @@ def test_joints_and_bodies_may_have_any_names(arm):
     assert other.compile(2).nbody == arm.compile(2).nbody
 
 
-@pytest.mark.parametrize("gap", [0.02, 0.004])
-def test_bodies_that_are_near_at_home_are_compared_and_fitted_closely(gap):
-    text = near_arm(gap)
-    arm = load_arm(
-        text, hand_site="tool", joints=("one", "two", "three"), velocity_limit=1.0, torque_limit=1e3
-    )
+def test_bodies_that_are_near_at_home_are_compared_and_fitted_closely():
+    arguments = {"velocity_limit": 1.0, "torque_limit": 1e3}
+    arm = load_arm(near_arm(0.004), **arguments)
     assert [(arm.group_names[a], arm.group_names[b]) for a, b in arm.spheres.pairs] == [("a", "c")]
-    assert 0.0 < least_pair_distance(arm, arm.home).min() < gap
+    assert 0.0 < least_pair_distance(arm, arm.home).min() < 0.004
+    # Farther away, they are in contact nowhere.
+    far = load_arm(near_arm(0.02), **arguments)
+    assert [pair[:2] for pair in far.left_out if "none of" in pair.reason] == [("a", "c")]
 
 
 def test_bodies_that_touch_at_home_are_left_out_and_bodies_too_close_are_refused():
@@ -212,7 +215,7 @@ def near_arm(gap):
 
 def test_without_velocity_limits_a_warning_names_the_default():
     with pytest.warns(UserWarning, match="2 rad/s"):
-        arm = ur5e(velocity_limit=None)
+        arm = ur5e(velocity_limit=None, name="other")
     np.testing.assert_array_equal(arm.velocity_limit, 2.0)
     custom = (
         "<worldbody>",
@@ -258,8 +261,6 @@ def test_a_tolerance_that_takes_too_many_capsules_is_named():
 @pytest.mark.parametrize(
     ("pattern", "other"),
     [
-        (r' range="-6.2832 6.2832"', ""),  # joints without limits
-        (r' actuatorfrcrange="[^"]*"', ""),  # and without torques
         (r'<joint name="elbow" range', '<joint name="elbow" type="ball" range'),
         (r"<geom[^>]*/>", ""),
         (r"<geom type[^>]*/>", ""),  # bodies without mass
@@ -267,7 +268,6 @@ def test_a_tolerance_that_takes_too_many_capsules_is_named():
         (r'<geom type="box"', '<geom type="sdf" mesh="cube" mass="0.1"/><geom type="box"'),
         (r'<joint name="wrist_1" class="wrist"/>((?s:.*?))<joint name="wrist_2"',
          r'\1<joint name="wrist_1" class="wrist" axis="0 1 0"/><joint name="wrist_2"'),  # two in one body
-        (r'actuatorfrcrange="-28 28"', 'actuatorfrcrange="0 28"'),  # motors that pull one way
     ],
 )  # fmt: skip
 def test_files_that_lack_something_are_refused(pattern, other):
@@ -276,3 +276,170 @@ def test_files_that_lack_something_are_refused(pattern, other):
     assert number
     with pytest.raises(ValueError):
         ur5e(text)
+
+
+def test_nothing_but_the_file_is_needed(arm):
+    alone = load_arm(UR5E, home=HOME)
+    assert alone.joint_names == JOINTS
+    np.testing.assert_array_equal(alone.hand(HOME), arm.hand(HOME))
+    np.testing.assert_array_equal(alone.velocity_limit, 3.14)  # a well-known arm
+    assert any(note.startswith("tool: 'hand'") for note in alone.notes)
+    assert "shoulder_pan: -6.283 to 6.283" in alone.report()
+    searched = load_arm(UR5E)
+    assert least_own_clearance(searched, searched.home) > 0.0
+
+
+def least_own_clearance(arm, joints):
+    found = row_clearances(arm.chain, arm.spheres, np.array([joints]), pack([[]]), 1.0)
+    return found[1][0]
+
+
+@pytest.mark.parametrize(
+    ("tool", "where"),
+    [("hand", None), ("wrist_3", (0.0, 0.0, 0.0)), (("wrist_3", (0.0, 0.1, 0.2)), (0.0, 0.1, 0.2))],
+)
+def test_tools_are_sites_bodies_or_points(arm, tool, where):
+    other = load_arm(UR5E, tool=tool, home=HOME)
+    model = mujoco.MjModel.from_xml_path(str(UR5E))
+    data = mujoco.MjData(model)
+    data.qpos[:] = HOME
+    mujoco.mj_kinematics(model, data)
+    body = data.body("wrist_3")
+    expected = arm.hand(HOME) if where is None else body.xpos + body.xmat.reshape(3, 3) @ where
+    np.testing.assert_allclose(other.hand(HOME), expected, atol=1e-5)
+
+
+def test_limits_that_the_file_lacks_are_chosen_and_told():
+    with pytest.warns(UserWarning, match="torque limits"):
+        arm = ur5e(re.sub(r' actuatorfrcrange="[^"]*"', "", TEXT))
+    weight = np.abs(torques(arm.chain, np.array(HOME), np.zeros(6), np.zeros(6)))
+    assert (arm.torque_limit > 2.0 * weight).all()
+    endless = ur5e(TEXT.replace(' range="-6.2832 6.2832"', ' limited="false"'))
+    assert np.allclose(endless.joint_range[0], (-np.pi, np.pi), atol=1e-5)
+    assert any("continuous" in note for note in endless.notes)
+
+
+def test_bodies_that_never_touch_are_left_out_and_others_are_not(arm):
+    rng = np.random.default_rng(1)
+    joints = rng.uniform(*arm.joint_range.T, (2000, 6))
+    compared = {frozenset(pair) for pair in arm.spheres.pairs.tolist()}
+    names = list(arm.group_names)
+    never = [pair for pair in arm.left_out if pair.reason.startswith("in contact in none")]
+    assert never
+    for pair in never:
+        first, second = names.index(pair.first), names.index(pair.second)
+        assert frozenset((first, second)) not in compared
+        spheres = arm.spheres._replace(pairs=np.array([[first, second]]))
+        assert least_pair_distance(dataclasses.replace(arm, spheres=spheres), joints).min() > 0.0
+    assert (least_pair_distance(arm, rng.uniform(*arm.joint_range.T, (50_000, 6))).min(axis=0) < 0.0).all()
+
+
+URDF = """<robot name="crane">
+  <link name="base"><collision><geometry><box size="0.2 0.2 0.1"/></geometry></collision></link>
+  <joint name="lift" type="prismatic"><parent link="base"/><child link="post"/><origin xyz="0.1 0 0.1"/>
+    <axis xyz="0 0 1"/><limit lower="0" upper="0.4" effort="900" velocity="0.3"/></joint>
+  <link name="post"><inertial><mass value="3"/>
+    <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><cylinder radius="0.04" length="0.2"/></geometry></collision></link>
+  <joint name="turn" type="continuous"><parent link="post"/><child link="boom"/><origin xyz="0 0 0.2"/>
+    <axis xyz="0 0 1"/><limit effort="80" velocity="1.5"/></joint>
+  <link name="boom"><inertial><origin xyz="0.2 0 0"/><mass value="2"/>
+    <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><mesh filename="package://nowhere/boom.dae"/></geometry></visual>
+    <collision><origin xyz="0.2 0 0"/><geometry><box size="0.4 0.06 0.06"/></geometry></collision></link>
+  <joint name="tilt" type="revolute"><parent link="boom"/><child link="wrist"/><origin xyz="0.4 0 0"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="2" effort="50" velocity="2"/></joint>
+  <link name="wrist"><inertial><mass value="1"/>
+    <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin xyz="0.1 0 0"/><geometry><mesh filename="MESH"/></geometry></collision></link>
+  <joint name="mount" type="fixed"><parent link="wrist"/><child link="tool0"/><origin xyz="0.25 0 0.02"/></joint>
+  <link name="tool0"/>
+</robot>"""
+
+
+@pytest.fixture
+def crane(tmp_path):
+    """Folder of a package with a URDF and a mesh."""
+    package = tmp_path / "crane_description"
+    (package / "meshes").mkdir(parents=True)
+    (package / "urdf").mkdir()
+    vertices = [f"v {0.1 * x} {0.1 * y} {0.1 * z}" for x, y, z in np.ndindex(2, 2, 2)]
+    faces = "f 1 2 4\nf 1 4 3\nf 5 7 8\nf 5 8 6\nf 1 5 6\nf 1 6 2\nf 3 4 8\nf 3 8 7\nf 1 3 7\nf 1 7 5\nf 2 6 8\nf 2 8 4"
+    (package / "meshes" / "wrist.obj").write_text("\n".join(vertices) + "\n" + faces + "\n")
+    return package
+
+
+def written(folder, mesh="package://crane_description/meshes/wrist.obj"):
+    path = folder / "urdf" / "crane.urdf"
+    path.write_text(URDF.replace("MESH", mesh))
+    return path
+
+
+def test_urdf_files_are_arms(crane):
+    arm = load_arm(written(crane))
+    assert arm.name == "crane"
+    assert arm.joint_names == ("lift", "turn", "tilt")
+    np.testing.assert_array_equal(arm.velocity_limit, (0.3, 1.5, 2.0))
+    np.testing.assert_array_equal(arm.torque_limit, (900.0, 80.0, 50.0))
+    np.testing.assert_allclose(arm.joint_range, [(0.0, 0.4), (-np.pi, np.pi), (-1.0, 2.0)], atol=1e-5)
+    assert "wrist" in arm.group_names
+    joints = (0.2, np.pi / 2, 0.0)
+    np.testing.assert_allclose(arm.hand(joints), (0.1, 0.65, 0.52), atol=1e-5)
+    np.testing.assert_allclose(arm.hand((0.0, 0.0, np.pi / 2)), (0.52, 0.0, 0.05), atol=1e-5)
+
+
+def test_pairs_of_an_srdf_beside_it_are_not_compared(crane):
+    path = written(crane)
+    (crane / "urdf" / "crane.srdf").write_text(
+        '<robot name="crane"><disable_collisions link1="wrist" link2="post" reason="Never"/></robot>'
+    )
+    assert ("post", "wrist", "excluded in the file") in {tuple(pair) for pair in load_arm(path).left_out}
+
+
+@pytest.mark.parametrize(
+    ("mesh", "message"),
+    [("package://elsewhere/wrist.obj", "packages="), ("missing.stl", "no file 'missing.stl'")],
+)
+def test_meshes_that_are_missing_are_named(crane, mesh, message):
+    with pytest.raises(ValueError, match=message):
+        load_arm(written(crane, mesh))
+
+
+def test_packages_are_looked_for_in_given_folders(crane, tmp_path):
+    path = tmp_path / "other" / "crane.urdf"
+    path.parent.mkdir()
+    path.write_text(URDF.replace("MESH", "package://parts/meshes/wrist.obj"))
+    (tmp_path / "store").mkdir()
+    crane.rename(tmp_path / "store" / "parts")
+    assert load_arm(path, packages=[tmp_path / "store"]).joint_names == ("lift", "turn", "tilt")
+
+
+def test_meshes_that_cannot_be_read_are_left_out_and_told(crane):
+    (crane / "meshes" / "wrist.dae").write_text("<COLLADA/>")
+    arm = load_arm(written(crane, "package://crane_description/meshes/wrist.dae"))
+    assert any("wrist.dae" in note for note in arm.notes)
+    assert "wrist" not in arm.group_names
+
+
+def test_files_that_are_no_robot_are_refused(tmp_path):
+    for name, text, message in (
+        ("a.urdf", "<robot", "not XML"),
+        ("b.urdf", "<mujoco/>", "no URDF"),
+        ("c.urdf", '<robot name="x"><xacro:include/></robot>'.replace("xacro:", ""), "xacro"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(ValueError, match=message):
+            load_arm(tmp_path / name)
+
+
+def test_of_two_arms_one_must_be_named():
+    one = TEXT[TEXT.index('<body name="shoulder"') : TEXT.rindex("</worldbody>")]
+    other = re.sub(r'name="(\w+)"', r'name="left_\1"', one).replace("<body", "<body", 1)
+    text = TEXT.replace("</worldbody>", f'<body name="left" pos="0 1 0">{other}</body></worldbody>')
+    with pytest.raises(ValueError, match="left_hand"):
+        load_arm(text)
+    left = load_arm(text, base="left")
+    assert left.joint_names[0] == "left_shoulder_pan"
+    assert load_arm(text, tool="hand").joint_names == JOINTS
+    with pytest.raises(ValueError, match="there is no body 'right'"):
+        load_arm(text, base="right")

@@ -167,7 +167,7 @@ def test_gradient_of_the_objective(kwargs) -> None:
     def objective(problem, offsets) -> float:
         start, scene = problem
         return refine._assemble(
-            setting, table, 80, start, offsets, 1.0, scene, 0, aim, hessian, gradient, work
+            setting, table, 80, start, offsets, 1.0, scene, 0, aim, 360.0, hessian, gradient, work
         )[0]
 
     for start, goal, scene in zip(starts, goals, obstacles, strict=True):

@@ -54,11 +54,15 @@ def arm_for(config: PlanConfig) -> Arm:
     if config.arm in arm_names():
         return arm_of(config.arm)
     if not Path(config.arm).expanduser().is_file():
-        raise ValueError(f"arm must be {', '.join(arm_names())} or an MJCF file, got {config.arm}")
-    if not config.tool or not config.joints:
-        raise ValueError("an arm of a file needs --tool SITE and --joints NAMES, from the base to the tool")
-    path = Path(config.arm).expanduser()
-    return load_arm(path, hand_site=config.tool, joints=config.joints, velocity_limit=config.velocity_limit)
+        raise ValueError(f"arm must be {', '.join(arm_names())} or an MJCF or URDF file, got {config.arm}")
+    return load_arm(
+        Path(config.arm).expanduser(),
+        tool=config.tool or None,
+        joints=config.joints or None,
+        base=config.base or None,
+        packages=config.packages,
+        velocity_limit=config.velocity_limit,
+    )
 
 
 def _scene(path: Path | None) -> dict[str, Any]:

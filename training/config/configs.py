@@ -416,7 +416,7 @@ class PlanConfig(Config):
     """
 
     arm: str = "panda"
-    """Name of an arm, or MJCF file of one, which needs --tool and --joints."""
+    """Name of an arm, or MJCF or URDF file of one."""
     start: tuple[float, ...] = ()
     """Joint positions at the start, [rad]; by default those of the scene file, or home."""
     goal: tuple[float, ...] = ()
@@ -428,9 +428,13 @@ class PlanConfig(Config):
     scene: Path | None = None
     """JSON file of a scene, or of a list of obstacles."""
     tool: str = ""
-    """Site of the tool of an arm of a file."""
+    """Site or body of the tool of an arm of a file; by default one with a usual name, or the tip."""
     joints: tuple[str, ...] = ()
-    """Names of its joints from the base to the tool."""
+    """Names of its joints from the base to the tool; by default all of the chain."""
+    base: str = ""
+    """Body that the chain begins at, where a file has two arms."""
+    packages: tuple[Path, ...] = ()
+    """Folders for package:// in a URDF."""
     velocity_limit: float | None = None
     """Velocity limit of its joints, [rad/s]; by default that of the file."""
     n_via: int = 2

@@ -49,7 +49,9 @@ AIMS = (
 free; the others polish free movements."""
 SMOOTH = 1.5
 """Relative jerk cost with which a movement is polished no more."""
-ROUGH, MORE = 2.0, 4
+SHORT = {"joints": 2.0, "hand": 0.2}
+"""Way of a straight movement whose jerk cost is the unit for shorter ones, too, [rad] and [m]."""
+ROUGH, MORE = 4.0, 4
 """Relative jerk cost above which more seeds are tried after a free movement, and how many of them."""
 SPREADS = 0.8, 1.0
 """Spread of the first random seeds around the straight line, and of later ones, [rad]."""
@@ -342,7 +344,7 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     fixed, nothing = problem.offsets(np.zeros((0, len(start))), 1.0), np.zeros((0, n_via, len(start)))
     refine_seeds(
         problem.setting, movement_table(n_via), _fine_table(n_via), start, fixed, nothing, 1.0, problem.obstacles, 0,
-        0.0, AIMS, 0.0, 1,
+        0.0, AIMS, 1.0, 0.0, 1,
     )  # fmt: skip
 
 
@@ -476,14 +478,14 @@ def _search(
     share = np.arange(1, n_via + 1)[:, None] / (n_via + 1)
     straight = share * (problem.goal - problem.start)
     fixed = problem.offsets(straight, duration)[n_via:]
-    straight_cost = STRAIGHT_COST * float(fixed[0] @ fixed[0])
+    unit = _unit(problem)
     near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
     table, fine = movement_table(n_via), _fine_table(n_via)
     best, least = None, np.inf
     tried = free = first_free = 0
     total = len(given) + 1 + number
     while tried < total and time.perf_counter() < until:
-        if free >= enough and (least <= ROUGH * straight_cost or tried >= first_free + MORE):
+        if free >= enough and (least <= ROUGH * unit or tried >= first_free + MORE):
             break
         seeds = np.empty((min(CHUNKS[min(tried, len(CHUNKS) - 1)], total - tried), *straight.shape))
         for k in range(len(seeds)):
@@ -495,7 +497,7 @@ def _search(
             seeds[k] = straight + spread * generator.uniform(-1.0, 1.0, straight.shape)
         done, found = refine_seeds(
             problem.setting, table, fine, problem.start, fixed, seeds, duration, problem.obstacles, 0,
-            kept, AIMS, SMOOTH * straight_cost, max(enough - free, 1),
+            kept, AIMS, unit, SMOOTH, max(enough - free, 1),
         )  # fmt: skip
         for k in range(done):
             if found.clearance[k] < kept:
@@ -510,6 +512,12 @@ def _search(
                 best = _Movement(found.vias[k], fine, int(found.times[k]), duration, source, clearance)
         tried += done
     return best, tried
+
+
+def _unit(problem: _Problem) -> float:
+    """Return the unit of jerk costs in unit time: the cost of the straight movement, if it is not too short."""
+    way = float(np.linalg.norm(problem.goal - problem.start))
+    return STRAIGHT_COST * max(way, SHORT[problem.space.name]) ** 2
 
 
 def _along_path(problem: _Problem, kept: float, duration: float, until: float) -> _Movement | None:
@@ -532,20 +540,9 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
         vias = points[None, 1:-1] - problem.start
         fixed = problem.offsets(vias[0], duration)[count:]
         _, found = refine_seeds(
-            problem.setting,
-            table,
-            fine,
-            problem.start,
-            fixed,
-            vias,
-            duration,
-            problem.obstacles,
-            0,
-            kept,
-            AIMS,
-            0.0,
-            1,
-        )
+            problem.setting, table, fine, problem.start, fixed, vias, duration, problem.obstacles, 0,
+            kept, AIMS, _unit(problem), 0.0, 1,
+        )  # fmt: skip
         if found.clearance[0] >= kept:
             return _Movement(found.vias[0], fine, 0, duration, "ompl", float(found.clearance[0]))
     return None

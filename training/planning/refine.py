@@ -55,8 +55,6 @@ FLAT = 0.02
 """Share of CONTACT_WEIGHT that damps directions in which nothing is known."""
 LONGEST_STEP = 0.6, 0.15
 """Longest step of a coordinate in joint space, [rad], and in hand space, [m]."""
-SHORTEST_WAY = 0.2
-"""Way of a straight movement whose jerk cost is the unit for shorter ones, too, [rad] or [m]."""
 STRAIGHT_COST = 360.0
 """Jerk cost of a straight minimum-jerk movement of the way 1 in unit time."""
 SINGULAR = 1e-3
@@ -69,7 +67,7 @@ class Aim(NamedTuple):
     clearance: float
     """Wanted clearance from obstacles, [m]."""
     jerk: float
-    """Weight of the relative jerk cost."""
+    """Weight of the jerk cost in units of `unit`."""
     iterations: int
     """Greatest number of iterations."""
     gain: float
@@ -266,6 +264,7 @@ def _assemble(
     obstacles: Obstacles,
     scene: int,
     aim: Aim,
+    unit: float,
     hessian: Float,
     gradient: Float,
     work: _Work,
@@ -273,10 +272,7 @@ def _assemble(
     """Fill in matrix and gradient of the objective; return the objective, and the least clearance, [m] or [rad]."""
     columns, dimension = offsets.shape
     vias = columns - 3
-    way = 0.0
-    for d in range(dimension):
-        way += offsets[vias, d] * offsets[vias, d]
-    weight = aim.jerk * 2.0 / aim.stride / (STRAIGHT_COST * max(way, SHORTEST_WAY**2))
+    weight = aim.jerk * 2.0 / (aim.stride * unit)
     hessian[:] = 0.0
     gradient[:] = 0.0
     objective = 0.0
@@ -301,13 +297,18 @@ def _assemble(
         work.force[:] = 0.0
         time = duration * k / last
         from_obstacles, first = _add_obstacles(setting, obstacles, scene, time, aim.clearance, work)
-        from_itself, second = _add_own(setting, OWN_CLEARANCE, work)
+        from_itself, second = 0.0, OWN_CLEARANCE
+        if (k - begin) % (2 * aim.stride) == 0:  # bodies of the arm are less often near one another
+            from_itself, second = _add_own(setting, OWN_CLEARANCE, work)
         from_ranges, third = _add_ranges(setting, reached or not setting.of_hand, work)
         missing = from_obstacles + from_itself + from_ranges
         if missing == 0.0:
             continue
         contact += missing
-        nearest = min(nearest, first, second, third)
+        # Some bodies are always near one another: only their contact counts.
+        nearest = min(nearest, first, third)
+        if second < 0.0:
+            nearest = min(nearest, second)
         for a in range(vias):
             share = table.basis[times, k, a]
             for i in range(dimension):
@@ -331,6 +332,7 @@ def _refine(
     obstacles: Obstacles,
     scene: int,
     aim: Aim,
+    unit: float,
     work: _Work,
 ) -> int:
     """Move the via-points of a movement, the first rows of its offsets, and return the index of its passage times."""
@@ -343,7 +345,7 @@ def _refine(
     longest = LONGEST_STEP[1] if setting.of_hand else LONGEST_STEP[0]
     times, _ = best_times(table, offsets, work.gram)
     objective, _ = _assemble(
-        setting, table, times, start, offsets, duration, obstacles, scene, aim, hessian, gradient, work
+        setting, table, times, start, offsets, duration, obstacles, scene, aim, unit, hessian, gradient, work
     )
     damping = DAMPING
     for _ in range(aim.iterations):
@@ -365,7 +367,7 @@ def _refine(
                     trial[a, d] = min(max(trial[a, d], low), high)
         other, _ = best_times(table, trial, work.gram)
         value, nearest = _assemble(
-            setting, table, other, start, trial, duration, obstacles, scene, aim,
+            setting, table, other, start, trial, duration, obstacles, scene, aim, unit,
             other_hessian, other_gradient, work,
         )  # fmt: skip
         if value < objective:
@@ -397,6 +399,7 @@ def refine_seeds(
     scene: int,
     margin: float,
     aims: tuple[Aim, ...],
+    unit: float,
     smooth: float,
     enough: int,
 ) -> tuple[int, Found]:
@@ -414,7 +417,8 @@ def refine_seeds(
         scene: Index of the scene.
         margin: Least clearance of movements that count as free, [m].
         aims: What the first refinement of each seed aims at, and those that polish a free movement.
-        smooth: Jerk cost in unit time with which a movement that was polished once is smooth enough.
+        unit: Unit of jerk costs in unit time.
+        smooth: Jerk cost in this unit with which a movement that was polished once is smooth enough.
         enough: Number of free movements after which to stop.
     """
     number, vias, dimension = seeds.shape
@@ -429,7 +433,7 @@ def refine_seeds(
     for each in range(number):
         tried += 1
         offsets[0, :vias] = seeds[each]
-        times[0] = _refine(setting, table, start, offsets[0], duration, obstacles, scene, aims[0], work)
+        times[0] = _refine(setting, table, start, offsets[0], duration, obstacles, scene, aims[0], unit, work)
         found.vias[each] = offsets[0, :vias]
         found.times[each] = times[0]
         if not is_free(setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin):
@@ -437,10 +441,10 @@ def refine_seeds(
         stage = 0
         _, cost = best_times(table, offsets[0], work.gram)
         for later in range(1, stages):
-            if later > 1 and cost < smooth:
+            if later > 1 and cost < smooth * unit:
                 break
             trial[:] = offsets[stage]
-            other = _refine(setting, table, start, trial, duration, obstacles, scene, aims[later], work)
+            other = _refine(setting, table, start, trial, duration, obstacles, scene, aims[later], unit, work)
             _, less = best_times(table, trial, work.gram)
             if less < cost and is_free(
                 setting, table, other, start, trial, duration, obstacles, scene, margin

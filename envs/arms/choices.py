@@ -1,0 +1,246 @@
+"""Choices for an arm of a file: tool, joints, limits and home, where the user names none."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import finite_array
+
+MOVES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+"""Types of joints that an arm may have."""
+TOOL_NAMES = (
+    r"attachment(_site)?", r"tcp", r"tool\d*(_?center)?(_?(point|frame|link))?", r"ee(f|_?site|_?link|_?frame)?",
+    r"end_?effector.*", r"grip(per)?(_?(site|link|base|center))?", r"pinch(_?site)?", r"grasp(_?(site|target|frame))?",
+    r"(right_|left_)?hand(_?(site|link))?", r"flange.*", r"link_(tcp|eef)",
+)  # fmt: skip
+"""Usual names of tools, the most telling first; prefixes that end in `_`, `/` or `:` may precede them."""
+LEAST_CHAIN = 3
+"""Least number of joints of a branch that is an arm and not a finger."""
+HOMES = 256
+"""Number of random configurations among which a home is looked for."""
+INSET = 0.1
+"""Least distance of home from the joint limits, as a share of the ranges."""
+KNOWN_VELOCITIES: dict[str, tuple[float, ...]] = {
+    "panda": (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),
+    "fr3": (2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
+    "ur3e": (3.14, 3.14, 3.14, 6.28, 6.28, 6.28),
+    "ur5e": (3.14,) * 6,
+    "ur10e": (2.09, 2.09, 3.14, 3.14, 3.14, 3.14),
+    "iiwa14": (1.48, 1.48, 1.75, 1.31, 2.27, 2.36, 2.36),
+    "gen3": (1.39, 1.39, 1.39, 1.39, 1.22, 1.22, 1.22),
+    "xarm7": (3.14,) * 7,
+    "sawyer": (1.74, 1.33, 1.96, 1.96, 3.49, 3.49, 4.55),
+}
+"""Velocity limits of well-known arms by a part of their name, [rad/s]: data sheets of Franka Robotics (Panda, FR3),
+Universal Robots (e-Series), KUKA (LBR iiwa 14 R820), Kinova (Gen3), UFACTORY (xArm 7) and Rethink Robotics (Sawyer)."""
+
+
+class Tool(NamedTuple):
+    """Frame of the tool."""
+
+    body: int
+    """Body that carries it."""
+    position: Float
+    """Place in the frame of the body, shape (3,), [m]."""
+    quaternion: Float
+    """Orientation in this frame, shape (4,)."""
+    name: str
+    """Name of the site or the body, for the report."""
+
+
+def choose_tool(model: mujoco.MjModel, given: Any, base: str | None) -> Tool:
+    """Return the tool: the given site, body, or body and point; else one with a usual name; else the tip of the chain.
+
+    Raises:
+        ValueError: There is no such part, or there are several arms and neither `tool` nor `base` tells which.
+    """
+    if isinstance(given, str):
+        return _named_tool(model, given)
+    if given is not None:
+        return _tool_at_point(model, given)
+    inside = _under(model, base)
+    for pattern in TOOL_NAMES:
+        for kind, number in (("site", model.nsite), ("body", model.nbody)):
+            bodies: dict[int, str] = {}
+            for index in range(number):
+                part = getattr(model, kind)(index)
+                body = int(part.bodyid[0]) if kind == "site" else index
+                if (
+                    inside(body)
+                    and len(chain_joints(model, body, base)) >= LEAST_CHAIN
+                    and _fits(pattern, part.name)
+                ):
+                    bodies.setdefault(body, part.name)
+            names = list(bodies.values())
+            if len(names) == 1:
+                return _named_tool(model, names[0], kind)
+            if len(names) > 1:
+                last = {tuple(chain_joints(model, body, base)): name for body, name in bodies.items()}
+                longest = max(last, key=len)
+                if all(set(chain) <= set(longest) for chain in last):
+                    return _named_tool(model, last[longest], kind)
+                raise ValueError(
+                    f"there are several tools: {', '.join(names)}; name one with tool=, or a side with base="
+                )
+    body = _tip(model, base)
+    return Tool(body, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), f"the frame of {model.body(body).name!r}")
+
+
+def _fits(pattern: str, name: str) -> bool:
+    """Return True if a name, without the prefix of its robot, fits a pattern."""
+    return re.fullmatch(rf"(.*[_/:])?{pattern}", name, re.IGNORECASE) is not None
+
+
+def _named_tool(model: mujoco.MjModel, name: str, kind: str = "") -> Tool:
+    """Return the site of a name, or the origin of the body of a name."""
+    sites = [model.site(index).name for index in range(model.nsite)]
+    bodies = [model.body(index).name for index in range(1, model.nbody)]
+    if name in sites and kind != "body":
+        site = model.site(name)
+        return Tool(int(site.bodyid[0]), site.pos.copy(), site.quat.copy(), name)
+    if name in bodies:
+        return Tool(int(model.body(name).id), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), name)
+    raise ValueError(
+        f"there is no site or body {name!r} in the file; sites are {', '.join(filter(None, sites)) or 'none'}; bodies "
+        f"are {', '.join(filter(None, bodies)) or 'none'}"
+    )
+
+
+def _tool_at_point(model: mujoco.MjModel, given: Any) -> Tool:
+    """Return a point of a body as the tool."""
+    try:
+        name, point = given
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"tool must be a site, a body, or a pair of body and point, got {given!r:.60}"
+        ) from None
+    found = _named_tool(model, name, "body")
+    return found._replace(position=finite_array("tool", point, (3,)), name=f"a point of {name!r}")
+
+
+def chain_joints(model: mujoco.MjModel, body: int, base: str | None = None) -> list[str]:
+    """Return the names of the hinges and slides that carry a body, from the base to it."""
+    end = int(model.body(base).id) if base is not None else 0
+    names: list[str] = []
+    while body not in (0, end):
+        first = int(model.body_jntadr[body])
+        for joint in range(first, first + int(model.body_jntnum[body])):
+            if model.jnt_type[joint] in MOVES:
+                names.insert(0, model.joint(joint).name)
+        body = int(model.body_parentid[body])
+    return names
+
+
+def arm_joints(model: mujoco.MjModel, chain: list[str], notes: list[str]) -> list[str]:
+    """Return the joints of a chain without those of a mobile base: several of one body, or slides without an end."""
+    kept = []
+    for name in chain:
+        joint = model.joint(name)
+        several = model.body_jntnum[int(joint.bodyid[0])] > 1
+        endless = joint.type[0] == MOVES[1] and not model.jnt_limited[joint.id]
+        if several or endless:
+            notes.append(f"left out: {name}, which seems to move a mobile base")
+        else:
+            kept.append(name)
+    return kept
+
+
+def _under(model: mujoco.MjModel, base: str | None) -> Callable[[int], bool]:
+    """Return a function that tells whether a body hangs on the base.
+
+    Raises:
+        ValueError: There is no such body.
+    """
+    if base is None:
+        return lambda body: True
+    names = [model.body(index).name for index in range(1, model.nbody)]
+    if base not in names:
+        raise ValueError(
+            f"there is no body {base!r} in the file; there are: {', '.join(filter(None, names))}"
+        )
+    root = int(model.body(base).id)
+
+    def hangs(body: int) -> bool:
+        while body not in (0, root):
+            body = int(model.body_parentid[body])
+        return body == root
+
+    return hangs
+
+
+def _tip(model: mujoco.MjModel, base: str | None) -> int:
+    """Return the last body of the longest chain of joints, before it branches into fingers.
+
+    Raises:
+        ValueError: There are several arms, or no chain.
+    """
+    below = {body: _joints_below(model, body) for body in range(model.nbody)}
+    body = int(model.body(base).id) if base is not None else 0
+    while True:
+        children = [each for each in range(1, model.nbody) if model.body_parentid[each] == body]
+        moving = [each for each in children if below[each]]
+        arms = [each for each in moving if below[each] >= LEAST_CHAIN]
+        if (
+            len(arms) > 1
+            and max(below[each] for each in arms) - min(below[each] for each in arms) < LEAST_CHAIN
+        ):
+            names = ", ".join(model.body(each).name or str(each) for each in arms)
+            raise ValueError(f"the chain branches into {names}; name one with base=, or a tool with tool=")
+        if arms:
+            body = max(arms, key=lambda each: below[each])
+        elif len(moving) == 1:
+            body = moving[0]
+        else:  # nothing more that moves, or fingers
+            break
+    if len(chain_joints(model, body, base)) < 2:
+        raise ValueError("no chain of two or more hinges and slides leads to a tool; name one with tool=")
+    return body
+
+
+def _joints_below(model: mujoco.MjModel, body: int) -> int:
+    """Return the greatest number of hinges and slides on a way from a body to a leaf, its own included."""
+    first, number = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+    own = sum(model.jnt_type[joint] in MOVES for joint in range(first, first + number))
+    children = (each for each in range(1, model.nbody) if model.body_parentid[each] == body)
+    return own + max((_joints_below(model, each) for each in children), default=0)
+
+
+def known_velocities(name: str, number: int) -> Float | None:
+    """Return the velocity limits of a well-known arm by its name, shape (J,), [rad/s]; None for others."""
+    plain = re.sub(r"[^a-z0-9]", "", name.lower())
+    for known, limits in KNOWN_VELOCITIES.items():
+        if known in plain and len(limits) == number:
+            return np.array(limits)
+    return None
+
+
+def choose_home(
+    ranges: Float, candidates: Sequence[Float], apart: Callable[[Float], float]
+) -> tuple[Float, str]:
+    """Return the first configuration in which the arm does not touch itself, and where it comes from.
+
+    Args:
+        ranges: Ranges of the joints, shape (J, 2).
+        candidates: Configurations of the file that are tried first: its keyframe, then zeros.
+        apart: Function that returns the least distance of bodies that should not touch, [m].
+    """
+    low, high = ranges.T
+    inset = INSET * (high - low)
+    for configuration, origin in zip(candidates, ("keyframe", "zeros"), strict=False):
+        inside = (configuration >= low) & (configuration <= high)
+        if inside.all() and apart(configuration) > 0.0:
+            return configuration, f"the file's {origin}"
+    middle = 0.5 * (low + high)
+    if apart(middle) > 0.0:
+        return middle, "the middle of the ranges"
+    rng = np.random.default_rng(0)
+    drawn = rng.uniform(low + inset, high - inset, (HOMES, len(low)))
+    best = max(itertools.chain([middle], drawn[: HOMES // 4]), key=apart)
+    return best, "the one that is farthest from touching itself, of random ones"
