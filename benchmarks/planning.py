@@ -21,6 +21,14 @@ from viapoint.training.planning.plan_motion import plan_motion
 
 DOCS = Path(__file__).parents[1] / "docs"
 TABLE = DOCS / "planning.csv"
+PAGE = DOCS / "planning.md"
+BEGIN, END = "<!-- table -->", "<!-- end of table -->"
+HARDEST = ("cage", "table_under_pick")
+PUBLISHED = (
+    "| *VAMP, RRT-Connect (published; not smooth, not timed)* | 100 | | 0.035 | | | | | |",
+    "| *cuRobo (published; on a GPU, 800 problems)* | 100 | | | 38 | | 1.3 | | |",
+)
+"""Rows from the papers on VAMP (Thomason et al. 2024) and cuRobo (Sundaralingam et al. 2023)."""
 FIGURE = DOCS / "figures" / "planning.png"
 DEVELOPED_ON = 20
 """Greatest number of the problems that were looked at during development."""
@@ -50,11 +58,39 @@ def write_table(problems: list[BenchmarkProblem]) -> None:
     """Measure all planners, print the table, and write it."""
     lines = pd.concat([benchmark_report.measure_planner(name, problems) for name in PLANNERS])
     print(benchmark_report.markdown(lines))
-    benchmark_report.summary(lines).to_csv(TABLE, index=False, float_format="%.4g", lineterminator="\n")
+    found = benchmark_report.summary(lines)
+    found.to_csv(TABLE, index=False, float_format="%.4g", lineterminator="\n")
+    before, _, after = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+    _, _, after = after.partition(END)
+    PAGE.write_text(f"{before}{BEGIN}\n{page_table(found)}\n{END}{after}", encoding="utf-8")
     unsolved = lines[
         lines.planner.str.startswith("plan_motion") & ~lines.refused & ~(lines.solved & lines.physics)
     ]
     print(unsolved[["planner", "set", "number", "solved", "physics", "clearance", "seeds"]].to_string())
+
+
+def page_table(found: pd.DataFrame) -> str:
+    """Return the table of the page: all sets together, the hardest ones of plan_motion, and what others published."""
+    rows = found[(found["set"] == "all") | ((found.planner == "plan_motion") & found["set"].isin(HARDEST))]
+    heads = [
+        "planner",
+        "solved %",
+        "physics %",
+        "median ms",
+        "mean ms",
+        "95 % ms",
+        "motion s",
+        "jerk",
+        "length rad",
+    ]
+    lines = ["| " + " | ".join(heads) + " |", "|---" + "|---:" * (len(heads) - 1) + "|"]
+    for row in rows.to_dict("records"):
+        name = row["planner"] if row["set"] == "all" else f"{row['planner']}, {row['set']}"
+        numbers = [row[head] for head in heads[1:]]
+        digits = (1, 1, 1, 1, 1, 2, 2, 2)
+        cells = ["-" if np.isnan(n) else f"{n:.{d}f}" for n, d in zip(numbers, digits, strict=True)]
+        lines.append("| " + " | ".join([name, *cells]) + " |")
+    return "\n".join([*lines, *PUBLISHED])
 
 
 def draw_curves(problems: list[BenchmarkProblem]) -> None:

@@ -283,7 +283,7 @@ class Task:
     def as_dict(self) -> dict[str, Any]:
         """Return the task as plain values for JSON; the arm by its name."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        values["arm"] = self.arm.name
+        values["arm"] = self.arm.file or self.arm.name
         values["space"] = values.pop("space_name")
         values["reward_weights"] = dataclasses.asdict(values.pop("weights"))
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}

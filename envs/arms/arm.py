@@ -79,6 +79,8 @@ class Arm:
     """Space in which movements are planned by default."""
     timestep: float
     """Length of a physics step, [s]."""
+    file: str = ""
+    """Path of the file that tasks load the arm from; empty for arms that are known by their names."""
     notes: tuple[str, ...] = ()
     """Choices that were made for the arm when it was loaded, and parts that were left out."""
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
+from viapoint.envs.arms.load import load_arm
 
+ARM_FILES = (".xml", ".mjcf", ".urdf")
+"""Suffixes of files of arms."""
 REGISTER_HINT = "register_arm adds an arm of your own"
 """Advice for names that are not known."""
 PANDA_HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
@@ -67,8 +72,7 @@ def register_arm(arm: Arm) -> None:
 
     Example:
         >>> from viapoint.envs import arm_of, load_arm, register_arm
-        >>> joints = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-        >>> arm = load_arm("docs/ur5e.xml", hand_site="hand", joints=joints, velocity_limit=3.14)
+        >>> arm = load_arm("docs/ur5e.xml")
         >>> register_arm(arm)
         >>> arm_of(arm.name) is arm
         True
@@ -81,10 +85,10 @@ def register_arm(arm: Arm) -> None:
 
 
 def arm_of(arm: Any) -> Arm:
-    """Return an arm as it is, or the arm of a name.
+    """Return an arm as it is, the arm of a name, or that of an MJCF or URDF file; a task keeps the path of the file.
 
     Raises:
-        ValueError: There is no such arm.
+        ValueError: There is no such arm, or the file cannot be read.
 
     Example:
         >>> from viapoint.envs import arm_of
@@ -97,6 +101,18 @@ def arm_of(arm: Any) -> Arm:
         return _BUILT_IN[arm]()
     if isinstance(arm, str) and arm in _OWN:
         return _OWN[arm]
+    if isinstance(arm, str) and arm.endswith(ARM_FILES):
+        path = Path(arm).expanduser().resolve()
+        if not path.is_file():
+            raise ValueError(f"arm: there is no file {arm!r}")
+        return _of_file(path, path.stat().st_mtime_ns)
     raise ValueError(
-        f"arm must be an Arm or one of {', '.join(arm_names())}, got {arm!r:.60}; {REGISTER_HINT}"
+        f"arm must be an Arm, a file that ends in {' or '.join(ARM_FILES)}, or one of {', '.join(arm_names())}, got "
+        f"{arm!r:.60}; {REGISTER_HINT}"
     )
+
+
+@functools.lru_cache(maxsize=16)
+def _of_file(path: Path, changed: int) -> Arm:
+    """Return the arm of a file, which was last changed at some time."""
+    return dataclasses.replace(load_arm(path), file=str(path))

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.registry import arm_names, arm_of
+from viapoint.envs.arms.registry import ARM_FILES, arm_names, arm_of
 from viapoint.envs.common.validation import is_number
 from viapoint.envs.registration import ENV_IDS
 from viapoint.envs.task import Task
@@ -77,10 +77,16 @@ def _plain(name: str, value: Any) -> Any:
     """
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
+    if isinstance(value, Arm) and value.file:
+        return value.file
     if isinstance(value, Arm) and value.name in arm_names() and arm_of(value.name) is value:
         return value.name
     if isinstance(value, Mapping):
-        return {f"{key}": _plain(f"{key} in {name}", each) for key, each in value.items()}
+        found = {f"{key}": _plain(f"{key} in {name}", each) for key, each in value.items()}
+        file = found.get("arm")
+        if isinstance(file, str) and file.endswith(ARM_FILES):
+            found["arm"] = str(Path(file).expanduser().resolve())  # runs go on in other folders, too
+        return found
     if isinstance(value, list | tuple):
         return [_plain(name, each) for each in value]
     if value is None or isinstance(value, str | bool | int | float):
