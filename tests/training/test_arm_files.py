@@ -29,7 +29,7 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert Run(run).config.env_kwargs["arm"] == str(tmp_path / "my_arm.xml")
     agent = load_agent(run)
-    result = evaluate(agent, baselines=["straight"], scenes="uniform", n_scenes=4)
+    result = evaluate(agent, baselines=["straight"], scenes="validation", n_scenes=4)
     assert len(result.rows) == 2
 
 
