@@ -331,7 +331,7 @@ def _fine_table(n_via: int) -> MovementTable:
     return table_with(movement_table(n_via).durations, FINE_INSTANTS)
 
 
-@functools.cache
+@functools.lru_cache(maxsize=64)
 def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     """Make tables, and load or compile the machine code, so that no time limit is spent on them."""
     space = space_of(arm, "hand" if of_hand else "joints")

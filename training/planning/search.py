@@ -115,14 +115,15 @@ class GeometrySearch:
         moving = problem.remaining is not None
         actions = candidate_actions(self.task, self.n_checks, replanning=moving)
         candidates = np.broadcast_to(actions, (len(problem.start), *actions.shape))
-        merit = merits(self.task, problem, candidates)
+        setting = setting_of(self.task, problem.obstacles)
+        merit = merits(self.task, problem, candidates, setting)
         for each in range(self.refinements):
             top = np.argsort(-merit, axis=-1, kind="stable")[:, :N_CENTRES]
             centres = np.take_along_axis(candidates, top[..., None], axis=1)
             steps = SPREAD * 0.5**each * self._steps(moving)
             near = np.clip(centres[:, np.arange(self.per_round) % centres.shape[1]] + steps, -1.0, 1.0)
             candidates = np.concatenate((candidates, near), axis=1)
-            merit = np.concatenate((merit, merits(self.task, problem, near)), axis=1)
+            merit = np.concatenate((merit, merits(self.task, problem, near, setting)), axis=1)
         return best_of(self.task, problem, candidates, merit).astype(np.float64)
 
     def predict(
@@ -185,17 +186,25 @@ def best_of(task: Task, problem: Problem, actions: Numbers, merit: Numbers) -> N
             if not rows.size:
                 break
             barred[rows, best[rows]] = True
-            again = merits(task, problem.take(rows), actions[rows], barred[rows])
+            again = merits(task, problem.take(rows), actions[rows], barred=barred[rows])
             best[rows] = again.argmax(axis=1)
     return np.asarray(actions[np.arange(len(best)), best])
 
 
-def merits(task: Task, problem: Problem, actions: Numbers, barred: Bool | None = None) -> Float:
+def merits(
+    task: Task,
+    problem: Problem,
+    actions: Numbers,
+    setting: Setting | None = None,
+    *,
+    barred: Bool | None = None,
+) -> Float:
     """Return the merit of actions of shape (B, H, m), by which the best one has the greatest, shape (B, H).
 
     The merit of a clear plan is its reward if the physics follows it, and that of others is near INFEASIBLE. It is a
     lower bound for plans that are certainly no better than another one. When replanning, a first action of zero, which
     keeps the plan, gains KEEP_BONUS. Actions that are barred, by a mask of shape (B, H), are not considered.
+    Where no setting is given, it is that of the obstacles.
     """
     moves = moves_of(task, problem, actions)
     worth = worth_of(task, problem, moves)
@@ -204,7 +213,7 @@ def merits(task: Task, problem: Problem, actions: Numbers, barred: Bool | None =
     replanning = problem.remaining is not None
     if replanning and not actions[:, 0].any():
         worth[:, 0] += KEEP_BONUS
-    setting = setting_of(task, problem.obstacles)
+    setting = setting or setting_of(task, problem.obstacles)
     horizons = np.array(HORIZONS if replanning else HORIZONS[:1])
     gain = task.weights.clearance / CLEARANCE_UNIT
     return _merits(setting, moves.table, problem.start, moves, worth, problem.obstacles, horizons, gain)
