@@ -102,6 +102,7 @@ def test_modules_import_one_another_without_cycles():
         ("viapoint.primitives", {"torch", "mujoco", "gymnasium", "scipy", "matplotlib"}),
         ("viapoint.envs", {"torch", "stable_baselines3", "matplotlib", "scipy", "viapoint.training"}),
         ("viapoint.training.cli.main", {"torch", "stable_baselines3", "matplotlib"}),
+        ("viapoint.training.planning.plan_motion", {"torch", "stable_baselines3", "matplotlib", "pandas"}),
     ],
 )
 def test_importing_is_light(module, absent):

@@ -79,6 +79,8 @@ class Arm:
     """Space in which movements are planned by default."""
     timestep: float
     """Length of a physics step, [s]."""
+    continuous: tuple[str, ...] = ()
+    """Names of joints that turn without end in the file; goals of planning are taken modulo a turn."""
     file: str = ""
     """Path of the file that tasks load the arm from; empty for arms that are known by their names."""
     notes: tuple[str, ...] = ()

@@ -191,7 +191,8 @@ def load_arm(
         raise ValueError(
             f"the torque limits of {some} do not hold the arm's own weight at home; raise torque_limit"
         )
-    return replace(arm, excess=arm.excess + excess, notes=tuple(notes))
+    endless = [name for name in names if joint_range is None and not whole.jnt_limited[whole.joint(name).id]]
+    return replace(arm, excess=arm.excess + excess, notes=tuple(notes), continuous=tuple(endless))
 
 
 def _read(file: Any, packages: tuple[str | Path, ...]) -> tuple[mujoco.MjSpec, str, Urdf]:

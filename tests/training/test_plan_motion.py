@@ -1,10 +1,13 @@
 """Laws of planning around known obstacles."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from viapoint.envs import Box, Capsule, Cylinder, Pose, Sphere, Task, arm_of, obstacles_to_json
 from viapoint.envs.arms.kinematics import torques
+from viapoint.envs.arms.load import load_arm
 from viapoint.envs.geometry.obstacles import pack
 from viapoint.training import plan_motion, plan_motions
 from viapoint.training.cli.main import main
@@ -15,6 +18,7 @@ from viapoint.training.planning.export import read_motion, write_motion
 from viapoint.training.planning.motion_plan import UnsafePlanError, execute_plans
 from viapoint.training.planning.movements import movement_table
 
+UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 PANDA = arm_of("panda")
 GOAL = PANDA.home + np.array([0.8, 0.5, 0.0, 0.6, 0.0, 0.3, 0.0])
 POST = Box((0.05, 0.05, 0.4), position=(0.5, 0.15, 0.4))
@@ -132,6 +136,15 @@ def test_poses_and_several_goals() -> None:
     assert np.array_equal(several.waypoints[-1], GOAL)
     with pytest.raises(ValueError, match="cannot be reached"):
         plan_motion(PANDA, PANDA.home, Pose(position=(2.0, 0.0, 0.3)))
+
+
+def test_goals_of_continuous_joints_are_taken_modulo_a_turn() -> None:
+    text = UR5E.read_text().replace(' range="-6.2832 6.2832"', ' limited="false"')
+    arm = load_arm(text, velocity_limit=3.0)
+    assert arm.continuous == arm.joint_names
+    goal = arm.home + 0.5
+    plan = plan_motion(arm, arm.home, goal + 2.0 * np.pi * np.array([1, -1, 0, 2, 0, 0]))
+    assert np.allclose(plan.waypoints[-1], goal)
 
 
 def test_given_seeds_come_first() -> None:

@@ -357,6 +357,11 @@ def _goals(problem: _Problem, goal: Any) -> Float:
         return problem.space.coordinates(found[:GOALS])
     several = np.ndim(goal) > 1
     goals = finite_array("goal", goal if several else [goal], (None, len(problem.start)))
+    if problem.arm.continuous and not problem.space.of_hand:
+        # The equivalent position that is nearest to the middle of the range.
+        endless = np.isin(problem.arm.joint_names, problem.arm.continuous)
+        turns = np.round((goals - problem.arm.joint_range.mean(axis=1)) / (2.0 * np.pi))
+        goals = goals - 2.0 * np.pi * np.where(endless, turns, 0.0)
     away = np.abs(goals - problem.start).max(axis=-1)
     # Copies are contiguous and writable, which compiled functions depend on.
     return np.array(goals[np.argsort(away, kind="stable")])
