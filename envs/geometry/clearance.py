@@ -101,23 +101,20 @@ def group_clearance(
 ) -> tuple[float, int]:
     """Return the clearance of a group of spheres from an obstacle, at most `least`, [m], and the sphere that has it.
 
-    The sphere is -1 if none is nearer than `least`. The arguments are those of :func:`obstacle_clearance`.
+    The sphere is -1 if none is nearer than `least`. The bounding ball of the group should be looked at before. The
+    arguments are those of :func:`obstacle_clearance`.
     """
     nearest = -1
-    size = spheres.ball_radius[group]
-    x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
-    away = point_distance(obstacles, scene, row, x, y, z, time, least + size)
-    if away - size < least:
-        place_group(spheres, group, placed)
-        for sphere in range(spheres.first[group], spheres.first[group + 1]):
-            radius = spheres.radius[sphere]
-            x, y, z = placed.centre[sphere, 0], placed.centre[sphere, 1], placed.centre[sphere, 2]
-            distance = point_distance(obstacles, scene, row, x, y, z, time, least + radius) - radius
-            if distance < least:
-                least = distance
-                nearest = sphere
-                if least < floor:
-                    break
+    place_group(spheres, group, placed)
+    for sphere in range(spheres.first[group], spheres.first[group + 1]):
+        radius = spheres.radius[sphere]
+        x, y, z = placed.centre[sphere, 0], placed.centre[sphere, 1], placed.centre[sphere, 2]
+        distance = point_distance(obstacles, scene, row, x, y, z, time, least + radius) - radius
+        if distance < least:
+            least = distance
+            nearest = sphere
+            if least < floor:
+                break
     return least, nearest
 
 
@@ -147,11 +144,16 @@ def obstacle_clearance(
     for group in range(len(spheres.link)):
         if spheres.link[group] == 0:
             continue
+        x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
+        size = spheres.ball_radius[group]
         for row in range(obstacles.kind.shape[1]):
-            if obstacles.kind[scene, row] != ABSENT:
-                least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
-                if least < floor:
-                    return least
+            if obstacles.kind[scene, row] == ABSENT:
+                continue
+            if point_distance(obstacles, scene, row, x, y, z, time, least + size) - size >= least:
+                continue
+            least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
+            if least < floor:
+                return least
     return least
 
 

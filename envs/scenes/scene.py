@@ -15,6 +15,7 @@ from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.clearance import FAR, Placed, group_clearance, memory, place, self_clearance
 from viapoint.envs.geometry.clouds import Clouds
 from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.distance import point_distance
 from viapoint.envs.geometry.meshes import Meshes
 from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, MESH, Obstacles, no_obstacles
 
@@ -170,7 +171,11 @@ def row_clearance(
     if obstacles.kind[scene, row] == ABSENT:
         return least
     for group in range(len(spheres.link)):
-        if spheres.link[group] >= link:
+        if spheres.link[group] < link:
+            continue
+        x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
+        size = spheres.ball_radius[group]
+        if point_distance(obstacles, scene, row, x, y, z, time, least + size) - size < least:
             least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
             if least < floor:
                 return least

@@ -25,7 +25,7 @@ from viapoint.envs.geometry.clearance import (
     place,
 )
 from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.distance import point_distance_and_normal
+from viapoint.envs.geometry.distance import point_distance, point_distance_and_normal
 from viapoint.envs.geometry.kernels import kernel
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.training.planning.movements import (
@@ -177,16 +177,20 @@ def _add_obstacles(
     for group in range(len(spheres.link)):
         if spheres.link[group] == 0:
             continue
+        u, v, w = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
+        size = spheres.ball_radius[group]
         for row in range(obstacles.kind.shape[1]):
             if obstacles.kind[scene, row] == ABSENT:
+                continue
+            if point_distance(obstacles, scene, row, u, v, w, time, wanted + size) - size >= wanted:
                 continue
             least, sphere = group_clearance(spheres, placed, group, obstacles, scene, row, time, wanted, -1e9)
             if sphere < 0:
                 continue
             x, y, z = placed.centre[sphere, 0], placed.centre[sphere, 1], placed.centre[sphere, 2]
-            _, u, v, w = point_distance_and_normal(obstacles, scene, row, x, y, z, time, 1e9)
+            _, a, b, c = point_distance_and_normal(obstacles, scene, row, x, y, z, time, 1e9)
             work.pull[:] = 0.0
-            _pull(setting, work, sphere, spheres.link[group], u, v, w, -1.0)
+            _pull(setting, work, sphere, spheres.link[group], a, b, c, -1.0)
             nearest = min(nearest, least)
             missing = wanted - least
             total += missing * missing
