@@ -178,9 +178,9 @@ def test_exactly_the_stated_number_of_plans_is_checked(monkeypatch):
     env, observation, _ = made(PLANE, 4)
     counted = []
 
-    def counting(task, problem, actions):
+    def counting(task, problem, actions, setting=None):
         counted.append(actions.shape[1])
-        return merits(task, problem, actions)
+        return merits(task, problem, actions, setting)
 
     monkeypatch.setattr(search_module, "merits", counting)
     search = GeometrySearch(env.task, 50, refinements=3, per_round=10)
