@@ -147,6 +147,14 @@ def test_goals_of_continuous_joints_are_taken_modulo_a_turn() -> None:
     assert np.allclose(plan.waypoints[-1], goal)
 
 
+def test_a_start_that_is_the_goal_is_a_plan() -> None:
+    for arm, place in ((PANDA, PANDA.home), (arm_of("planar"), (0.0, 0.4))):
+        plan = plan_motion(arm, place, place)
+        assert plan.success
+        assert plan.duration > 0.0
+        assert np.isfinite(plan.joints(100).torque).all()
+
+
 def test_given_seeds_come_first() -> None:
     found = plan_motion(PANDA, PANDA.home, GOAL, [POST])
     again = plan_motion(PANDA, PANDA.home, GOAL, [POST], seeds=found.waypoints[None, 1:-1])

@@ -23,7 +23,7 @@ from viapoint.envs.common.validation import finite_array, number_of_at_least, wh
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape
 from viapoint.envs.limits import slowdown
-from viapoint.envs.plans import Motion, Plan, SpaceName
+from viapoint.envs.plans import SHORTEST_DURATION, Motion, Plan, SpaceName
 from viapoint.envs.scenes.options import Pose
 from viapoint.envs.scenes.scene import row_clearances
 from viapoint.envs.spaces import Space, space_of
@@ -571,8 +571,9 @@ def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple
     factor = 1.0
     if least is not None:
         factor = max(slowdown(arm.chain, arm.velocity_limit, arm.torque_limit, *motion), least)
-        if least == 0.0 and not np.isfinite(arm.velocity_limit).all():
-            factor = max(factor, UNLIMITED / duration)
+        if least == 0.0:  # a start that is the goal needs a duration, too
+            shortest = SHORTEST_DURATION if np.isfinite(arm.velocity_limit).all() else UNLIMITED
+            factor = max(factor, shortest / duration)
     rate, change = motion.velocity / factor, motion.acceleration / factor**2
     torque = torques(arm.chain, motion.position, rate, change)
     shares = np.abs(rate) / arm.velocity_limit, np.abs(torque) / arm.torque_limit
