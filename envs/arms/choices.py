@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import mujoco
@@ -23,7 +22,7 @@ TOOL_NAMES = (
 """Usual names of tools, the most telling first; prefixes that end in `_`, `/` or `:` may precede them."""
 LEAST_CHAIN = 3
 """Least number of joints of a branch that is an arm and not a finger."""
-HOMES = 256
+HOMES = 64
 """Number of random configurations among which a home is looked for."""
 INSET = 0.1
 """Least distance of home from the joint limits, as a share of the ranges."""
@@ -222,25 +221,24 @@ def known_velocities(name: str, number: int) -> Float | None:
 
 
 def choose_home(
-    ranges: Float, candidates: Sequence[Float], apart: Callable[[Float], float]
+    ranges: Float, candidates: Mapping[str, Float], apart: Callable[[Float], float]
 ) -> tuple[Float, str]:
     """Return the first configuration in which the arm does not touch itself, and where it comes from.
 
     Args:
         ranges: Ranges of the joints, shape (J, 2).
-        candidates: Configurations of the file that are tried first: its keyframe, then zeros.
+        candidates: Configurations of the file that are tried first, by their names.
         apart: Function that returns the least distance of bodies that should not touch, [m].
     """
     low, high = ranges.T
-    inset = INSET * (high - low)
-    for configuration, origin in zip(candidates, ("keyframe", "zeros"), strict=False):
+    for origin, configuration in candidates.items():
         inside = (configuration >= low) & (configuration <= high)
         if inside.all() and apart(configuration) > 0.0:
             return configuration, f"the file's {origin}"
     middle = 0.5 * (low + high)
     if apart(middle) > 0.0:
         return middle, "the middle of the ranges"
-    rng = np.random.default_rng(0)
-    drawn = rng.uniform(low + inset, high - inset, (HOMES, len(low)))
-    best = max(itertools.chain([middle], drawn[: HOMES // 4]), key=apart)
+    inset = INSET * (high - low)
+    drawn = np.random.default_rng(0).uniform(low + inset, high - inset, (HOMES, len(low)))
+    best = max([middle, *drawn], key=apart)
     return best, "the one that is farthest from touching itself, of random ones"

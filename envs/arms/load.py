@@ -383,8 +383,8 @@ def _home(
     def apart(home: Float) -> float:
         return min(_distances(parsed, home, pairs).values(), default=1.0)
 
-    zeros = np.zeros(len(joints))
-    candidates = [keyframe, zeros] if keyframe is not None else [np.full(len(joints), np.inf), zeros]
+    candidates = {"keyframe": keyframe} if keyframe is not None else {}
+    candidates["zeros"] = np.zeros(len(joints))
     home, origin = choose_home(ranges, candidates, apart)
     notes.append(f"home: {origin}")
     return home
@@ -394,12 +394,7 @@ def _pairs_that_move(
     parsed: Parsed, ranges: Float, exclude: Sequence[tuple[str, str]]
 ) -> list[tuple[int, int]]:
     """Return the pairs of bodies that are compared, without those that touch in every one of some configurations."""
-    excluded = {frozenset(pair) for pair in exclude}
-    pairs = [
-        pair
-        for pair in _distant_pairs(parsed)
-        if frozenset(_body_name(parsed, body) for body in pair) not in excluded
-    ]
+    pairs = _compared_pairs(parsed, exclude)
     low, high = ranges.T
     rng = np.random.default_rng(0)
     free: set[tuple[int, int]] = set()
@@ -577,6 +572,16 @@ def _distant_pairs(parsed: Parsed) -> Iterator[tuple[int, int]]:
             yield first, second
 
 
+def _compared_pairs(parsed: Parsed, exclude: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
+    """Return the distant pairs of bodies that are not excluded by name."""
+    excluded = {frozenset(pair) for pair in exclude}
+    return [
+        pair
+        for pair in _distant_pairs(parsed)
+        if frozenset(_body_name(parsed, body) for body in pair) not in excluded
+    ]
+
+
 def _excluded(parsed: Parsed) -> list[tuple[str, str]]:
     """Return the names of pairs of bodies that the file does not let collide."""
     return [
@@ -634,12 +639,7 @@ def _home_distances(
     parsed: Parsed, home: Float, exclude: Sequence[tuple[str, str]]
 ) -> dict[tuple[int, int], float]:
     """Return the distance at home of each pair of bodies that must stay apart, [m]; at most 0.1."""
-    excluded = {frozenset(pair) for pair in exclude}
-    pairs = [
-        pair
-        for pair in _distant_pairs(parsed)
-        if frozenset(_body_name(parsed, body) for body in pair) not in excluded
-    ]
+    pairs = _compared_pairs(parsed, exclude)
     return {pair: away for pair, away in _distances(parsed, home, pairs).items() if away > 0.0}
 
 

@@ -79,20 +79,15 @@ def safe_ratio(numerator: Float, denominator: Float) -> Float:
     return np.where(zero, 0.0, numerator / np.where(zero, 1.0, denominator))
 
 
-def frame_axes(quaternion: Float) -> tuple[list[Float], list[Float], list[Float]]:
-    """Return the components of the axes of frames from their quaternions, shape (..., 4)."""
-    w, x, y, z = (quaternion[..., i] for i in range(4))
-    return (
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)],
-        [2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)],
-        [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)],
-    )
-
-
 def frame_matrices(quaternion: Float) -> Float:
     """Return the axes of frames as columns, shape (..., 3, 3), from their quaternions, shape (..., 4)."""
-    axes = np.stack([np.stack(axis, axis=-1) for axis in frame_axes(quaternion)], axis=-1)
-    return np.ascontiguousarray(axes)
+    w, x, y, z = (quaternion[..., i] for i in range(4))
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def quaternion_to(direction: Any) -> Float:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -98,7 +97,8 @@ class MotionPlan:
     success: bool
     """True if the movement touches nothing and keeps all limits."""
     clearance: float
-    """Least clearance from obstacles and of the arm from itself, [m]; negative in contact, at most 0.1."""
+    """Least clearance from obstacles and of the arm from itself, [m]; at most 1, negative in contact, and -2 for a
+    movement that leaves the joint limits or the reach."""
     limits: Limits
     """Shares of the velocity and torque limits."""
     jerk: float
@@ -149,7 +149,7 @@ class MotionPlan:
         number_of_at_least("rate", rate, 1e-3)
         last = int(np.floor(self.duration * rate * (1.0 - 1e-12)))
         time = np.append(np.arange(last + 1) / rate, self.duration)
-        motion = joint_motion(space_of(self.arm, self.space), self.trajectory(), time)
+        motion = _joint_motion(space_of(self.arm, self.space), self.trajectory(), time)
         return JointMotion(time, *motion, torques(self.arm.chain, *motion))
 
     def execute(self, *, force: bool = False) -> Outcome:
@@ -172,12 +172,8 @@ class MotionPlan:
         if not self.success and not force:
             raise UnsafePlanError(f"the plan is not safe: {self.reason}; force=True takes it nevertheless")
 
-    def replaced(self, **changes: Any) -> MotionPlan:
-        """Return the plan with some fields changed."""
-        return dataclasses.replace(self, **changes)
 
-
-def joint_motion(space: Space, trajectory: primitives.Trajectory, time: Float) -> Motion:
+def _joint_motion(space: Space, trajectory: primitives.Trajectory, time: Float) -> Motion:
     """Return positions, velocities and accelerations of the joints at instants, shape (N, J) each."""
     sampled = Motion(*(part[None] for part in trajectory.sample(time)))
     return Motion(*(np.ascontiguousarray(part[0]) for part in space.joint_motion(sampled)))

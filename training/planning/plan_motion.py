@@ -5,6 +5,7 @@ It needs an arm and obstacles, but no environment and no network.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -37,7 +38,14 @@ from viapoint.training.planning.movements import (
     table_with,
 )
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl, path_around, points_on
-from viapoint.training.planning.refine import STRAIGHT_COST, Aim, exact_clearance, is_free, refine_seeds
+from viapoint.training.planning.refine import (
+    STRAIGHT_COST,
+    Aim,
+    Found,
+    exact_clearance,
+    is_free,
+    refine_seeds,
+)
 
 AIMS = (
     Aim(clearance=0.04, jerk=0.1, iterations=20, gain=1.0, stride=2),
@@ -235,7 +243,7 @@ def plan_motion(
         if time.perf_counter() > until:
             break
     assert best is not None
-    return best.replaced(milliseconds=1e3 * (time.perf_counter() - began))
+    return dataclasses.replace(best, milliseconds=1e3 * (time.perf_counter() - began))
 
 
 def plan_motions(
@@ -341,11 +349,8 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     straight = _straight(problem)
     _is_free(problem, straight, 0.0)
     _result(problem, straight, _fault(problem)[0])
-    fixed, nothing = problem.offsets(np.zeros((0, len(start))), 1.0), np.zeros((0, n_via, len(start)))
-    refine_seeds(
-        problem.setting, movement_table(n_via), _fine_table(n_via), start, fixed, nothing, 1.0, problem.obstacles, 0,
-        0.0, AIMS, 1.0, 0.0, 1,
-    )  # fmt: skip
+    nothing = np.zeros((0, n_via, len(start)))
+    _refined(problem, 0.0, movement_table(n_via), _fine_table(n_via), nothing, 1.0, smooth=SMOOTH, enough=1)
 
 
 def _goals(problem: _Problem, goal: Any) -> Float:
@@ -447,13 +452,14 @@ def _plan(
         found = best
         plan = _result(problem, found, "")
         if plan.success or problem.duration is not None:
-            return plan.replaced(seeds=tried)
+            return dataclasses.replace(plan, seeds=tried)
         # In motion, and among moving obstacles, a longer movement is another one.
         duration *= LONGER
         seeds = (found.vias + problem.start)[None]
     plan = _result(problem, found, "")
     ended = "the time limit was reached" if time.perf_counter() >= until else "no free one was found"
-    return plan.replaced(success=False, seeds=tried, reason=f"{plan.reason}; {ended} from {tried} seeds")
+    reason = f"{plan.reason}; {ended} from {tried} seeds"
+    return dataclasses.replace(plan, success=False, seeds=tried, reason=reason)
 
 
 def _straight(problem: _Problem) -> _Movement:
@@ -482,7 +488,6 @@ def _search(
     """Refine seeds until enough movements are free; return the one with the least jerk, and the number of seeds."""
     share = np.arange(1, n_via + 1)[:, None] / (n_via + 1)
     straight = share * (problem.goal - problem.start)
-    fixed = problem.offsets(straight, duration)[n_via:]
     unit = _unit(problem)
     near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
     table, fine = movement_table(n_via), _fine_table(n_via)
@@ -500,10 +505,8 @@ def _search(
                 continue
             spread = 0.0 if rank == 0 else near if rank < NARROW else far
             seeds[k] = straight + spread * generator.uniform(-1.0, 1.0, straight.shape)
-        done, found = refine_seeds(
-            problem.setting, table, fine, problem.start, fixed, seeds, duration, problem.obstacles, 0,
-            kept, AIMS, unit, SMOOTH, max(enough - free, 1),
-        )  # fmt: skip
+        wanted = max(enough - free, 1)
+        done, found = _refined(problem, kept, table, fine, seeds, duration, smooth=SMOOTH, enough=wanted)
         for k in range(done):
             if found.clearance[k] < kept:
                 continue
@@ -517,6 +520,26 @@ def _search(
                 best = _Movement(found.vias[k], fine, int(found.times[k]), duration, source, clearance)
         tried += done
     return best, tried
+
+
+def _refined(
+    problem: _Problem,
+    kept: float,
+    table: MovementTable,
+    fine: MovementTable,
+    seeds: Float,
+    duration: float,
+    *,
+    smooth: float,
+    enough: int,
+) -> tuple[int, Found]:
+    """Refine seeds, shape (S, K, D); see :func:`~viapoint.training.planning.refine.refine_seeds`."""
+    n_via = seeds.shape[1]
+    fixed = problem.offsets(np.zeros((n_via, len(problem.start))), duration)[n_via:]
+    return refine_seeds(
+        problem.setting, table, fine, problem.start, fixed, seeds, duration, problem.obstacles, 0, kept, AIMS,
+        _unit(problem), smooth, enough,
+    )  # fmt: skip
 
 
 def _unit(problem: _Problem) -> float:
@@ -543,11 +566,7 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
         durations = np.asarray(primitives.passage_durations(points, 1.0))[None]
         table, fine = table_with(durations), table_with(durations, FINE_INSTANTS)
         vias = points[None, 1:-1] - problem.start
-        fixed = problem.offsets(vias[0], duration)[count:]
-        _, found = refine_seeds(
-            problem.setting, table, fine, problem.start, fixed, vias, duration, problem.obstacles, 0,
-            kept, AIMS, _unit(problem), 0.0, 1,
-        )  # fmt: skip
+        _, found = _refined(problem, kept, table, fine, vias, duration, smooth=0.0, enough=1)
         if found.clearance[0] >= kept:
             return _Movement(found.vias[0], fine, 0, duration, "ompl", float(found.clearance[0]))
     return None
@@ -627,7 +646,7 @@ def _known(problem: _Problem, movement: _Movement, fault: str, least: float | No
         success=not reason,
         clearance=clearance,
         limits=limits,
-        jerk=max(float(cost) / max(360.0 * float(line @ line), 1e-12), 1.0),
+        jerk=max(float(cost) / max(STRAIGHT_COST * float(line @ line), 1e-12), 1.0),
         source=movement.source,
         reason=reason,
     )

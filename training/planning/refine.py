@@ -1,9 +1,9 @@
 """Refinement of via-points by the gradient of clearance and jerk, compiled.
 
 The via-points of a movement are moved by damped least squares (K. Levenberg 1944, D. W. Marquardt 1963). The residuals
-are, at every second instant, what is missing to a wanted clearance, for the deepest sphere of each body and obstacle
-and of each pair of bodies, and what is missing to a margin from the joint limits. To the sum of their squares comes the
-jerk cost relative to that of the straight movement, which is a quadratic form of the via-points.
+are, at some instants, what is missing to a wanted clearance, for the deepest sphere of each body and obstacle and of
+each pair of bodies, and what is missing to a margin from the joint limits. To the sum of their squares comes the jerk
+cost, which is a quadratic form of the via-points.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Found(NamedTuple):
     times: Int
     """Indices of passage times in the table, shape (S,)."""
     cost: Float
-    """Jerk cost relative to that of the straight movement, shape (S,)."""
+    """Jerk cost in unit time, shape (S,); infinite for movements that are not free."""
     clearance: Float
     """Least clearance at many instants, shape (S,), [m]; -1 for movements that are not free."""
 
