@@ -24,7 +24,7 @@ GOAL = PANDA.home + np.array([0.8, 0.5, 0.0, 0.6, 0.0, 0.3, 0.0])
 POST = Box((0.05, 0.05, 0.4), position=(0.5, 0.15, 0.4))
 """Obstacle in the way from home to GOAL."""
 WALL = [Box((0.02, 2.0, 2.0), position=(0.45, 0.2, 0.0), quaternion=(0.924, 0.0, 0.0, 0.383))]
-"""Obstacle that nothing leads around."""
+"""Obstacle that nothing leads around; the goal is inside it."""
 
 
 def drawn(n: int, **kwargs):
@@ -69,9 +69,13 @@ def test_what_is_free_stays_straight() -> None:
     assert len(plan.durations) == 1
 
 
-@pytest.mark.parametrize("arguments", [{"time_limit": 0.0}, {"seeds": 4}])
-def test_plans_never_lie(arguments) -> None:
-    plan = plan_motion(PANDA, PANDA.home, GOAL, WALL, **arguments)
+@pytest.mark.parametrize(
+    ("obstacles", "arguments"),
+    [(WALL, {"time_limit": 0.0}), (WALL, {"seeds": 4}), ([POST], {"time_limit": 0.0})],
+    ids=["end in contact, no time", "end in contact", "free ends, no time"],
+)
+def test_plans_never_lie(obstacles, arguments) -> None:
+    plan = plan_motion(PANDA, PANDA.home, GOAL, obstacles, **arguments)
     assert not plan.success
     assert plan.clearance < 0.0
     assert "clearance" in plan.reason
@@ -97,6 +101,11 @@ def test_given_duration_stays_or_fails() -> None:
     fast = plan_motion(PANDA, PANDA.home, GOAL, [POST], duration=0.3)
     assert not fast.success
     assert "limit" in fast.reason
+
+
+def test_ends_that_do_not_keep_the_margin_are_told() -> None:
+    reason = plan_motion(PANDA, PANDA.home, GOAL, margin=0.1).reason
+    assert "nearer to itself than the margin at the start" in reason
 
 
 def test_margin_is_kept() -> None:

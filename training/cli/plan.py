@@ -54,7 +54,7 @@ def arm_for(config: PlanConfig) -> Arm:
     if config.arm in arm_names():
         return arm_of(config.arm)
     if not Path(config.arm).expanduser().is_file():
-        raise ValueError(f"arm must be {', '.join(arm_names())} or an MJCF or URDF file, got {config.arm}")
+        raise ValueError(f"there is no arm or file {config.arm!r}; arms are {', '.join(arm_names())}")
     return load_arm(
         Path(config.arm).expanduser(),
         tool=config.tool or None,

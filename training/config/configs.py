@@ -113,6 +113,8 @@ NamedValues = Annotated[
 
 BENCHMARK = "motionbenchmaker"
 """Name of the scene set that measures planners."""
+MOTION_FILES = (".csv", ".yaml", ".yml")
+"""Suffixes of files of movements."""
 USUAL_BASELINES = ("straight", "random", "search512")
 """Baselines of an evaluation."""
 
@@ -467,6 +469,10 @@ class PlanConfig(Config):
     def _check(self) -> None:
         super()._check()
         check_file("video", self.video, ".mp4")
+        if self.out is not None and self.out.suffix not in MOTION_FILES:
+            raise ValueError(f"out must end in {' or '.join(MOTION_FILES)}, got {self.out}")
+        if self.goal and self.position:
+            raise ValueError("a goal is either --goal, joint positions, or --position; both are given")
         for name, length in (("position", 3), ("quaternion", 4)):
             given = len(getattr(self, name))
             if given not in (0, length):

@@ -411,12 +411,13 @@ def _fault(problem: _Problem) -> tuple[str, float]:
             )
             return text, most
         if own[end] < problem.margin:
-            return f"the arm touches itself at the {name}, clearance {1e3 * own[end]:.1f} mm", most
+            touches = "touches itself" if own[end] < 0.0 else "is nearer to itself than the margin"
+            return f"the arm {touches} at the {name}, clearance {1e3 * own[end]:.1f} mm", most
         near = both.present[end] & (rows[end] < problem.margin) & (resting | (end == 0))
         if near.any():
             row = int(near.argmax())
-            text = f"the {name} is in contact with obstacle {row}, clearance {1e3 * rows[end, row]:.1f} mm"
-            return text, most
+            where = "in contact with" if rows[end, row] < 0.0 else "nearer than the margin to"
+            return f"the {name} is {where} obstacle {row}, clearance {1e3 * rows[end, row]:.1f} mm", most
     counted = both.present & (resting | np.array([[True], [False]]))
     nearest = min(float(own.min()), float(rows.min(where=counted, initial=most)))
     return "", max(problem.margin, min(most, nearest - ROUNDING))
@@ -492,10 +493,10 @@ def _search(
     near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
     table, fine = movement_table(n_via), _fine_table(n_via)
     best, least = None, np.inf
-    tried = free = first_free = 0
+    tried = free = 0
     total = len(given) + 1 + number
     while tried < total and time.perf_counter() < until:
-        if free >= enough and (least <= ROUGH * unit or tried >= first_free + MORE):
+        if free >= enough and least <= ROUGH * unit:
             break
         seeds = np.empty((min(CHUNKS[min(tried, len(CHUNKS) - 1)], total - tried), *straight.shape))
         for k in range(len(seeds)):
@@ -511,7 +512,8 @@ def _search(
             if found.clearance[k] < kept:
                 continue
             free += 1
-            first_free = first_free or tried
+            if free == enough:  # a rough movement is worth some more seeds
+                total = min(total, tried + k + 1 + MORE)
             if found.cost[k] < least:
                 rank = tried + k - len(given)
                 least = float(found.cost[k])
