@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 from viapoint.envs.arms.chain import Spheres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.kernels import kernel
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
 from viapoint.envs.plans import SHORTEST_DURATION
-from viapoint.envs.replanning import NEARBY, revised_waypoints
+from viapoint.envs.replanning import NEARBY, least_remaining
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.planning.movements import (
@@ -22,9 +25,11 @@ from viapoint.training.planning.movements import (
     INSTANTS,
     MovementTable,
     Setting,
+    best_times,
+    jerk_cost,
     movement_table,
-    shortest_durations,
-    table_costs,
+    products,
+    shortest_duration,
     table_with,
 )
 
@@ -118,6 +123,40 @@ class Moves(NamedTuple):
     """True for plans beyond the velocity limits of the joints, shape (B, H); the environment would prolong them."""
 
 
+class _Layout(NamedTuple):
+    """Meaning of actions, as compiled functions take it; see :class:`~viapoint.envs.plans.ActionLayout`."""
+
+    of_hand: bool
+    via_scale: Float
+    rate_limit: Float
+    """Velocity limits of the joints, shape (D,), [rad/s]; unused in hand space."""
+    centre: float
+    log_half_range: float
+    shortest: float
+    """Shortest duration of a revised movement, [s]."""
+    longest: float
+    """Longest duration in hand space, [s], unless more is left of the plan under way."""
+
+
+class _Nominal(NamedTuple):
+    """Plans of zero actions in B problems, as compiled functions take them."""
+
+    start: Float
+    velocity: Float
+    acceleration: Float
+    goal: Float
+    line: Float
+    """Line along which offsets are measured in hand space, shape (B, D)."""
+    vias: Float
+    """Shape (B, K, D)."""
+    remaining: Float
+    """Shape (B,), [s]; unused in joint space at rest."""
+    whole: Float
+    """Durations of the straight movements that rewards are relative to, shape (B,), [s]."""
+    straight: Float
+    """Their jerk costs, shape (B,)."""
+
+
 def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = False) -> Moves:
     """Return the plans of actions of shape (B, H, m).
 
@@ -125,53 +164,129 @@ def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = Fa
     instants.
     """
     layout, table = task.action, movement_table(task.n_via)
-    vectors = np.asarray(actions, dtype=np.float64)
-    start, goal = problem.start[:, None], problem.goal[:, None]
-    batch = vectors.shape[:2]
-    columns, dimension = task.n_via + 3, layout.dimension
-    offsets = np.zeros((*batch, columns, dimension))
-    if problem.remaining is None or problem.vias is None:
-        waypoints = layout.waypoints(vectors, np.broadcast_to(start, (*batch, dimension)), goal)
-        duration = layout.centre * np.exp(vectors[..., task.n_via * dimension] * layout.log_half_range)
-    else:
-        waypoints, duration = revised_waypoints(
-            layout,
-            _line(problem)[:, None],
-            np.broadcast_to(start, (*batch, dimension)),
-            problem.vias[:, None],
-            np.broadcast_to(goal, (*batch, dimension)),
-            problem.remaining[:, None],
-            vectors,
-        )
-        _set_motion(problem, duration, offsets)
-    offsets[..., : task.n_via + 1, :] = waypoints[..., 1:, :] - waypoints[..., :1, :]
-    flat = offsets.reshape(-1, columns, dimension)
-    if (exact or layout.timing == "learned") and problem.remaining is None:
-        shares = layout.shares(waypoints, vectors).reshape(-1, task.n_via + 1)
-        table = table_with(shares, FINE_INSTANTS if exact else INSTANTS)  # each plan has times of its own
-        times = np.arange(len(flat))
-        cost = np.einsum("hij,hid,hjd->h", table.cost, flat, flat)
-    else:
-        times, cost = table_costs(table, flat)
-    fast = np.zeros(batch, bool)
-    if layout.space == "joints":
-        limits = np.array(layout.rate_limit)
-        shortest = shortest_durations(table, times, flat, limits).reshape(batch)
-        if problem.remaining is None:
-            duration = duration * shortest
-        else:
-            # A first plan is relative to the shortest; the environment prolongs later ones beyond the limits.
-            factor = np.exp(vectors[..., task.n_via * dimension] * layout.log_half_range)
-            resting = ~np.asarray((problem.velocity != 0.0) | (problem.acceleration != 0.0)).any(axis=-1)
-            longer = np.clip(shortest / duration, 1.0, PROLONGED) * duration
-            duration = np.where(np.asarray(resting)[:, None], layout.centre * factor * shortest, longer)
-            _set_motion(problem, duration, offsets)
-            times, cost = table_costs(table, flat)
-            fast = shortest_durations(table, times, flat, limits).reshape(batch) > 1.02 * duration
+    vectors = np.ascontiguousarray(actions, dtype=np.float64)
+    resting = problem.remaining is None
+    given = (exact or layout.timing == "learned") and resting
+    if given:  # each plan has passage times of its own
+        start, goal = problem.start[:, None], problem.goal[:, None]
+        start = np.broadcast_to(start, (*vectors.shape[:2], layout.dimension))
+        shares = layout.shares(layout.waypoints(vectors, start, goal), vectors)
+        table = table_with(shares.reshape(-1, task.n_via + 1), FINE_INSTANTS if exact else INSTANTS)
+    numbers = _Layout(
+        of_hand=layout.space == "hand",
+        via_scale=np.array(layout.via_scale),
+        rate_limit=np.array(layout.rate_limit),
+        centre=layout.centre,
+        log_half_range=layout.log_half_range,
+        shortest=least_remaining(layout),
+        longest=layout.duration_range[1],
+    )
+    return Moves(table, *_expand(numbers, table, _nominal(task, problem), vectors, given))
+
+
+def _nominal(task: Task, problem: Problem) -> _Nominal:
+    """Return the plans of zero actions."""
+    line = problem.goal - problem.start
+    shares = np.arange(1, task.n_via + 1)[:, None] / (task.n_via + 1)
+    vias = problem.start[:, None] + line[:, None] * shares if problem.vias is None else problem.vias
+    remaining = problem.remaining
+    if remaining is None:
+        remaining = np.full(len(line), task.action.centre)
+    elif task.space.of_hand:
+        line = np.where((norm(line) < NEARBY["hand"])[:, None], np.eye(1, line.shape[-1]), line)
     length, whole = _straight_movement(task, problem)
-    straight = straight_jerk_cost(length, whole)[:, None]
-    rough = np.log1p(cost.reshape(batch) / duration**5 / straight)
-    return Moves(table, offsets, times.reshape(batch), duration, rough, duration / whole[:, None], fast)
+    parts = problem.start, problem.velocity, problem.acceleration, problem.goal, line, vias, remaining, whole
+    return _Nominal(*(np.ascontiguousarray(part) for part in parts), straight_jerk_cost(length, whole))
+
+
+@compiled
+def _expand(
+    layout: _Layout, table: MovementTable, nominal: _Nominal, actions: Float, given: bool
+) -> tuple[Float, Int, Float, Float, Float, Bool]:
+    """Return offsets, passage times, durations, `rough`, `relative` and `fast` of plans, see :class:`Moves`.
+
+    The meaning of an action is that of :meth:`~viapoint.envs.plans.ActionLayout.decode` and
+    :func:`~viapoint.envs.replanning.revise`. With `given`, each plan has a row of the table as passage times.
+    """
+    number, plans, _ = actions.shape
+    _, vias, dimension = nominal.vias.shape
+    columns = vias + 3
+    every = np.empty((number, plans, columns, dimension))
+    times, duration = np.empty((number, plans), np.int64), np.empty((number, plans))
+    rough, relative = np.empty((number, plans)), np.empty((number, plans))
+    fast = np.zeros((number, plans), np.bool_)
+    gram = np.empty((columns, columns))
+    for b in range(number):
+        moving = False
+        for d in range(dimension):
+            moving = moving or nominal.velocity[b, d] != 0.0 or nominal.acceleration[b, d] != 0.0
+        for h in range(plans):
+            offsets, action = every[b, h], actions[b, h]
+            _place_vias(layout, nominal, b, action, offsets)
+            factor = math.exp(layout.log_half_range * action[vias * dimension])
+            left = max(nominal.remaining[b], layout.shortest)
+            time = max(left * factor, layout.shortest)
+            if layout.of_hand:
+                time = min(time, max(left, layout.longest))
+            row = b * plans + h if given else -1
+            chosen, cost = _timed(table, offsets, nominal, b, row, time, gram)
+            if not layout.of_hand:
+                shortest = shortest_duration(table, chosen, offsets, layout.rate_limit)
+                if moving:
+                    # The environment prolongs plans in motion beyond the limits.
+                    time *= min(max(shortest / time, 1.0), PROLONGED)
+                    chosen, cost = _timed(table, offsets, nominal, b, row, time, gram)
+                    shortest = shortest_duration(table, chosen, offsets, layout.rate_limit)
+                    fast[b, h] = shortest > 1.02 * time
+                else:
+                    time = layout.centre * factor * shortest
+            times[b, h], duration[b, h] = chosen, time
+            rough[b, h] = math.log1p(cost / time**5 / nominal.straight[b])
+            relative[b, h] = time / nominal.whole[b]
+    return every, times, duration, rough, relative, fast
+
+
+@kernel
+def _place_vias(layout: _Layout, nominal: _Nominal, b: int, action: Float, offsets: Float) -> None:
+    """Fill in the offsets of via-points and goal from the start."""
+    _, vias, dimension = nominal.vias.shape
+    line, start = nominal.line[b], nominal.start[b]
+    for k in range(vias):
+        for d in range(dimension):
+            step = action[k * dimension + d] * layout.via_scale[d]
+            offsets[k, d] = nominal.vias[b, k, d] - start[d] + (0.0 if layout.of_hand else step)
+        if layout.of_hand:  # offsets along and across the line
+            length = math.sqrt(line[0] * line[0] + line[1] * line[1])
+            x, y = line[0] / length, line[1] / length
+            along, across = action[2 * k] * layout.via_scale[0], action[2 * k + 1] * layout.via_scale[1]
+            offsets[k, 0] += along * x - across * y
+            offsets[k, 1] += along * y + across * x
+    for d in range(dimension):
+        offsets[vias, d] = nominal.goal[b, d] - start[d]
+
+
+@kernel
+def _timed(
+    table: MovementTable,
+    offsets: Float,
+    nominal: _Nominal,
+    b: int,
+    row: int,
+    duration: float,
+    gram: Float,
+) -> tuple[int, float]:
+    """Fill in the present motion of a plan of some duration; return its passage times and jerk cost in unit time.
+
+    The passage times are a row of the table, the best one if it is negative.
+    """
+    last = len(offsets)
+    for d in range(offsets.shape[1]):
+        offsets[last - 2, d] = nominal.velocity[b, d] * duration
+        offsets[last - 1, d] = nominal.acceleration[b, d] * duration * duration
+    if row >= 0:
+        products(offsets, gram)
+        return row, jerk_cost(table, row, gram)
+    return best_times(table, offsets, gram)
 
 
 def _straight_movement(task: Task, problem: Problem) -> tuple[Float, Float]:
@@ -187,12 +302,6 @@ def _straight_movement(task: Task, problem: Problem) -> tuple[Float, Float]:
         whole = np.maximum(whole, task.time_limit - problem.time_left + problem.remaining)
         length = np.maximum(length, whole * min(layout.rate_limit) / (1.875 * layout.centre))
     return length, whole
-
-
-def _set_motion(problem: Problem, duration: Float, offsets: Float) -> None:
-    """Fill in the columns of offsets for the present motion, of plans of some durations, shape (B, H)."""
-    offsets[..., -2, :] = problem.velocity[:, None] * duration[..., None]
-    offsets[..., -1, :] = problem.acceleration[:, None] * duration[..., None] ** 2
 
 
 def worth_of(task: Task, problem: Problem, moves: Moves) -> Float:
@@ -249,12 +358,6 @@ def _within_height(spheres: Spheres, heights: Float, obstacles: Obstacles) -> Sp
         ball_radius=spheres.ball_radius[kept],
         pairs=np.zeros((0, 2), np.int64),
     )
-
-
-def _line(problem: Problem) -> Float:
-    """Return the line of the offsets' frame, shape (B, D)."""
-    line = problem.goal - problem.start
-    return np.where((norm(line) < NEARBY["hand"])[:, None], np.eye(1, line.shape[-1]), line)
 
 
 def _some(part: Any, rows: Any) -> Any:
