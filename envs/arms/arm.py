@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.arms.chain import Chain, FirstTwo, Spheres
 from viapoint.envs.arms.kinematics import forward, inverse_dynamics
 from viapoint.envs.arms.spheres import Capsule, Cover, LeftOut, cover, touching_at_home
 from viapoint.envs.common.types import Bool, Float
@@ -331,16 +331,17 @@ def _chain(
     origin, rotation = np.zeros((len(joints), 3)), np.zeros((len(joints), 3, 3))
     for link, (turn, place) in enumerate(frames[1:]):
         before, start = frames[link]
-        origin[link] = before.T @ (place - start)
-        rotation[link] = before.T @ turn
+        origin[link] = _rounded(before.T @ (place - start))
+        rotation[link] = _rounded(before.T @ turn)
     last, end = frames[-1]
     site = model.site(tool).id
     dofs = model.jnt_dofadr[numbers]
+    tool_origin = _rounded(last.T @ (data.site_xpos[site] - end))
     chain = Chain(
-        origin=_rounded(origin),
-        rotation=_rounded(rotation),
+        origin=origin,
+        rotation=rotation,
         sliding=model.jnt_type[numbers] == mujoco.mjtJoint.mjJNT_SLIDE,
-        tool_origin=_rounded(last.T @ (data.site_xpos[site] - end)),
+        tool_origin=tool_origin,
         tool_rotation=_rounded(last.T @ data.site_xmat[site].reshape(3, 3)),
         mass=mass,
         centre=_rounded(centre),
@@ -348,6 +349,7 @@ def _chain(
         armature=model.dof_armature[dofs].copy(),
         damping=model.dof_damping[dofs].reshape(len(joints), -1)[:, 0].copy(),
         gravity=model.opt.gravity.copy(),
+        first_two=FirstTwo.of(origin, rotation, tool_origin),
     )
     return chain, links
 

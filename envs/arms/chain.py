@@ -2,9 +2,39 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from viapoint.envs.common.types import Bool, Float, Int
+
+
+class FirstTwo(NamedTuple):
+    """Angles and lengths of an arm of two hinges with vertical axes."""
+
+    upper_angle: float
+    """Angle of the upper arm in the frame of the shoulder, [rad]."""
+    fore_angle: float
+    """Angle of the forearm in the frame of the elbow, [rad]."""
+    elbow: float
+    """Angle of the frame of the elbow in that of the shoulder, [rad]."""
+    base: float
+    """Angle of the frame of the shoulder in the world, [rad]."""
+    upper: float
+    """Length of the upper arm, [m]."""
+    fore: float
+    """Length of the forearm, [m]."""
+
+    @classmethod
+    def of(cls, origin: Float, rotation: Float, tool_origin: Float) -> FirstTwo:
+        """Return the numbers of a chain; see :class:`Chain` for the arguments."""
+        return cls(
+            upper_angle=math.atan2(origin[1, 1], origin[1, 0]),
+            fore_angle=math.atan2(tool_origin[1], tool_origin[0]),
+            elbow=math.atan2(rotation[1, 1, 0], rotation[1, 0, 0]),
+            base=math.atan2(rotation[0, 1, 0], rotation[0, 0, 0]),
+            upper=math.hypot(origin[1, 0], origin[1, 1]),
+            fore=math.hypot(tool_origin[0], tool_origin[1]),
+        )
 
 
 class Chain(NamedTuple):
@@ -36,6 +66,8 @@ class Chain(NamedTuple):
     """Viscous friction of the joints, shape (J,), [N m s/rad] or [N s/m]."""
     gravity: Float
     """Gravitational acceleration, shape (3,), [m/s^2]."""
+    first_two: FirstTwo
+    """Angles and lengths of the first two links, for the inverse kinematics of an arm in the plane."""
 
 
 class Spheres(NamedTuple):

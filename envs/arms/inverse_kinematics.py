@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import mujoco
@@ -13,6 +14,7 @@ from viapoint.envs.arms.kinematics import forward, link_frames, tool_jacobian, t
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.kernels import kernel
 
 ITERATIONS = 80
 """Greatest number of iterations from one seed."""
@@ -171,7 +173,7 @@ def solve_planar(chain: Chain, joint_range: Float, x: float, y: float, joints: F
 
     Out of reach, the elbow is as straight or as bent as it can be, and the result is False.
     """
-    first, second, turn, base, upper, fore = _lengths(chain)
+    first, second, turn, base, upper, fore = chain.first_two
     u, v = x - chain.origin[0, 0], y - chain.origin[0, 1]
     # Law of cosines for the angle between the links.
     cosine = (u * u + v * v - upper * upper - fore * fore) / (2.0 * upper * fore)
@@ -191,19 +193,35 @@ def solve_planar(chain: Chain, joint_range: Float, x: float, y: float, joints: F
 
 
 @compiled
-def _lengths(chain: Chain) -> tuple[float, float, float, float, float, float]:
-    """Return angles and lengths of an arm in the plane.
+def planar_limits(chain: Chain, joint_range: Float) -> Float:
+    """Return numbers by which :func:`in_planar_reach` knows the limits of an arm in the plane, shape (6,).
 
-    Angles of upper arm and forearm in their frames, of the frame of the elbow in that of the shoulder, and of the
-    shoulder's frame in the world, [rad]; lengths of upper arm and forearm, [m].
+    Least and greatest cosine of the angle between the links, the side of the elbow, cosine and sine of the direction of
+    the upper arm in the middle of the shoulder's range, and the cosine of half this range.
     """
-    first = np.arctan2(chain.origin[1, 1], chain.origin[1, 0])
-    second = np.arctan2(chain.tool_origin[1], chain.tool_origin[0])
-    turn = np.arctan2(chain.rotation[1, 1, 0], chain.rotation[1, 0, 0])
-    base = np.arctan2(chain.rotation[0, 1, 0], chain.rotation[0, 0, 0])
-    upper = np.sqrt(chain.origin[1, 0] ** 2 + chain.origin[1, 1] ** 2)
-    fore = np.sqrt(chain.tool_origin[0] ** 2 + chain.tool_origin[1] ** 2)
-    return first, second, turn, base, upper, fore
+    first, second, turn, base, _, _ = chain.first_two
+    offset = turn + second - first
+    low, high = joint_range[1, 0] + offset, joint_range[1, 1] + offset
+    side = 1.0 if low + high >= 0.0 else -1.0
+    nearest, farthest = max(min(side * low, side * high), 0.0), min(max(side * low, side * high), np.pi)
+    middle = base + first + 0.5 * (joint_range[0, 0] + joint_range[0, 1])
+    half = min(0.5 * (joint_range[0, 1] - joint_range[0, 0]), np.pi)
+    return np.array([np.cos(farthest), np.cos(nearest), side, np.cos(middle), np.sin(middle), np.cos(half)])
+
+
+@kernel
+def in_planar_reach(chain: Chain, limits: Float, x: float, y: float) -> bool:
+    """Return True where :func:`solve_planar` finds joints; without angles it takes a tenth of the time."""
+    upper, fore = chain.first_two.upper, chain.first_two.fore
+    u, v = x - chain.origin[0, 0], y - chain.origin[0, 1]
+    square = u * u + v * v
+    cosine = (square - upper * upper - fore * fore) / (2.0 * upper * fore)
+    if cosine < limits[0] or cosine > limits[1]:
+        return False
+    along, across = upper + fore * cosine, limits[2] * fore * math.sqrt(max(1.0 - cosine * cosine, 0.0))
+    # Direction of the upper arm, times the squared distance.
+    p, q = u * along + v * across, v * along - u * across
+    return bool(p * limits[3] + q * limits[4] >= limits[5] * square)
 
 
 @compiled
@@ -228,7 +246,7 @@ def _planar_motion(
     links in the world, and n1 . u2 = sin(a2 - a1), so its components along u2 and u1 give the rates. Accelerations
     follow alike after the centripetal terms are taken away.
     """
-    first, second, turn, base, upper, fore = _lengths(chain)
+    first, second, turn, base, upper, fore = chain.first_two
     joints, rates, changes = out
     for i in range(len(position)):
         solve_planar(chain, joint_range, position[i, 0], position[i, 1], joints[i])

@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 
 from viapoint.envs.arms.arm import arm_from_xml
-from viapoint.envs.arms.inverse_kinematics import inverse_kinematics, planar_joints, planar_motion
+from viapoint.envs.arms.inverse_kinematics import (
+    in_planar_reach,
+    inverse_kinematics,
+    planar_joints,
+    planar_limits,
+    planar_motion,
+    solve_planar,
+)
 from viapoint.envs.arms.kinematics import forward, jacobians, link_poses, sphere_centres, torques
 from viapoint.envs.arms.registry import arm_of
 
@@ -115,6 +122,15 @@ def test_the_closed_form_moves_the_hand_as_it_should():
     np.testing.assert_allclose(rates[sound], (ahead - behind)[sound] / (2 * step), rtol=1e-5, atol=1e-5)
     second = (ahead - 2 * joints + behind) / step**2
     np.testing.assert_allclose(changes[sound], second[sound], rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize("limits", [None, [[-0.5, 0.9], [-2.0, -0.3]], [[-3.0, 3.0], [0.2, 3.1]]])
+def test_reach_in_the_plane_without_angles(limits):
+    arm = arm_of("planar")
+    limits = arm.joint_range if limits is None else np.array(limits)
+    known, joints = planar_limits(arm.chain, limits), np.empty(2)
+    for x, y in np.random.default_rng(0).uniform(-0.8, 0.8, (2000, 2)):
+        assert in_planar_reach(arm.chain, known, x, y) == solve_planar(arm.chain, limits, x, y, joints)
 
 
 def test_spheres_contain_the_geoms_and_stick_out_little(arm):

@@ -4,11 +4,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from viapoint import primitives
 from viapoint.envs import Cylinder
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.training.planning import search as search_module
 from viapoint.training.planning.baselines import make_method
-from viapoint.training.planning.movements import INSTANTS
+from viapoint.training.planning.movements import INSTANTS, table_with
 from viapoint.training.planning.problem import Problem, moves_of, worth_of
 from viapoint.training.planning.search import (
     CLEARANCE_MARGIN,
@@ -101,6 +102,23 @@ def test_looking_at_the_most_promising_plans_first_finds_the_best(env_id):
     solved = every.max(axis=1) > INFEASIBLE
     assert solved.any()
     np.testing.assert_allclose(found.max(axis=1)[solved], every.max(axis=1)[solved], atol=1e-6)
+
+
+@pytest.mark.parametrize("n_via", [0, 1, 2, 5])
+def test_tables_hold_the_movements_of_the_primitives(n_via):
+    rng = np.random.default_rng(n_via)
+    shares = rng.dirichlet(np.full(n_via + 1, 5.0), 3)
+    table, instants = table_with(shares), np.linspace(0.0, 1.0, INSTANTS)
+    offsets = rng.normal(size=(3, n_via + 3, 2))
+    waypoints = np.concatenate((np.zeros((3, 1, 2)), offsets[:, : n_via + 1]), axis=1)
+    motion = {"start_velocity": offsets[:, -2], "start_acceleration": offsets[:, -1]}
+    trajectory = primitives.through(waypoints, shares, **motion)
+    for part, expected in zip(
+        (table.basis, table.rate, table.bend), trajectory.sample(instants), strict=True
+    ):
+        np.testing.assert_allclose(np.einsum("mti,mid->mtd", part, offsets), expected, atol=1e-9)
+    cost = np.einsum("mij,mid,mjd->m", table.cost, offsets, offsets)
+    np.testing.assert_allclose(cost, trajectory.cost(), rtol=1e-9)
 
 
 @pytest.mark.parametrize("env_id", AMONG_OBSTACLES)

@@ -13,16 +13,26 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from viapoint.envs.arms.chain import Chain, Spheres
-from viapoint.envs.arms.inverse_kinematics import solve_planar
+from viapoint.envs.arms.inverse_kinematics import in_planar_reach, planar_limits, solve_planar
 from viapoint.envs.common.types import Float, Int
-from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, self_clearance
+from viapoint.envs.geometry.clearance import (
+    WINDOW,
+    Placed,
+    fastest,
+    memory,
+    obstacle_clearance,
+    place,
+    self_clearance,
+    travel,
+)
 from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.kernels import kernel
+from viapoint.envs.geometry.kernels import inlined, kernel
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import SHORTEST_DURATION
 
@@ -30,6 +40,8 @@ INSTANTS = 64
 """Instants of a movement that are checked; a power of two."""
 FINE_INSTANTS = 256
 """Instants of a movement that is checked once more before it is executed; a power of two."""
+NOWHERE = 1e9
+"""Clearance that nothing limits, [m]."""
 OUTSIDE = -2.0
 """Clearance of movements that leave the reach or the joint ranges, [m]."""
 TABLES: dict[int, list[tuple[float, ...]]] = {
@@ -275,7 +287,8 @@ def joints_at(
 ) -> bool:
     """Fill in position and joints at an instant of a movement, and return True within reach and joint ranges.
 
-    The arguments are those of :func:`place_arm`.
+    `position`, shape (D,), and `joints`, shape (J,), are filled in; the other arguments are those of
+    :func:`least_clearance`.
     """
     position_at(table, times, instant, start, offsets, position)
     if setting.of_hand:
@@ -307,15 +320,43 @@ def place_arm(
     if not joints_at(setting, table, times, instant, start, offsets, position, joints):
         return False
     if setting.hand_alone:
-        placed.ball[0, 0] = position[0]
-        placed.ball[0, 1] = position[1]
-        placed.ball[0, 2] = 0.0
-        for axis in range(3):
-            placed.centre[0, axis] = placed.ball[0, axis]
-        placed.known[0] = True
+        place_hand(position, placed)
     else:
         place(setting.chain, setting.spheres, joints, placed)
     return True
+
+
+@inlined
+def place_hand(position: Float, placed: Placed) -> None:
+    """Place the only sphere, that around the hand of an arm in the plane."""
+    placed.ball[0, 0], placed.ball[0, 1], placed.ball[0, 2] = position[0], position[1], 0.0
+    for axis in range(3):
+        placed.centre[0, axis] = placed.ball[0, axis]
+    placed.known[0] = True
+
+
+class Memory(NamedTuple):
+    """Memory of :func:`least_clearance`, which it uses again and again."""
+
+    position: Float
+    """Position of a movement, shape (D,)."""
+    path: Float
+    """Joints at each instant, or positions if the hand is alone, shape (N, J)."""
+    bound: Float
+    """Lower bounds of the clearance at each instant, shape (N,), [m]."""
+    placed: Placed
+    """Places of the arm's parts."""
+    limits: Float
+    """Limits of an arm in the plane, see :func:`~viapoint.envs.arms.inverse_kinematics.planar_limits`."""
+
+
+@compiled
+def memory_of(setting: Setting, table: MovementTable, dimension: int) -> Memory:
+    """Return memory for movements in a space of D dimensions."""
+    instants, joints = len(table.order), len(setting.joint_range)
+    placed = memory(setting.chain, setting.spheres)
+    limits = planar_limits(setting.chain, setting.joint_range)
+    return Memory(np.empty(dimension), np.empty((instants, joints)), np.empty(instants), placed, limits)
 
 
 @kernel
@@ -331,13 +372,12 @@ def least_clearance(
     least: float,
     floor: float,
     until: float,
-    place_of_hand: Float,
-    joints: Float,
-    placed: Placed,
+    memory: Memory,
 ) -> float:
     """Return the least clearance of a movement, at most `least`, [m]; OUTSIDE where it leaves reach or joint ranges.
 
-    The search stops at the first clearance below `floor`.
+    The search stops at the first clearance below `floor`. In the plane, instants are skipped whose neighbours have so
+    much clearance that they cannot have less than the least so far. (Arms in space move too far between two instants.)
 
     Args:
         setting: Arm and space.
@@ -351,25 +391,74 @@ def least_clearance(
         least: Greatest clearance of interest, [m].
         floor: Clearance below which the exact value does not matter, [m].
         until: Time after which clearance does not matter, [s].
-        place_of_hand: Memory, shape (D,).
-        joints: Memory, shape (J,).
-        placed: Memory of the clearance functions.
+        memory: Memory of :func:`memory_of`.
     """
-    for k in range(len(table.order)):
+    alone, last = setting.hand_alone, len(table.order) - 1
+    path, bound, placed = memory.path, memory.bound, memory.placed
+    drift = fastest(obstacles, scene) * duration / last
+    for k in range(last + 1):
         instant = table.order[k]
-        time = duration * instant / (len(table.order) - 1)
-        if time > until:  # obstacles may change course until then, joint ranges do not
-            if not joints_at(setting, table, times, instant, start, offsets, place_of_hand, joints):
+        here = path[instant]
+        if alone:
+            position_at(table, times, instant, start, offsets, here)
+            if not in_planar_reach(setting.chain, memory.limits, here[0], here[1]):
                 return OUTSIDE
-            continue
-        if not place_arm(setting, table, times, instant, start, offsets, place_of_hand, joints, placed):
+        elif not joints_at(setting, table, times, instant, start, offsets, memory.position, here):
             return OUTSIDE
-        least = obstacle_clearance(setting.spheres, placed, obstacles, scene, time, least, floor)
-        if least < floor:
-            return least
-        least = self_clearance(setting.spheres, placed, least, floor)
-        if least < floor:
-            return least
+        time = duration * instant / last
+        if time > until:  # obstacles may change course until then, joint ranges do not
+            bound[instant] = -NOWHERE
+            continue
+        apart = -NOWHERE
+        if setting.of_hand:
+            apart = _bound_of_neighbours(setting, path, bound, instant, last, drift)
+        if apart < least:
+            if alone:
+                place_hand(here, placed)
+            else:
+                place(setting.chain, setting.spheres, here, placed)
+            window = WINDOW if setting.of_hand else 0.0
+            apart = obstacle_clearance(setting.spheres, placed, obstacles, scene, time, least + window, floor)
+            least = min(least, apart)
+            if least < floor:
+                return least
+            apart = self_clearance(setting.spheres, placed, apart, floor)
+            least = min(least, apart)
+            if least < floor:
+                return least
+        bound[instant] = apart
+    return least
+
+
+@kernel
+def _bound_of_neighbours(
+    setting: Setting, path: Float, bound: Float, instant: int, last: int, drift: float
+) -> float:
+    """Return the least clearance that an instant can have, by those of two neighbours and the way from there, [m].
+
+    The neighbours are those that come just before in the order of reversed bits.
+
+    Args:
+        setting: Arm and space.
+        path: Configurations that are known, see :class:`Memory`.
+        bound: Clearances that are known.
+        instant: Instant.
+        last: Last instant.
+        drift: Greatest way of an obstacle between two instants, [m].
+    """
+    least = -NOWHERE
+    distance = instant & -instant if instant else last + 1
+    here = path[instant]
+    for neighbour in (instant - distance, instant + distance):
+        if 0 <= neighbour <= last:
+            there = path[neighbour]
+            if setting.hand_alone:
+                way = math.sqrt((there[0] - here[0]) ** 2 + (there[1] - here[1]) ** 2)
+            else:
+                way = 2.0 * travel(
+                    setting.reach, there, here
+                )  # two parts of the arm may approach one another
+            least = max(least, bound[neighbour] - way - drift * distance)
     return least
 
 

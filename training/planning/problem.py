@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -9,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.chain import Spheres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
@@ -195,8 +197,19 @@ def _nominal(task: Task, problem: Problem) -> _Nominal:
     elif task.space.of_hand:
         line = np.where((norm(line) < NEARBY["hand"])[:, None], np.eye(1, line.shape[-1]), line)
     length, whole = _straight_movement(task, problem)
-    parts = problem.start, problem.velocity, problem.acceleration, problem.goal, line, vias, remaining, whole
-    return _Nominal(*(np.ascontiguousarray(part) for part in parts), straight_jerk_cost(length, whole))
+    cost = straight_jerk_cost(length, whole)
+    parts = (
+        problem.start,
+        problem.velocity,
+        problem.acceleration,
+        problem.goal,
+        line,
+        vias,
+        remaining,
+        whole,
+        cost,
+    )
+    return _Nominal(*(np.ascontiguousarray(part) for part in parts))
 
 
 @compiled
@@ -324,35 +337,42 @@ def setting_of(task: Task, obstacles: Obstacles, *, exact: bool = False) -> Sett
     ranges = arm.joint_range
     if exact and task.space.of_hand:
         ranges = ranges + ELBOW_ROOM * np.array([1.0, -1.0])
-    spheres, alone = arm.spheres, False
-    if task.space.of_hand:
-        spheres = _within_height(spheres, arm.chain.origin[:, 2], obstacles)
-        alone = len(spheres.radius) == 1 and bool(np.allclose(spheres.centre[0], arm.chain.tool_origin))
-    return Setting(arm.chain, spheres, ranges, task.space.of_hand, arm.reach, alone)
-
-
-def _within_height(spheres: Spheres, heights: Float, obstacles: Obstacles) -> Spheres:
-    """Return the groups of spheres of an arm in the plane that are near the heights of some obstacle."""
+    if not task.space.of_hand:
+        return Setting(arm.chain, arm.spheres, ranges, False, arm.reach, False)
     centre, half = bounding_boxes(obstacles)
     tall = (np.abs(obstacles.rotation[..., 2, :]) * half).sum(axis=-1)
     present = obstacles.present
-    low = float((centre[..., 2] - tall)[present].min(initial=1e9)) - NEAR
-    high = float((centre[..., 2] + tall)[present].max(initial=-1e9)) + NEAR
-    level = np.concatenate(([0.0], np.cumsum(heights)))
-    kept = []
+    low = (centre[..., 2] - tall).min(where=present, initial=1e9) - NEAR
+    high = (centre[..., 2] + tall).max(where=present, initial=-1e9) + NEAR
+    bottom, top = _heights(arm)
+    spheres = _some_groups(arm, tuple((top > low) & (bottom < high)))
+    alone = len(spheres.radius) == 1 and bool(np.allclose(spheres.centre[0], arm.chain.tool_origin))
+    return Setting(arm.chain, spheres, ranges, True, arm.reach, alone)
+
+
+@functools.lru_cache(maxsize=64)
+def _heights(arm: Arm) -> Float:
+    """Return the least and greatest heights of the groups of spheres of an arm in the plane, shape (2, G), [m]."""
+    spheres = arm.spheres
+    level = np.concatenate(([0.0], np.cumsum(arm.chain.origin[:, 2])))
+    found = np.empty((2, len(spheres.link)))
     for group, link in enumerate(spheres.link):
         some = slice(spheres.first[group], spheres.first[group + 1])
         place = level[link] + spheres.centre[some, 2]
-        if ((place + spheres.radius[some] > low) & (place - spheres.radius[some] < high)).any():
-            kept.append(group)
-    if not kept:  # one group at least, so that no table is empty
-        kept = [len(spheres.link) - 1]
+        found[:, group] = (place - spheres.radius[some]).min(), (place + spheres.radius[some]).max()
+    return found
+
+
+@functools.lru_cache(maxsize=256)
+def _some_groups(arm: Arm, wanted: tuple[bool, ...]) -> Spheres:
+    """Return some groups of spheres of an arm, the last one if none is wanted, so that no table is empty."""
+    spheres = arm.spheres
+    kept = np.flatnonzero(wanted) if any(wanted) else np.array([len(wanted) - 1])
     rows = np.concatenate([np.arange(spheres.first[group], spheres.first[group + 1]) for group in kept])
-    counts = [spheres.first[group + 1] - spheres.first[group] for group in kept]
     return Spheres(
         centre=spheres.centre[rows],
         radius=spheres.radius[rows],
-        first=np.concatenate(([0], np.cumsum(counts))),
+        first=np.concatenate(([0], np.cumsum(np.diff(spheres.first)[kept]))),
         link=spheres.link[kept],
         ball_centre=spheres.ball_centre[kept],
         ball_radius=spheres.ball_radius[kept],

@@ -35,6 +35,7 @@ from viapoint.training.planning.movements import (
     best_times,
     joints_at,
     least_clearance,
+    memory_of,
 )
 
 CONTACT_WEIGHT = 400.0
@@ -488,10 +489,9 @@ def is_free(
     margin: float,
 ) -> bool:
     """Return True if a movement keeps a margin at the instants of a table; it stops at the first that does not."""
-    work = _work(setting, len(offsets), len(start))
     least = least_clearance(
         setting, table, times, start, offsets, duration, obstacles, scene, margin, margin, 1e9,
-        work.position, work.joints, work.placed,
+        memory_of(setting, table, len(start)),
     )  # fmt: skip
     return bool(least >= margin)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,6 @@ import numpy as np
 
 from viapoint.envs.common.types import Bool, Float, Single
 from viapoint.envs.common.validation import whole_number
-from viapoint.envs.geometry.clearance import memory
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.registration import check_registered
@@ -19,7 +19,7 @@ from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.task import Task
 from viapoint.training.planning.candidates import candidate_actions, sobol_actions
 from viapoint.training.planning.motion_plan import MotionPlan
-from viapoint.training.planning.movements import MovementTable, Setting, least_clearance
+from viapoint.training.planning.movements import MovementTable, Setting, least_clearance, memory_of
 from viapoint.training.planning.plan_motion import checked_motion
 from viapoint.training.planning.problem import (
     Moves,
@@ -113,6 +113,8 @@ class GeometrySearch:
     def solve(self, problem: Problem) -> Float:
         """Return the best action of each of B problems, shape (B, m)."""
         moving = problem.remaining is not None
+        at = self.task.n_via * self.task.action.dimension
+        duration = None if moving or not at else at  # from rest the duration stays as it is
         actions = candidate_actions(self.task, self.n_checks, replanning=moving)
         candidates = np.broadcast_to(actions, (len(problem.start), *actions.shape))
         setting = setting_of(self.task, problem.obstacles)
@@ -120,7 +122,7 @@ class GeometrySearch:
         for each in range(self.refinements):
             top = np.argsort(-merit, axis=-1, kind="stable")[:, :N_CENTRES]
             centres = np.take_along_axis(candidates, top[..., None], axis=1)
-            steps = SPREAD * 0.5**each * self._steps(moving)
+            steps = SPREAD * 0.5**each * _steps(self.per_round, self.task.action.size, duration)
             near = np.clip(centres[:, np.arange(self.per_round) % centres.shape[1]] + steps, -1.0, 1.0)
             candidates = np.concatenate((candidates, near), axis=1)
             merit = np.concatenate((merit, merits(self.task, problem, near, setting)), axis=1)
@@ -161,12 +163,13 @@ class GeometrySearch:
         plan = self.task.action.decode(self.solve(problem), problem.start, problem.goal).take(0)
         return checked_motion(self.task.arm, self.task.space_name, plan, problem.obstacles, self.name)
 
-    def _steps(self, moving: bool) -> Single:
-        """Return steps of a round of refinement, shape (per_round, m); from rest the duration stays as it is."""
-        size, at = self.task.action.size, self.task.n_via * self.task.action.dimension
-        if moving or not at:
-            return sobol_actions(self.per_round + 1, size)[1:]
-        return np.insert(sobol_actions(self.per_round + 1, size - 1)[1:], at, 0.0, axis=1)
+
+@functools.cache
+def _steps(number: int, size: int, duration: int | None) -> Single:
+    """Return steps of a round of refinement, shape (number, size); the component of the duration is zero if given."""
+    if duration is None:
+        return sobol_actions(number + 1, size)[1:]
+    return np.insert(sobol_actions(number + 1, size - 1)[1:], duration, 0.0, axis=1)
 
 
 def best_of(task: Task, problem: Problem, actions: Numbers, merit: Numbers) -> Numbers:
@@ -250,13 +253,12 @@ def _clearances(
     """Return the clearances of H plans in each of B problems, see :func:`plan_clearances`."""
     number, plans = moves.duration.shape
     found = np.empty((number, plans))
-    placed = memory(setting.chain, setting.spheres)
-    position, joints = np.empty(start.shape[1]), np.empty(len(setting.joint_range))
+    memory = memory_of(setting, table, start.shape[1])
     for b in range(number):
         for h in range(plans):
             found[b, h] = least_clearance(
                 setting, table, moves.times[b, h], start[b], moves.offsets[b, h], moves.duration[b, h],
-                obstacles, b, most, least, HORIZONS[0], position, joints, placed,
+                obstacles, b, most, least, HORIZONS[0], memory,
             )  # fmt: skip
     return found
 
@@ -275,33 +277,20 @@ def _merits(
     """Return the merits of H plans in each of B problems, see :func:`merits`."""
     number, plans = worth.shape
     found = np.full((number, plans), 3.0 * INFEASIBLE)
-    placed = memory(setting.chain, setting.spheres)
-    position, joints = np.empty(start.shape[1]), np.empty(len(setting.joint_range))
+    memory = memory_of(setting, table, start.shape[1])
     high = CLEARANCE_RANGE[1]
     for b in range(number):
         order = np.argsort(-worth[b])
         for rank in range(len(horizons)):
             best, deepest = 2.0 * INFEASIBLE, -1e9
             for h in order:
-                if worth[b, h] + gain * high <= best:
+                if worth[b, h] + gain * high - rank <= best:
                     break
                 floor = CLEARANCE_MARGIN if best > INFEASIBLE else min(deepest, CLEARANCE_MARGIN)
                 clearance = least_clearance(
-                    setting,
-                    table,
-                    moves.times[b, h],
-                    start[b],
-                    moves.offsets[b, h],
-                    moves.duration[b, h],
-                    obstacles,
-                    b,
-                    high,
-                    floor,
-                    horizons[rank],
-                    position,
-                    joints,
-                    placed,
-                )
+                    setting, table, moves.times[b, h], start[b], moves.offsets[b, h], moves.duration[b, h],
+                    obstacles, b, high, floor, horizons[rank], memory,
+                )  # fmt: skip
                 if clearance >= CLEARANCE_MARGIN:
                     value = worth[b, h] + gain * clearance - rank
                     best = max(best, value)
