@@ -192,7 +192,7 @@ def test_gradient_of_the_objective(kwargs) -> None:
     dimension = task.space.dimension
     generator = np.random.default_rng(0)
     hessian, gradient = np.empty((2 * dimension, 2 * dimension)), np.empty(2 * dimension)
-    work = refine._work(setting, 5, dimension)
+    work = refine._work(setting, 5, dimension, obstacles[0], 0)
 
     def objective(problem, offsets) -> float:
         start, scene = problem

@@ -17,7 +17,9 @@ from viapoint.envs.arms.inverse_kinematics import solve_symmetric
 from viapoint.envs.arms.kinematics import point_jacobian
 from viapoint.envs.common.types import Float, Int
 from viapoint.envs.geometry.clearance import (
+    WINDOW,
     Placed,
+    fastest,
     group_clearance,
     memory,
     movement_clearance,
@@ -106,10 +108,14 @@ class _Work(NamedTuple):
     force: Float
     """Sum of residual times row at one instant, shape (D,)."""
     gram: Float
+    seen: Float
+    """Place of the ball of each group at its last look for obstacles, its clearance then, and the time, shape (G, 5)."""
+    speed: float
+    """Greatest speed of an obstacle, [m/s]."""
 
 
 @compiled
-def _work(setting: Setting, columns: int, dimension: int) -> _Work:
+def _work(setting: Setting, columns: int, dimension: int, obstacles: Obstacles, scene: int) -> _Work:
     """Return memory for a refinement."""
     joints = len(setting.joint_range)
     return _Work(
@@ -122,6 +128,8 @@ def _work(setting: Setting, columns: int, dimension: int) -> _Work:
         np.empty((dimension, dimension)),
         np.empty(dimension),
         np.empty((columns, columns)),
+        np.empty((len(setting.spheres.link), 5)),
+        fastest(obstacles, scene),
     )
 
 
@@ -180,10 +188,19 @@ def _add_obstacles(
             continue
         u, v, w = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
         size = spheres.ball_radius[group]
+        # After a far look, no obstacle matters to a group before its ball has come as much nearer.
+        seen = work.seen[group]
+        way = math.sqrt((u - seen[0]) ** 2 + (v - seen[1]) ** 2 + (w - seen[2]) ** 2)
+        if seen[3] - way - work.speed * abs(time - seen[4]) >= wanted:
+            continue
+        far = wanted + WINDOW
+        seen[0], seen[1], seen[2], seen[3], seen[4] = u, v, w, far, time
         for row in range(obstacles.kind.shape[1]):
             if obstacles.kind[scene, row] == ABSENT:
                 continue
-            if point_distance(obstacles, scene, row, u, v, w, time, wanted + size) - size >= wanted:
+            apart = point_distance(obstacles, scene, row, u, v, w, time, far + size) - size
+            seen[3] = min(seen[3], apart)
+            if apart >= wanted:
                 continue
             least, sphere = group_clearance(spheres, placed, group, obstacles, scene, row, time, wanted, -1e9)
             if sphere < 0:
@@ -295,6 +312,7 @@ def _assemble(
     for d in range(dimension):
         resting = resting and offsets[vias + 1, d] == 0.0 and offsets[vias + 2, d] == 0.0
     begin = aim.stride // 2 + (SLOW if resting else 0)
+    work.seen[:] = -1e9
     for k in range(begin, last + 1 - SLOW, aim.stride):
         reached = joints_at(setting, table, times, k, start, offsets, work.position, work.joints)
         place(setting.chain, setting.spheres, work.joints, work.placed)
@@ -427,7 +445,7 @@ def refine_seeds(
         enough: Number of free movements after which to stop.
     """
     number, vias, dimension = seeds.shape
-    work = _work(setting, vias + 3, dimension)
+    work = _work(setting, vias + 3, dimension, obstacles, scene)
     found = Found(seeds.copy(), np.zeros(number, np.int64), np.full(number, np.inf), np.full(number, -1.0))
     # The refined movement, and the polished ones, each of which is smoother than the one before.
     stages = len(aims)
