@@ -317,7 +317,9 @@ def scene_from_json(text: str | bytes) -> dict[str, Any]:
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"the scene file is not JSON: {error}") from None
     if not isinstance(record, Mapping) or record.get("format") != FORMAT:
-        raise ValueError(f'a scene file is a JSON object with "format": "{FORMAT}"')
+        raise ValueError(
+            f'a scene file is a JSON object with "format": "{FORMAT}"; obstacles alone are a JSON list of objects'
+        )
     options = {name: value for name, value in record.items() if name not in ("format", "env")}
     _refuse_unknown(options)
     if "obstacles" in options:

@@ -36,17 +36,16 @@ def run(config: PlanConfig) -> None:
         rng=config.seed,
     )
     print(plan)
+    if not plan.success and not config.force:
+        raise ValueError(f"no plan is safe: {plan.reason}; --force writes it nevertheless")
     if config.out is not None:
         motion = write_motion(plan, config.out, config.rate, force=config.force)
         print(f"{len(motion.time)} instants at {config.rate:g} Hz: {config.out}")
     if config.video is not None:
         from viapoint.training.plotting.video import record_plan
 
-        plan.refuse_unsafe(config.force)
         config.video.parent.mkdir(parents=True, exist_ok=True)
         print(f"{record_plan(config.video, plan)} frames: {config.video}")
-    if not plan.success and not config.force:
-        raise ValueError(f"no plan is safe: {plan.reason}")
 
 
 def arm_for(config: PlanConfig) -> Arm:

@@ -361,6 +361,12 @@ def _goals(problem: _Problem, goal: Any) -> Float:
         found = inverse_kinematics(problem.arm, pose.position, pose.quaternion, seed=near)
         return problem.space.coordinates(found[:GOALS])
     several = np.ndim(goal) > 1
+    number = np.shape(goal)[-1:] or (0,)
+    if number != (len(problem.start),) and number in ((3,), (7,)):
+        raise ValueError(
+            f"goal must be {len(problem.start)} coordinates, got {number[0]}; a place in space is "
+            "goal=Pose(position=(x, y, z)), with quaternion=(w, x, y, z) for the direction of the tool"
+        )
     goals = finite_array("goal", goal if several else [goal], (None, len(problem.start)))
     if problem.arm.continuous and not problem.space.of_hand:
         # The equivalent position that is nearest to the middle of the range.
@@ -470,7 +476,7 @@ def _straight(problem: _Problem) -> _Movement:
     if problem.duration is None and problem.moves:
         still = np.zeros_like(problem.start)
         resting = problem._replace(velocity=still, acceleration=still)
-        duration = _timed(resting, movement, 0.0)[0]
+        duration = _timed(resting, movement, 0.0).duration
         movement = movement._replace(duration=LONGER * duration)
     return movement
 
@@ -554,7 +560,7 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
     """Return a movement along a path of OMPL, with as many via-points as it needs; None if there is none."""
     patience = until - time.perf_counter()
     try:
-        import_ompl()
+        import_ompl()  # the first time takes a second that does not count
     except ValueError:
         return None
     ends = np.ascontiguousarray(problem.space.joints(np.stack((problem.start, problem.goal))))
@@ -574,8 +580,21 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
     return None
 
 
-def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple[float, Limits]:
-    """Return the duration of a movement and the shares of the limits that it then uses.
+class _Timed(NamedTuple):
+    """Duration of a movement, and what it needs of the limits."""
+
+    duration: float
+    """Duration, [s]."""
+    limits: Limits
+    """Shares of the limits that the movement uses."""
+    joint: int
+    """Index of the joint that is nearest to a limit, or the farthest beyond it."""
+    shortest: float
+    """Shortest duration that keeps the limits, for a movement from rest, [s]."""
+
+
+def _timed(problem: _Problem, movement: _Movement, least: float | None) -> _Timed:
+    """Return the duration of a movement and what it needs of the limits.
 
     Args:
         problem: Problem.
@@ -589,16 +608,16 @@ def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple
     acceleration = movement.table.bend[movement.times, ::LIMIT_STRIDE] @ offsets / duration**2
     sampled = Motion(position[None], velocity[None], acceleration[None])
     motion = Motion(*(np.ascontiguousarray(part[0]) for part in problem.space.joint_motion(sampled)))
-    factor = 1.0
-    if least is not None:
-        factor = max(slowdown(arm.chain, arm.velocity_limit, arm.torque_limit, *motion), least)
-        if least == 0.0:  # a start that is the goal needs a duration, too
-            shortest = SHORTEST_DURATION if np.isfinite(arm.velocity_limit).all() else UNLIMITED
-            factor = max(factor, shortest / duration)
+    needed = slowdown(arm.chain, arm.velocity_limit, arm.torque_limit, *motion)
+    factor = 1.0 if least is None else max(needed, least)
+    if least == 0.0:  # a start that is the goal needs a duration, too
+        shortest = SHORTEST_DURATION if np.isfinite(arm.velocity_limit).all() else UNLIMITED
+        factor = max(factor, shortest / duration)
     rate, change = motion.velocity / factor, motion.acceleration / factor**2
     torque = torques(arm.chain, motion.position, rate, change)
-    shares = np.abs(rate) / arm.velocity_limit, np.abs(torque) / arm.torque_limit
-    return factor * duration, Limits(float(shares[0].max()), float(shares[1].max()))
+    shares = np.stack((np.abs(rate) / arm.velocity_limit, np.abs(torque) / arm.torque_limit)).max(axis=1)
+    limits = Limits(float(shares[0].max()), float(shares[1].max()))
+    return _Timed(factor * duration, limits, int(shares.max(axis=0).argmax()), needed * duration)
 
 
 def _is_free(problem: _Problem, movement: _Movement, kept: float) -> bool:
@@ -622,7 +641,8 @@ def _result(problem: _Problem, movement: _Movement, fault: str) -> MotionPlan:
 
 def _known(problem: _Problem, movement: _Movement, fault: str, least: float | None) -> MotionPlan:
     """Return a movement with what is known of it; see :func:`_timed` for its duration."""
-    duration, limits = _timed(problem, movement, least)
+    timed = _timed(problem, movement, least)
+    duration, limits = timed.duration, timed.limits
     movement = movement._replace(duration=duration)
     clearance = movement.clearance
     if clearance is None:
@@ -636,7 +656,11 @@ def _known(problem: _Problem, movement: _Movement, fault: str, least: float | No
     elif not reason and clearance < problem.margin:
         reason = f"its clearance is {1e3 * clearance:.1f} mm, less than {1e3 * problem.margin:g} mm"
     elif not reason and max(limits) > 1.0:
-        reason = f"it needs {limits.velocity:.2f} of a velocity and {limits.torque:.2f} of a torque limit"
+        kind = "velocity" if limits.velocity > limits.torque else "torque"
+        reason = (
+            f"joint {problem.arm.joint_names[timed.joint]!r} needs {max(limits):.2f} times its {kind} limit "
+            f"in {timed.duration:.2f} s; the shortest duration is {timed.shortest:.2f} s"
+        )
     return MotionPlan(
         arm=problem.arm,
         space=problem.space.name,

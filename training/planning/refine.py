@@ -109,7 +109,7 @@ class _Work(NamedTuple):
     """Sum of residual times row at one instant, shape (D,)."""
     gram: Float
     seen: Float
-    """Place of the ball of each group at its last look for obstacles, its clearance then, and the time, shape (G, 5)."""
+    """Place of the ball of each group at the last look for obstacles, its clearance, and the time, shape (G, 5)."""
     speed: float
     """Greatest speed of an obstacle, [m/s]."""
 
