@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from viapoint.training.config.configs import TrainConfig
     from viapoint.training.evaluation.evaluator import EvaluationResult, evaluate
     from viapoint.training.live.page import LivePage
+    from viapoint.training.planning.export import read_motion, write_motion
     from viapoint.training.planning.motion_plan import MotionPlan, UnsafePlanError
     from viapoint.training.planning.observe_candidates import ObserveCandidates, VectorObserveCandidates
     from viapoint.training.planning.plan_motion import plan_motion, plan_motions
@@ -54,6 +55,8 @@ __all__ = [
     "load_agent",
     "plan_motion",
     "plan_motions",
+    "read_motion",
     "run_study",
     "train",
+    "write_motion",
 ]

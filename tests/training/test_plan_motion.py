@@ -308,7 +308,7 @@ def test_command_line_plans_and_measures(tmp_path, capsys) -> None:
     scene.write_text(obstacles_to_json(WALL))
     with pytest.raises(SystemExit):
         main([*words, "--time-limit", "0"])
-    assert "not safe" in capsys.readouterr().err
+    assert "no plan is safe" in capsys.readouterr().err
     main(
         [
             "evaluate",

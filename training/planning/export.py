@@ -43,8 +43,7 @@ def write_motion(
     Example:
         >>> import numpy as np
         >>> from viapoint.envs import arm_of
-        >>> from viapoint.training import plan_motion
-        >>> from viapoint.training.planning.export import read_motion, write_motion
+        >>> from viapoint.training import plan_motion, read_motion, write_motion
         >>> arm = arm_of("panda")
         >>> motion = write_motion(plan_motion(arm, arm.home, np.zeros(7) + [0, 0, 0, -1, 0, 1, 0]), "runs/plan.csv")
         >>> names, again = read_motion("runs/plan.csv")
@@ -65,6 +64,15 @@ def read_motion(path: str | Path) -> tuple[tuple[str, ...], JointMotion]:
 
     Raises:
         ValueError: The file is no such file.
+
+    Example:
+        >>> from viapoint.envs import arm_of
+        >>> from viapoint.training import plan_motion, read_motion, write_motion
+        >>> plan = plan_motion("planar", (-0.2, 0.3), (0.1, 0.4))
+        >>> _ = write_motion(plan, "runs/planar.csv")
+        >>> names, motion = read_motion("runs/planar.csv")
+        >>> names, motion.position.shape[1]
+        (('shoulder', 'elbow'), 2)
     """
     path = Path(path).expanduser()
     form = _form(path)
