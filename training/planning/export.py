@@ -47,7 +47,7 @@ def write_motion(
         >>> arm = arm_of("panda")
         >>> motion = write_motion(plan_motion(arm, arm.home, np.zeros(7) + [0, 0, 0, -1, 0, 1, 0]), "runs/plan.csv")
         >>> names, again = read_motion("runs/plan.csv")
-        >>> names == arm.joint_names, np.abs(again.position - motion.position).max() < 1e-9
+        >>> names == arm.joint_names, np.allclose(again.position, motion.position)
         (True, True)
     """
     path = Path(path).expanduser()
