@@ -13,6 +13,7 @@ from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import (
     Placed,
     configuration_clearances,
+    fastest,
     memory,
     movement_clearance,
     obstacle_clearance,
@@ -20,11 +21,11 @@ from viapoint.envs.geometry.clearance import (
     travel,
 )
 from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.obstacles import ABSENT, BOX, CYLINDER, HALF_SPACE, MESH, Obstacles
+from viapoint.envs.geometry.obstacles import ABSENT, BOX, CYLINDER, HALF_SPACE, MESH, POINT_CLOUD, Obstacles
 from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Rollout, Tolerance
 from viapoint.envs.plans import Motion
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.simulator import SimulationLog, Simulator
+from viapoint.envs.simulator import MOST_BETWEEN, SimulationLog, Simulator
 from viapoint.envs.spaces import Space
 
 BLOCK = 32
@@ -75,11 +76,7 @@ class Executor:
         """Start episodes at rest at joint positions, shape (n, J), among the obstacles of n scenes."""
         arm = self.simulator.arm
         self.simulator.place(rows, joints, obstacles)
-        first = np.empty((len(rows), 2))
-        for i in range(len(rows)):
-            first[i] = movement_clearance(
-                arm.chain, arm.spheres, arm.reach, joints[i : i + 1], obstacles, i, 0.0, 0.0, self._placed
-            )
+        first = configuration_clearances(arm.chain, arm.spheres, joints, obstacles, np.zeros(len(rows)))
         self.state.begin(rows, joints, arm.hand(joints), first[:, 0], first[:, 1])
         for row in rows:
             self.past[row] = []
@@ -128,61 +125,58 @@ class Executor:
             centres = block.obstacles.centre[:, None] + time * block.obstacles.velocity[:, None]
         log = self.simulator.rollout(block.rows, controls, block.steps, centres, resume=resume)
         self._look_between(block, log)
+        steps = _measure_all(
+            arm.chain,
+            arm.spheres,
+            arm.reach,
+            arm.joint_range,
+            self.space.of_hand,
+            log.joints,
+            log.contact,
+            motion.position,
+            path,
+            block.steps,
+            block.obstacles,
+            timestep,
+            block.goal,
+            self.tolerance.goal,
+            self.tolerance.speed,
+            self.state,
+            block.rows,
+            self._placed,
+        )
         for i, row in enumerate(block.rows):
-            steps = _measure(
-                arm.chain,
-                arm.spheres,
-                arm.reach,
-                arm.joint_range,
-                self.space.of_hand,
-                log.joints[i],
-                log.contact[i],
-                motion.position[i],
-                path[i],
-                int(block.steps[i]),
-                block.obstacles,
-                i,
-                timestep,
-                block.goal[i],
-                self.tolerance.goal,
-                self.tolerance.speed,
-                self.state,
-                int(row),
-                self._placed,
-            )
-            piece = log.joints[i, :steps], motion.position[i, 1 : steps + 1], log.contact[i, :steps]
-            self.past[row].append((piece[0].copy(), piece[1].copy(), piece[2].copy()))
+            end = steps[i]
+            piece = log.joints[i, :end], motion.position[i, 1 : end + 1], log.contact[i, :end]
+            self.past[row].append(piece)
         self.state.unstable[block.rows] |= log.unstable
 
     def _look_between(self, block: Segment, log: SimulationLog) -> None:
         """Mark contacts between physics steps, which bodies have that are thin compared with their way in a step."""
         arm, timestep = self.simulator.arm, self.simulator.timestep
-        for i, row in enumerate(block.rows):
-            thin = self.simulator.thinnest + _thinnest(block.obstacles, i)
-            steps = int(block.steps[i])
-            for k in _risky_steps(
-                arm.chain,
-                arm.spheres,
-                arm.reach,
-                log.joints[i, :steps],
-                log.contact[i, :steps],
-                block.obstacles,
-                i,
-                timestep,
-                0.5 * thin,
-                self._placed,
-            ):
-                ends = log.joints[i, k], log.joints[i, k + 1]
-                places = [
-                    block.obstacles.centre[i] + timestep * (k + 1 + later) * block.obstacles.velocity[i]
-                    for later in (0, 1)
-                ]
-                way = travel(arm.reach, *ends) + np.abs(places[1] - places[0]).max(initial=0.0)
-                if self.simulator.touches_between(
-                    int(row), ends, (places[0], places[1]), int(2.0 * way / thin)
-                ):
-                    log.contact[i, k + 1] = True
-                    break
+        risky = _risky_steps(
+            arm.chain,
+            arm.spheres,
+            arm.reach,
+            log.joints,
+            log.contact,
+            block.steps,
+            block.obstacles,
+            timestep,
+            self.simulator.thinnest,
+            self._placed,
+        )
+        for i, k, number in risky:
+            if log.contact[i, : k + 1].any():
+                continue
+            ends = log.joints[i, k], log.joints[i, k + 1]
+            before, after = (
+                block.obstacles.centre[i] + timestep * (k + later) * block.obstacles.velocity[i]
+                for later in (1, 2)
+            )
+            log.contact[i, k + 1] = self.simulator.touches_between(
+                int(block.rows[i]), ends, (before, after), number
+            )
 
 
 @compiled
@@ -198,7 +192,7 @@ def _thinnest(obstacles: Obstacles, scene: int) -> float:
             half = min(half, obstacles.size[scene, row, 1])
         if kind == BOX:
             half = min(half, obstacles.size[scene, row, 2])
-        thin = min(thin, half if kind < MESH else 0.0)
+        thin = min(thin, 0.0 if kind in (MESH, POINT_CLOUD) else half)
     return thin
 
 
@@ -207,35 +201,49 @@ def _risky_steps(
     chain: Chain,
     spheres: Spheres,
     reach: Float,
-    path: Float,
+    joints: Float,
     contact: Bool,
+    steps: Int,
     obstacles: Obstacles,
-    scene: int,
     timestep: float,
-    longest: float,
+    thinnest: float,
     placed: Placed,
-) -> list[int]:
-    """Return steps in which the arm may have passed through something thin.
+) -> list[tuple[int, int, int]]:
+    """Return steps in which the arm may have passed through something thin: scene, step, and states to look at.
 
-    These are steps longer than `longest` [m] from a state without contact to another, with a clearance at the first
-    state that is less than the way.
+    Bodies move by more than half their thickness in these steps, from a state without contact to another, and both
+    clearances together are less than the way: otherwise no state between them can be in contact.
+
+    Args:
+        chain: Chain of the arm.
+        spheres: Spheres of the arm.
+        reach: Reach of the joints.
+        joints: Joint positions after each step, shape (n, T, J), [rad].
+        contact: True where there is a contact at the state before a step, shape (n, T).
+        steps: Number of steps of each scene, shape (n,).
+        obstacles: Obstacles of n scenes.
+        timestep: Length of a step, [s].
+        thinnest: Half the thickness of the thinnest part of the arm, [m].
+        placed: Memory.
     """
-    found = [0 for _ in range(0)]
+    found = [(0, 0, 0) for _ in range(0)]
     if obstacles.kind.shape[1] == 0:
         return found
-    fast = 0.0
-    for row in range(obstacles.kind.shape[1]):
-        if obstacles.kind[scene, row] != ABSENT:
-            speed = np.abs(obstacles.velocity[scene, row]).sum()
-            fast = max(fast, speed)
-    for k in range(len(path) - 1):
-        way = travel(reach, path[k], path[k + 1]) + fast * timestep
-        if way <= longest or contact[k] or contact[k + 1]:
-            continue
-        place(chain, spheres, path[k], placed)
-        time = timestep * (k + 1)
-        if obstacle_clearance(spheres, placed, obstacles, scene, time, way, 0.0) < way:
-            found.append(k)
+    for scene in range(len(joints)):
+        thin = thinnest + _thinnest(obstacles, scene)
+        drift = timestep * fastest(obstacles, scene)
+        path = joints[scene]
+        for k in range(steps[scene] - 1):
+            way = travel(reach, path[k], path[k + 1]) + drift
+            if way <= 0.5 * thin or contact[scene, k] or contact[scene, k + 1]:
+                continue
+            apart = 0.0
+            for state in (k, k + 1):
+                place(chain, spheres, path[state], placed)
+                time = timestep * (state + 1)
+                apart += obstacle_clearance(spheres, placed, obstacles, scene, time, way, -way)
+            if apart < way:
+                found.append((scene, k, int(min(2.0 * way / thin, MOST_BETWEEN))))
     return found
 
 
@@ -263,26 +271,7 @@ def _measure(
 ) -> int:
     """Add one executed segment to the metrics of an episode, and return how many of its steps count.
 
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        reach: Reach of the joints.
-        joint_range: Ranges of the joints, shape (J, 2), [rad].
-        of_hand: True if references are of the hand, False if they are of the joints.
-        joints: Joint positions after each step, shape (T, J), [rad].
-        contact: True where there is a contact at the state before a step, shape (T,).
-        planned: References before the first step and after each, shape (T + 1 or more, D).
-        path: Joint positions that belong to them, shape (T + 1 or more, J), [rad].
-        steps: Number of steps.
-        obstacles: Obstacles of the block.
-        scene: Index of the scene in the block.
-        timestep: Length of a step, [s].
-        goal: Goal, shape (D,).
-        goal_tolerance: Greatest distance from the goal at rest.
-        rest_speed: Greatest speed at rest.
-        state: Metrics, which are changed.
-        row: Index of the episode.
-        placed: Memory.
+    The arguments are those of :func:`_measure_all` for one scene.
     """
     begin, commanded = state.steps[row], steps
     for k in range(steps):
@@ -335,3 +324,56 @@ def _measure(
     )
     state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
     return steps
+
+
+@compiled
+def _measure_all(
+    chain: Chain,
+    spheres: Spheres,
+    reach: Float,
+    joint_range: Float,
+    of_hand: bool,
+    joints: Float,
+    contact: Bool,
+    planned: Float,
+    path: Float,
+    steps: Int,
+    obstacles: Obstacles,
+    timestep: float,
+    goal: Float,
+    goal_tolerance: float,
+    rest_speed: float,
+    state: EpisodeState,
+    rows: Int,
+    placed: Placed,
+) -> Int:
+    """Add executed segments to the metrics of n episodes, and return how many of their steps count, shape (n,).
+
+    Args:
+        chain: Chain of the arm.
+        spheres: Spheres of the arm.
+        reach: Reach of the joints.
+        joint_range: Ranges of the joints, shape (J, 2), [rad].
+        of_hand: True if references are of the hand, False if they are of the joints.
+        joints: Joint positions after each step, shape (n, T, J), [rad].
+        contact: True where there is a contact at the state before a step, shape (n, T).
+        planned: References before the first step and after each, shape (n, T + 1 or more, D).
+        path: Joint positions that belong to them, shape (n, T + 1 or more, J), [rad].
+        steps: Numbers of steps, shape (n,).
+        obstacles: Obstacles of n scenes.
+        timestep: Length of a step, [s].
+        goal: Goals, shape (n, D).
+        goal_tolerance: Greatest distance from the goal at rest.
+        rest_speed: Greatest speed at rest.
+        state: Metrics, which are changed.
+        rows: Indices of the episodes, shape (n,).
+        placed: Memory.
+    """
+    done = np.empty_like(steps)
+    for scene in range(len(rows)):
+        done[scene] = _measure(
+            chain, spheres, reach, joint_range, of_hand, joints[scene], contact[scene], planned[scene], path[scene],
+            steps[scene], obstacles, scene, timestep, goal[scene], goal_tolerance, rest_speed, state, rows[scene],
+            placed,
+        )  # fmt: skip
+    return done
