@@ -28,8 +28,9 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.simulator import MOST_BETWEEN, SimulationLog, Simulator
 from viapoint.envs.spaces import Space
 
-BLOCK = 32
-"""Movements that are executed together: few enough for the processor's cache, and of similar length."""
+BLOCK, SIMILAR = 32, 1.1
+"""Greatest number of movements that are executed together, few enough for the processor's cache, and the greatest
+length of one relative to another: all run as long as the longest one."""
 CONTROL_STRIDE = 4
 """Physics steps between two computed torques; those in between are interpolated linearly."""
 
@@ -91,12 +92,17 @@ class Executor:
             moving: True if obstacles move.
         """
         order = np.argsort(segment.steps, kind="stable")
-        for first in range(0, len(order), BLOCK):
-            some = np.sort(order[first : first + BLOCK])
+        length = segment.steps[order]
+        first = 0
+        while first < len(order):
+            similar = int(np.searchsorted(length, SIMILAR * length[first], side="right"))
+            last = min(similar, first + BLOCK)
+            some = np.sort(order[first:last])
             block = Segment(
                 segment.rows[some], segment.steps[some], segment.obstacles.take(some), segment.goal[some]
             )
             self._run_block(block, references, resume, moving)
+            first = last
 
     def rollout(self, pieces: Pieces, scene: Scenes) -> Rollout:
         """Return an episode that was recorded in pieces, in its scene."""

@@ -72,6 +72,18 @@ class Plan(NamedTuple):
         )
 
 
+def movements_at(movements: primitives.Trajectory, rows: Any) -> primitives.Trajectory:
+    """Return the movements at `rows`, an index array, of a batch with one axis."""
+    return primitives.Trajectory(
+        movements.coefficients[rows],
+        movements.durations[rows],
+        movements.order,
+        movements.starts[rows],
+        movements.rates[rows],
+        movements.end[rows],
+    )
+
+
 class Motion(NamedTuple):
     """States of references, shape (..., D) each."""
 
@@ -198,6 +210,10 @@ class ActionLayout:
         action = finite_array("action", action, (..., self.size))
         start = finite_array("start", start, (..., self.dimension))
         goal = finite_array("goal", goal, (..., self.dimension))
+        return self.plans(action, start, goal)
+
+    def plans(self, action: Float, start: Float, goal: Float) -> Plan:
+        """Return the movements of actions that are known to be good; see :meth:`decode`."""
         waypoints = self.waypoints(action, start, goal)
         factor = self.centre * np.exp(action[..., self.n_via * self.dimension] * self.log_half_range)
         shares = self.shares(waypoints, action)

@@ -315,21 +315,22 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Raises:
             ValueError: A target is out of reach; the episodes are unchanged.
         """
-        scenes, space = self._check_running(), self.task.space
+        self._check_running()
+        space = self.task.space
         goals = finite_array("goals", goals, (self.num_envs, space.dimension))
         inside = space.inside(goals)
         if not inside.all():
             row = int(inside.argmin())
             raise ValueError(f"goals must be within the arm's reach, got {goals[row].tolist()} in row {row}")
         joints = space.joints(goals)
-        check_jumps(scenes._replace(goal=joints), self.arm)
+        assert self.scenes is not None
+        check_jumps(self.scenes._replace(goal=joints), self.arm)
         self._each(lambda episodes, share: episodes.move_goals(joints[share]))
         return self.observe()
 
     def observe(self) -> Observation:
         """Return the present observations."""
-        parts = [each.observe() for each in self._episodes]
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return _together([each.observe() for each in self._episodes])
 
     def state(self) -> dict[str, Any]:
         """Return scenes, random generators and running episodes as values and arrays for :meth:`restore`.
@@ -411,13 +412,11 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def _joined(self, parts: list[Decision]) -> Decision:
         """Return the decisions of all environments together."""
-        observation = {
-            name: np.concatenate([part.observation[name] for part in parts]) for name in parts[0].observation
-        }
-        info = {name: np.concatenate([part.info[name] for part in parts]) for name in parts[0].info}
+        observation = _together([part.observation for part in parts])
+        info = _together([part.info for part in parts])
+        reward = np.concatenate([part.reward for part in parts])
         self.terminated = np.concatenate([part.terminated for part in parts])
         self.truncated = np.concatenate([part.truncated for part in parts])
-        reward = np.concatenate([part.reward for part in parts])
         return Decision(observation, reward, self.terminated, self.truncated, info)
 
     def _as_step(
@@ -475,12 +474,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                     f"movement; here it is {self.task.decide_at!r}"
                 )
 
-    def _check_running(self) -> Scenes:
-        """Return the running scenes, or raise an error before the first reset."""
-        scenes = self.scenes
-        if scenes is None:
+    def _check_running(self) -> None:
+        """Raise an error before the first reset."""
+        if not self._running:
             raise gym.error.ResetNeeded("the episodes have not begun: call reset() before step()")
-        return scenes
 
     def _seeded(
         self, seed: int | Sequence[int | None] | None, rows: Int
@@ -494,6 +491,13 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                 generators[i], used = seeding.np_random(seeds[i])
                 first_seed = used if i == 0 else first_seed
         return generators, first_seed
+
+
+def _together(parts: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the arrays of all environments by name, from those of the environments of each thread."""
+    if len(parts) == 1:
+        return parts[0]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:

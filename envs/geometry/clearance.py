@@ -334,9 +334,7 @@ def _forget(placed: Placed) -> None:
 
 
 @inlined
-def _move(
-    reach: Float, first: Float, second: Float, drift: float, spheres: Spheres, placed: Placed
-) -> None:
+def _move(reach: Float, first: Float, second: Float, drift: float, spheres: Spheres, placed: Placed) -> None:
     """Lower the bounds of clearance by what spheres, and obstacles by `drift`, may move between two configurations.
 
     Seen from its first link, a pair of groups is moved by the joints between both links alone.

@@ -187,7 +187,7 @@ def evaluated(task: Task, scenes: Scenes, actions: Float) -> list[Proposal]:
     problem = Problem.of_scenes(scenes, task)
     plans = _plans(task, problem, actions)
     worth = worth_of(task, problem, moves_of(task, problem, actions[None]))[0]
-    cost = jerk_cost_between(plans, np.zeros(len(actions)), plans.duration)
+    cost = jerk_cost_between(plans.trajectory(), np.zeros(len(actions)), plans.duration)
     straight = straight_jerk_cost(norm(problem.goal - problem.start), plans.duration)
     found = []
     for i in range(len(actions)):
