@@ -27,15 +27,13 @@ from viapoint.envs.common.validation import (
     whole_number,
 )
 from viapoint.envs.episodes import Decision, Episodes, History
-from viapoint.envs.events import Trigger
 from viapoint.envs.geometry.obstacles import check_simulated
 from viapoint.envs.outcome import Rollout
-from viapoint.envs.plans import Plan, SpaceName, Timing
+from viapoint.envs.plans import Plan
 from viapoint.envs.rendering.renderer import RENDER_MODES, EpisodeRenderer
-from viapoint.envs.rewards import RewardWeights
 from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.scenes.scene import Scenes, check_jumps
-from viapoint.envs.task import END, Task
+from viapoint.envs.task import Task
 
 SINGLE_METADATA: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
 METADATA: dict[str, Any] = {**SINGLE_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -91,34 +89,25 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self,
         num_envs: int = 1,
         *,
-        arm: Arm | str = "planar",
-        space: SpaceName | None = None,
-        n_via: int = 1,
-        timing: Timing = "optimal",
-        duration_range: tuple[float, float] | None = None,
-        n_obstacles: int | tuple[int, int] = (1, 5),
-        shapes: str | Sequence[str] | None = None,
-        families: str | Sequence[str] | None = None,
-        whole_arm: bool = False,
-        moving_obstacles: bool = False,
-        n_jumps: int | tuple[int, int] = 0,
-        decide_at: str | Sequence[Trigger] = END,
-        horizon: float = 0.3,
-        margin: float = 0.02,
-        control_step: float = 0.04,
-        reward_weights: RewardWeights | Mapping[str, float] | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
         width: int = 480,
         height: int = 480,
         threads: int = 0,
+        **task: Any,
     ) -> None:
-        given = as_given(
-            {name: value for name, value in locals().items() if name not in ("self", "__class__")}
+        task = as_given(task)
+        EzPickle.__init__(
+            self,
+            num_envs,
+            autoreset_mode=autoreset_mode,
+            render_mode=render_mode,
+            width=width,
+            height=height,
+            threads=threads,
+            **task,
         )
-        EzPickle.__init__(self, **given)
-        own = ("num_envs", "autoreset_mode", "render_mode", "width", "height", "threads")
-        self.task = Task.of(**{name: value for name, value in given.items() if name not in own})
+        self.task = Task.of(**task)
         """Task of an episode: what an agent may compute with before it moves."""
         self.num_envs = whole_number("num_envs", num_envs, 1)
         self.autoreset_mode = _mode_of(autoreset_mode)

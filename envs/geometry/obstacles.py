@@ -10,8 +10,8 @@ import numpy as np
 from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.clouds import Cloud, Clouds, join_clouds, split_clouds
-from viapoint.envs.geometry.meshes import Mesh, Meshes, join_meshes, split_meshes
+from viapoint.envs.geometry.clouds import Clouds, join_clouds, split_clouds
+from viapoint.envs.geometry.meshes import Meshes, join_meshes, split_meshes
 from viapoint.envs.geometry.shapes import (
     ABSENT,
     BOX,
@@ -45,7 +45,7 @@ BOXES = np.array([shape.box for shape in SHAPES], np.float64)
 GEOMS = np.array([shape.geom for shape in SHAPES])
 """MuJoCo's geoms by kind."""
 
-Table = TypeVar("Table", Mesh, Cloud)
+Table = TypeVar("Table", Meshes, Clouds)
 
 
 class Obstacles(NamedTuple):
@@ -178,8 +178,8 @@ def pack(scenes: Sequence[Iterable[Shape | Mapping[str, Any]]], rows: int | None
     if most > rows:
         raise ValueError(f"there must be at most {rows} obstacles, got {most}")
     found = no_obstacles(len(shapes), rows)
-    meshes: list[Mesh] = []
-    clouds: list[Cloud] = []
+    meshes: list[Meshes] = []
+    clouds: list[Clouds] = []
     for scene, each in enumerate(shapes):
         if not each:
             continue
@@ -219,7 +219,7 @@ def unpack(obstacles: Obstacles, scene: int) -> list[Shape]:
             values["vertices"] = np.unique(corners.reshape(-1, 3), axis=0)
         elif shape is PointCloud:
             cloud = split_clouds(obstacles.clouds)[int(size[0])]
-            values.update(points=cloud.points, radius=cloud.radius)
+            values.update(points=cloud.points, radius=float(cloud.radius[0]))
         else:
             sizes = iter(size)
             for name, each in shape.sizes.items():
@@ -258,7 +258,7 @@ def mesh_names(meshes: Meshes) -> list[str]:
     return names
 
 
-def _same(first: Mesh | None, second: Mesh) -> bool:
+def _same(first: Meshes | None, second: Meshes) -> bool:
     """Return True for meshes with the same triangles."""
     return first is not None and np.array_equal(first.corners, second.corners)
 

@@ -25,10 +25,9 @@ from viapoint.envs.common.arrays import frame_matrices, frozen, quaternion_to
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least
-from viapoint.envs.geometry.clouds import Cloud, Clouds, build_cloud, cloud_distance, join_clouds
+from viapoint.envs.geometry.clouds import Clouds, build_cloud, cloud_distance, join_clouds
 from viapoint.envs.geometry.kernels import inlined, kernel
 from viapoint.envs.geometry.meshes import (
-    Mesh,
     Meshes,
     build_mesh,
     convex_hull,
@@ -201,9 +200,9 @@ class Shape:
     """Shape (3,), [m/s]."""
     name: str = ""
     """Name for messages."""
-    mesh: Mesh | None = field(init=False, repr=False, default=None)
+    mesh: Meshes | None = field(init=False, repr=False, default=None)
     """Triangles of a mesh."""
-    cloud: Cloud | None = field(init=False, repr=False, default=None)
+    cloud: Clouds | None = field(init=False, repr=False, default=None)
     """Point cloud with its tree."""
 
     def __post_init__(self) -> None:
@@ -261,8 +260,8 @@ class Shape:
             raise ValueError(f"radius must be 0 or greater, got {radius.min()}")
         flat = np.array(points.reshape(-1, 3))
         found = np.empty(len(flat))
-        meshes = join_meshes([] if self.mesh is None else [self.mesh])
-        clouds = join_clouds([] if self.cloud is None else [self.cloud])
+        meshes = self.mesh or join_meshes([])
+        clouds = self.cloud or join_clouds([])
         _distances(
             self.number, self.packed_size, self.rotation, np.array(self.position), meshes, clouds, flat, found
         )
