@@ -10,7 +10,7 @@ import numpy as np
 from viapoint import primitives
 from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float, Int, Observation
-from viapoint.envs.events import NEVER, Event
+from viapoint.envs.events import NEVER, Event, EventPredictor
 from viapoint.envs.executor import Executor, Pieces, Segment
 from viapoint.envs.geometry.obstacles import KINDS
 from viapoint.envs.limits import slowdowns
@@ -76,7 +76,7 @@ class Episodes:
         self._finished: tuple[Int, Scenes, list[tuple[History, Pieces]]] | None = None
         """Rows, scenes and records of the episodes before the running ones; None if they are not kept."""
         self._moving = False
-        self._events = task.events()
+        self._events = EventPredictor(task)
         self._start = np.zeros((number, task.space.dimension))
         self._zero_duration = np.ones(number)
         points = task.n_via + 2

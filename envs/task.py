@@ -18,7 +18,7 @@ from viapoint.envs.common.validation import (
     number_of_at_least,
     whole_number,
 )
-from viapoint.envs.events import TRIGGERS, EventPredictor, Trigger
+from viapoint.envs.events import TRIGGERS, Trigger
 from viapoint.envs.geometry.shapes import check_kinds
 from viapoint.envs.observation import ObservationLayout
 from viapoint.envs.outcome import SETTLING, TOLERANCES, Tolerance
@@ -250,18 +250,6 @@ class Task:
             speed=top,
             acceleration=0.0 if self.whole_movement else self.steering.greatest_acceleration,
             time_limit=0.0 if self.whole_movement else self.time_limit,
-        )
-
-    def events(self) -> EventPredictor:
-        """Return the predictor of the ends of decisions."""
-        return EventPredictor(
-            self.arm,
-            self.space,
-            timestep=self.arm.timestep,
-            triggers=() if isinstance(self.decide_at, str) else self.decide_at,
-            horizon=self.horizon,
-            margin=self.margin,
-            time_limit=self.time_limit,
         )
 
     def sampler(self) -> SceneSampler:

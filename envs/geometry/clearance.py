@@ -370,26 +370,3 @@ def configuration_clearances(
         found[scene, 0] = obstacle_clearance(spheres, placed, obstacles, scene, times[scene], FAR, -FAR)
         found[scene, 1] = self_clearance(spheres, placed, FAR, -FAR)
     return found
-
-
-@compiled
-def clearance_profile(
-    chain: Chain, spheres: Spheres, path: Float, obstacles: Obstacles, scene: int, step: float, most: float
-) -> Float:
-    """Return the clearance from obstacles at each of T configurations of a movement, shape (T,), at most `most`, [m].
-
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        path: Configurations, shape (T, J); the first is looked at with the obstacles as they are.
-        obstacles: Obstacles of N scenes.
-        scene: Index of the scene.
-        step: Time between two configurations, [s].
-        most: Greatest clearance of interest, [m].
-    """
-    placed = memory(chain, spheres)
-    found = np.empty(len(path))
-    for k in range(len(path)):
-        place(chain, spheres, path[k], placed)
-        found[k] = obstacle_clearance(spheres, placed, obstacles, scene, k * step, most, -FAR)
-    return found
