@@ -215,7 +215,7 @@ def _first_falls(
             step = steps[piece, look]
             if step >= latest[row] or found[row] < NEVER:
                 break
-            will_be = low[piece, look : look + ahead + 1].any()
+            will_be = bool(low[piece, look : look + ahead + 1].any())
             if will_be and not below and step > now[row]:
                 found[row] = step
             below = will_be

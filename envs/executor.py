@@ -21,7 +21,8 @@ from viapoint.envs.geometry.clearance import (
     travel,
 )
 from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.obstacles import ABSENT, BOX, CYLINDER, HALF_SPACE, MESH, POINT_CLOUD, Obstacles
+from viapoint.envs.geometry.obstacles import ABSENT, BOX, CYLINDER, HALF_SPACE, Obstacles
+from viapoint.envs.geometry.shapes import IN_TABLES
 from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Rollout, Tolerance
 from viapoint.envs.plans import Motion
 from viapoint.envs.scenes.scene import Scenes
@@ -131,7 +132,7 @@ class Executor:
             centres = block.obstacles.centre[:, None] + time * block.obstacles.velocity[:, None]
         log = self.simulator.rollout(block.rows, controls, block.steps, centres, resume=resume)
         self._look_between(block, log)
-        steps = _measure_all(
+        steps = _measure(
             arm.chain,
             arm.spheres,
             arm.reach,
@@ -198,7 +199,7 @@ def _thinnest(obstacles: Obstacles, scene: int) -> float:
             half = min(half, obstacles.size[scene, row, 1])
         if kind == BOX:
             half = min(half, obstacles.size[scene, row, 2])
-        thin = min(thin, 0.0 if kind in (MESH, POINT_CLOUD) else half)
+        thin = min(thin, 0.0 if kind in IN_TABLES else half)
     return thin
 
 
@@ -264,85 +265,6 @@ def _measure(
     contact: Bool,
     planned: Float,
     path: Float,
-    steps: int,
-    obstacles: Obstacles,
-    scene: int,
-    timestep: float,
-    goal: Float,
-    goal_tolerance: float,
-    rest_speed: float,
-    state: EpisodeState,
-    row: int,
-    placed: Placed,
-) -> int:
-    """Add one executed segment to the metrics of an episode, and return how many of its steps count.
-
-    The arguments are those of :func:`_measure_all` for one scene.
-    """
-    begin, commanded = state.steps[row], steps
-    for k in range(steps):
-        if contact[k]:
-            # The state before this step is the last one that counts.
-            if state.first_contact[row] < 0:
-                state.first_contact[row] = begin + k
-            steps = k + 1
-            break
-    dimension = len(goal)
-    hand = state.hand[row].copy()
-    before = state.joints[row].copy()
-    speed = 0.0
-    for k in range(steps):
-        now = tool_position(chain, joints[k], placed.rotation, placed.origin)
-        moved = 0.0
-        for axis in range(3):
-            moved += (now[axis] - hand[axis]) ** 2
-            hand[axis] = now[axis]
-        moved = np.sqrt(moved)
-        state.path_length[row] += moved
-        state.peak_speed[row] = max(state.peak_speed[row], moved / timestep)
-        away, error, fastest = 0.0, 0.0, 0.0
-        for d in range(dimension):
-            here = now[d] if of_hand else joints[k, d]
-            away += (here - planned[k + 1, d]) ** 2
-            error = error + (here - goal[d]) ** 2 if of_hand else max(error, abs(here - goal[d]))
-        for j in range(joints.shape[1]):
-            fastest = max(fastest, abs(joints[k, j] - before[j]) / timestep)
-            before[j] = joints[k, j]
-            low, high = joint_range[j, 0] - LIMIT_TOLERANCE, joint_range[j, 1] + LIMIT_TOLERANCE
-            if joints[k, j] < low or joints[k, j] > high:
-                state.within[row] = False
-        state.deviation[row] += away
-        error = np.sqrt(error) if of_hand else error
-        speed = moved / timestep if of_hand else fastest
-        resting = speed < rest_speed and error < goal_tolerance
-        state.rest[row] = state.rest[row] + 1 if resting else 0
-    state.last_speed[row] = speed
-    state.hand[row] = hand
-    state.joints[row] = before
-    state.steps[row] = begin + steps
-    done = movement_clearance(
-        chain, spheres, reach, joints[:steps], obstacles, scene, timestep, timestep, placed
-    )
-    state.min_clearance[row] = min(state.min_clearance[row], done[0])
-    state.self_clearance[row] = min(state.self_clearance[row], done[1])
-    command = movement_clearance(
-        chain, spheres, reach, path[: commanded + 1], obstacles, scene, 0.0, timestep, placed
-    )
-    state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
-    return steps
-
-
-@compiled
-def _measure_all(
-    chain: Chain,
-    spheres: Spheres,
-    reach: Float,
-    joint_range: Float,
-    of_hand: bool,
-    joints: Float,
-    contact: Bool,
-    planned: Float,
-    path: Float,
     steps: Int,
     obstacles: Obstacles,
     timestep: float,
@@ -375,11 +297,61 @@ def _measure_all(
         rows: Indices of the episodes, shape (n,).
         placed: Memory.
     """
-    done = np.empty_like(steps)
+    found = np.empty_like(steps)
     for scene in range(len(rows)):
-        done[scene] = _measure(
-            chain, spheres, reach, joint_range, of_hand, joints[scene], contact[scene], planned[scene], path[scene],
-            steps[scene], obstacles, scene, timestep, goal[scene], goal_tolerance, rest_speed, state, rows[scene],
-            placed,
-        )  # fmt: skip
-    return done
+        row = rows[scene]
+        executed = joints[scene]
+        begin, end = state.steps[row], steps[scene]
+        for k in range(end):
+            if contact[scene, k]:
+                # The state before this step is the last one that counts.
+                if state.first_contact[row] < 0:
+                    state.first_contact[row] = begin + k
+                end = k + 1
+                break
+        hand = state.hand[row].copy()
+        before = state.joints[row].copy()
+        speed = 0.0
+        for k in range(end):
+            now = tool_position(chain, executed[k], placed.rotation, placed.origin)
+            moved = 0.0
+            for axis in range(3):
+                moved += (now[axis] - hand[axis]) ** 2
+                hand[axis] = now[axis]
+            moved = np.sqrt(moved)
+            state.path_length[row] += moved
+            state.peak_speed[row] = max(state.peak_speed[row], moved / timestep)
+            away, square, greatest, rate = 0.0, 0.0, 0.0, 0.0
+            for d in range(goal.shape[1]):
+                here = now[d] if of_hand else executed[k, d]
+                error = here - goal[scene, d]
+                away += (here - planned[scene, k + 1, d]) ** 2
+                square += error * error
+                greatest = max(greatest, abs(error))
+            for j in range(executed.shape[1]):
+                rate = max(rate, abs(executed[k, j] - before[j]) / timestep)
+                before[j] = executed[k, j]
+                low, high = joint_range[j, 0] - LIMIT_TOLERANCE, joint_range[j, 1] + LIMIT_TOLERANCE
+                if executed[k, j] < low or executed[k, j] > high:
+                    state.within[row] = False
+            state.deviation[row] += away
+            error = np.sqrt(square) if of_hand else greatest
+            speed = moved / timestep if of_hand else rate
+            resting = speed < rest_speed and error < goal_tolerance
+            state.rest[row] = state.rest[row] + 1 if resting else 0
+        state.last_speed[row] = speed
+        state.hand[row] = hand
+        state.joints[row] = before
+        state.steps[row] = begin + end
+        # Clearance of what was done, and of what was commanded
+        done = movement_clearance(
+            chain, spheres, reach, executed[:end], obstacles, scene, timestep, timestep, placed
+        )
+        state.min_clearance[row] = min(state.min_clearance[row], done[0])
+        state.self_clearance[row] = min(state.self_clearance[row], done[1])
+        command = movement_clearance(
+            chain, spheres, reach, path[scene, : steps[scene] + 1], obstacles, scene, 0.0, timestep, placed
+        )
+        state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
+        found[scene] = end
+    return found

@@ -25,15 +25,15 @@ from viapoint.envs.outcome import SETTLING, TOLERANCES, Tolerance
 from viapoint.envs.plans import ActionLayout, SpaceName, Timing
 from viapoint.envs.rewards import RewardWeights
 from viapoint.envs.scenes.families_registry import check_families, default_families
-from viapoint.envs.scenes.sampler import SceneSampler, is_planar
+from viapoint.envs.scenes.sampler import MOST_DRAWN, SceneSampler, is_planar
 from viapoint.envs.scenes.scene import MOST_JUMPS
 from viapoint.envs.spaces import Space, space_of
 from viapoint.envs.steering import Steering
 
 END, STEPS = "end", "steps"
 """Values of `decide_at` with one decision for a movement, and with one in every control step."""
-MOST_OBSTACLES, MOST_DRAWN = 256, 32
-"""Greatest number of obstacles in a scene that is given, and in one that is drawn."""
+MOST_OBSTACLES = 256
+"""Greatest number of obstacles in a scene that is given."""
 PLANE_SHAPES = ("cylinder", "box")
 """Default shapes of obstacles in the plane."""
 SPACE_SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")
@@ -254,19 +254,7 @@ class Task:
 
     def sampler(self) -> SceneSampler:
         """Return a sampler of scenes of the task."""
-        low, high = self.duration_range
-        return SceneSampler(
-            self.arm,
-            space=self.space_name,
-            n_obstacles=self.n_obstacles,
-            kinds=self.shapes,
-            families=self.families,
-            rows=self.n_obstacles[1],
-            tall=self.whole_arm,
-            jumps=self.n_jumps,
-            moving=self.moving_obstacles,
-            durations=(low, self.action.centre, high),
-        )
+        return SceneSampler(self)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the task as plain values for JSON; the arm by its name."""

@@ -18,6 +18,7 @@ from viapoint.envs.geometry.shapes import (
     CAPSULE,
     CYLINDER,
     HALF_SPACE,
+    IN_TABLES,
     KINDS,
     MESH,
     POINT_CLOUD,
@@ -37,7 +38,8 @@ __all__ = [
 ]  # fmt: skip
 
 POSE_SIZE = 16
-"""Numbers of an obstacle in an observation after those of its kind."""
+"""Numbers of an obstacle in an observation after those of its kind: centre 3, axes 6, half lengths 3, velocity 3,
+present 1."""
 EXTENT = 1.0
 """Half length of the cube that stands for a half-space in observations, [m]."""
 BOXES = np.array([shape.box for shape in SHAPES], np.float64)
@@ -411,7 +413,7 @@ def check_simulated(obstacles: Obstacles) -> None:
     Raises:
         ValueError: An obstacle is a point cloud, which has many geoms, or a mesh without a name.
     """
-    if (obstacles.kind >= MESH).any():
+    if np.isin(obstacles.kind, IN_TABLES).any():
         geoms_of(obstacles)
 
 

@@ -40,6 +40,10 @@ KINDS = ("sphere", "capsule", "cylinder", "box", "half_space", "convex_mesh", "p
 SPHERE, CAPSULE, CYLINDER, BOX, HALF_SPACE, MESH, POINT_CLOUD = range(len(KINDS))
 ABSENT = -1
 """Kind of a row that holds no obstacle."""
+IN_TABLES = (MESH, POINT_CLOUD)
+"""Kinds whose first size is an index of a table, and whose second is the radius of a bounding sphere."""
+PLAIN_KINDS = tuple(kind for number, kind in enumerate(KINDS) if number not in IN_TABLES)
+"""Kinds that are known by their sizes alone."""
 UNIT_TOLERANCE = 1e-3
 """Greatest error of a quaternion's length; smaller ones are corrected."""
 LEAST_SPACING = 1e-6
