@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint import primitives
 from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float, Int, Observation
 from viapoint.envs.events import NEVER, Event, EventPredictor
@@ -15,7 +14,7 @@ from viapoint.envs.executor import Executor, Pieces, Segment
 from viapoint.envs.geometry.obstacles import KINDS
 from viapoint.envs.limits import slowdowns
 from viapoint.envs.outcome import SETTLING, Outcome, Rollout, straight_jerk_cost
-from viapoint.envs.plans import Motion, Plan, checked_plan, movements_at
+from viapoint.envs.plans import Motion, Movements, Plan, checked_plan, jerk_cost_between
 from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed
 from viapoint.envs.rewards import reward_terms
 from viapoint.envs.scenes.scene import Scenes
@@ -84,7 +83,7 @@ class Episodes:
             np.zeros((number, points, task.space.dimension)), np.ones((number, points - 1))
         )
         """Plans under way."""
-        self._movement = self.plan.trajectory()
+        self._movements = Movements.of(self.plan)
         self.begun = np.zeros(number, bool)
         """True where a plan is under way, shape (n,)."""
         self._began = np.zeros(number, np.int64)
@@ -259,7 +258,7 @@ class Episodes:
         ):  # whole movements have any number of via-points
             self.plan = Plan(*(part.copy() for part in given))
         put(self.plan, rows, plan)
-        self._movement = self.plan.trajectory()
+        self._movements = Movements.of(self.plan)
         self.last_plan = Plan(*(part.copy() for part in self.plan))
         self._began[rows] = state.steps[rows]
         self.begun[rows] = True
@@ -295,7 +294,7 @@ class Episodes:
         """Return how much slower plans must be to keep the arm's limits, and True within reach and joint ranges."""
         arm, space = self.task.arm, self.task.space
         share = np.linspace(0.0, 1.0, 2 * LIMIT_INSTANTS + 1)
-        motion = Motion(*plan.trajectory().sample(plan.duration[:, None] * share))
+        motion = Movements.of(plan).sample(plan.duration[:, None] * share)
         inside = np.asarray(space.inside(motion.position).all(axis=-1))
         some = Motion(*(np.ascontiguousarray(part[:, ::2]) for part in motion))
         needed = slowdowns(arm.chain, arm.velocity_limit, arm.torque_limit, *space.joint_motion(some))
@@ -321,14 +320,16 @@ class Episodes:
             self.executor.run(segment, self._references, resume=not whole, moving=self._moving)
             since = (begin - self._began)[rows]
             done = since + (state.steps - begin)[rows]
-            movement = movements_at(self._movement, rows)
-            state.jerk_cost[rows] += jerk_cost_between(movement, since * timestep, done * timestep)
+            movements = take(self._movements, rows)
+            state.jerk_cost[rows] += jerk_cost_between(
+                movements, np.asarray(since * timestep), np.asarray(done * timestep)
+            )
 
     def _references(self, rows: Int, number: int) -> Motion:
         """Return references of plans from now on, shape (n, T + 1, D) each."""
         since = (self.executor.state.steps - self._began)[rows]
-        times = self.simulator.timestep * (since[:, None] + np.arange(number + 1))
-        return Motion(*movements_at(self._movement, rows).sample(times))
+        times = np.asarray(self.simulator.timestep * (since[:, None] + np.arange(number + 1)))
+        return take(self._movements, rows).sample(times)
 
     # Decisions of one control step
 
@@ -435,25 +436,8 @@ class Episodes:
         self.start(np.arange(len(self.begun)), Scenes.from_dict(state["scenes"]))
         put(self.executor.state, slice(None), type(self.executor.state)(**state["metrics"]))
         self.plan = Plan(**{name: np.array(part) for name, part in state["plan"].items()})
-        self._movement = self.plan.trajectory()
+        self._movements = Movements.of(self.plan)
         put(self._motion, slice(None), Motion(**state["motion"]))
         self._began[:], self.begun[:] = state["began"], state["begun"]
         self.simulator.batch.state[:] = state["physics"]
         self.simulator.physics_steps = int(state["physics_steps"])
-
-
-def jerk_cost_between(movement: primitives.Trajectory, begin: Any, end: Any) -> Float:
-    """Return half the integral of the squared jerk of movements between two times, shape (n,).
-
-    On each segment the jerk is a parabola of time, so its square has degree four: three Gauss-Legendre nodes are exact.
-    """
-    nodes, weights = np.polynomial.legendre.leggauss(3)
-    knots = np.asarray(movement.knots)
-    low = np.clip(begin[:, None], knots[:, :-1], knots[:, 1:])
-    half = 0.5 * (np.clip(end[:, None], knots[:, :-1], knots[:, 1:]) - low)
-    times = low[..., None] + half[..., None] * (1.0 + nodes)
-    jerk = movement(times.reshape(len(times), -1), 3)
-    square = (jerk * jerk).sum(axis=-1).reshape(times.shape)
-    each = (square * weights * half[..., None]).reshape(len(times), -1)
-    # Added one after the other, so that the sum does not depend on the number of terms.
-    return 0.5 * np.cumsum(each, axis=-1)[:, -1]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,13 +20,7 @@ from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import MAX_START_OFFSET, Plan
 from viapoint.envs.scenes.scene import Scenes
-
-if TYPE_CHECKING:
-    from viapoint.envs.task import Task
-
-Trigger = Literal["horizon", "target", "course", "clearance"]
-TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)
-"""Events that may end a decision before the goal."""
+from viapoint.envs.task import Task
 
 FORESIGHT = 0.4
 """Horizon of the predicted clearance, [s]."""

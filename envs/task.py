@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from viapoint.envs.common.validation import (
     number_of_at_least,
     whole_number,
 )
-from viapoint.envs.events import TRIGGERS, Trigger
 from viapoint.envs.geometry.shapes import check_kinds
 from viapoint.envs.observation import ObservationLayout
 from viapoint.envs.outcome import SETTLING, TOLERANCES, Tolerance
@@ -30,6 +29,9 @@ from viapoint.envs.scenes.scene import MOST_JUMPS
 from viapoint.envs.spaces import Space, space_of
 from viapoint.envs.steering import Steering
 
+Trigger = Literal["horizon", "target", "course", "clearance"]
+TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)
+"""Events that may end a decision before the goal."""
 END, STEPS = "end", "steps"
 """Values of `decide_at` with one decision for a movement, and with one in every control step."""
 MOST_OBSTACLES = 256
@@ -254,7 +256,19 @@ class Task:
 
     def sampler(self) -> SceneSampler:
         """Return a sampler of scenes of the task."""
-        return SceneSampler(self)
+        low, high = self.duration_range
+        return SceneSampler(
+            self.arm,
+            space=self.space_name,
+            n_obstacles=self.n_obstacles,
+            kinds=self.shapes,
+            families=self.families,
+            rows=self.n_obstacles[1],
+            tall=self.whole_arm,
+            jumps=self.n_jumps,
+            moving=self.moving_obstacles,
+            durations=(low, self.action.centre, high),
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the task as plain values for JSON; the arm by its name."""

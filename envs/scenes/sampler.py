@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,9 +42,6 @@ from viapoint.envs.scenes.motions import (
     numbers_of_jumps,
 )
 from viapoint.envs.scenes.scene import Scenes, resting, row_clearances
-
-if TYPE_CHECKING:
-    from viapoint.envs.task import Task
 
 LOW_HALF_HEIGHT, TALL_HALF_HEIGHT = 0.04, 0.3
 """Half heights of obstacles in the plane that the hand alone must clear, and that links must clear, too, [m]."""
@@ -82,25 +79,47 @@ class Given(NamedTuple):
 
 
 class SceneSampler:
-    """Sampler of the scenes of a task: `arm`, `space`, `kinds` of obstacles, `rows` for them, and `room` are public.
+    """Sampler of scenes for an arm; a :class:`~viapoint.envs.task.Task` makes it of checked values.
 
-    The families are drawn with equal chances; furniture has as many obstacles as it needs.
+    Args:
+        arm: Arm.
+        space: Space in which the straight movement is straight: `hand` or `joints`.
+        n_obstacles: Fewest and most obstacles; furniture has as many as it needs.
+        kinds: Kinds that obstacles may have.
+        families: Names of families, drawn with equal chances; a repeated name is drawn more often.
+        rows: Rows for obstacles in the scenes, at least as many as are drawn.
+        tall: True if obstacles in the plane are in the way of the links, too.
+        jumps: Fewest and most jumps of the target.
+        moving: True if obstacles move.
+        durations: Shortest, centre and longest duration of a movement, [s]; in joint space relative to the shortest
+            duration of the straight movement that the velocity limits of the joints allow.
     """
 
-    def __init__(self, task: Task) -> None:
-        arm = task.arm
-        fewest, most = task.n_obstacles
-        self.arm, self.space, self.kinds, self.rows = arm, task.space_name, task.shapes, most
+    def __init__(
+        self,
+        arm: Arm,
+        *,
+        space: SpaceName,
+        n_obstacles: tuple[int, int],
+        kinds: tuple[str, ...],
+        families: tuple[str, ...],
+        rows: int,
+        tall: bool = False,
+        jumps: tuple[int, int] = (0, 0),
+        moving: bool = False,
+        durations: tuple[float, float, float] = (0.5, 0.8, 1.2),
+    ) -> None:
+        fewest, most = n_obstacles
+        self.arm, self.space, self.kinds, self.rows = arm, space, kinds, rows
         self.plane = is_planar(arm)
-        self.families = task.families
+        self.families = families
         most = min(most, max(fewest, MOST_DRAWN))
-        self.room = room_of(arm, self.kinds, (fewest, most), task.whole_arm)
-        shortest, longest = task.duration_range
-        self.changes = Changes(*task.n_jumps, task.moving_obstacles, shortest, task.action.centre, longest)
-        self._mover = mover_of(arm, self.space, self.plane)
+        self.room = room_of(arm, kinds, (fewest, most), tall)
+        self.changes = Changes(*jumps, moving, *durations)
+        self._mover = mover_of(arm, space, self.plane)
         self._builds = [scene_families(self.plane)[name].build for name in self.families]
         self._bare = families_plane.clutter if self.plane else families_space.clutter
-        self._width = max(most_rows(most), self.rows)
+        self._width = max(most_rows(most), rows)
         self._memories = [memory(arm.chain, arm.spheres) for _ in range(3)]
 
     def __call__(self, generators: Sequence[np.random.Generator], given: Given | None = None) -> Scenes:
