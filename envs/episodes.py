@@ -9,12 +9,12 @@ import numpy as np
 
 from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float, Int, Observation
-from viapoint.envs.events import NEVER, Event
+from viapoint.envs.events import NEVER, Event, EventPredictor
 from viapoint.envs.executor import Executor, Pieces, Segment
 from viapoint.envs.geometry.obstacles import KINDS
 from viapoint.envs.limits import slowdowns
 from viapoint.envs.outcome import SETTLING, Outcome, Rollout, straight_jerk_cost
-from viapoint.envs.plans import Motion, Plan, checked_plan
+from viapoint.envs.plans import Motion, Movements, Plan, checked_plan, jerk_cost_between
 from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed
 from viapoint.envs.rewards import reward_terms
 from viapoint.envs.scenes.scene import Scenes
@@ -72,10 +72,10 @@ class Episodes:
         """Scenes of the running episodes; None before the first start."""
         self.history: list[History] = [[] for _ in range(number)]
         """Plans of the running episodes."""
-        self._finished: dict[int, tuple[Scenes, History, Pieces]] = {}
-        """Episodes before the running ones, by row."""
+        self._finished: tuple[Int, Scenes, list[tuple[History, Pieces]]] | None = None
+        """Rows, scenes and records of the episodes before the running ones; None if they are not kept."""
         self._moving = False
-        self._events = task.events()
+        self._events = EventPredictor(task)
         self._start = np.zeros((number, task.space.dimension))
         self._zero_duration = np.ones(number)
         points = task.n_via + 2
@@ -83,6 +83,7 @@ class Episodes:
             np.zeros((number, points, task.space.dimension)), np.ones((number, points - 1))
         )
         """Plans under way."""
+        self._movements = Movements.of(self.plan)
         self.begun = np.zeros(number, bool)
         """True where a plan is under way, shape (n,)."""
         self._began = np.zeros(number, np.int64)
@@ -103,7 +104,10 @@ class Episodes:
             scenes: Their scenes.
             keep: True to keep the records of the episodes before.
         """
-        self._keep_records(rows if keep else rows[:0])
+        self._finished = None
+        if keep and self.scenes is not None:
+            records = [(self.history[row], self.executor.past[row]) for row in rows]
+            self._finished = rows, self.scenes.take(rows), records
         if not keep and len(rows) == len(self.begun):
             self.last_plan = None
         if self.scenes is None:
@@ -168,7 +172,7 @@ class Episodes:
         if self.task.stepwise:
             return self._steer(actions, active)
         if self.task.whole_movement:
-            plan = self.task.action.decode(actions, self._start, self.goals(self.time))
+            plan = self.task.action.plans(actions, self._start, self.goals(self.time))
             return self._follow(plan, active, active)
         plan, kept = revise(self.task.action, self.nominal, self.plan, actions)
         return self._follow(plan, ~kept & active, active)
@@ -209,21 +213,13 @@ class Episodes:
     def recorded(self, row: int) -> Recorded:
         """Return the running episode of one environment; where it has not moved yet, the one before if it is kept."""
         assert self.scenes is not None
-        if not self.executor.state.steps[row] and row in self._finished:
-            scene, history, pieces = self._finished[row]
-        else:
-            scene, history, pieces = self.scenes.take([row]), self.history[row], self.executor.past[row]
+        scene, history, pieces = self.scenes.take([row]), self.history[row], self.executor.past[row]
+        if not self.executor.state.steps[row] and self._finished is not None:
+            rows, scenes, records = self._finished
+            for i in np.flatnonzero(rows == row):
+                scene = scenes.take([i])
+                history, pieces = records[i]
         return Recorded(scene, history, self.executor.rollout(pieces, scene))
-
-    def _keep_records(self, rows: Int) -> None:
-        """Keep the records of some episodes that are over, and forget all others."""
-        self._finished = {}
-        if not len(rows):
-            return
-        assert self.scenes is not None
-        scenes = self.scenes.take(rows)
-        for i, row in enumerate(rows):
-            self._finished[int(row)] = scenes.take([i]), self.history[row], self.executor.past[row]
 
     # Decisions that are plans
 
@@ -252,9 +248,7 @@ class Episodes:
         if not rows.size:
             return
         state, given = self.executor.state, plan
-        plan = plan.take(rows)
-        plan, stretch, within = self._within_limits(plan)
-        inside = self._inside(plan)
+        plan, stretch, within, inside = self._within_limits(plan.take(rows))
         state.reachable[rows] &= inside
         adopted = within | ~self.begun[rows]
         rows, plan = rows[adopted], plan.take(adopted)
@@ -264,15 +258,20 @@ class Episodes:
         ):  # whole movements have any number of via-points
             self.plan = Plan(*(part.copy() for part in given))
         put(self.plan, rows, plan)
+        self._movements = Movements.of(self.plan)
         self.last_plan = Plan(*(part.copy() for part in self.plan))
         self._began[rows] = state.steps[rows]
         self.begun[rows] = True
         for i, row in enumerate(rows):
             self.history[row].append((float(self.time[row]), plan.take([i])))
 
-    def _within_limits(self, plan: Plan) -> tuple[Plan, Float, Bool]:
-        """Return plans that are slow enough, how much slower they are, and True where they keep the limits."""
-        needed = self._slowdown(plan)
+    def _within_limits(self, plan: Plan) -> tuple[Plan, Float, Bool, Bool]:
+        """Return plans that are slow enough, with what they are like, shape (n,).
+
+        Returns:
+            The plans; how much slower they are; True where they keep the limits; True where they stay within reach.
+        """
+        needed, inside = self._look_at(plan)
         stretch = np.maximum(needed, 1.0)
         moving = ((plan.velocity != 0.0) | (plan.acceleration != 0.0)).any(axis=-1)
         stretch[moving] = np.minimum(stretch[moving], MOST_PROLONGED)
@@ -283,27 +282,23 @@ class Episodes:
                 break
             state = Motion(plan.waypoints[rows, 0], plan.velocity[rows], plan.acceleration[rows])
             put(slower, rows, timed(plan.waypoints[rows], slower.duration[rows], state))
-            again = self._slowdown(slower.take(rows))
+            again, inside[rows] = self._look_at(slower.take(rows))
             rows, again = rows[again > ENOUGH], np.minimum(again[again > ENOUGH], MOST_PROLONGED)
             stretch[rows] *= again
             slower.durations[rows] *= again[:, None]
         within = np.ones(len(stretch), bool)
         within[rows] = False
-        return slower, stretch, within
+        return slower, stretch, within, inside
 
-    def _slowdown(self, plan: Plan) -> Float:
-        """Return the factors by which plans must be slower to keep the arm's limits, shape (n,)."""
-        arm = self.task.arm
-        share = np.linspace(0.0, 1.0, LIMIT_INSTANTS + 1)
-        motion = Motion(*plan.trajectory().sample(plan.duration[:, None] * share))
-        joints = self.task.space.joint_motion(motion)
-        return np.asarray(slowdowns(arm.chain, arm.velocity_limit, arm.torque_limit, *joints))
-
-    def _inside(self, plan: Plan) -> Bool:
-        """Return True for plans that stay within reach and joint ranges, shape (n,)."""
+    def _look_at(self, plan: Plan) -> tuple[Float, Bool]:
+        """Return how much slower plans must be to keep the arm's limits, and True within reach and joint ranges."""
+        arm, space = self.task.arm, self.task.space
         share = np.linspace(0.0, 1.0, 2 * LIMIT_INSTANTS + 1)
-        places = plan.trajectory()(plan.duration[:, None] * share)
-        return np.asarray(self.task.space.inside(places).all(axis=-1))
+        motion = Movements.of(plan).sample(plan.duration[:, None] * share)
+        inside = np.asarray(space.inside(motion.position).all(axis=-1))
+        some = Motion(*(np.ascontiguousarray(part[:, ::2]) for part in motion))
+        needed = slowdowns(arm.chain, arm.velocity_limit, arm.torque_limit, *space.joint_motion(some))
+        return needed, inside
 
     def _run_until(self, last: Int) -> None:
         """Run the episodes until a physics step each; obstacles keep their velocity in every piece of it."""
@@ -325,16 +320,16 @@ class Episodes:
             self.executor.run(segment, self._references, resume=not whole, moving=self._moving)
             since = (begin - self._began)[rows]
             done = since + (state.steps - begin)[rows]
-            plan = self.plan.take(rows)
+            movements = take(self._movements, rows)
             state.jerk_cost[rows] += jerk_cost_between(
-                plan, np.asarray(since * timestep), np.asarray(done * timestep)
+                movements, np.asarray(since * timestep), np.asarray(done * timestep)
             )
 
     def _references(self, rows: Int, number: int) -> Motion:
         """Return references of plans from now on, shape (n, T + 1, D) each."""
         since = (self.executor.state.steps - self._began)[rows]
-        times = self.simulator.timestep * (since[:, None] + np.arange(number + 1))
-        return Motion(*self.plan.take(rows).trajectory().sample(times))
+        times = np.asarray(self.simulator.timestep * (since[:, None] + np.arange(number + 1)))
+        return take(self._movements, rows).sample(times)
 
     # Decisions of one control step
 
@@ -441,24 +436,8 @@ class Episodes:
         self.start(np.arange(len(self.begun)), Scenes.from_dict(state["scenes"]))
         put(self.executor.state, slice(None), type(self.executor.state)(**state["metrics"]))
         self.plan = Plan(**{name: np.array(part) for name, part in state["plan"].items()})
+        self._movements = Movements.of(self.plan)
         put(self._motion, slice(None), Motion(**state["motion"]))
         self._began[:], self.begun[:] = state["began"], state["begun"]
         self.simulator.batch.state[:] = state["physics"]
         self.simulator.physics_steps = int(state["physics_steps"])
-
-
-def jerk_cost_between(plan: Plan, begin: Float, end: Float) -> Float:
-    """Return half the integral of the squared jerk between two times, shape (n,).
-
-    On each segment the jerk is a parabola of time, so its square has degree four: three Gauss-Legendre nodes are exact.
-    """
-    nodes, weights = np.polynomial.legendre.leggauss(3)
-    knots = np.concatenate((np.zeros_like(begin)[:, None], np.cumsum(plan.durations, axis=-1)), axis=-1)
-    low = np.clip(begin[:, None], knots[:, :-1], knots[:, 1:])
-    half = 0.5 * (np.clip(end[:, None], knots[:, :-1], knots[:, 1:]) - low)
-    times = low[..., None] + half[..., None] * (1.0 + nodes)
-    jerk = plan.trajectory()(times.reshape(len(times), -1), 3)
-    square = (jerk * jerk).sum(axis=-1).reshape(times.shape)
-    each = (square * weights * half[..., None]).reshape(len(times), -1)
-    # Added one after the other, so that the sum does not depend on the number of terms.
-    return 0.5 * np.cumsum(each, axis=-1)[:, -1]

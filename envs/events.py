@@ -6,23 +6,21 @@ Plans and courses are known to the environment, so all events but a contact are 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from enum import IntEnum
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.clearance import clearance_profile
+from viapoint.envs.geometry.clearance import memory, obstacle_clearance, place
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.outcome import SETTLING
-from viapoint.envs.plans import MAX_START_OFFSET, Motion, Plan
+from viapoint.envs.plans import MAX_START_OFFSET, Plan
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.spaces import Space
-
-Trigger = Literal["horizon", "target", "course", "clearance"]
-TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)
-"""Events that may end a decision before the goal."""
+from viapoint.envs.task import Task
 
 FORESIGHT = 0.4
 """Horizon of the predicted clearance, [s]."""
@@ -71,39 +69,15 @@ class Ends(NamedTuple):
 
 
 class EventPredictor:
-    """Predictor of the ends of decisions.
+    """Predictor of the ends of decisions of a task."""
 
-    Args:
-        arm: Arm.
-        space: Space of the plans.
-        timestep: Length of a physics step, [s].
-        triggers: Events that end a decision before the goal; none for whole movements.
-        horizon: Time after which a decision ends, [s].
-        margin: Predicted clearance below which a decision ends, [m].
-        time_limit: Time limit of an episode, [s].
-
-    Raises:
-        ValueError: There is no such trigger.
-    """
-
-    def __init__(
-        self,
-        arm: Arm,
-        space: Space,
-        *,
-        timestep: float,
-        triggers: Sequence[Trigger],
-        horizon: float,
-        margin: float,
-        time_limit: float,
-    ) -> None:
-        known = not isinstance(triggers, str) and isinstance(triggers, Iterable)
-        if not known or any(each not in TRIGGERS for each in triggers):
-            raise ValueError(f"decide_at must be some of {', '.join(TRIGGERS)}, got {triggers!r}")
-        self.arm, self.space, self.timestep, self.margin = arm, space, timestep, margin
-        self.triggers = frozenset(triggers)
-        self.horizon = int(self.steps(min(horizon, time_limit)))
-        self.limit = int(self.steps(time_limit))
+    def __init__(self, task: Task) -> None:
+        self.arm, self.space, self.margin = task.arm, task.space, task.margin
+        self.timestep = task.arm.timestep
+        self.triggers = frozenset(() if isinstance(task.decide_at, str) else task.decide_at)
+        self.horizon = int(self.steps(min(task.horizon, task.time_limit)))
+        """Physics steps of the horizon."""
+        self.limit = int(self.steps(task.time_limit))
         """Greatest number of physics steps of an episode."""
 
     def steps(self, time: Any) -> Any:
@@ -157,38 +131,88 @@ class EventPredictor:
         found = np.full(len(now), NEVER)
         if "clearance" not in self.triggers or not scenes.obstacles.present.any():
             return found
-        every = max(round(LOOK / self.timestep), 1)
-        ahead = round(FORESIGHT / LOOK)
+        every, ahead = max(round(LOOK / self.timestep), 1), round(FORESIGHT / LOOK)
+        turns = self.steps(scenes.turn_time)
+        # Pieces of the episodes in which the obstacles keep their velocity
+        pieces = []
         for row in range(len(now)):
-            found[row] = self._falls(plan, began[row], now[row], scenes, row, int(latest[row]), every, ahead)
+            inside = (turns[row] > now[row]) & (turns[row] < latest[row])
+            cuts = [now[row], *np.unique(turns[row][inside]), latest[row]]
+            pieces += [(row, begin, end) for begin, end in itertools.pairwise(cuts)]
+        rows, begin, end = np.array(pieces, np.int64).T.copy()
+        looks = (end - begin) // every + 1
+        steps = begin[:, None] + every * np.arange(int(looks.max()) + ahead)
+        movement = plan.take(rows).trajectory()
+        path = self.space.joints(movement(self.timestep * (steps - began[rows][:, None])))
+        obstacles = scenes.take(rows).obstacles_at(begin * self.timestep)
+        interval = every * self.timestep
+        chain, spheres = self.arm.chain, self.arm.spheres
+        low = _low_clearances(chain, spheres, path, obstacles, looks + ahead, interval, self.margin)
+        _first_falls(low, rows, steps, looks, ahead, now, latest, found)
         return found
 
-    def _falls(
-        self, plan: Plan, began: int, now: int, scenes: Scenes, row: int, latest: int, every: int, ahead: int
-    ) -> int:
-        """Return the step at which the predicted clearance of one episode falls below the margin."""
-        turns = np.unique(self.steps(scenes.turn_time[row]))
-        pieces = [now, *(int(turn) for turn in turns if now < turn < latest), latest]
-        trajectory = plan.take([row]).trajectory()
-        below = True  # a clearance that is below the margin already does not fall
-        for begin, end in itertools.pairwise(pieces):
-            looks = (end - begin) // every + 1
-            steps = begin + every * np.arange(looks + ahead)
-            position, velocity, acceleration = trajectory.sample(self.timestep * (steps - began)[None])
-            path = self.space.joint_motion(Motion(position, velocity, acceleration)).position[0]
-            obstacles = scenes.take([row]).obstacles_at(np.array([begin * self.timestep]))
-            profile = clearance_profile(
-                self.arm.chain, self.arm.spheres, path, obstacles, 0, every * self.timestep, self.margin
-            )
-            window = np.lib.stride_tricks.sliding_window_view(profile, ahead + 1).min(axis=-1) < self.margin
-            for look in range(looks):
-                step = begin + every * look
-                if step >= latest:
-                    break
-                if window[look] and not below and step > now:
-                    return int(step)
-                below = bool(window[look])
-        return NEVER
+
+@compiled
+def _low_clearances(
+    chain: Chain,
+    spheres: Spheres,
+    path: Float,
+    obstacles: Obstacles,
+    number: Int,
+    interval: float,
+    margin: float,
+) -> Bool:
+    """Return True where the clearance from obstacles is below a margin, shape (M, T).
+
+    Args:
+        chain: Chain of the arm.
+        spheres: Spheres of the arm.
+        path: Configurations of M movements, shape (M, T, J).
+        obstacles: Obstacles of M scenes at the first configuration.
+        number: Number of configurations of each movement that are looked at, shape (M,).
+        interval: Time between two configurations, [s].
+        margin: Margin, [m].
+    """
+    placed = memory(chain, spheres)
+    low = np.zeros(path.shape[:2], np.bool_)
+    for scene in range(len(path)):
+        for k in range(number[scene]):
+            place(chain, spheres, path[scene, k], placed)
+            time = k * interval
+            clearance = obstacle_clearance(spheres, placed, obstacles, scene, time, margin, margin)
+            low[scene, k] = clearance < margin
+    return low
+
+
+@compiled
+def _first_falls(
+    low: Bool, rows: Int, steps: Int, looks: Int, ahead: int, now: Int, latest: Int, found: Int
+) -> None:
+    """Fill in the first step of each episode at which the clearance ahead falls below the margin.
+
+    Args:
+        low: True where the clearance is below the margin, shape (M, T).
+        rows: Episodes of M pieces, in order, shape (M,).
+        steps: Physics steps, shape (M, T).
+        looks: Number of predictions in each piece, shape (M,).
+        ahead: Number of further configurations of a prediction.
+        now: Present steps, shape (N,).
+        latest: Steps from which on the result does not matter, shape (N,).
+        found: Result, shape (N,).
+    """
+    below = True  # a clearance that is below the margin already does not fall
+    for piece in range(len(rows)):
+        row = rows[piece]
+        if piece == 0 or row != rows[piece - 1]:
+            below = True
+        for look in range(looks[piece]):
+            step = steps[piece, look]
+            if step >= latest[row] or found[row] < NEVER:
+                break
+            will_be = bool(low[piece, look : look + ahead + 1].any())
+            if will_be and not below and step > now[row]:
+                found[row] = step
+            below = will_be
 
 
 def _next(steps: Int, now: Int) -> Int:

@@ -13,6 +13,7 @@ from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import (
     Placed,
     configuration_clearances,
+    fastest,
     memory,
     movement_clearance,
     obstacle_clearance,
@@ -20,15 +21,17 @@ from viapoint.envs.geometry.clearance import (
     travel,
 )
 from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.obstacles import ABSENT, BOX, CYLINDER, HALF_SPACE, MESH, Obstacles
+from viapoint.envs.geometry.obstacles import ABSENT, BOX, CYLINDER, HALF_SPACE, Obstacles
+from viapoint.envs.geometry.shapes import IN_TABLES
 from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Rollout, Tolerance
 from viapoint.envs.plans import Motion
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.simulator import SimulationLog, Simulator
+from viapoint.envs.simulator import MOST_BETWEEN, SimulationLog, Simulator
 from viapoint.envs.spaces import Space
 
-BLOCK = 32
-"""Movements that are executed together: few enough for the processor's cache, and of similar length."""
+BLOCK, SIMILAR = 32, 1.1
+"""Greatest number of movements that are executed together, few enough for the processor's cache, and the greatest
+length of one relative to another: all run as long as the longest one."""
 CONTROL_STRIDE = 4
 """Physics steps between two computed torques; those in between are interpolated linearly."""
 
@@ -75,11 +78,7 @@ class Executor:
         """Start episodes at rest at joint positions, shape (n, J), among the obstacles of n scenes."""
         arm = self.simulator.arm
         self.simulator.place(rows, joints, obstacles)
-        first = np.empty((len(rows), 2))
-        for i in range(len(rows)):
-            first[i] = movement_clearance(
-                arm.chain, arm.spheres, arm.reach, joints[i : i + 1], obstacles, i, 0.0, 0.0, self._placed
-            )
+        first = configuration_clearances(arm.chain, arm.spheres, joints, obstacles, np.zeros(len(rows)))
         self.state.begin(rows, joints, arm.hand(joints), first[:, 0], first[:, 1])
         for row in rows:
             self.past[row] = []
@@ -94,12 +93,17 @@ class Executor:
             moving: True if obstacles move.
         """
         order = np.argsort(segment.steps, kind="stable")
-        for first in range(0, len(order), BLOCK):
-            some = np.sort(order[first : first + BLOCK])
+        length = segment.steps[order]
+        first = 0
+        while first < len(order):
+            similar = int(np.searchsorted(length, SIMILAR * length[first], side="right"))
+            last = min(similar, first + BLOCK)
+            some = np.sort(order[first:last])
             block = Segment(
                 segment.rows[some], segment.steps[some], segment.obstacles.take(some), segment.goal[some]
             )
             self._run_block(block, references, resume, moving)
+            first = last
 
     def rollout(self, pieces: Pieces, scene: Scenes) -> Rollout:
         """Return an episode that was recorded in pieces, in its scene."""
@@ -128,61 +132,58 @@ class Executor:
             centres = block.obstacles.centre[:, None] + time * block.obstacles.velocity[:, None]
         log = self.simulator.rollout(block.rows, controls, block.steps, centres, resume=resume)
         self._look_between(block, log)
+        steps = _measure(
+            arm.chain,
+            arm.spheres,
+            arm.reach,
+            arm.joint_range,
+            self.space.of_hand,
+            log.joints,
+            log.contact,
+            motion.position,
+            path,
+            block.steps,
+            block.obstacles,
+            timestep,
+            block.goal,
+            self.tolerance.goal,
+            self.tolerance.speed,
+            self.state,
+            block.rows,
+            self._placed,
+        )
         for i, row in enumerate(block.rows):
-            steps = _measure(
-                arm.chain,
-                arm.spheres,
-                arm.reach,
-                arm.joint_range,
-                self.space.of_hand,
-                log.joints[i],
-                log.contact[i],
-                motion.position[i],
-                path[i],
-                int(block.steps[i]),
-                block.obstacles,
-                i,
-                timestep,
-                block.goal[i],
-                self.tolerance.goal,
-                self.tolerance.speed,
-                self.state,
-                int(row),
-                self._placed,
-            )
-            piece = log.joints[i, :steps], motion.position[i, 1 : steps + 1], log.contact[i, :steps]
-            self.past[row].append((piece[0].copy(), piece[1].copy(), piece[2].copy()))
+            end = steps[i]
+            piece = log.joints[i, :end], motion.position[i, 1 : end + 1], log.contact[i, :end]
+            self.past[row].append(piece)
         self.state.unstable[block.rows] |= log.unstable
 
     def _look_between(self, block: Segment, log: SimulationLog) -> None:
         """Mark contacts between physics steps, which bodies have that are thin compared with their way in a step."""
         arm, timestep = self.simulator.arm, self.simulator.timestep
-        for i, row in enumerate(block.rows):
-            thin = self.simulator.thinnest + _thinnest(block.obstacles, i)
-            steps = int(block.steps[i])
-            for k in _risky_steps(
-                arm.chain,
-                arm.spheres,
-                arm.reach,
-                log.joints[i, :steps],
-                log.contact[i, :steps],
-                block.obstacles,
-                i,
-                timestep,
-                0.5 * thin,
-                self._placed,
-            ):
-                ends = log.joints[i, k], log.joints[i, k + 1]
-                places = [
-                    block.obstacles.centre[i] + timestep * (k + 1 + later) * block.obstacles.velocity[i]
-                    for later in (0, 1)
-                ]
-                way = travel(arm.reach, *ends) + np.abs(places[1] - places[0]).max(initial=0.0)
-                if self.simulator.touches_between(
-                    int(row), ends, (places[0], places[1]), int(2.0 * way / thin)
-                ):
-                    log.contact[i, k + 1] = True
-                    break
+        risky = _risky_steps(
+            arm.chain,
+            arm.spheres,
+            arm.reach,
+            log.joints,
+            log.contact,
+            block.steps,
+            block.obstacles,
+            timestep,
+            self.simulator.thinnest,
+            self._placed,
+        )
+        for i, k, number in risky:
+            if log.contact[i, : k + 1].any():
+                continue
+            ends = log.joints[i, k], log.joints[i, k + 1]
+            before, after = (
+                block.obstacles.centre[i] + timestep * (k + later) * block.obstacles.velocity[i]
+                for later in (1, 2)
+            )
+            log.contact[i, k + 1] = self.simulator.touches_between(
+                int(block.rows[i]), ends, (before, after), number
+            )
 
 
 @compiled
@@ -198,7 +199,7 @@ def _thinnest(obstacles: Obstacles, scene: int) -> float:
             half = min(half, obstacles.size[scene, row, 1])
         if kind == BOX:
             half = min(half, obstacles.size[scene, row, 2])
-        thin = min(thin, half if kind < MESH else 0.0)
+        thin = min(thin, 0.0 if kind in IN_TABLES else half)
     return thin
 
 
@@ -207,35 +208,49 @@ def _risky_steps(
     chain: Chain,
     spheres: Spheres,
     reach: Float,
-    path: Float,
+    joints: Float,
     contact: Bool,
+    steps: Int,
     obstacles: Obstacles,
-    scene: int,
     timestep: float,
-    longest: float,
+    thinnest: float,
     placed: Placed,
-) -> list[int]:
-    """Return steps in which the arm may have passed through something thin.
+) -> list[tuple[int, int, int]]:
+    """Return steps in which the arm may have passed through something thin: scene, step, and states to look at.
 
-    These are steps longer than `longest` [m] from a state without contact to another, with a clearance at the first
-    state that is less than the way.
+    Bodies move by more than half their thickness in these steps, from a state without contact to another, and both
+    clearances together are less than the way: otherwise no state between them can be in contact.
+
+    Args:
+        chain: Chain of the arm.
+        spheres: Spheres of the arm.
+        reach: Reach of the joints.
+        joints: Joint positions after each step, shape (n, T, J), [rad].
+        contact: True where there is a contact at the state before a step, shape (n, T).
+        steps: Number of steps of each scene, shape (n,).
+        obstacles: Obstacles of n scenes.
+        timestep: Length of a step, [s].
+        thinnest: Half the thickness of the thinnest part of the arm, [m].
+        placed: Memory.
     """
-    found = [0 for _ in range(0)]
+    found = [(0, 0, 0) for _ in range(0)]
     if obstacles.kind.shape[1] == 0:
         return found
-    fast = 0.0
-    for row in range(obstacles.kind.shape[1]):
-        if obstacles.kind[scene, row] != ABSENT:
-            speed = np.abs(obstacles.velocity[scene, row]).sum()
-            fast = max(fast, speed)
-    for k in range(len(path) - 1):
-        way = travel(reach, path[k], path[k + 1]) + fast * timestep
-        if way <= longest or contact[k] or contact[k + 1]:
-            continue
-        place(chain, spheres, path[k], placed)
-        time = timestep * (k + 1)
-        if obstacle_clearance(spheres, placed, obstacles, scene, time, way, 0.0) < way:
-            found.append(k)
+    for scene in range(len(joints)):
+        thin = thinnest + _thinnest(obstacles, scene)
+        drift = timestep * fastest(obstacles, scene)
+        path = joints[scene]
+        for k in range(steps[scene] - 1):
+            way = travel(reach, path[k], path[k + 1]) + drift
+            if way <= 0.5 * thin or contact[scene, k] or contact[scene, k + 1]:
+                continue
+            apart = 0.0
+            for state in (k, k + 1):
+                place(chain, spheres, path[state], placed)
+                time = timestep * (state + 1)
+                apart += obstacle_clearance(spheres, placed, obstacles, scene, time, way, -way)
+            if apart < way:
+                found.append((scene, k, int(min(2.0 * way / thin, MOST_BETWEEN))))
     return found
 
 
@@ -250,18 +265,17 @@ def _measure(
     contact: Bool,
     planned: Float,
     path: Float,
-    steps: int,
+    steps: Int,
     obstacles: Obstacles,
-    scene: int,
     timestep: float,
     goal: Float,
     goal_tolerance: float,
     rest_speed: float,
     state: EpisodeState,
-    row: int,
+    rows: Int,
     placed: Placed,
-) -> int:
-    """Add one executed segment to the metrics of an episode, and return how many of its steps count.
+) -> Int:
+    """Add executed segments to the metrics of n episodes, and return how many of their steps count, shape (n,).
 
     Args:
         chain: Chain of the arm.
@@ -269,69 +283,75 @@ def _measure(
         reach: Reach of the joints.
         joint_range: Ranges of the joints, shape (J, 2), [rad].
         of_hand: True if references are of the hand, False if they are of the joints.
-        joints: Joint positions after each step, shape (T, J), [rad].
-        contact: True where there is a contact at the state before a step, shape (T,).
-        planned: References before the first step and after each, shape (T + 1 or more, D).
-        path: Joint positions that belong to them, shape (T + 1 or more, J), [rad].
-        steps: Number of steps.
-        obstacles: Obstacles of the block.
-        scene: Index of the scene in the block.
+        joints: Joint positions after each step, shape (n, T, J), [rad].
+        contact: True where there is a contact at the state before a step, shape (n, T).
+        planned: References before the first step and after each, shape (n, T + 1 or more, D).
+        path: Joint positions that belong to them, shape (n, T + 1 or more, J), [rad].
+        steps: Numbers of steps, shape (n,).
+        obstacles: Obstacles of n scenes.
         timestep: Length of a step, [s].
-        goal: Goal, shape (D,).
+        goal: Goals, shape (n, D).
         goal_tolerance: Greatest distance from the goal at rest.
         rest_speed: Greatest speed at rest.
         state: Metrics, which are changed.
-        row: Index of the episode.
+        rows: Indices of the episodes, shape (n,).
         placed: Memory.
     """
-    begin, commanded = state.steps[row], steps
-    for k in range(steps):
-        if contact[k]:
-            # The state before this step is the last one that counts.
-            if state.first_contact[row] < 0:
-                state.first_contact[row] = begin + k
-            steps = k + 1
-            break
-    dimension = len(goal)
-    hand = state.hand[row].copy()
-    before = state.joints[row].copy()
-    speed = 0.0
-    for k in range(steps):
-        now = tool_position(chain, joints[k], placed.rotation, placed.origin)
-        moved = 0.0
-        for axis in range(3):
-            moved += (now[axis] - hand[axis]) ** 2
-            hand[axis] = now[axis]
-        moved = np.sqrt(moved)
-        state.path_length[row] += moved
-        state.peak_speed[row] = max(state.peak_speed[row], moved / timestep)
-        away, error, fastest = 0.0, 0.0, 0.0
-        for d in range(dimension):
-            here = now[d] if of_hand else joints[k, d]
-            away += (here - planned[k + 1, d]) ** 2
-            error = error + (here - goal[d]) ** 2 if of_hand else max(error, abs(here - goal[d]))
-        for j in range(joints.shape[1]):
-            fastest = max(fastest, abs(joints[k, j] - before[j]) / timestep)
-            before[j] = joints[k, j]
-            low, high = joint_range[j, 0] - LIMIT_TOLERANCE, joint_range[j, 1] + LIMIT_TOLERANCE
-            if joints[k, j] < low or joints[k, j] > high:
-                state.within[row] = False
-        state.deviation[row] += away
-        error = np.sqrt(error) if of_hand else error
-        speed = moved / timestep if of_hand else fastest
-        resting = speed < rest_speed and error < goal_tolerance
-        state.rest[row] = state.rest[row] + 1 if resting else 0
-    state.last_speed[row] = speed
-    state.hand[row] = hand
-    state.joints[row] = before
-    state.steps[row] = begin + steps
-    done = movement_clearance(
-        chain, spheres, reach, joints[:steps], obstacles, scene, timestep, timestep, placed
-    )
-    state.min_clearance[row] = min(state.min_clearance[row], done[0])
-    state.self_clearance[row] = min(state.self_clearance[row], done[1])
-    command = movement_clearance(
-        chain, spheres, reach, path[: commanded + 1], obstacles, scene, 0.0, timestep, placed
-    )
-    state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
-    return steps
+    found = np.empty_like(steps)
+    for scene in range(len(rows)):
+        row = rows[scene]
+        executed = joints[scene]
+        begin, end = state.steps[row], steps[scene]
+        for k in range(end):
+            if contact[scene, k]:
+                # The state before this step is the last one that counts.
+                if state.first_contact[row] < 0:
+                    state.first_contact[row] = begin + k
+                end = k + 1
+                break
+        hand = state.hand[row].copy()
+        before = state.joints[row].copy()
+        speed = 0.0
+        for k in range(end):
+            now = tool_position(chain, executed[k], placed.rotation, placed.origin)
+            moved = 0.0
+            for axis in range(3):
+                moved += (now[axis] - hand[axis]) ** 2
+                hand[axis] = now[axis]
+            moved = np.sqrt(moved)
+            state.path_length[row] += moved
+            state.peak_speed[row] = max(state.peak_speed[row], moved / timestep)
+            away, square, greatest, rate = 0.0, 0.0, 0.0, 0.0
+            for d in range(goal.shape[1]):
+                here = now[d] if of_hand else executed[k, d]
+                error = here - goal[scene, d]
+                away += (here - planned[scene, k + 1, d]) ** 2
+                square += error * error
+                greatest = max(greatest, abs(error))
+            for j in range(executed.shape[1]):
+                rate = max(rate, abs(executed[k, j] - before[j]) / timestep)
+                before[j] = executed[k, j]
+                low, high = joint_range[j, 0] - LIMIT_TOLERANCE, joint_range[j, 1] + LIMIT_TOLERANCE
+                if executed[k, j] < low or executed[k, j] > high:
+                    state.within[row] = False
+            state.deviation[row] += away
+            error = np.sqrt(square) if of_hand else greatest
+            speed = moved / timestep if of_hand else rate
+            resting = speed < rest_speed and error < goal_tolerance
+            state.rest[row] = state.rest[row] + 1 if resting else 0
+        state.last_speed[row] = speed
+        state.hand[row] = hand
+        state.joints[row] = before
+        state.steps[row] = begin + end
+        # Clearance of what was done, and of what was commanded
+        done = movement_clearance(
+            chain, spheres, reach, executed[:end], obstacles, scene, timestep, timestep, placed
+        )
+        state.min_clearance[row] = min(state.min_clearance[row], done[0])
+        state.self_clearance[row] = min(state.self_clearance[row], done[1])
+        command = movement_clearance(
+            chain, spheres, reach, path[scene, : steps[scene] + 1], obstacles, scene, 0.0, timestep, placed
+        )
+        state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
+        found[scene] = end
+    return found

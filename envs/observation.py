@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from viapoint.envs.common.types import Float, Observation
-from viapoint.envs.geometry.obstacles import Obstacles, observation_rows
+from viapoint.envs.geometry.obstacles import POSE_SIZE, Obstacles, observation_rows
 from viapoint.envs.plans import Motion
 from viapoint.envs.replanning import NominalPlan
 
@@ -20,8 +20,6 @@ FASTEST = 1.0
 """Bound of the velocity of an obstacle along any axis, [m/s]."""
 BEYOND_LIMIT = 0.1
 """Margin beyond the joint limits at which observed joints are clipped, [rad]."""
-POSE_SIZE = 16
-"""Numbers of an obstacle's row besides its kind: centre 3, axes 6, half lengths 3, velocity 3, present 1."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,6 +11,7 @@ import numpy as np
 from viapoint import primitives
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import check_increasing_pair, finite_array, whole_number
+from viapoint.envs.geometry.compiled import compiled
 
 Timing = Literal["optimal", "learned"]
 SpaceName = Literal["hand", "joints"]
@@ -21,6 +22,8 @@ MOST_VIAS = 16
 """Greatest number of via-points of an action; more add no new movements in practice."""
 SHORTEST_DURATION, LONGEST_DURATION = 0.05, 60.0
 """Bounds of the duration range, [s] in hand space, factors in joint space."""
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)
+"""Nodes and weights of Gauss-Legendre quadrature."""
 PEAK_INSTANTS = 64
 """Instants at which the joint rates of a movement are looked at."""
 
@@ -86,6 +89,83 @@ class Motion(NamedTuple):
     def at_rest(cls, position: Float) -> Motion:
         """Return references that rest at a position, shape (..., D)."""
         return cls(position.copy(), np.zeros_like(position), np.zeros_like(position))
+
+
+class Movements(NamedTuple):
+    """N minimum-jerk movements as :class:`~viapoint.primitives.Trajectory` has them, for compiled functions."""
+
+    coefficients: Float
+    """Coefficients of powers of unit time, shape (N, 6, S, D)."""
+    starts: Float
+    """First instant of each segment, shape (N, S), [s]."""
+    rates: Float
+    """Rate of unit time in each segment, shape (N, S), [1/s]."""
+    end: Float
+    """Last instant, shape (N, 1), [s]."""
+
+    @classmethod
+    def of(cls, plan: Plan) -> Movements:
+        """Return the movements of a batch of plans."""
+        found = plan.trajectory()
+        return cls(*(np.array(part) for part in (found.coefficients, found.starts, found.rates, found.end)))
+
+    def sample(self, times: Float) -> Motion:
+        """Return the states at times of shape (N, T), [s]; outside the movement, the arm rests at an end."""
+        return Motion(*_sampled(self, times))
+
+
+# The second evaluation of such polynomials besides that of `primitives`: it takes a third of the time or less.
+@compiled
+def _sampled(movements: Movements, times: Float) -> tuple[Float, Float, Float]:
+    """Return position, velocity and acceleration, see :meth:`Movements.sample`."""
+    number, _, segments, dimension = movements.coefficients.shape
+    shape = (number, times.shape[1], dimension)
+    position, velocity, acceleration = np.empty(shape), np.empty(shape), np.empty(shape)
+    for i in range(number):
+        c = movements.coefficients[i]
+        for k in range(times.shape[1]):
+            time = min(max(times[i, k], 0.0), movements.end[i, 0])
+            s = segments - 1
+            while s > 0 and time < movements.starts[i, s]:
+                s -= 1
+            rate = movements.rates[i, s]
+            u = (time - movements.starts[i, s]) * rate
+            moving = 1.0 if time == times[i, k] else 0.0
+            for d in range(dimension):
+                high = c[3, s, d] + u * (c[4, s, d] + u * c[5, s, d])
+                position[i, k, d] = c[0, s, d] + u * (c[1, s, d] + u * (c[2, s, d] + u * high))
+                slope = 3.0 * c[3, s, d] + u * (4.0 * c[4, s, d] + u * 5.0 * c[5, s, d])
+                slope = c[1, s, d] + u * (2.0 * c[2, s, d] + u * slope)
+                bend = 6.0 * c[3, s, d] + u * (12.0 * c[4, s, d] + u * 20.0 * c[5, s, d])
+                bend = 2.0 * c[2, s, d] + u * bend
+                velocity[i, k, d] = moving * rate * slope
+                acceleration[i, k, d] = moving * rate * rate * bend
+    return position, velocity, acceleration
+
+
+@compiled
+def jerk_cost_between(movements: Movements, begin: Float, end: Float) -> Float:
+    """Return half the integral of the squared jerk of movements between two times of each, shape (N,).
+
+    On each segment the jerk is a parabola of time, so its square has degree four: three Gauss-Legendre nodes are exact.
+    """
+    number, _, segments, dimension = movements.coefficients.shape
+    cost = np.zeros(number)
+    for i in range(number):
+        c = movements.coefficients[i]
+        for s in range(segments):
+            first, rate = movements.starts[i, s], movements.rates[i, s]
+            last = movements.starts[i, s + 1] if s + 1 < segments else movements.end[i, 0]
+            low, high = max(begin[i], first), min(end[i], last)
+            half = 0.5 * max(high - low, 0.0)
+            for node in range(3):
+                u = (low + half * (1.0 + NODES[node]) - first) * rate
+                square = 0.0
+                for d in range(dimension):
+                    jerk = 6.0 * c[3, s, d] + u * (24.0 * c[4, s, d] + u * 60.0 * c[5, s, d])
+                    square += (rate * rate * rate * jerk) ** 2
+                cost[i] += 0.5 * half * WEIGHTS[node] * square
+    return cost
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,6 +278,10 @@ class ActionLayout:
         action = finite_array("action", action, (..., self.size))
         start = finite_array("start", start, (..., self.dimension))
         goal = finite_array("goal", goal, (..., self.dimension))
+        return self.plans(action, start, goal)
+
+    def plans(self, action: Float, start: Float, goal: Float) -> Plan:
+        """Return the movements of actions that are known to be good; see :meth:`decode`."""
         waypoints = self.waypoints(action, start, goal)
         factor = self.centre * np.exp(action[..., self.n_via * self.dimension] * self.log_half_range)
         shares = self.shares(waypoints, action)

@@ -88,7 +88,7 @@ def revise(layout: ActionLayout, nominal: NominalPlan, plan: Plan, actions: Floa
     revised = Plan(*(part.copy() for part in plan))
     first = np.flatnonzero(~nominal.begun)
     if first.size:
-        fresh = layout.decode(actions[first], nominal.state.position[first], nominal.goal[first])
+        fresh = layout.plans(actions[first], nominal.state.position[first], nominal.goal[first])
         put(revised, first, fresh)
     later = np.flatnonzero(nominal.begun & ~keep)
     if later.size:

@@ -186,7 +186,6 @@ class Simulator:
             model = copy.copy(self.model)
             self._probe = model, mujoco.MjData(model)
         model, data = self._probe
-        number = min(number, MOST_BETWEEN)
         for share in np.arange(1, number + 1) / (number + 1):
             data.qpos[:] = (1.0 - share) * joints[0] + share * joints[1]
             self.copy_obstacles(sim, model, data, (1.0 - share) * centres[0] + share * centres[1])

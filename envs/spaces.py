@@ -3,45 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.inverse_kinematics import planar_joints, planar_motion
+from viapoint.envs.arms.chain import Chain
+from viapoint.envs.arms.inverse_kinematics import planar_joints, planar_motion, solve_planar
 from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.plans import Motion, SpaceName
 
 REACH_TOLERANCE = 1e-9
 """Greatest distance of the hand from a reference within reach, [m], and of a joint beyond its range, [rad]."""
-
-
-class Space(Protocol):
-    """Space in which a movement is a minimum-jerk trajectory."""
-
-    @property
-    def name(self) -> SpaceName:
-        """Name of the space."""
-
-    @property
-    def dimension(self) -> int:
-        """Dimension D."""
-
-    @property
-    def of_hand(self) -> bool:
-        """True if coordinates are those of the hand, False if they are joint positions."""
-
-    def coordinates(self, joints: Float) -> Float:
-        """Return coordinates, shape (..., D), of joint positions of shape (..., J)."""
-
-    def joints(self, coordinates: Float) -> Float:
-        """Return joint positions, shape (..., J), of coordinates of shape (..., D)."""
-
-    def joint_motion(self, motion: Motion) -> Motion:
-        """Return positions, rates and accelerations of the joints, shape (N, T, J) each, of N references."""
-
-    def inside(self, coordinates: Float) -> Bool:
-        """Return True for coordinates within reach and joint ranges, shape (...), of shape (..., D)."""
 
 
 @dataclass(frozen=True)
@@ -99,10 +72,23 @@ class HandPlane:
 
     def inside(self, coordinates: Float) -> Bool:
         """Return True where the hand reaches the coordinates with joints within their ranges."""
-        joints = self.joints(coordinates)
-        away = np.abs(self.coordinates(joints) - coordinates).max(axis=-1)
-        within = JointSpace(self.arm).inside(joints)
-        return np.asarray(within & (away < REACH_TOLERANCE))
+        chain, limits = self.arm.chain, self.arm.joint_range + REACH_TOLERANCE * np.array([-1.0, 1.0])
+        flat = np.ascontiguousarray(coordinates.reshape(-1, 2))
+        return np.asarray(_are_reached(chain, limits, flat).reshape(coordinates.shape[:-1]))
+
+
+@compiled
+def _are_reached(chain: Chain, joint_range: Float, places: Float) -> Bool:
+    """Return True for places of the hand of an arm in the plane, shape (N, 2), [m], that it reaches, shape (N,)."""
+    joints = np.empty(2)
+    found = np.empty(len(places), np.bool_)
+    for i in range(len(places)):
+        found[i] = solve_planar(chain, joint_range, places[i, 0], places[i, 1], joints)
+    return found
+
+
+Space = JointSpace | HandPlane
+"""Space in which a movement is a minimum-jerk trajectory, with coordinates of shape (..., D)."""
 
 
 def space_of(arm: Arm, name: SpaceName) -> Space:

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -18,22 +18,24 @@ from viapoint.envs.common.validation import (
     number_of_at_least,
     whole_number,
 )
-from viapoint.envs.events import TRIGGERS, EventPredictor, Trigger
 from viapoint.envs.geometry.shapes import check_kinds
 from viapoint.envs.observation import ObservationLayout
 from viapoint.envs.outcome import SETTLING, TOLERANCES, Tolerance
 from viapoint.envs.plans import ActionLayout, SpaceName, Timing
 from viapoint.envs.rewards import RewardWeights
 from viapoint.envs.scenes.families_registry import check_families, default_families
-from viapoint.envs.scenes.sampler import SceneSampler, is_planar
+from viapoint.envs.scenes.sampler import MOST_DRAWN, SceneSampler, is_planar
 from viapoint.envs.scenes.scene import MOST_JUMPS
 from viapoint.envs.spaces import Space, space_of
 from viapoint.envs.steering import Steering
 
+Trigger = Literal["horizon", "target", "course", "clearance"]
+TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)
+"""Events that may end a decision before the goal."""
 END, STEPS = "end", "steps"
 """Values of `decide_at` with one decision for a movement, and with one in every control step."""
-MOST_OBSTACLES, MOST_DRAWN = 256, 32
-"""Greatest number of obstacles in a scene that is given, and in one that is drawn."""
+MOST_OBSTACLES = 256
+"""Greatest number of obstacles in a scene that is given."""
 PLANE_SHAPES = ("cylinder", "box")
 """Default shapes of obstacles in the plane."""
 SPACE_SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")
@@ -250,18 +252,6 @@ class Task:
             speed=top,
             acceleration=0.0 if self.whole_movement else self.steering.greatest_acceleration,
             time_limit=0.0 if self.whole_movement else self.time_limit,
-        )
-
-    def events(self) -> EventPredictor:
-        """Return the predictor of the ends of decisions."""
-        return EventPredictor(
-            self.arm,
-            self.space,
-            timestep=self.arm.timestep,
-            triggers=() if isinstance(self.decide_at, str) else self.decide_at,
-            horizon=self.horizon,
-            margin=self.margin,
-            time_limit=self.time_limit,
         )
 
     def sampler(self) -> SceneSampler:

@@ -27,15 +27,13 @@ from viapoint.envs.common.validation import (
     whole_number,
 )
 from viapoint.envs.episodes import Decision, Episodes, History
-from viapoint.envs.events import Trigger
 from viapoint.envs.geometry.obstacles import check_simulated
 from viapoint.envs.outcome import Rollout
-from viapoint.envs.plans import Plan, SpaceName, Timing
+from viapoint.envs.plans import Plan
 from viapoint.envs.rendering.renderer import RENDER_MODES, EpisodeRenderer
-from viapoint.envs.rewards import RewardWeights
 from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.scenes.scene import Scenes, check_jumps
-from viapoint.envs.task import END, Task
+from viapoint.envs.task import Task
 
 SINGLE_METADATA: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
 METADATA: dict[str, Any] = {**SINGLE_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -91,34 +89,25 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self,
         num_envs: int = 1,
         *,
-        arm: Arm | str = "planar",
-        space: SpaceName | None = None,
-        n_via: int = 1,
-        timing: Timing = "optimal",
-        duration_range: tuple[float, float] | None = None,
-        n_obstacles: int | tuple[int, int] = (1, 5),
-        shapes: str | Sequence[str] | None = None,
-        families: str | Sequence[str] | None = None,
-        whole_arm: bool = False,
-        moving_obstacles: bool = False,
-        n_jumps: int | tuple[int, int] = 0,
-        decide_at: str | Sequence[Trigger] = END,
-        horizon: float = 0.3,
-        margin: float = 0.02,
-        control_step: float = 0.04,
-        reward_weights: RewardWeights | Mapping[str, float] | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
         width: int = 480,
         height: int = 480,
         threads: int = 0,
+        **task: Any,
     ) -> None:
-        given = as_given(
-            {name: value for name, value in locals().items() if name not in ("self", "__class__")}
+        task = as_given(task)
+        EzPickle.__init__(
+            self,
+            num_envs,
+            autoreset_mode=autoreset_mode,
+            render_mode=render_mode,
+            width=width,
+            height=height,
+            threads=threads,
+            **task,
         )
-        EzPickle.__init__(self, **given)
-        own = ("num_envs", "autoreset_mode", "render_mode", "width", "height", "threads")
-        self.task = Task.of(**{name: value for name, value in given.items() if name not in own})
+        self.task = Task.of(**task)
         """Task of an episode: what an agent may compute with before it moves."""
         self.num_envs = whole_number("num_envs", num_envs, 1)
         self.autoreset_mode = _mode_of(autoreset_mode)
@@ -315,21 +304,22 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Raises:
             ValueError: A target is out of reach; the episodes are unchanged.
         """
-        scenes, space = self._check_running(), self.task.space
+        self._check_running()
+        space = self.task.space
         goals = finite_array("goals", goals, (self.num_envs, space.dimension))
         inside = space.inside(goals)
         if not inside.all():
             row = int(inside.argmin())
             raise ValueError(f"goals must be within the arm's reach, got {goals[row].tolist()} in row {row}")
         joints = space.joints(goals)
-        check_jumps(scenes._replace(goal=joints), self.arm)
+        assert self.scenes is not None
+        check_jumps(self.scenes._replace(goal=joints), self.arm)
         self._each(lambda episodes, share: episodes.move_goals(joints[share]))
         return self.observe()
 
     def observe(self) -> Observation:
         """Return the present observations."""
-        parts = [each.observe() for each in self._episodes]
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return _together([each.observe() for each in self._episodes])
 
     def state(self) -> dict[str, Any]:
         """Return scenes, random generators and running episodes as values and arrays for :meth:`restore`.
@@ -411,13 +401,11 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def _joined(self, parts: list[Decision]) -> Decision:
         """Return the decisions of all environments together."""
-        observation = {
-            name: np.concatenate([part.observation[name] for part in parts]) for name in parts[0].observation
-        }
-        info = {name: np.concatenate([part.info[name] for part in parts]) for name in parts[0].info}
+        observation = _together([part.observation for part in parts])
+        info = _together([part.info for part in parts])
+        reward = np.concatenate([part.reward for part in parts])
         self.terminated = np.concatenate([part.terminated for part in parts])
         self.truncated = np.concatenate([part.truncated for part in parts])
-        reward = np.concatenate([part.reward for part in parts])
         return Decision(observation, reward, self.terminated, self.truncated, info)
 
     def _as_step(
@@ -475,12 +463,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                     f"movement; here it is {self.task.decide_at!r}"
                 )
 
-    def _check_running(self) -> Scenes:
-        """Return the running scenes, or raise an error before the first reset."""
-        scenes = self.scenes
-        if scenes is None:
+    def _check_running(self) -> None:
+        """Raise an error before the first reset."""
+        if not self._running:
             raise gym.error.ResetNeeded("the episodes have not begun: call reset() before step()")
-        return scenes
 
     def _seeded(
         self, seed: int | Sequence[int | None] | None, rows: Int
@@ -494,6 +480,13 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                 generators[i], used = seeding.np_random(seeds[i])
                 first_seed = used if i == 0 else first_seed
         return generators, first_seed
+
+
+def _together(parts: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the arrays of all environments by name, from those of the environments of each thread."""
+    if len(parts) == 1:
+        return parts[0]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:

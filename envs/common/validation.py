@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Int
 
-MIN_GOAL_DISTANCE = 0.02
-"""Least distance between start and goal, [m]."""
-
 
 def is_whole(value: Any) -> bool:
     """Return True for a whole number, also NumPy's; a bool is none."""

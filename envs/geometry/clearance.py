@@ -22,8 +22,10 @@ from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 
 FAR = 1.0
 """Greatest clearance that is reported, [m]; farther obstacles do not matter."""
-WINDOW = 0.06
+WINDOW = 0.1
 """Way beyond the least clearance so far up to which a movement looks for more, to skip configurations, [m]."""
+COARSE = 16
+"""Configurations from one to the next that a first, coarse look at a movement takes."""
 
 
 class Placed(NamedTuple):
@@ -39,6 +41,12 @@ class Placed(NamedTuple):
     """Centres of the spheres of known groups, shape (S, 3), [m]."""
     known: Bool
     """True for groups whose spheres are placed, shape (G,)."""
+    way: Float
+    """Bound of the way of the spheres of links 0 to J since another configuration, shape (J + 1,), [m]."""
+    apart: Float
+    """Lower bounds of the clearance of groups from obstacles in a movement, shape (G,), [m]."""
+    pair_apart: Float
+    """Lower bounds of the clearance of pairs of groups in a movement, shape (P,), [m]."""
 
 
 @compiled
@@ -52,6 +60,9 @@ def memory(chain: Chain, spheres: Spheres) -> Placed:
         np.empty((groups, 3)),
         np.empty((len(spheres.radius), 3)),
         np.empty(groups, np.bool_),
+        np.empty(joints + 1),
+        np.empty(groups),
+        np.empty(len(spheres.pairs)),
     )
 
 
@@ -118,6 +129,34 @@ def group_clearance(
     return least, nearest
 
 
+@inlined
+def nearest_obstacle(
+    spheres: Spheres,
+    placed: Placed,
+    group: int,
+    obstacles: Obstacles,
+    scene: int,
+    time: float,
+    least: float,
+    floor: float,
+) -> float:
+    """Return the clearance of a group of spheres from all obstacles, at most `least`, [m].
+
+    The arguments are those of :func:`obstacle_clearance`.
+    """
+    x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
+    size = spheres.ball_radius[group]
+    for row in range(obstacles.kind.shape[1]):
+        if obstacles.kind[scene, row] == ABSENT:
+            continue
+        if point_distance(obstacles, scene, row, x, y, z, time, least + size) - size >= least:
+            continue
+        least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
+        if least < floor:
+            break
+    return least
+
+
 @kernel
 def obstacle_clearance(
     spheres: Spheres,
@@ -142,16 +181,8 @@ def obstacle_clearance(
         floor: Clearance below which the exact value does not matter, [m].
     """
     for group in range(len(spheres.link)):
-        if spheres.link[group] == 0:
-            continue
-        x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
-        size = spheres.ball_radius[group]
-        for row in range(obstacles.kind.shape[1]):
-            if obstacles.kind[scene, row] == ABSENT:
-                continue
-            if point_distance(obstacles, scene, row, x, y, z, time, least + size) - size >= least:
-                continue
-            least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
+        if spheres.link[group] > 0:
+            least = nearest_obstacle(spheres, placed, group, obstacles, scene, time, least, floor)
             if least < floor:
                 return least
     return least
@@ -249,8 +280,8 @@ def movement_clearance(
 ) -> tuple[float, float]:
     """Return the least clearance of T configurations from obstacles and from the arm itself, at most FAR each, [m].
 
-    The values are exact, but most configurations are skipped: after a clearance c, no later one is below the least so
-    far before the spheres and the obstacles have moved by the difference.
+    The values are exact, but most configurations are skipped: after a clearance c of some spheres, none of them is
+    nearer than the least so far before they, and the obstacles, have moved by the difference.
 
     Args:
         chain: Chain of the arm.
@@ -265,25 +296,58 @@ def movement_clearance(
     """
     least, least_self = FAR, FAR
     drift = step * fastest(obstacles, scene)
-    spare, spare_self = -1.0, -1.0
-    for k in range(len(path)):
-        if k:
-            way = travel(reach, path[k - 1], path[k])
-            spare -= way + drift
-            spare_self -= 2.0 * way
-        if spare > 0.0 and spare_self > 0.0:
-            continue
-        place(chain, spheres, path[k], placed)
-        if spare <= 0.0:
-            window = min(least + WINDOW, FAR)
-            clearance = obstacle_clearance(spheres, placed, obstacles, scene, begin + k * step, window, -FAR)
-            least = min(least, clearance)
-            spare = clearance - least
-        if spare_self <= 0.0:
-            clearance = self_clearance(spheres, placed, min(least_self + WINDOW, FAR), -FAR)
-            least_self = min(least_self, clearance)
-            spare_self = clearance - least_self
+    # A coarse look comes first: with a small clearance from the start, the second one skips most configurations.
+    for stride in (COARSE, 1):
+        _forget(placed)
+        for k in range(0, len(path), stride):
+            _move(reach, path[max(k - stride, 0)], path[k], stride * drift, spheres, placed)
+            is_placed = False
+            for group in range(len(spheres.link)):
+                if spheres.link[group] == 0 or placed.apart[group] >= least:
+                    continue
+                if not is_placed:
+                    place(chain, spheres, path[k], placed)
+                    is_placed = True
+                time, most = begin + k * step, least + WINDOW
+                apart = nearest_obstacle(spheres, placed, group, obstacles, scene, time, most, -FAR)
+                placed.apart[group] = apart
+                least = min(least, apart)
+            for pair in range(len(spheres.pairs)):
+                if placed.pair_apart[pair] >= least_self:
+                    continue
+                if not is_placed:
+                    place(chain, spheres, path[k], placed)
+                    is_placed = True
+                apart, _, _ = nearest_spheres(spheres, placed, pair, least_self + WINDOW, -FAR)
+                placed.pair_apart[pair] = apart
+                least_self = min(least_self, apart)
     return least, least_self
+
+
+@inlined
+def _forget(placed: Placed) -> None:
+    """Set all lower bounds of clearance so low that they tell nothing."""
+    for group in range(len(placed.apart)):
+        placed.apart[group] = -FAR
+    for pair in range(len(placed.pair_apart)):
+        placed.pair_apart[pair] = -FAR
+
+
+@inlined
+def _move(reach: Float, first: Float, second: Float, drift: float, spheres: Spheres, placed: Placed) -> None:
+    """Lower the bounds of clearance by what spheres, and obstacles by `drift`, may move between two configurations.
+
+    Seen from its first link, a pair of groups is moved by the joints between both links alone.
+    """
+    way = placed.way
+    way[0] = 0.0
+    for joint in range(len(reach)):
+        way[joint + 1] = way[joint] + reach[joint] * abs(second[joint] - first[joint])
+    for group in range(len(placed.apart)):
+        placed.apart[group] -= way[spheres.link[group]] + drift
+    for pair in range(len(placed.pair_apart)):
+        one, other = spheres.link[spheres.pairs[pair, 0]], spheres.link[spheres.pairs[pair, 1]]
+        placed.pair_apart[pair] -= abs(way[other] - way[one])
 
 
 @compiled
@@ -305,27 +369,4 @@ def configuration_clearances(
         place(chain, spheres, configurations[scene], placed)
         found[scene, 0] = obstacle_clearance(spheres, placed, obstacles, scene, times[scene], FAR, -FAR)
         found[scene, 1] = self_clearance(spheres, placed, FAR, -FAR)
-    return found
-
-
-@compiled
-def clearance_profile(
-    chain: Chain, spheres: Spheres, path: Float, obstacles: Obstacles, scene: int, step: float, most: float
-) -> Float:
-    """Return the clearance from obstacles at each of T configurations of a movement, shape (T,), at most `most`, [m].
-
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        path: Configurations, shape (T, J); the first is looked at with the obstacles as they are.
-        obstacles: Obstacles of N scenes.
-        scene: Index of the scene.
-        step: Time between two configurations, [s].
-        most: Greatest clearance of interest, [m].
-    """
-    placed = memory(chain, spheres)
-    found = np.empty(len(path))
-    for k in range(len(path)):
-        place(chain, spheres, path[k], placed)
-        found[k] = obstacle_clearance(spheres, placed, obstacles, scene, k * step, most, -FAR)
     return found

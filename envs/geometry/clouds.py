@@ -13,40 +13,19 @@ from viapoint.envs.geometry.kernels import kernel
 
 LEAF = 16
 """Greatest number of points of a leaf of the tree."""
-CELLS, CELLS_PER_POINT = 1 << 15, 8
-"""Greatest number of cells of a grid, and for each point."""
-FAR = 1e6
-"""Distance beyond everything, [m]."""
 TINY = 1e-12
 """Length below which a vector has no direction, [m]."""
 
 
-class Cloud(NamedTuple):
-    """Point cloud with a balanced binary tree of bounding boxes.
+class Clouds(NamedTuple):
+    """Packed arrays of C point clouds, each in a frame of its own, with balanced binary trees of bounding boxes.
 
     The nodes of a tree with L leaves are numbered from 1, the root, to 2 L - 1; node i has the children 2 i and
-    2 i + 1. Leaf j holds the points from j K // L to (j + 1) K // L.
+    2 i + 1. Leaf j of a cloud of K points holds those from j K // L to (j + 1) K // L.
     """
 
     points: Float
-    """Points, neighbours near one another, shape (K, 3), [m]."""
-    radius: float
-    """Radius of the spheres around the points, [m]."""
-    boxes: Float
-    """Least and greatest corner of the box of each node, shape (2 L, 6), [m]; node 0 has none."""
-    edge: float
-    """Edge of the cells of a grid over the box of the root, [m]."""
-    cells: Int
-    """Number of cells along each axis, shape (3,)."""
-    gap: Float
-    """Distance from the centre of each cell to the nearest point, shape (cells,), [m]."""
-
-
-class Clouds(NamedTuple):
-    """Packed arrays of C point clouds, each in a frame of its own; see :class:`Cloud`."""
-
-    points: Float
-    """Points of all clouds, shape (P, 3), [m]."""
+    """Points of all clouds, neighbours near one another, shape (P, 3), [m]."""
     radius: Float
     """Radius of the spheres around the points, shape (C,), [m]."""
     first: Int
@@ -54,15 +33,7 @@ class Clouds(NamedTuple):
     node: Int
     """Index of node 0 of each tree, and the number of all nodes, shape (C + 1,)."""
     boxes: Float
-    """Boxes of all trees, shape (nodes, 6), [m]."""
-    edge: Float
-    """Edge of the cells of each grid, shape (C,), [m]."""
-    cells: Int
-    """Number of cells of each grid along each axis, shape (C, 3)."""
-    cell: Int
-    """Index of the first cell of each grid, and the number of all cells, shape (C + 1,)."""
-    gap: Float
-    """Distance from the centre of each cell to the nearest point, shape (cells,), [m]."""
+    """Least and greatest corner of the box of each node, shape (nodes, 6), [m]; node 0 of each tree has none."""
 
 
 @kernel
@@ -71,11 +42,10 @@ def cloud_distance(
 ) -> tuple[float, float, float, float]:
     """Return the distance of a point from the nearest sphere of a cloud, and its gradient.
 
-    The grid gives a lower bound at once, the result where it is beyond `limit`. Otherwise the tree gives the nearest
-    point; if there is none within `limit`, the result is `limit`.
+    Beyond `limit`, the result is a lower bound.
     """
     radius = clouds.radius[index]
-    bound = _lower_bound(clouds, index, x, y, z) - radius
+    bound = math.sqrt(_box_square(clouds.boxes, clouds.node[index] + 1, x, y, z)) - radius
     if bound > limit:
         return bound, 0.0, 0.0, 1.0
     nearest = _nearest_point(clouds, index, x, y, z, max(limit + radius, 0.0))
@@ -88,26 +58,6 @@ def cloud_distance(
     if distance < TINY:
         return -radius, 0.0, 0.0, 1.0
     return distance - radius, dx / distance, dy / distance, dz / distance
-
-
-@kernel
-def _lower_bound(clouds: Clouds, index: int, x: float, y: float, z: float) -> float:
-    """Return a lower bound of the distance of a place from the points of a cloud, [m]."""
-    box = clouds.node[index] + 1
-    edge = clouds.edge[index]
-    number = 0
-    beyond, within = 0.0, 0.0
-    for axis in range(3):
-        place = x if axis == 0 else y if axis == 1 else z
-        inside = min(max(place, clouds.boxes[box, axis]), clouds.boxes[box, axis + 3])
-        offset = (inside - clouds.boxes[box, axis]) / edge
-        cell = min(int(offset), clouds.cells[index, axis] - 1)
-        number = number * clouds.cells[index, axis] + cell
-        beyond += (place - inside) ** 2
-        within += (offset - cell - 0.5) ** 2
-    # A point x of a box is at least as far from p as sqrt(|p - q|^2 + |q - x|^2), where q is nearest to p in the box.
-    gap = max(clouds.gap[clouds.cell[index] + number] - edge * math.sqrt(within), 0.0)
-    return math.sqrt(beyond + gap * gap)
 
 
 @kernel
@@ -170,19 +120,15 @@ def _box_square(boxes: Float, node: int, x: float, y: float, z: float) -> float:
     return float(dx * dx + dy * dy + dz * dz)
 
 
-def build_cloud(points: Float, radius: float) -> Cloud:
-    """Return a cloud with its tree and grid from points, shape (K, 3), [m]."""
+def build_cloud(points: Float, radius: float) -> Clouds:
+    """Return a cloud with its tree from points, shape (K, 3), [m]."""
     points, boxes = _tree(points)
-    extent = boxes[1, 3:] - boxes[1, :3]
-    edge = max(float(extent.max()), TINY)
-    most = min(CELLS_PER_POINT * len(points), CELLS)
-    while edge > TINY and np.prod(np.ceil(extent / (0.8 * edge)).clip(1.0)) <= most:
-        edge *= 0.8
-    cells = np.ceil(extent / edge).clip(1.0).astype(np.int64)
-    gap = np.zeros(int(cells.prod()))
-    cloud = Cloud(points, radius, boxes, edge, cells, gap)
-    _fill_gaps(join_clouds([cloud]), gap)
-    return cloud
+    return _one_cloud(points, np.array([radius]), boxes)
+
+
+def _one_cloud(points: Float, radius: Float, boxes: Float) -> Clouds:
+    """Return packed arrays of one cloud."""
+    return Clouds(points, radius, np.array([0, len(points)]), np.array([0, len(boxes)]), boxes)
 
 
 def _tree(points: Float) -> tuple[Float, Float]:
@@ -212,53 +158,23 @@ def _tree(points: Float) -> tuple[Float, Float]:
         level *= 2
 
 
-@kernel
-def _fill_gaps(clouds: Clouds, gap: Float) -> None:
-    """Fill in the distances from the centres of the cells of one cloud to the nearest points, [m]."""
-    edge, cells = clouds.edge[0], clouds.cells[0]
-    number = 0
-    for i in range(cells[0]):
-        x = clouds.boxes[1, 0] + (i + 0.5) * edge
-        for j in range(cells[1]):
-            y = clouds.boxes[1, 1] + (j + 0.5) * edge
-            for k in range(cells[2]):
-                z = clouds.boxes[1, 2] + (k + 0.5) * edge
-                # Neighbouring cells differ by at most an edge.
-                reach = gap[number - 1] + 1.001 * edge if k > 0 else FAR
-                point = _nearest_point(clouds, 0, x, y, z, reach)
-                dx = x - clouds.points[point, 0]
-                dy = y - clouds.points[point, 1]
-                dz = z - clouds.points[point, 2]
-                gap[number] = math.sqrt(dx * dx + dy * dy + dz * dz)
-                number += 1
-
-
-def join_clouds(clouds: Iterable[Cloud]) -> Clouds:
-    """Return clouds as packed arrays."""
+def join_clouds(clouds: Iterable[Clouds]) -> Clouds:
+    """Return several records of one cloud each as one."""
     clouds = list(clouds)
     return Clouds(
         points=np.concatenate([np.empty((0, 3)), *(each.points for each in clouds)]),
-        radius=np.array([each.radius for each in clouds], np.float64),
+        radius=np.concatenate([np.empty(0), *(each.radius for each in clouds)]),
         first=np.cumsum([0, *(len(each.points) for each in clouds)], dtype=np.int64),
         node=np.cumsum([0, *(len(each.boxes) for each in clouds)], dtype=np.int64),
         boxes=np.concatenate([np.empty((0, 6)), *(each.boxes for each in clouds)]),
-        edge=np.array([each.edge for each in clouds], np.float64),
-        cells=np.array([each.cells for each in clouds], np.int64).reshape(-1, 3),
-        cell=np.cumsum([0, *(len(each.gap) for each in clouds)], dtype=np.int64),
-        gap=np.concatenate([np.empty(0), *(each.gap for each in clouds)]),
     )
 
 
-def split_clouds(clouds: Clouds) -> list[Cloud]:
-    """Return the clouds of packed arrays."""
-    return [
-        Cloud(
-            points=clouds.points[clouds.first[i] : clouds.first[i + 1]],
-            radius=float(clouds.radius[i]),
-            boxes=clouds.boxes[clouds.node[i] : clouds.node[i + 1]],
-            edge=float(clouds.edge[i]),
-            cells=clouds.cells[i],
-            gap=clouds.gap[clouds.cell[i] : clouds.cell[i + 1]],
-        )
-        for i in range(len(clouds.radius))
-    ]
+def split_clouds(clouds: Clouds) -> list[Clouds]:
+    """Return a record of its own for each cloud."""
+    found = []
+    for i in range(len(clouds.radius)):
+        points = clouds.points[clouds.first[i] : clouds.first[i + 1]]
+        boxes = clouds.boxes[clouds.node[i] : clouds.node[i + 1]]
+        found.append(_one_cloud(points, clouds.radius[i : i + 1], boxes))
+    return found

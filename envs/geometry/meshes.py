@@ -26,22 +26,13 @@ SLIVER = 1e-12
 """Area of triangles that are left out, as a share of the square of the mesh's size; their neighbours cover them."""
 
 
-class Mesh(NamedTuple):
-    """Convex mesh."""
-
-    corners: Float
-    """Corners of the triangles, counterclockwise as seen from outside, shape (F, 3, 3), [m]."""
-    normals: Float
-    """Outward unit normals of the triangles, shape (F, 3)."""
-
-
 class Meshes(NamedTuple):
-    """Packed arrays of M convex meshes, each in a frame of its own; see :class:`Mesh`."""
+    """Packed arrays of M convex meshes, each in a frame of its own."""
 
     first: Int
     """Index of the first face of each mesh, and the number of all faces, shape (M + 1,)."""
     corners: Float
-    """Corners of all triangles, shape (F, 3, 3), [m]."""
+    """Corners of all triangles, counterclockwise as seen from outside, shape (F, 3, 3), [m]."""
     normals: Float
     """Outward unit normals of all triangles, shape (F, 3)."""
 
@@ -127,7 +118,7 @@ def _from_triangle(
     return dx, dy, dz
 
 
-def build_mesh(vertices: Float, faces: Int | None) -> Mesh:
+def build_mesh(vertices: Float, faces: Int | None) -> Meshes:
     """Return the convex mesh of vertices, shape (V, 3), [m], with the triangles of their hull.
 
     Args:
@@ -152,7 +143,12 @@ def build_mesh(vertices: Float, faces: Int | None) -> Mesh:
     clockwise = (area * normals).sum(axis=1) < 0.0
     corners[clockwise] = corners[clockwise, ::-1]
     wide = np.linalg.norm(area, axis=1) > SLIVER * size**2
-    return Mesh(corners[wide], normals[wide])
+    return _one_mesh(corners[wide], normals[wide])
+
+
+def _one_mesh(corners: Float, normals: Float) -> Meshes:
+    """Return packed arrays of one mesh."""
+    return Meshes(np.array([0, len(normals)]), corners, normals)
 
 
 def convex_hull(vertices: Float, coplanar: float = 0.0) -> Any:
@@ -198,8 +194,8 @@ def _check_faces(vertices: Float, faces: Int, volume: float, tolerance: float) -
         )
 
 
-def join_meshes(meshes: Iterable[Mesh]) -> Meshes:
-    """Return meshes as packed arrays."""
+def join_meshes(meshes: Iterable[Meshes]) -> Meshes:
+    """Return several records of one mesh each as one."""
     meshes = list(meshes)
     return Meshes(
         np.cumsum([0, *(len(each.normals) for each in meshes)], dtype=np.int64),
@@ -208,7 +204,7 @@ def join_meshes(meshes: Iterable[Mesh]) -> Meshes:
     )
 
 
-def split_meshes(meshes: Meshes) -> list[Mesh]:
-    """Return the meshes of packed arrays."""
+def split_meshes(meshes: Meshes) -> list[Meshes]:
+    """Return a record of its own for each mesh."""
     parts = [slice(*ends) for ends in zip(meshes.first, meshes.first[1:], strict=False)]
-    return [Mesh(meshes.corners[part], meshes.normals[part]) for part in parts]
+    return [_one_mesh(meshes.corners[part], meshes.normals[part]) for part in parts]

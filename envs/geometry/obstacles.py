@@ -10,14 +10,15 @@ import numpy as np
 from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.clouds import Cloud, Clouds, join_clouds, split_clouds
-from viapoint.envs.geometry.meshes import Mesh, Meshes, join_meshes, split_meshes
+from viapoint.envs.geometry.clouds import Clouds, join_clouds, split_clouds
+from viapoint.envs.geometry.meshes import Meshes, join_meshes, split_meshes
 from viapoint.envs.geometry.shapes import (
     ABSENT,
     BOX,
     CAPSULE,
     CYLINDER,
     HALF_SPACE,
+    IN_TABLES,
     KINDS,
     MESH,
     POINT_CLOUD,
@@ -37,7 +38,8 @@ __all__ = [
 ]  # fmt: skip
 
 POSE_SIZE = 16
-"""Numbers of an obstacle in an observation after those of its kind."""
+"""Numbers of an obstacle in an observation after those of its kind: centre 3, axes 6, half lengths 3, velocity 3,
+present 1."""
 EXTENT = 1.0
 """Half length of the cube that stands for a half-space in observations, [m]."""
 BOXES = np.array([shape.box for shape in SHAPES], np.float64)
@@ -45,7 +47,7 @@ BOXES = np.array([shape.box for shape in SHAPES], np.float64)
 GEOMS = np.array([shape.geom for shape in SHAPES])
 """MuJoCo's geoms by kind."""
 
-Table = TypeVar("Table", Mesh, Cloud)
+Table = TypeVar("Table", Meshes, Clouds)
 
 
 class Obstacles(NamedTuple):
@@ -178,8 +180,8 @@ def pack(scenes: Sequence[Iterable[Shape | Mapping[str, Any]]], rows: int | None
     if most > rows:
         raise ValueError(f"there must be at most {rows} obstacles, got {most}")
     found = no_obstacles(len(shapes), rows)
-    meshes: list[Mesh] = []
-    clouds: list[Cloud] = []
+    meshes: list[Meshes] = []
+    clouds: list[Clouds] = []
     for scene, each in enumerate(shapes):
         if not each:
             continue
@@ -219,7 +221,7 @@ def unpack(obstacles: Obstacles, scene: int) -> list[Shape]:
             values["vertices"] = np.unique(corners.reshape(-1, 3), axis=0)
         elif shape is PointCloud:
             cloud = split_clouds(obstacles.clouds)[int(size[0])]
-            values.update(points=cloud.points, radius=cloud.radius)
+            values.update(points=cloud.points, radius=float(cloud.radius[0]))
         else:
             sizes = iter(size)
             for name, each in shape.sizes.items():
@@ -258,7 +260,7 @@ def mesh_names(meshes: Meshes) -> list[str]:
     return names
 
 
-def _same(first: Mesh | None, second: Mesh) -> bool:
+def _same(first: Meshes | None, second: Meshes) -> bool:
     """Return True for meshes with the same triangles."""
     return first is not None and np.array_equal(first.corners, second.corners)
 
@@ -411,7 +413,7 @@ def check_simulated(obstacles: Obstacles) -> None:
     Raises:
         ValueError: An obstacle is a point cloud, which has many geoms, or a mesh without a name.
     """
-    if (obstacles.kind >= MESH).any():
+    if np.isin(obstacles.kind, IN_TABLES).any():
         geoms_of(obstacles)
 
 

@@ -25,10 +25,9 @@ from viapoint.envs.common.arrays import frame_matrices, frozen, quaternion_to
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least
-from viapoint.envs.geometry.clouds import Cloud, Clouds, build_cloud, cloud_distance, join_clouds
+from viapoint.envs.geometry.clouds import Clouds, build_cloud, cloud_distance, join_clouds
 from viapoint.envs.geometry.kernels import inlined, kernel
 from viapoint.envs.geometry.meshes import (
-    Mesh,
     Meshes,
     build_mesh,
     convex_hull,
@@ -41,6 +40,10 @@ KINDS = ("sphere", "capsule", "cylinder", "box", "half_space", "convex_mesh", "p
 SPHERE, CAPSULE, CYLINDER, BOX, HALF_SPACE, MESH, POINT_CLOUD = range(len(KINDS))
 ABSENT = -1
 """Kind of a row that holds no obstacle."""
+IN_TABLES = (MESH, POINT_CLOUD)
+"""Kinds whose first size is an index of a table, and whose second is the radius of a bounding sphere."""
+PLAIN_KINDS = tuple(kind for number, kind in enumerate(KINDS) if number not in IN_TABLES)
+"""Kinds that are known by their sizes alone."""
 UNIT_TOLERANCE = 1e-3
 """Greatest error of a quaternion's length; smaller ones are corrected."""
 LEAST_SPACING = 1e-6
@@ -201,9 +204,9 @@ class Shape:
     """Shape (3,), [m/s]."""
     name: str = ""
     """Name for messages."""
-    mesh: Mesh | None = field(init=False, repr=False, default=None)
+    mesh: Meshes | None = field(init=False, repr=False, default=None)
     """Triangles of a mesh."""
-    cloud: Cloud | None = field(init=False, repr=False, default=None)
+    cloud: Clouds | None = field(init=False, repr=False, default=None)
     """Point cloud with its tree."""
 
     def __post_init__(self) -> None:
@@ -261,8 +264,8 @@ class Shape:
             raise ValueError(f"radius must be 0 or greater, got {radius.min()}")
         flat = np.array(points.reshape(-1, 3))
         found = np.empty(len(flat))
-        meshes = join_meshes([] if self.mesh is None else [self.mesh])
-        clouds = join_clouds([] if self.cloud is None else [self.cloud])
+        meshes = self.mesh or join_meshes([])
+        clouds = self.cloud or join_clouds([])
         _distances(
             self.number, self.packed_size, self.rotation, np.array(self.position), meshes, clouds, flat, found
         )

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.common.validation import whole_number
-from viapoint.envs.geometry.obstacles import KINDS, MESH, pack
-from viapoint.envs.geometry.shapes import Shape
+from viapoint.envs.geometry.obstacles import KINDS, pack
+from viapoint.envs.geometry.shapes import IN_TABLES, PLAIN_KINDS, Shape
 from viapoint.envs.scenes import families_plane, families_space
 from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Layout, Place, Room, most_rows
 
@@ -159,9 +159,9 @@ def register_scene_family(
     taken = scene_families(plane)
     if not name or name in taken:
         raise ValueError(f"name must not be empty or one of {', '.join(taken)}, got {name!r}")
-    unknown = [kind for kind in kinds if kind not in KINDS[:MESH]]
+    unknown = [kind for kind in kinds if kind not in PLAIN_KINDS]
     if unknown:
-        raise ValueError(f"kinds of families must be some of {', '.join(KINDS[:MESH])}, got {unknown}")
+        raise ValueError(f"kinds of families must be some of {', '.join(PLAIN_KINDS)}, got {unknown}")
     whole_number("n_obstacles", n_obstacles, 1)
     try:
         inspect.signature(build).bind(None, None)
@@ -209,8 +209,8 @@ def _as_layout(shapes: Iterable[Shape], goals: Iterable[Place] = (), starts: Ite
     obstacles = pack([list(shapes)])
     rows: list[float] = []
     for row in range(obstacles.kind.shape[1]):
-        if obstacles.kind[0, row] >= MESH:
-            raise ValueError(f"kinds must be some of {', '.join(KINDS[:MESH])}")
+        if obstacles.kind[0, row] in IN_TABLES:
+            raise ValueError(f"kinds must be some of {', '.join(PLAIN_KINDS)}")
         rows += [obstacles.kind[0, row], *obstacles.centre[0, row], *obstacles.rotation[0, row].ravel()]
         rows += [*obstacles.size[0, row]]
     return Layout(rows, _numbers(goals), _numbers(starts))

@@ -17,7 +17,6 @@ from viapoint.envs.arms.inverse_kinematics import planar_joints
 from viapoint.envs.arms.kinematics import link_poses, sphere_centres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.common.validation import fewest_and_most
 from viapoint.envs.geometry.clearance import memory
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
 from viapoint.envs.plans import SpaceName
@@ -32,7 +31,7 @@ from viapoint.envs.scenes.ends import (
     draw_ends,
     numbers_of_end,
 )
-from viapoint.envs.scenes.families_registry import Build, check_families, scene_families
+from viapoint.envs.scenes.families_registry import Build, scene_families
 from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Layout, Room, most_rows
 from viapoint.envs.scenes.motions import (
     CANDIDATES,
@@ -42,7 +41,7 @@ from viapoint.envs.scenes.motions import (
     draw_jumps,
     numbers_of_jumps,
 )
-from viapoint.envs.scenes.scene import MOST_JUMPS, Scenes, resting, row_clearances
+from viapoint.envs.scenes.scene import Scenes, resting, row_clearances
 
 LOW_HALF_HEIGHT, TALL_HALF_HEIGHT = 0.04, 0.3
 """Half heights of obstacles in the plane that the hand alone must clear, and that links must clear, too, [m]."""
@@ -80,7 +79,7 @@ class Given(NamedTuple):
 
 
 class SceneSampler:
-    """Sampler of scenes for an arm.
+    """Sampler of scenes for an arm; a :class:`~viapoint.envs.task.Task` makes it of checked values.
 
     Args:
         arm: Arm.
@@ -94,9 +93,6 @@ class SceneSampler:
         moving: True if obstacles move.
         durations: Shortest, centre and longest duration of a movement, [s]; in joint space relative to the shortest
             duration of the straight movement that the velocity limits of the joints allow.
-
-    Raises:
-        ValueError: A number or name is not allowed.
     """
 
     def __init__(
@@ -113,11 +109,10 @@ class SceneSampler:
         moving: bool = False,
         durations: tuple[float, float, float] = (0.5, 0.8, 1.2),
     ) -> None:
-        fewest, most = fewest_and_most("n_obstacles", n_obstacles, rows, rows)
-        jumps = fewest_and_most("jumps", jumps, MOST_JUMPS, MOST_JUMPS)
+        fewest, most = n_obstacles
         self.arm, self.space, self.kinds, self.rows = arm, space, kinds, rows
         self.plane = is_planar(arm)
-        self.families = check_families(families, self.plane, kinds, most)
+        self.families = families
         most = min(most, max(fewest, MOST_DRAWN))
         self.room = room_of(arm, kinds, (fewest, most), tall)
         self.changes = Changes(*jumps, moving, *durations)

@@ -17,7 +17,8 @@ from viapoint.envs.geometry.clouds import Clouds
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.distance import point_distance
 from viapoint.envs.geometry.meshes import Meshes
-from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, MESH, Obstacles, no_obstacles
+from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, Obstacles, no_obstacles
+from viapoint.envs.geometry.shapes import IN_TABLES
 
 MOST_JUMPS = 4
 """Greatest number of jumps of the target in an episode."""
@@ -250,8 +251,7 @@ class _Check:
         """Check sizes, places and courses of obstacles."""
         obstacles, turn_time = self.scenes.obstacles, self.scenes.turn_time
         kind, present, size = obstacles.kind, obstacles.present, obstacles.size
-        # The first size of meshes and clouds is an index.
-        largest = np.where(kind >= MESH, size[..., 1], size.max(axis=-1))
+        largest = np.where(np.isin(kind, IN_TABLES), size[..., 1], size.max(axis=-1))
         self.refuse_row(present & (largest > FARTHEST), f"must be at most {FARTHEST:g} m large", largest)
         away = np.abs(obstacles.centre).max(axis=-1)
         far = present & (kind != HALF_SPACE) & (away > FARTHEST)

@@ -8,7 +8,6 @@ from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.geometry.clearance import (
     FAR,
-    clearance_profile,
     configuration_clearances,
     memory,
     movement_clearance,
@@ -73,6 +72,3 @@ def test_clearance_of_a_movement_is_that_of_its_nearest_configuration(name):
         whole = obstacles.take(np.zeros(len(path), int))
         each = configuration_clearances(arm.chain, arm.spheres, path, whole, step * np.arange(len(path)))
         np.testing.assert_allclose(np.maximum(found, -FAR), np.maximum(each.min(axis=0), -FAR), atol=1e-12)
-        profile = clearance_profile(arm.chain, arm.spheres, path, obstacles, 0, step, 0.1)
-        profile, exact = np.maximum(profile, -FAR), np.clip(each[:, 0], -FAR, 0.1)
-        np.testing.assert_allclose(profile, exact, atol=1e-12)

@@ -18,7 +18,8 @@ from viapoint.envs.scenes.families_registry import (
     scene_families,
 )
 from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Furniture, Layout, Place, Room, most_rows
-from viapoint.envs.scenes.sampler import SceneSampler, room_of
+from viapoint.envs.scenes.sampler import room_of
+from viapoint.envs.task import Task
 
 ALL = KINDS[:5]
 NAMES = sorted(FAMILIES)
@@ -124,10 +125,8 @@ def test_own_family_of_shapes_and_places_is_drawn():
 
     register_scene_family("ball", ball, kinds=("sphere",), trained=True)
     assert "ball" in default_families(False, ("sphere",), 1)
-    arm = arm_of("panda")
-    sampler = SceneSampler(
-        arm, space="joints", n_obstacles=(1, 1), kinds=("sphere",), families=("ball",), rows=1
-    )
+    task = Task.of(arm="panda", n_obstacles=1, shapes="sphere", families="ball")
+    sampler = task.sampler()
     scenes = sampler([np.random.default_rng(seed) for seed in range(5)])
     assert (scenes.obstacles.centre == (0.45, 0.0, 0.45)).all()
     assert (scenes.obstacles.kind == 0).all()

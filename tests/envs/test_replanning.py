@@ -21,11 +21,10 @@ from episodes import (
 )
 
 from viapoint import primitives
-from viapoint.envs.episodes import jerk_cost_between
 from viapoint.envs.events import FORESIGHT, LOOK, Event
 from viapoint.envs.limits import LIMIT_SHARE, slowdowns
 from viapoint.envs.outcome import SETTLING
-from viapoint.envs.plans import Plan
+from viapoint.envs.plans import Movements, Plan, jerk_cost_between
 from viapoint.envs.replanning import least_remaining
 
 IDS = (JUMP, MOVING, PANDA_MOVING)
@@ -158,7 +157,10 @@ def test_jerk_cost_of_the_parts_is_that_of_the_whole():
     env.step(np.array([0.3, 0.7, 0.1], np.float32))
     plan = env.last_plans[0][1]
     cuts = np.sort(np.append(np.random.default_rng(0).uniform(0.0, 1.0, 6), [0.0, 2.0]))
-    parts = [jerk_cost_between(plan, np.array([a]), np.array([b])) for a, b in itertools.pairwise(cuts)]
+    parts = [
+        jerk_cost_between(Movements.of(plan), np.array([a]), np.array([b]))
+        for a, b in itertools.pairwise(cuts)
+    ]
     assert sum(parts)[0] == pytest.approx(plan.trajectory().cost()[0], rel=1e-12)
 
 

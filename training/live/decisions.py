@@ -13,9 +13,9 @@ from viapoint import primitives
 from viapoint.envs import Plan, Scenes, Task
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float, Observation
-from viapoint.envs.episodes import jerk_cost_between
 from viapoint.envs.geometry.clearance import FAR
 from viapoint.envs.outcome import straight_jerk_cost
+from viapoint.envs.plans import Movements, jerk_cost_between
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.training.live.movements import Profile, plan_profile
 from viapoint.training.live.scene import LiveScene
@@ -187,7 +187,7 @@ def evaluated(task: Task, scenes: Scenes, actions: Float) -> list[Proposal]:
     problem = Problem.of_scenes(scenes, task)
     plans = _plans(task, problem, actions)
     worth = worth_of(task, problem, moves_of(task, problem, actions[None]))[0]
-    cost = jerk_cost_between(plans, np.zeros(len(actions)), plans.duration)
+    cost = jerk_cost_between(Movements.of(plans), np.zeros(len(actions)), plans.duration)
     straight = straight_jerk_cost(norm(problem.goal - problem.start), plans.duration)
     found = []
     for i in range(len(actions)):
