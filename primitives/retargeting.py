@@ -87,12 +87,12 @@ def retarget(
     require(arrival > time, "arrival", arrival, "must lie after time")
     position, *motion = (value[..., 0, :] for value in trajectory.sample(time[..., None], (0, 1, 2)))
     goal, *final = targets.values()
-    ends: dict[str, Any] = dict(zip(END_NAMES, (*motion, *final), strict=True))
+    states: dict[str, Any] = dict(zip(END_NAMES, (*motion, *final), strict=True))
     passed, shape = [position, goal] if via is None else [position, via, goal], (*batch, trajectory.dimension)
     waypoints = xp.stack([broadcast_to(xp, point, shape) for point in passed], axis=-2)
     remaining = arrival - time
-    durations = remaining[..., None] if via is None else passage_durations(waypoints, remaining, **ends)
-    return through(waypoints, durations, **ends)
+    durations = remaining[..., None] if via is None else passage_durations(waypoints, remaining, **states)
+    return through(waypoints, durations, **states)
 
 
 def _keep_old_target(

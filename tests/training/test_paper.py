@@ -44,7 +44,7 @@ def is_within(value, ends):
 
 def test_every_number_is_as_promised(made):
     claims = claims_of(made)
-    assert {claim["row"] for claim in claims} == {*ROWS, 12}
+    assert {claim["row"] for claim in claims} == set(ROWS)
     for claim in claims:
         numbers = [name for name in ("model", "arm") if claim[name] is not None]
         assert numbers, claim["claim"]

@@ -53,7 +53,7 @@ class Claim:
     """
 
     row: int
-    """Number of its subject in SUBJECTS."""
+    """Number of its subject."""
     claim: str
     """Text of the statement; it says where the statement is only approximate."""
     figure: str = "-"
@@ -92,24 +92,6 @@ class Claim:
             ]
         record["deviation_mm"] = None if self.deviation is None else float(self.deviation)
         return {**record, "verdict": self.verdict}
-
-
-SUBJECTS = {
-    1: "Point to point",
-    2: "Invariance of hand paths",
-    3: "Joints and torques",
-    4: "Free passage time",
-    5: "Speed valley and curvature",
-    6: "Place of the via-point",
-    7: "Isochrony",
-    8: "Scaling with time",
-    9: "Alternatives to minimum jerk",
-    10: "Repetitive and performance-limited movements",
-    11: "The primer and its replanned version",
-    12: "Obstacle avoidance",
-    13: "A target that jumps on the way (Flash & Henis 1991)",
-}
-"""Titles of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991."""
 
 
 class Reproduction(NamedTuple):

@@ -17,8 +17,15 @@ from viapoint.envs.geometry.obstacles import unpack
 from viapoint.primitives import Trajectory, point_to_point
 from viapoint.training.io.files import MARK
 from viapoint.training.paper import movements
-from viapoint.training.paper.lights import TARGETS
-from viapoint.training.paper.movements import EDGE, Profile, SimulatedMovements, curved, simulate, straight
+from viapoint.training.paper.movements import (
+    EDGE,
+    TARGETS,
+    Profile,
+    SimulatedMovements,
+    curved,
+    simulate,
+    straight,
+)
 from viapoint.training.paper.rows import alternatives, double_step, one_via
 from viapoint.training.paper.rows.double_step import DoubleStep
 from viapoint.training.paper.rows.obstacles import ObstacleMovements

@@ -20,25 +20,29 @@ from viapoint.training.config.configs import PaperConfig
 from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import MARK, check_ours, versions, write_bytes, write_json
 from viapoint.training.paper import figures
-from viapoint.training.paper.claim import SUBJECTS, Claim, Number, Reproduction
+from viapoint.training.paper.claim import Claim, Number, Reproduction
 from viapoint.training.paper.rows import alternatives, double_step, obstacles, one_via, straight
 from viapoint.training.paper.rows.one_via import ENDS, FAST, SLOW, THREE_POINTS
 
-ROWS: dict[int, Callable[[], list[Claim]]] = {
-    1: straight.point_to_point_claims,
-    2: straight.invariance_claims,
-    3: straight.joint_claims,
-    4: one_via.passage_claims,
-    5: one_via.valley_claims,
-    6: one_via.place_claims,
-    7: one_via.isochrony_claims,
-    8: one_via.scaling_claims,
-    9: alternatives.alternative_claims,
-    10: alternatives.limit_claims,
-    11: double_step.replanning_claims,
-    13: double_step.double_step_claims,
+ROWS: dict[int, tuple[str, Callable[..., list[Claim]]]] = {
+    1: ("Point to point", straight.point_to_point_claims),
+    2: ("Invariance of hand paths", straight.invariance_claims),
+    3: ("Joints and torques", straight.joint_claims),
+    4: ("Free passage time", one_via.passage_claims),
+    5: ("Speed valley and curvature", one_via.valley_claims),
+    6: ("Place of the via-point", one_via.place_claims),
+    7: ("Isochrony", one_via.isochrony_claims),
+    8: ("Scaling with time", one_via.scaling_claims),
+    9: ("Alternatives to minimum jerk", alternatives.alternative_claims),
+    10: ("Repetitive and performance-limited movements", alternatives.limit_claims),
+    11: ("The primer and its replanned version", double_step.replanning_claims),
+    12: ("Obstacle avoidance", obstacles.obstacle_claims),
+    13: ("A target that jumps on the way (Flash & Henis 1991)", double_step.double_step_claims),
 }
-"""Functions of the rows; row 12 needs movements around obstacles."""
+"""Titles and functions of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991.
+
+That of row 12 takes the movements around obstacles.
+"""
 
 
 class Drawing(NamedTuple):
@@ -97,14 +101,12 @@ STEPS = len(ROWS) + 1 + len(DRAWINGS)
 
 def reproduce(out: Path, agent: Path | None, report_step: Callable[[str], None]) -> Reproduction:
     """Compute every row, row 12 with an agent or a search, and draw every figure; each step is reported."""
-    claims: list[Claim] = []
-    for row, compute in ROWS.items():
-        report_step(f"row {row}")
-        claims += compute()
-    report_step("row 12")
+    report_step("movements around lights")
     avoidance = obstacles.light_movements(agent)
-    claims += obstacles.obstacle_claims(avoidance)
-    claims.sort(key=lambda claim: claim.row)
+    claims: list[Claim] = []
+    for row, (_, compute) in ROWS.items():
+        report_step(f"row {row}")
+        claims += compute(avoidance) if compute is obstacles.obstacle_claims else compute()
     pictures = []
     for drawing in DRAWINGS:
         report_step(drawing.name)
@@ -144,7 +146,7 @@ def write(reproduction: Reproduction, out: Path) -> list[Path]:
         (files("viapoint.training") / "paper/templates/page.html.j2").read_text("utf-8")
     )
     html = template.render(
-        title=TITLE, note=NOTE, summary=summary, headings=HEADINGS[1:], claims=claims, cells=cells, subjects=SUBJECTS,
+        title=TITLE, note=NOTE, summary=summary, headings=HEADINGS[1:], claims=claims, cells=cells, rows=ROWS,
         figures=[(base64.b64encode(path.read_bytes()).decode(), caption) for path, caption in pictures],
     )  # fmt: skip
     paths = [out / name for name in PAGES]

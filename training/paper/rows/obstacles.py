@@ -18,7 +18,6 @@ from viapoint.primitives import speed_valleys
 from viapoint.training.agents.agent import load_agent
 from viapoint.training.config.checks import DEFAULT_ENV
 from viapoint.training.paper.claim import Claim, Range, at_least, at_most, near
-from viapoint.training.paper.lights import rows_of_lights
 from viapoint.training.paper.movements import (
     PLANE,
     Profile,
@@ -29,6 +28,7 @@ from viapoint.training.paper.movements import (
     minimum_jerk_through,
     model_profiles,
     passage_share,
+    rows_of_lights,
     simulate,
 )
 from viapoint.training.paper.rows.one_via import FAST, SLOW
