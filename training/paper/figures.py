@@ -21,7 +21,6 @@ from viapoint.training.paper.movements import (
     EDGE,
     TARGETS,
     Profile,
-    SimulatedMovements,
     curved,
     simulate,
     straight,
@@ -44,6 +43,7 @@ ARM: dict[str, Any] = {"color": PALETTE.executed, "linewidth": 0.9, "linestyle":
 SECOND = PALETTE.goal
 THIRD = PALETTE.via
 GREY = PALETTE.start
+NAMES = ("model", "simulated arm")
 JOINTS = (("shoulder $S$", SECOND), ("elbow $E$", THIRD))
 
 
@@ -100,11 +100,9 @@ def zero(ax: Axes) -> None:
     ax.axhline(0.0, color="0.8", linewidth=0.6, zorder=0)
 
 
-def profiles(axes: Any, model: Profile, arm: Profile, end: float = 1.0, names: Any = ()) -> None:
+def profiles(axes: Any, model: Profile, arm: Profile, end: float, names: Any = NAMES) -> None:
     """Draw speed on the first and curvature on the second of two axes, the curvature without its unbounded ends."""
-    for profile, style, name in zip(
-        (model, arm), (MODEL, ARM), names or ("model", "simulated arm"), strict=True
-    ):
+    for profile, style, name in zip((model, arm), (MODEL, ARM), names, strict=True):
         axes[0].plot(end * profile.time, profile.speed, label=name, **style)
         curvature(axes[1], profile, end, **style)
 
@@ -209,10 +207,9 @@ def joints() -> Figure:
                 ax.plot(motion.time[within], unit * arm[within, joint], **ARM)
             zero(ax)
         column[2].set(xlabel="$t$ [s]", xlim=(0, DURATION))
-    for ax, text in zip(
-        axes[:, 0], (r"$\theta$ [deg]", r"$\dot{\theta}$ [deg/s]", "torque [N m]"), strict=True
-    ):
-        ax.set_ylabel(text)
+    axes[0, 0].set_ylabel(r"$\theta$ [deg]")
+    axes[1, 0].set_ylabel(r"$\dot{\theta}$ [deg/s]")
+    axes[2, 0].set_ylabel("torque [N m]")
     titles(axes[0], ("A   $T_3$ to $T_6$", "B   $T_2$ to $T_5$"))
     axes[0, 0].legend(loc="upper left", handlelength=1.2)
     axes[0, 0].set_ylim(-10, 215)
@@ -231,7 +228,14 @@ def pair(first: Any, second: Any, texts: Any) -> Figure:
         passage = float(movement.knots[1])
         paths(ax[0], movement, motion.hand[0])
         dot(ax[0], movement(passage))
-        _against_time(ax[1:], movement, motion)
+        end = float(movement.duration)
+        (model,), (arm,) = movements.model_profiles(movement), movements.arm_profiles(motion)
+        profiles(ax[1:], model, arm, end)
+        planned, reached = movement.sample(len(model.time), 1)[0], motion.velocity()[0]
+        for each, x, y in zip(ax[3:], planned.T, reached.T, strict=True):
+            each.plot(end * model.time, x, **MODEL)
+            each.plot(motion.time, y, **ARM)
+            zero(each)
         for each in ax[1:]:
             each.axvline(passage, color=THIRD, linewidth=0.7, linestyle=":")
         ax[4].set_xlabel("$t$ [s]")
@@ -239,18 +243,6 @@ def pair(first: Any, second: Any, texts: Any) -> Figure:
     titles(axes[0], [f"{letter}   {text}" for letter, text in zip("AB", texts, strict=True)], pad=6.0)
     axes[1, 1].legend(loc="upper right")
     return figure
-
-
-def _against_time(ax: Any, movement: Trajectory, motion: SimulatedMovements) -> None:
-    """Draw speed, curvature and velocity components against time."""
-    end = float(movement.duration)
-    (model,), (arm,) = movements.model_profiles(movement), movements.arm_profiles(motion)
-    profiles(ax, model, arm, end)
-    planned, reached = movement.sample(len(model.time), 1)[0], motion.velocity()[0]
-    for i in (0, 1):
-        ax[2 + i].plot(end * model.time, planned[:, i], **MODEL)
-        ax[2 + i].plot(motion.time, reached[:, i], **ARM)
-        zero(ax[2 + i])
 
 
 def _same_scales(axes: Any, duration: float) -> None:
@@ -279,7 +271,7 @@ def around_lights(avoidance: ObstacleMovements) -> Figure:
         ax[0].fill(*(100.0 * footprint(lights)[0].T), color=PALETTE.obstacle)
         dot(ax[0], via)
         (model,) = movements.model_profiles(movement)
-        profiles(ax[1:], model, profile, names=("model through $\\bullet$", avoidance.name))
+        profiles(ax[1:], model, profile, 1.0, ("model through $\\bullet$", avoidance.name))
         ax[2].set_xlabel("$t/t_f$")
     _same_scales(axes[1:], 1.0)
     titles(axes[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -311,6 +312,14 @@ def arm_profiles(motion: SimulatedMovements) -> list[Profile]:
         within = motion.time <= duration + 1e-9
         profiles.append(Profile.of(motion.time[within] / duration, *(part[within] for part in row)))
     return profiles
+
+
+def first_place(holds: Callable[[Any], bool], low: Any, high: Any, halvings: int) -> Any:
+    """Return where in an interval a condition begins to hold, by bisection; it holds at `high`, not at `low`."""
+    for _ in range(halvings):
+        middle = (low + high) / 2
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return (low + high) / 2
 
 
 def vertex(before: float, here: float, after: float) -> tuple[float, float]:

@@ -175,11 +175,11 @@ def _speed_claim() -> Claim:
 def torque_limited() -> Trajectory:
     """Return the movement from T3 to T6 in the shortest time within the arm's torque limits."""
     movement = movements.straight("T3", "T6", 1.0)
-    low, high = 0.1, 2.0
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if _relative_torque(movement.stretched(middle)) <= 1.0 else (middle, high)
-    return movement.stretched(high)
+
+    def is_within(duration: float) -> bool:
+        return _relative_torque(movement.stretched(duration)) <= 1.0
+
+    return movement.stretched(movements.first_place(is_within, 0.1, 2.0, halvings=40))
 
 
 def _relative_torque(movement: Trajectory) -> float:

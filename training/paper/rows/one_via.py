@@ -52,11 +52,8 @@ def count_roots(polynomial: Polynomial) -> int:
 
 def root_of(polynomial: Polynomial) -> float:
     """Return the root in (0, 1) by exact bisection; the polynomial is positive at 0 and negative at 1."""
-    low, high = Fraction(0), Fraction(1)
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if polyval(middle, polynomial) > 0 else (low, middle)
-    return float((low + high) / 2)
+    root = movements.first_place(lambda t: polyval(t, polynomial) <= 0, Fraction(0), Fraction(1), halvings=60)
+    return float(root)
 
 
 def closed_form(waypoints: Float, share: float, time: Float) -> Float:
@@ -219,11 +216,7 @@ def model_has_valley(along: float, height: float) -> bool:
 
 def valley_threshold(has_valley: Callable[[float], bool], halvings: int = 30) -> float:
     """Return the least d3 / (d1 + d2) with a speed valley, by bisection."""
-    low, high = 0.2, 0.5
-    for _ in range(halvings):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if has_valley(middle) else (middle, high)
-    return 0.5 * (low + high)
+    return float(movements.first_place(has_valley, 0.2, 0.5, halvings))
 
 
 def place_claims() -> list[Claim]:
