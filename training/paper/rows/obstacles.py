@@ -17,20 +17,9 @@ from viapoint.envs.scenes.scene import check_scenes, resting
 from viapoint.primitives import speed_valleys
 from viapoint.training.agents.agent import load_agent
 from viapoint.training.config.checks import DEFAULT_ENV
+from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, Range, at_least, at_most, near
-from viapoint.training.paper.movements import (
-    PLANE,
-    Profile,
-    SimulatedMovements,
-    arm_profiles,
-    construction,
-    left_of,
-    minimum_jerk_through,
-    model_profiles,
-    passage_share,
-    rows_of_lights,
-    simulate,
-)
+from viapoint.training.paper.movements import PLANE, Profile, SimulatedMovements, simulate
 from viapoint.training.paper.rows.one_via import FAST, SLOW
 from viapoint.training.planning.baselines import Method, agent_method
 from viapoint.training.planning.search import GeometrySearch
@@ -70,9 +59,9 @@ def light_scenes(n_rows: int) -> Scenes:
     """
     ends, lights = [], []
     for length, radius, shift in itertools.product(LENGTHS, RADII, SHIFTS):
-        for row in rows_of_lights(length, radius):
+        for row in movements.rows_of_lights(length, radius):
             along = (row.goal - row.start) / np.linalg.norm(row.goal - row.start)
-            offset = shift[0] * along + shift[1] * left_of(along)
+            offset = shift[0] * along + shift[1] * movements.left_of(along)
             moved = row.lights.position + np.append(offset, 0.0)
             lights.append([dataclasses.replace(row.lights, position=moved)])
             ends.append((row.start, row.goal))
@@ -103,7 +92,7 @@ def light_movements(agent: Path | None) -> ObstacleMovements:
         action[success], task.space.coordinates(kept.start), task.space.coordinates(kept.goal)
     )
     motion = simulate(plan.trajectory())
-    executed, planned = arm_profiles(motion), model_profiles(plan.trajectory())
+    executed, planned = movements.arm_profiles(motion), movements.model_profiles(plan.trajectory())
     return ObstacleMovements(
         method.name, kept, plan, motion, len(scenes.start), executed, features(executed, plan), features(planned, plan)
     )  # fmt: skip
@@ -143,13 +132,14 @@ def features(profiles: list[Profile], plan: Plan) -> pd.DataFrame:
         lines.append(line)
         if np.isfinite(line["bend"]):
             points = np.stack((start, profile.place(line["bend"]), goal))
-            model = minimum_jerk_through(points)
+            model = movements.minimum_jerk_through(points)
             distance = np.linalg.norm(np.asarray(model(profile.time)) - profile.position, axis=-1)
-            line["along"], _ = construction(points)
-            line["residual"] = line["bend"] - passage_share(model)
+            line["along"], _ = movements.construction(points)
+            line["residual"] = line["bend"] - movements.passage_share(model)
             line["agrees"] = bool(speed_valleys(model).time.size) == bool(np.isfinite(line["valley"]))
             line["apart"] = distance.max() / np.linalg.norm(goal - start)
-    return pd.DataFrame(lines).astype(float)
+    columns = ["valley", "bend", "along", "residual", "agrees", "apart"]
+    return pd.DataFrame(lines, columns=columns).astype(float)
 
 
 def obstacle_claims(avoidance: ObstacleMovements) -> list[Claim]:
