@@ -7,15 +7,15 @@ library. Their gradients are right: the slope vanishes at an extremum (envelope 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from ._polynomial import differentiate, evaluate, multiply, root_candidates, unit_size
 from .array_api import Array, Floats, largest_exponent, like, ordered_sum, to_numpy
 
-if TYPE_CHECKING:
-    from .trajectory import Trajectory
+Trajectory: TypeAlias = Any
+"""A `Trajectory`, whose module imports this one."""
 
 
 @dataclass(frozen=True)
