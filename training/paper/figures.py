@@ -66,7 +66,7 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
 def plane(ax: Axes, *, names: tuple[str, ...] = tuple(TARGETS)) -> None:
     """Draw the horizontal plane with the paper's targets, in centimetres."""
     for name in names:
-        x, y = 100.0 * np.array(TARGETS[name])
+        x, y = 100.0 * TARGETS[name]
         ax.plot(x, y, "o", color="white", markeredgecolor=GREY, markersize=5.0, markeredgewidth=0.8, zorder=1)
         low = y < 35.0
         ax.annotate(

@@ -19,12 +19,12 @@ from viapoint.envs.spaces import HandPlane
 from viapoint.primitives import Trajectory, passage_durations, point_to_point, through
 
 TARGETS = {
-    "T1": (-0.32, 0.42),
-    "T2": (-0.22, 0.27),
-    "T3": (-0.02, 0.27),
-    "T4": (0.08, 0.42),
-    "T5": (-0.02, 0.57),
-    "T6": (-0.22, 0.57),
+    "T1": np.array([-0.32, 0.42]),
+    "T2": np.array([-0.22, 0.27]),
+    "T3": np.array([-0.02, 0.27]),
+    "T4": np.array([0.08, 0.42]),
+    "T5": np.array([-0.02, 0.57]),
+    "T6": np.array([-0.22, 0.57]),
 }
 """The six targets of Flash & Hogan 1985, Fig. 2, [m], shoulder at the origin.
 
@@ -37,14 +37,9 @@ PLANE = HandPlane(ADULT)
 """Plane of its hand."""
 
 
-def target(name: str) -> Float:
-    """Return the position of one of the paper's targets T1 to T6, shape (2,), [m]."""
-    return np.asarray(TARGETS[name], dtype=np.float64)
-
-
 def straight(first: str, last: str, duration: float = 0.8, *, order: int = 3) -> Trajectory:
     """Return the straight movement between two targets (Eq. 2); order 2, 3, 4 minimises acceleration, jerk, snap."""
-    return point_to_point(target(first), target(last), duration, order=order)
+    return point_to_point(TARGETS[first], TARGETS[last], duration, order=order)
 
 
 def left_of(line: Float) -> Float:
@@ -86,7 +81,7 @@ def minimum_jerk_through(waypoints: ArrayLike, duration: Any = 1.0) -> Trajector
 
 def curved(first: str, last: str, along: ArrayLike, height: ArrayLike, duration: Any = 1.0) -> Trajectory:
     """Return the movement between two targets through a via-point, see :func:`via_waypoints`."""
-    return minimum_jerk_through(via_waypoints(target(first), target(last), along, height), duration)
+    return minimum_jerk_through(via_waypoints(TARGETS[first], TARGETS[last], along, height), duration)
 
 
 def passage_share(movement: Trajectory) -> Float:
@@ -130,16 +125,16 @@ def rows_of_lights(
     found = []
     for first, start in TARGETS.items():
         for last, goal in TARGETS.items():
-            line = np.subtract(goal, start)
+            line = goal - start
             if np.hypot(*line) < LEAST_APART:
                 continue
             across = 0.5 * (np.arctan2(line[1], line[0]) + 0.5 * np.pi)
             lights = Box(
                 size=(0.5 * length, radius, half_height),
-                position=(*(0.5 * np.add(start, goal)), 0.0),
+                position=(*(0.5 * (start + goal)), 0.0),
                 quaternion=(np.cos(across), 0.0, 0.0, np.sin(across)),
             )
-            found.append(RowOfLights(first, last, np.array(start), np.array(goal), lights))
+            found.append(RowOfLights(first, last, start.copy(), goal.copy(), lights))
     return found
 
 

@@ -8,7 +8,7 @@ from viapoint.envs.common.types import Float
 from viapoint.primitives import FREE, Trajectory, minimum_duration, point_to_point, through
 from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
-from viapoint.training.paper.movements import ADULT, PLANE, SimulatedMovements, simulate, target
+from viapoint.training.paper.movements import ADULT, PLANE, TARGETS, SimulatedMovements, simulate
 from viapoint.training.paper.rows import straight
 from viapoint.training.paper.rows.straight import DURATION, bow, diagonal_ends, diagonals
 
@@ -99,7 +99,7 @@ def limit_claims() -> list[Claim]:
 
 
 def _tour_claims() -> list[Claim]:
-    points = np.array([target(name) for name in TOUR])
+    points = np.array([TARGETS[name] for name in TOUR])
     movement = movements.minimum_jerk_through(points, 1.6)
     knots = np.asarray(movement.knots)
     crackle = movement((knots[1:] + knots[:-1]) / 2.0, 5)  # constant within a segment
@@ -132,14 +132,14 @@ def _swing(acceleration: float) -> Trajectory:
 
 def swings() -> Trajectory:
     """Return a repetitive movement between T3 and T6 with free acceleration at every reversal."""
-    ends = np.array([target("T3"), target("T6")])
+    ends = np.array([TARGETS["T3"], TARGETS["T6"]])
     points = ends[np.arange(SWINGS + 1) % 2]
     return through(points, np.full(SWINGS, SWING), via_velocities=np.zeros((SWINGS - 1, 2)))
 
 
 def relative_swing_speed(motion: SimulatedMovements) -> Float:
     """Return the speed of simulated swings in units of amplitude / duration of a swing, shape (T,)."""
-    amplitude = np.linalg.norm(target("T6") - target("T3"))
+    amplitude = np.linalg.norm(TARGETS["T6"] - TARGETS["T3"])
     return np.asarray(np.linalg.norm(motion.velocity()[0], axis=-1) * (SWING / amplitude))
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory, minimum_jerk_coefficients, point_to_point, retarget
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
-from viapoint.training.paper.movements import SimulatedMovements, instants, straight, target, track
+from viapoint.training.paper.movements import TARGETS, SimulatedMovements, instants, straight, track
 
 STEP_DURATION = 0.7
 """Duration of the first movement and of the second one, [s]."""
@@ -90,9 +90,9 @@ def double_step(
         remaining: Duration of the second movement, which ends at moment + remaining >= duration, [s].
     """
     start, corner, last = NAMES
-    goal = target(last) if goal is None else goal
+    goal = TARGETS[last] if goal is None else goal
     first = straight(start, corner, duration)
-    second = point_to_point(target(corner), goal, remaining)
+    second = point_to_point(TARGETS[corner], goal, remaining)
     return DoubleStep(first, second, retarget(first, moment, goal, moment + remaining), moment)
 
 
@@ -162,7 +162,7 @@ def _claims_at(movement: DoubleStep) -> list[Claim]:
     when = f"Revised at {1e3 * movement.moment:.0f} ms"
     expected = 1.0 + _excess_of(movement.moment) / movement.cost("planned")
     distance = 1e3 * greatest_distance(movement)
-    to_T2 = 1e3 * greatest_distance(double_step(movement.moment, goal=target("T2")))
+    to_T2 = 1e3 * greatest_distance(double_step(movement.moment, goal=TARGETS["T2"]))
     found = peak_speed(movement, "superposed") / peak_speed(movement, "planned")
     motion = simulate_double(movement)
     arm = motion.peak_speed()
@@ -195,14 +195,14 @@ def _jump(movement: DoubleStep) -> float:
 
 def _excess_of(moment: float) -> float:
     """Return the excess cost of the sum in closed form for movements of the usual targets and durations."""
-    distance = float(np.linalg.norm(target(NAMES[1]) - target(NAMES[0])))
+    distance = float(np.linalg.norm(TARGETS[NAMES[1]] - TARGETS[NAMES[0]]))
     return excess_cost(distance, moment, STEP_DURATION, STEP_DURATION)
 
 
 def _spread() -> float:
     """Return the greatest relative deviation of the excess from its closed form over random second targets."""
     generator, moment = np.random.default_rng(0), 0.2
-    goals = target(NAMES[1]) + generator.uniform(-0.4, 0.4, (100, 2))
+    goals = TARGETS[NAMES[1]] + generator.uniform(-0.4, 0.4, (100, 2))
     movements = [double_step(moment, goal=goal) for goal in goals]
     found = np.array([each.cost("superposed") - each.cost("planned") for each in movements])
     return float(np.abs(found / _excess_of(moment) - 1.0).max())
@@ -214,10 +214,10 @@ def replanning_claims() -> list[Claim]:
     state = movement.first.sample(np.array([SWITCH]))
     begun = movement.replanned.sample(np.array([0.0]))
     jump = max(np.abs(a - b).max() / np.abs(a).max() for a, b in zip(state, begun, strict=True))
-    fresh = _solved(state, target("T5"), STEP_DURATION)
+    fresh = _solved(state, TARGETS["T5"], STEP_DURATION)
     apart = 1e3 * np.abs(fresh - movement.replanned.sample(201, 0)[0]).max()
     motion = simulate_double(movement)
-    missed = 1e3 * np.linalg.norm(motion.hand[1, -1] - target("T5"))
+    missed = 1e3 * np.linalg.norm(motion.hand[1, -1] - TARGETS["T5"])
     return [
         Claim(11, "Quintic from 1,000 random boundary values, T from 1 ms to 1000 s: greatest relative error at the "
               "ends", "primer", "Eqs. 16 to 24", (_boundary_error(), at_most(1e-12))),
@@ -262,7 +262,7 @@ def _replanned(times: int) -> float:
     whole = straight("T1", "T4", 0.8)
     plan, begun, apart = whole, 0.0, 0.0
     for now in np.linspace(0.0, 0.75, times + 1)[1:]:
-        plan, begun = retarget(plan, now - begun, target("T4"), 0.8 - begun), now
+        plan, begun = retarget(plan, now - begun, TARGETS["T4"], 0.8 - begun), now
         ahead = np.linspace(now, 0.8, 11)
         apart = max(apart, float(np.abs(plan(ahead - now) - whole(ahead)).max()))
     return apart

@@ -16,7 +16,7 @@ from viapoint.envs.common.types import Float
 from viapoint.primitives import speed_valleys
 from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
-from viapoint.training.paper.movements import SimulatedMovements, curved, passage_share, simulate, target
+from viapoint.training.paper.movements import TARGETS, SimulatedMovements, curved, passage_share, simulate
 
 Polynomial = list[Fraction]
 
@@ -99,7 +99,7 @@ def passage_claims() -> list[Claim]:
     wrong, difference = _count_and_compare()
     movement = curved(*ENDS, *EXAMPLE)
     share = float(passage_share(movement))
-    waypoints = movements.via_waypoints(target(ENDS[0]), target(ENDS[1]), *EXAMPLE)
+    waypoints = movements.via_waypoints(TARGETS[ENDS[0]], TARGETS[ENDS[1]], *EXAMPLE)
     via, goal = ([Fraction(float(each)) for each in point - waypoints[0]] for point in waypoints[1:])
     root = root_of(passage_polynomial(via, goal))
     time = np.linspace(0.0, 1.0, 401)
@@ -253,7 +253,7 @@ THREE_POINTS = (0.4, -0.45)
 def arm_shares(along: ArrayLike, height: ArrayLike) -> tuple[Float, float]:
     """Return the times of closest approach to each via-point, as fractions of the duration, and the deviation [mm]."""
     motion = simulate(curved(*ENDS, along, height))
-    vias = movements.via_waypoints(target(ENDS[0]), target(ENDS[1]), along, height)[:, 1]
+    vias = movements.via_waypoints(TARGETS[ENDS[0]], TARGETS[ENDS[1]], along, height)[:, 1]
     shares = [closest_approach(motion, via, row) for row, via in enumerate(vias)]
     return np.array(shares), motion.worst
 

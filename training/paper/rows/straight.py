@@ -11,7 +11,7 @@ from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory, point_to_point
 from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
-from viapoint.training.paper.movements import SimulatedMovements, minimum_jerk_through, simulate, target
+from viapoint.training.paper.movements import TARGETS, SimulatedMovements, minimum_jerk_through, simulate
 
 DIAGONALS = (("T3", "T6"), ("T1", "T4"), ("T2", "T5"))
 """The straight movements of Figs. 3 and 4."""
@@ -21,7 +21,7 @@ DURATION = 0.8
 
 def diagonal_ends() -> Float:
     """Return the ends of the straight movements of Figs. 3 and 4, shape (3, 2, 2), [m]."""
-    return np.array([[target(a), target(b)] for a, b in DIAGONALS])
+    return np.array([[TARGETS[a], TARGETS[b]] for a, b in DIAGONALS])
 
 
 def diagonals(order: int = 3) -> Trajectory:
@@ -102,7 +102,7 @@ def _placed_shapes() -> tuple[Float, float]:
         Paths in the frame of their ends, shape (5, 201, 2), and the greatest deviation from the plan, [mm].
     """
     pairs = (("T1", "T4"), ("T4", "T1"), ("T2", "T5"), ("T6", "T3"), ("T3", "T4"))
-    waypoints = [movements.via_waypoints(target(a), target(b), 0.35, 0.2) for a, b in pairs]
+    waypoints = [movements.via_waypoints(TARGETS[a], TARGETS[b], 0.35, 0.2) for a, b in pairs]
     motion = simulate(minimum_jerk_through(np.stack(waypoints), np.array([0.8, 0.7, 1.0, 1.2, 0.6])))
     shapes = []
     for row, (start, _, goal) in enumerate(waypoints):
