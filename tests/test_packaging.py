@@ -23,7 +23,8 @@ SHIPPED = (
     "README.md",
     ".safetensors",
     ".json",
-    ".j2", ".mplstyle",
+    ".j2",
+    ".mplstyle",
 )
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
 
