@@ -7,12 +7,15 @@ library. Their gradients are right: the slope vanishes at an extremum (envelope 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from ._polynomial import differentiate, evaluate, multiply, root_candidates, unit_size
-from .array_api import Array, Floats, Namespace, largest_exponent, like, ordered_sum, to_numpy
+from .array_api import Array, Floats, largest_exponent, like, ordered_sum, to_numpy
+
+Trajectory: TypeAlias = Any
+"""A `Trajectory`, whose module imports this one."""
 
 
 @dataclass(frozen=True)
@@ -38,45 +41,34 @@ class Extrema:
     maximum_time: Array
 
 
-@dataclass(frozen=True)
-class Pieces:
-    """One derivative of a trajectory: (..., n, S, D) coefficients, (..., S) starts and rates, (..., 1) end."""
-
-    coefficients: Array
-    starts: Array
-    rates: Array
-    end: Array
-    namespace: Namespace
-
-    def polynomials(self) -> tuple[Floats, Any]:
-        """Return the coefficients as (..., S, D, n) NumPy float64, of unit size, and the exponent (..., 1)."""
-        numbers, exponent = unit_size(to_numpy(self.coefficients).astype(np.float64), (-3, -2, -1))
-        return np.ascontiguousarray(np.moveaxis(numbers, -3, -1)), exponent[..., 0, 0]
-
-
-def axis_extrema(pieces: Pieces) -> Extrema:
-    """Return the extrema of every component."""
-    polynomials, _ = pieces.polynomials()
+def axis_extrema(trajectory: Trajectory, coefficients: Array) -> Extrema:
+    """Return the extrema of every component of a derivative with the coefficients (..., n, S, D)."""
+    polynomials, _ = _polynomials(coefficients)
     u = _with_ends(root_candidates(differentiate(polynomials)))
     values = evaluate(polynomials[..., None, :], u)
-    low = _read(pieces, _best(pieces, u, -values))
-    high = _read(pieces, _best(pieces, u, values))
+    low, high = (_read(trajectory, coefficients, _best(trajectory, u, score)) for score in (-values, values))
     return Extrema(*low, *high)
 
 
-def largest_norm(pieces: Pieces) -> Array:
-    """Return (...,) the largest Euclidean norm, from the roots of x . dx/du."""
-    xp = pieces.namespace
-    polynomials, exponent = pieces.polynomials()
+def largest_norm(trajectory: Trajectory, coefficients: Array) -> Array:
+    """Return (...,) the largest Euclidean norm of a derivative, from the roots of x . dx/du."""
+    xp = trajectory.namespace
+    polynomials, exponent = _polynomials(coefficients)
     square = ordered_sum(multiply(polynomials, polynomials), -2)
     change = ordered_sum(multiply(polynomials, differentiate(polynomials)), -2)
     u = _with_ends(root_candidates(change))
     score = evaluate(square[..., None, :], u)
-    values, _ = _read(pieces, _best(pieces, u[..., None, :], score[..., None, :]))
+    values, _ = _read(trajectory, coefficients, _best(trajectory, u[..., None, :], score[..., None, :]))
     limit = largest_exponent(xp, values.dtype)
     exponent = np.clip(exponent, -limit, limit)
     down, up = (like(xp, np.ldexp(1.0, sign * exponent), values) for sign in (-1, 1))
     return xp.linalg.vector_norm(values * down, axis=-1) * up[..., 0]
+
+
+def _polynomials(coefficients: Array) -> tuple[Floats, Any]:
+    """Return the coefficients as (..., S, D, n) NumPy float64, of unit size, and the exponent (..., 1)."""
+    numbers, exponent = unit_size(to_numpy(coefficients).astype(np.float64), (-3, -2, -1))
+    return np.ascontiguousarray(np.moveaxis(numbers, -3, -1)), exponent[..., 0, 0]
 
 
 def _with_ends(u: Floats) -> Floats:
@@ -85,9 +77,9 @@ def _with_ends(u: Floats) -> Floats:
     return np.concatenate([edge, u, edge + 1.0], axis=-1)
 
 
-def _best(pieces: Pieces, u: Floats, score: Floats) -> tuple[Any, Floats]:
+def _best(trajectory: Trajectory, u: Floats, score: Floats) -> tuple[Any, Floats]:
     """Return segment and unit time, (..., D) each, of the best of candidates (..., S, D, P): the earliest of equals."""
-    empty = to_numpy(pieces.rates) <= 0
+    empty = to_numpy(trajectory.rates) <= 0
     score = np.where(empty[..., None, None], -np.inf, score)
     u, score = np.swapaxes(u, -3, -2), np.swapaxes(score, -3, -2)  # (..., D, S, P)
     count = u.shape[-1]
@@ -96,18 +88,17 @@ def _best(pieces: Pieces, u: Floats, score: Floats) -> tuple[Any, Floats]:
     return chosen // count, np.take_along_axis(u, chosen[..., None], axis=-1)[..., 0]
 
 
-def _read(pieces: Pieces, place: tuple[Any, Floats]) -> tuple[Array, Array]:
+def _read(trajectory: Trajectory, coefficients: Array, place: tuple[Any, Floats]) -> tuple[Array, Array]:
     """Return the value (..., D) of axis d at place d (or of all axes at the one place), and the time."""
     segment, u = place
-    powers, segments, _ = pieces.coefficients.shape[-3:]
+    xp, (powers, segments, _) = trajectory.namespace, coefficients.shape[-3:]
     chosen = segment[..., None, None, :] == np.arange(segments)[:, None]  # (..., 1, S, D or 1)
     basis = chosen * u[..., None, None, :] ** np.arange(powers)[:, None, None]
-    xp, coefficients = pieces.namespace, pieces.coefficients
     values = xp.sum(xp.sum(like(xp, basis, coefficients) * coefficients, axis=-2), axis=-2)
-    starts, rates = to_numpy(pieces.starts), to_numpy(pieces.rates)
+    starts, rates = to_numpy(trajectory.starts), to_numpy(trajectory.rates)
     spans = np.where(rates > 0, 1.0 / np.where(rates > 0, rates, 1.0), 0.0)
     shape = (*segment.shape[:-1], segments)
     start = np.take_along_axis(np.broadcast_to(starts, shape), segment, axis=-1)
     span = np.take_along_axis(np.broadcast_to(spans, shape), segment, axis=-1)
-    time = np.minimum(start + u * span, to_numpy(pieces.end))  # no rounding past the end
+    time = np.minimum(start + u * span, to_numpy(trajectory.end))  # no rounding past the end
     return values, like(xp, time, coefficients)

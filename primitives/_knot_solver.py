@@ -157,7 +157,7 @@ def least_cost_coefficients(
         rows = index(where)
         chosen = [[value[rows] if is_given(value) else value for value in state] for state in flat_states]
         group = (flat_points[rows], flat_durations[rows], chosen)
-        parts.append(_connect_kind(xp, order, *group, empty=kind[:-1], extreme=bool(kind[-1])))
+        parts.append(_connect_kind(xp, order, *group, kind[:-1], bool(kind[-1])))
         members.append(where)
     joined = xp.concat(parts, axis=0)[index(np.argsort(np.concatenate(members)))]
     return xp.reshape(joined, (*batch, *joined.shape[1:]))
@@ -263,37 +263,24 @@ def _flat(value: Any, batch: tuple[int, ...], xp: Namespace) -> Any:
 
 
 def _connect_kind(
-    xp: Namespace,
-    order: int,
-    waypoints: Array,
-    durations: Array,
-    states: States,
-    *,
-    empty: Any,
-    extreme: bool,
+    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States, empty: Any, extreme: bool
 ) -> Array:
     """Return the coefficients where every item has the same empty segments; an empty one is a constant."""
     full = np.flatnonzero(~empty).tolist()
+    points = waypoints[..., None, :-1, :]
+    still = xp.concat([points, *[0.0 * points] * (2 * order - 1)], axis=-3)
+    if not full:
+        return still
     # Keep the start and the end of every full segment; merged knots share one state, the goal's at the end.
     kept = [0, *(s + 1 for s in full)]
     chosen = [states[0], *(states[k] for k in kept[1:-1]), states[-1]]
-    if not full:
-        return xp.concat(
-            [waypoints[..., None, :-1, :], *[0.0 * waypoints[..., None, :-1, :]] * (2 * order - 1)], axis=-3
-        )
     points = xp.stack([waypoints[..., k, :] for k in kept[:-1]] + [waypoints[..., -1, :]], axis=-2)
     lengths = xp.stack([durations[..., s] for s in full], axis=-1)
     solve = _weighted_coefficients if extreme else _banded_coefficients
     solved = solve(xp, order, points, lengths, chosen)
     if len(full) == len(empty):
         return solved
-    zeros = like(xp, np.zeros((2 * order - 1, 1, 1)), solved)
-    columns = []
-    for s, is_empty in enumerate(empty):
-        if is_empty:
-            first = waypoints[..., s : s + 1, :][..., None, :, :]
-            columns.append(xp.concat([first, zeros + 0.0 * first], axis=-3))
-        else:
-            place = full.index(s)
-            columns.append(solved[..., :, place : place + 1, :])
-    return xp.concat(columns, axis=-2)
+    columns = [
+        still[..., s, :] if is_empty else solved[..., full.index(s), :] for s, is_empty in enumerate(empty)
+    ]
+    return xp.stack(columns, axis=-2)

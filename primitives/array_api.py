@@ -198,13 +198,6 @@ def is_whole(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= 0
 
 
-def whole_order(nu: int) -> int:
-    """Return one order of derivative, or raise ValueError."""
-    if not is_whole(nu):
-        raise ValueError(f"nu must be a whole number of at least 0, got {nu!r}")
-    return int(nu)
-
-
 def whole_orders(nu: int | Sequence[int]) -> tuple[int, ...]:
     """Return one order of derivative, or a sequence of them, as a tuple, or raise ValueError."""
     given: Any = nu
@@ -270,11 +263,6 @@ def to_numpy(array: Array) -> np.ndarray[Any, Any]:
         if str(array.dtype) == "torch.bfloat16":  # a dtype that NumPy lacks; float32 represents it exactly
             array = array.float()
     return np.asarray(array)
-
-
-def own(array: Array) -> Array:
-    """Return a copy that shares no memory with the caller and keeps the gradient."""
-    return array.copy(order="K") if isinstance(array, np.ndarray) else 1.0 * array
 
 
 def follows_gradient(*arrays: Array) -> bool:

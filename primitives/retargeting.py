@@ -6,15 +6,7 @@ from math import inf
 from typing import Any
 
 from ._boundary import END_NAMES, end_shapes
-from .array_api import (
-    FREE,
-    Array,
-    Boundary,
-    as_number,
-    broadcast_batch,
-    broadcast_to,
-    require,
-)
+from .array_api import FREE, Array, Boundary, as_number, broadcast_batch, broadcast_to, require
 from .minimum_jerk import through
 from .passage_times import passage_durations
 from .trajectory import Trajectory, require_trajectory
@@ -76,46 +68,31 @@ def retarget(
     arrays = trajectory.floats({"via": via, **named}, widest=True, time=time, goal=goal, arrival=arrival)
     xp, (time, goal, arrival, via, *ends) = trajectory.namespace, arrays
     targets = {"goal": goal, **dict(zip(named, ends, strict=True))}
-    batch = _common_batch(trajectory, time, arrival, targets, via)
-    time, arrival = broadcast_to(xp, time, batch), broadcast_to(xp, arrival, batch)
-    end = broadcast_to(xp, trajectory.duration, batch)
-    require(time >= 0, "time", time, "must not be negative")
-    require(
-        (time < end) | ((time <= 0) & (end <= 0)), "time", time, "must lie before the end of the movement"
-    )
-    if freeze > 0:
-        frozen = end - time < freeze
-        arrival = xp.where(frozen, end, arrival)
-        targets, via = _keep_old_target(trajectory, frozen, targets, via)
-    require(arrival > time, "arrival", arrival, "must lie after time")
-    return _plan(trajectory, time, arrival - time, targets, via)
-
-
-def _common_batch(
-    trajectory: Trajectory, time: Array, arrival: Array, targets: dict[str, Any], via: Array | None
-) -> tuple[int, ...]:
-    """Return the common leading shape of all arguments, or raise ValueError."""
     points = targets if via is None else {**targets, "via": via}
-    return broadcast_batch(
+    batch = broadcast_batch(
         trajectory=trajectory.batch_shape,
         time=tuple(time.shape),
         arrival=tuple(arrival.shape),
         **end_shapes(points, trajectory.dimension),
     )
-
-
-def _plan(
-    trajectory: Trajectory, time: Array, remaining: Array, targets: dict[str, Any], via: Array | None
-) -> Trajectory:
-    """Return the movement of least jerk from the state at `time`."""
-    xp, shape = trajectory.namespace, (*time.shape, trajectory.dimension)
+    time, arrival = broadcast_to(xp, time, batch), broadcast_to(xp, arrival, batch)
+    end = broadcast_to(xp, trajectory.duration, batch)
+    require(time >= 0, "time", time, "must not be negative")
+    under_way = (time < end) | ((time <= 0) & (end <= 0))
+    require(under_way, "time", time, "must lie before the end of the movement")
+    if freeze > 0:
+        frozen = end - time < freeze
+        arrival = xp.where(frozen, end, arrival)
+        targets, via = _keep_old_target(trajectory, frozen, targets, via)
+    require(arrival > time, "arrival", arrival, "must lie after time")
     position, *motion = (value[..., 0, :] for value in trajectory.sample(time[..., None], (0, 1, 2)))
     goal, *final = targets.values()
-    points = [position, goal] if via is None else [position, via, goal]
-    waypoints = xp.stack([broadcast_to(xp, point, shape) for point in points], axis=-2)
-    ends: dict[str, Any] = dict(zip(END_NAMES, (*motion, *final), strict=True))
-    durations = remaining[..., None] if via is None else passage_durations(waypoints, remaining, **ends)
-    return through(waypoints, durations, **ends)
+    states: dict[str, Any] = dict(zip(END_NAMES, (*motion, *final), strict=True))
+    passed, shape = [position, goal] if via is None else [position, via, goal], (*batch, trajectory.dimension)
+    waypoints = xp.stack([broadcast_to(xp, point, shape) for point in passed], axis=-2)
+    remaining = arrival - time
+    durations = remaining[..., None] if via is None else passage_durations(waypoints, remaining, **states)
+    return through(waypoints, durations, **states)
 
 
 def _keep_old_target(

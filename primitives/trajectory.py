@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ._evaluate import derivative_coefficients, evaluate
-from ._extrema import Extrema, Pieces, axis_extrema, largest_norm
+from ._extrema import Extrema, axis_extrema, largest_norm
 from ._hermite_tables import energy_table
 from ._knot_solver import States, least_cost_coefficients
 from .array_api import (
@@ -24,10 +24,8 @@ from .array_api import (
     error_state,
     leading_shape,
     namespace_of,
-    own,
     require,
     to_numpy,
-    whole_order,
     whole_orders,
 )
 
@@ -144,8 +142,8 @@ class Trajectory:
             ValueError: time is not finite or does not broadcast; nu is not a whole number of at least 0.
         """
         if isinstance(time, int | float | np.generic):
-            return self.sample([time], whole_order(nu))[0][..., 0, :]
-        return self.sample(time, whole_order(nu))[0]
+            return self.sample([time], (nu,))[0][..., 0, :]
+        return self.sample(time, (nu,))[0]
 
     def sample(
         self, time: Array | int, nu: int | Sequence[int] = (0, 1, 2), *, out: Sequence[Array] | None = None
@@ -239,7 +237,8 @@ class Trajectory:
         Raises:
             ValueError: nu is not a whole number from 0 to 2 order - 1.
         """
-        if whole_order(nu) >= 2 * self.order:
+        (nu,) = whole_orders((nu,))
+        if nu >= 2 * self.order:
             raise ValueError(f"nu must lie in 0 ... {2 * self.order - 1}, got {nu}")
         return self._energy(nu)
 
@@ -261,7 +260,7 @@ class Trajectory:
         Raises:
             ValueError: as in `peak`.
         """
-        return axis_extrema(self._pieces(nu))
+        return axis_extrema(self, self._finite_derivative(nu))
 
     def peak(self, nu: int = 0) -> Array:
         """Return (...,) the largest Euclidean norm of the nu-th derivative [m/s^nu].
@@ -269,11 +268,11 @@ class Trajectory:
         Raises:
             ValueError: nu is not a whole number, or the movement is so short that the derivative overflows.
         """
-        return largest_norm(self._pieces(nu))
+        return largest_norm(self, self._finite_derivative(nu))
 
-    def _pieces(self, nu: int) -> Pieces:
-        """Return the nu-th derivative, or raise ValueError if it overflows."""
-        xp, nu = self.namespace, whole_order(nu)
+    def _finite_derivative(self, nu: int) -> Array:
+        """Return the coefficients of the nu-th derivative, or raise ValueError if it overflows."""
+        xp, (nu,) = self.namespace, whole_orders((nu,))
         with error_state(xp):
             coefficients = derivative_coefficients(self.coefficients, self.rates, nu)
         if not xp.isfinite(coefficients).all():
@@ -283,7 +282,7 @@ class Trajectory:
                 f"derivative {nu} of the trajectory overflows {self.coefficients.dtype}: its shortest segment "
                 f"lasts {shortest:g} s"
             )
-        return Pieces(coefficients, self.starts, self.rates, self.end, xp)
+        return coefficients
 
     def stretched(self, duration: Array) -> Trajectory:
         """Return the movement along the same path with time scaled to a new total duration (...,) [s].
@@ -299,7 +298,7 @@ class Trajectory:
             moves = (self.coefficients[..., 1:, :, :] != 0).any(-1).any(-1).any(-1)
             allowed = (duration > 0) | ((duration == 0) & ~moves)
             require(allowed, "duration", broadcast_to(xp, duration, batch), "must be positive")
-        end = own(duration)[..., None]
+        end = duration[..., None] + 0.0 * self.end  # the leading shape of the durations
         factor = end / xp.where(self.end > 0, self.end, 1.0)
         with error_state(xp):
             runs = (self.rates > 0) & (factor > 0)

@@ -24,6 +24,7 @@ SHIPPED = (
     ".safetensors",
     ".json",
     ".j2",
+    ".mplstyle",
 )
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
 

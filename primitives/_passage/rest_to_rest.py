@@ -15,15 +15,13 @@ nearer to x0 than to xf. Only a/b and c/b matter, in any dimension of space.
 
 from __future__ import annotations
 
-import functools
 import math
-import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..array_api import Array, Namespace, like, to_numpy
+from ..array_api import Array, Namespace, like, ordered_sum, to_numpy
 
 Number: TypeAlias = Any
 """A float, or an array with one entry per movement; both give the same bits."""
@@ -31,7 +29,7 @@ Number: TypeAlias = Any
 SHORTEST = 1e-40
 """Least fraction of a via-point apart from its neighbour; a higher power of it must not underflow."""
 
-STEPS = 5
+_STEPS = 5
 """Newton steps; the start is within 34 % of the root everywhere, and after five the error is 2e-16 (measured)."""
 
 _FLOOR = 1e-5
@@ -48,7 +46,7 @@ class Functions(NamedTuple):
     maximum: Callable[[Any, Any], Any]
 
 
-ARRAYS = Functions(np.where, np.sqrt, np.cbrt, np.minimum, np.maximum)
+_ARRAYS = Functions(np.where, np.sqrt, np.cbrt, np.minimum, np.maximum)
 _FLOATS = Functions(
     lambda condition, yes, no: yes if condition else no,
     math.sqrt,
@@ -70,10 +68,10 @@ def fractions_at_rest(points: Any) -> Any:
     """
     places = np.ascontiguousarray(points.transpose(1, 2, 0))
     legs, whole = places[1:] - places[:-1], places[2] - places[0]
-    first, second = _dot(*[legs.swapaxes(0, 1)] * 2)
+    first, second = ordered_sum(legs.swapaxes(0, 1) ** 2)
     is_late = second < first
     near = np.where(is_late, legs[1], legs[0])
-    a, b, c = _dot(near, whole), _dot(whole, whole), np.minimum(first, second)
+    a, b, c = ordered_sum(near * whole), ordered_sum(whole * whole), np.minimum(first, second)
     # A batch of one would spend its time in the overhead of array operations: Python floats give the same bits.
     arguments = (a, b, c) if len(points) > 1 else (a.item(), b.item(), c.item(), _FLOATS)
     t = nearer_fraction(*arguments)
@@ -83,12 +81,7 @@ def fractions_at_rest(points: Any) -> Any:
     return fractions
 
 
-def _dot(x: Array, y: Array) -> Array:
-    """Return the scalar product along the first axis, in a fixed order (NumPy's depends on the memory layout)."""
-    return functools.reduce(operator.add, x * y)
-
-
-def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = ARRAYS, steps: int = STEPS) -> Number:
+def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = _ARRAYS) -> Number:
     """Return the root of F (Eq. 1) in [0, 1/2], for E from the nearer end, so that a <= b / 2.
 
     Newton steps from the root of c = 4 a z + 10 b z^2, z = t^3, which are the lowest terms of F for small t.
@@ -100,7 +93,7 @@ def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = ARRAYS, step
     bottom = f.where(a >= 0, 2.0 * total, 10.0 * b) + 8.0 * top
     t = f.cube_root(top / f.where(bottom > 0, bottom, 1.0))
     t = f.minimum(f.maximum(t, 0.0), 0.5)
-    for _ in range(steps):
+    for _ in range(_STEPS):
         value, slope, _ = _residual(t, a, b, c)
         t = f.minimum(f.maximum(t - value / f.where(slope < 0, slope, -1.0), 0.5 * t), 0.5)
     return t
@@ -143,7 +136,7 @@ def _root_rates(points: Any, fractions: Any) -> tuple[tuple[Any, Any, Any], Any]
     t = fractions.min(axis=-1)
     near = np.where(is_late, goal - via, via - start)
     whole = goal - start
-    a, b, c = _dot(near, whole), _dot(whole, whole), _dot(near, near)
+    a, b, c = ordered_sum(near * whole), ordered_sum(whole * whole), ordered_sum(near * near)
     _, slope, (s, q, w) = _residual(t, a, b, c)
     extent = b + c
     floor = _FLOOR ** (5.0 / 3.0) * extent + (extent <= 0)  # |dF/dt| falls like |E|^(5/3)

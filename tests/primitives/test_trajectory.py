@@ -119,6 +119,17 @@ def test_movement_turns_shifts_grows_and_stretches_with_its_points(rng):
     np.testing.assert_allclose(slow.cost(), plain.cost() / pace**5, rtol=1e-13)
 
 
+@pytest.mark.parametrize("own_durations", [True, False])
+@pytest.mark.parametrize("pace", [2.0, np.array([2.0, 1.5, 0.3, 1.0])])
+def test_knots_are_stretched_with_their_movements(own_durations, pace, rng):
+    waypoints, durations, _ = random_movement(rng, 2, batch=(4,))
+    plain = through(waypoints, durations if own_durations else durations[0])
+    slow = plain.stretched(pace)
+    expected = plain.knots * (pace / plain.duration)[:, None]
+    np.testing.assert_allclose(slow.knots, expected, rtol=1e-14)
+    np.testing.assert_allclose(slow(slow.knots), waypoints, atol=1e-12)
+
+
 def test_outside_the_movement_the_end_points_are_held_at_rest(rng):
     waypoints, durations, ends = random_movement(rng, 1)
     trajectory = through(waypoints, durations, **ends)

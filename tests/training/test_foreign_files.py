@@ -157,7 +157,7 @@ def test_the_paper_is_written_over_no_file_of_something_else(name, tmp_path, mon
 def test_what_the_paper_and_the_demo_wrote_can_be_written_again(tmp_path, monkeypatch):
     from matplotlib.figure import Figure
 
-    claims = [paper.Claim(row=1, claim="one", model=1.0, expected=paper.straight.near(1.0, 0.1))]
+    claims = [paper.Claim(1, "one", model=(1.0, paper.straight.near(1.0, 0.1)))]
     pictures = []
     for drawing in paper.DRAWINGS:
         picture, _ = save_figure(Figure(), tmp_path, drawing.name)

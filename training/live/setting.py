@@ -24,7 +24,7 @@ from viapoint.training.live.decisions import DecisionMaker
 from viapoint.training.live.drawing import ArmDrawing
 from viapoint.training.live.movements import DECISION_INTERVAL
 from viapoint.training.live.scene import LiveScene
-from viapoint.training.paper.lights import rows_of_lights
+from viapoint.training.paper.movements import rows_of_lights
 from viapoint.training.planning.baselines import PLANNERS, PlannerMethod
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import load, shipped_set

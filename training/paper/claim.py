@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExpectedRange:
-    """Range of values that a number may have, from `low` to `high`."""
+class Range(NamedTuple):
+    """Range of values that a number may have."""
 
     low: float = -np.inf
     high: float = np.inf
@@ -26,100 +25,73 @@ class ExpectedRange:
         return f"at most {self.high:.4g}" if np.isfinite(self.high) else f"at least {self.low:.4g}"
 
 
-def near(value: float, tolerance: float) -> ExpectedRange:
+def near(value: float, tolerance: float) -> Range:
     """Return the range around a value."""
-    return ExpectedRange(low=value - tolerance, high=value + tolerance)
+    return Range(value - tolerance, value + tolerance)
 
 
-def at_most(value: float) -> ExpectedRange:
+def at_most(value: float) -> Range:
     """Return the range up to a value."""
-    return ExpectedRange(high=value)
+    return Range(high=value)
 
 
-def at_least(value: float) -> ExpectedRange:
+def at_least(value: float) -> Range:
     """Return the range from a value on."""
-    return ExpectedRange(low=value)
+    return Range(low=value)
 
 
-@dataclass(frozen=True, kw_only=True)
+Number: TypeAlias = tuple[Any, Range]
+"""Computed number, a float of Python or NumPy, and its expected range."""
+
+
+@dataclass(frozen=True)
 class Claim:
-    """Statement with its number on the model and, where it can be simulated, on the arm."""
+    """Statement with its number on the model and, where it can be simulated, on the arm.
+
+    Raises:
+        ValueError: There is no number.
+    """
 
     row: int
-    """Number of its subject in SUBJECTS."""
+    """Number of its subject."""
     claim: str
     """Text of the statement; it says where the statement is only approximate."""
     figure: str = "-"
     """Figure of the paper."""
     paper: str = "-"
     """Statement or measurement of the paper."""
-    unit: str = ""
-    """Unit of the numbers."""
-    model: float | None
+    model: Number | None = None
     """Number on the model; None where it needs an arm."""
-    expected: ExpectedRange | None = None
-    """Expected range of the model's number."""
-    arm: float | None = None
+    arm: Number | None = None
     """Number on the simulated arm; None for statements about the mathematics alone."""
-    arm_expected: ExpectedRange | None = None
-    """Expected range of the arm's number."""
     deviation: float | None = None
     """Greatest distance of the simulated hand from the plan, [mm]."""
+    unit: str = ""
+    """Unit of the numbers."""
 
-    @property
-    def holds(self) -> bool:
-        """Truth of the claim: every number is in its expected range.
-
-        Raises:
-            ValueError: There is no number, or a number without an expected range or the reverse.
-        """
-        pairs = ((self.model, self.expected), (self.arm, self.arm_expected))
-        if all(value is None for value, _ in pairs):
+    def __post_init__(self) -> None:
+        if self.model is None and self.arm is None:
             raise ValueError(f"claim without a number: {self.claim}")
-        if any((value is None) != (expected is None) for value, expected in pairs):
-            raise ValueError(f"a number and its expected range belong together: {self.claim}")
-        return all(expected.contains(value) for value, expected in pairs if expected and value is not None)
 
     @property
     def verdict(self) -> str:
-        """Verdict in one word."""
-        return "holds" if self.holds else "FAILS"
+        """Verdict in one word: every number is in its expected range, or not."""
+        numbers = [number for number in (self.model, self.arm) if number is not None]
+        return "holds" if all(expected.contains(value) for value, expected in numbers) else "FAILS"
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values for JSON; open ends of a range are null."""
         record: dict[str, Any] = {
             name: getattr(self, name) for name in ("row", "claim", "figure", "paper", "unit")
         }
-        for name, value, expected in (
-            ("model", self.model, self.expected),
-            ("arm", self.arm, self.arm_expected),
-        ):
+        for name, number in (("model", self.model), ("arm", self.arm)):
+            value, expected = number or (None, None)
             record[name] = None if value is None else float(value)
-            record[f"{name}_expected"] = None if expected is None else _ends(expected)
+            record[f"{name}_expected"] = expected and [
+                float(end) if np.isfinite(end) else None for end in expected
+            ]
         record["deviation_mm"] = None if self.deviation is None else float(self.deviation)
         return {**record, "verdict": self.verdict}
-
-
-SUBJECTS = {
-    1: "Point to point",
-    2: "Invariance of hand paths",
-    3: "Joints and torques",
-    4: "Free passage time",
-    5: "Speed valley and curvature",
-    6: "Place of the via-point",
-    7: "Isochrony",
-    8: "Scaling with time",
-    9: "Alternatives to minimum jerk",
-    10: "Repetitive and performance-limited movements",
-    11: "The primer and its replanned version",
-    12: "Obstacle avoidance",
-    13: "A target that jumps on the way (Flash & Henis 1991)",
-}
-"""Titles of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991."""
-
-
-def _ends(expected: ExpectedRange) -> list[float | None]:
-    return [end if np.isfinite(end) else None for end in (expected.low, expected.high)]
 
 
 class Reproduction(NamedTuple):
@@ -131,4 +103,4 @@ class Reproduction(NamedTuple):
     @property
     def failed(self) -> list[Claim]:
         """Claims that do not hold."""
-        return [claim for claim in self.claims if not claim.holds]
+        return [claim for claim in self.claims if claim.verdict != "holds"]

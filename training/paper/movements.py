@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from viapoint.envs import Box, arm_of
 from viapoint.envs.arms.kinematics import torques
-from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.outcome import SETTLING
@@ -16,25 +17,37 @@ from viapoint.envs.plans import Motion
 from viapoint.envs.simulator import Simulator
 from viapoint.envs.spaces import HandPlane
 from viapoint.primitives import Trajectory, passage_durations, point_to_point, through
-from viapoint.training.paper.lights import TARGETS
 
+TARGETS = {
+    "T1": np.array([-0.32, 0.42]),
+    "T2": np.array([-0.22, 0.27]),
+    "T3": np.array([-0.02, 0.27]),
+    "T4": np.array([0.08, 0.42]),
+    "T5": np.array([-0.02, 0.57]),
+    "T6": np.array([-0.22, 0.57]),
+}
+"""The six targets of Flash & Hogan 1985, Fig. 2, [m], shoulder at the origin.
+
+The figure gives no coordinates. Its movements T1-T4, T2-T5 and T3-T6 (Figs. 1, 3 and 4) are the three diagonals of a
+hexagon here, 40, 36 and 36 cm long, in front of the right shoulder and within the reach of the arm.
+"""
 ADULT = arm_of("planar")
 """Arm of an adult."""
 PLANE = HandPlane(ADULT)
 """Plane of its hand."""
 
 
-def target(name: str) -> Float:
-    """Return the position of one of the paper's targets T1 to T6, shape (2,), [m]."""
-    return np.asarray(TARGETS[name], dtype=np.float64)
-
-
 def straight(first: str, last: str, duration: float = 0.8, *, order: int = 3) -> Trajectory:
     """Return the straight movement between two targets (Eq. 2); order 2, 3, 4 minimises acceleration, jerk, snap."""
-    return point_to_point(target(first), target(last), duration, order=order)
+    return point_to_point(TARGETS[first], TARGETS[last], duration, order=order)
 
 
-def via_waypoints(start: ArrayLike, goal: ArrayLike, along: ArrayLike, height: ArrayLike) -> Float:
+def left_of(line: Float) -> Float:
+    """Return a vector of the plane, shape (2,), turned to the left by a right angle."""
+    return np.array([-line[1], line[0]])
+
+
+def via_waypoints(start: Any, goal: Any, along: ArrayLike, height: ArrayLike) -> Float:
     """Return start, via-point and goal by the construction of Fig. 1B.
 
     Args:
@@ -46,13 +59,10 @@ def via_waypoints(start: ArrayLike, goal: ArrayLike, along: ArrayLike, height: A
     Returns:
         Shape (..., 3, 2), [m].
     """
-    x0, xf = np.asarray(start, dtype=np.float64), np.asarray(goal, dtype=np.float64)
-    along, height = np.broadcast_arrays(np.asarray(along, dtype=np.float64), height)
-    line = xf - x0
-    left = np.array([-line[1], line[0]])
-    via = x0 + along[..., None] * line + height[..., None] * left
-    ends = np.broadcast_to(x0, via.shape), np.broadcast_to(xf, via.shape)
-    return np.stack((ends[0], via, ends[1]), axis=-2)
+    line = np.subtract(goal, start)
+    along, height = np.broadcast_arrays(along, height)
+    via = np.asarray(start) + along[..., None] * line + height[..., None] * left_of(line)
+    return np.stack(np.broadcast_arrays(start, via, goal), axis=-2)
 
 
 def construction(waypoints: Float) -> tuple[Float, Float]:
@@ -71,12 +81,61 @@ def minimum_jerk_through(waypoints: ArrayLike, duration: Any = 1.0) -> Trajector
 
 def curved(first: str, last: str, along: ArrayLike, height: ArrayLike, duration: Any = 1.0) -> Trajectory:
     """Return the movement between two targets through a via-point, see :func:`via_waypoints`."""
-    return minimum_jerk_through(via_waypoints(target(first), target(last), along, height), duration)
+    return minimum_jerk_through(via_waypoints(TARGETS[first], TARGETS[last], along, height), duration)
 
 
 def passage_share(movement: Trajectory) -> Float:
     """Return t1 / (t1 + t2) of movements through one via-point, shape (...,)."""
     return np.asarray(movement.knots[..., 1] / movement.knots[..., 2])
+
+
+LEAST_APART = 0.3
+"""Least distance of the targets of a movement, [m]."""
+
+
+class RowOfLights(NamedTuple):
+    """Movement between two targets, and the row of lights across its middle."""
+
+    first: str
+    last: str
+    """Names of the targets."""
+    start: Float
+    """Shape (2,), [m]."""
+    goal: Float
+    """Shape (2,), [m]."""
+    lights: Box
+
+
+def rows_of_lights(
+    length: float = 0.25, radius: float = 0.008, half_height: float = 0.04
+) -> list[RowOfLights]:
+    """Return the obstacle paradigm of Flash & Hogan 1985, one for each two targets that are far apart.
+
+    Args:
+        length: Length of the row, [m]; the paper's rows were up to 25 cm long.
+        radius: Half width of the row, [m].
+        half_height: Half height of the obstacle that stands for it, [m].
+
+    Example:
+        >>> from viapoint.training.paper.movements import rows_of_lights
+        >>> rows = rows_of_lights()
+        >>> len(rows), rows[0].first, rows[0].last
+        (14, 'T1', 'T3')
+    """
+    found = []
+    for first, start in TARGETS.items():
+        for last, goal in TARGETS.items():
+            line = goal - start
+            if np.hypot(*line) < LEAST_APART:
+                continue
+            across = 0.5 * (np.arctan2(line[1], line[0]) + 0.5 * np.pi)
+            lights = Box(
+                size=(0.5 * length, radius, half_height),
+                position=(*(0.5 * (start + goal)), 0.0),
+                quaternion=(np.cos(across), 0.0, 0.0, np.sin(across)),
+            )
+            found.append(RowOfLights(first, last, start.copy(), goal.copy(), lights))
+    return found
 
 
 TIMESTEP = 0.002
@@ -117,6 +176,10 @@ class SimulatedMovements(NamedTuple):
         """Return the acceleration of the hand by central differences, shape (N, T, 2), [m/s^2]."""
         return np.asarray(np.gradient(self.velocity(), self.time, axis=1))
 
+    def joint_rates(self) -> Float:
+        """Return the velocities of the joints by central differences, shape (N, T, 2), [rad/s]."""
+        return np.asarray(np.gradient(self.joints, self.time, axis=1))
+
     def peak_speed(self) -> Float:
         """Return the greatest speed of each movement, shape (N,), [m/s]."""
         return np.asarray(np.linalg.norm(self.velocity(), axis=-1).max(axis=-1))
@@ -129,10 +192,9 @@ class SimulatedMovements(NamedTuple):
 
 def simulate(movement: Trajectory) -> SimulatedMovements:
     """Simulate planar movements of batch shape () or (N,), each from rest at its start."""
-    number = int(np.prod(movement.batch_shape)) if movement.batch_shape else 1
-    duration = np.broadcast_to(np.asarray(movement.duration), (number,))
+    duration = np.atleast_1d(movement.duration)
     time = instants(float(duration.max()))
-    references = [part.reshape(number, len(time), 2) for part in movement.sample(time)]
+    references = [part.reshape(len(duration), len(time), 2) for part in movement.sample(time)]
     return track(duration, *references)
 
 
@@ -151,18 +213,13 @@ def track(duration: Float, position: Float, velocity: Float, acceleration: Float
     controls = ADULT.controls(*planned)[:, :-1]
     ran = simulator.batch.rollout(count - 1, controls, record=("qpos", "qvel", "actuator_force"))
     joints = np.concatenate((start[:, None], ran["qpos"]), axis=1)
-    time, torque = TIMESTEP * np.arange(count), _torque(ran["qvel"], ran["actuator_force"])
-    return SimulatedMovements(np.asarray(time), duration, position, PLANE.coordinates(joints), joints, torque)
-
-
-def _torque(rates: Float, force: Float) -> Float:
-    """Return the torque that moved the arm in each step.
-
-    The integrator applies the servo's damping at the end of a step; the recorded force is that at its beginning. A
-    force at its limit does not depend on the rates.
-    """
-    change = np.diff(rates, axis=1, prepend=0.0)
-    return np.where(np.abs(force) < ADULT.torque_limit, force - ADULT.damping * change, force)
+    # The integrator applies the servo's damping at the end of a step; the recorded force is that at its beginning.
+    # A force at its limit does not depend on the rates.
+    force = ran["actuator_force"]
+    damped = force - ADULT.damping * np.diff(ran["qvel"], axis=1, prepend=0.0)
+    torque = np.where(np.abs(force) < ADULT.torque_limit, damped, force)
+    time = np.asarray(TIMESTEP * np.arange(count))
+    return SimulatedMovements(time, duration, position, PLANE.coordinates(joints), joints, torque)
 
 
 def joint_motion(movement: Trajectory, count: int = 401) -> Motion:
@@ -170,9 +227,9 @@ def joint_motion(movement: Trajectory, count: int = 401) -> Motion:
     return PLANE.joint_motion(Motion(*movement.sample(count)))
 
 
-def required_torque(movement: Trajectory, count: int = 401) -> Float:
-    """Return the torque of shoulder and elbow that a plan requires, with viscosity, shape (..., count, 2), [N m]."""
-    return torques(ADULT.chain, *joint_motion(movement, count))
+def required_torque(movement: Trajectory) -> Float:
+    """Return the torque of shoulder and elbow that a plan requires, with viscosity, shape (..., 401, 2), [N m]."""
+    return torques(ADULT.chain, *joint_motion(movement))
 
 
 EDGE = 0.08
@@ -234,17 +291,30 @@ class Profile(NamedTuple):
         return np.array([np.interp(time, self.time, self.position[:, i]) for i in (0, 1)])
 
 
-def model_profile(movement: Trajectory) -> Profile:
-    """Return the profile of a single movement of the model."""
-    position, velocity, acceleration = movement.sample(SAMPLES)
-    return Profile.of(np.linspace(0.0, 1.0, SAMPLES), position, velocity, acceleration)
+def model_profiles(movement: Trajectory) -> list[Profile]:
+    """Return the profiles of movements of the model, of batch shape () or (N,)."""
+    time = np.linspace(0.0, 1.0, SAMPLES)
+    parts = [part.reshape(-1, SAMPLES, 2) for part in movement.sample(SAMPLES)]
+    return [Profile.of(time, *row) for row in zip(*parts, strict=True)]
 
 
-def arm_profile(motion: SimulatedMovements, row: int = 0) -> Profile:
-    """Return the profile of one movement of the simulated arm."""
-    within = motion.time <= motion.duration[row] + 1e-9
-    fields = (part[row, within] for part in (motion.hand, motion.velocity(), motion.acceleration()))
-    return Profile.of(motion.time[within] / motion.duration[row], *fields)
+def arm_profiles(motion: SimulatedMovements) -> list[Profile]:
+    """Return the profiles of movements of the simulated arm."""
+    profiles = []
+    for duration, *row in zip(
+        motion.duration, motion.hand, motion.velocity(), motion.acceleration(), strict=True
+    ):
+        within = motion.time <= duration + 1e-9
+        profiles.append(Profile.of(motion.time[within] / duration, *(part[within] for part in row)))
+    return profiles
+
+
+def first_place(holds: Callable[[Any], bool], low: Any, high: Any, halvings: int) -> Any:
+    """Return where in an interval a condition begins to hold, by bisection; it holds at `high`, not at `low`."""
+    for _ in range(halvings):
+        middle = (low + high) / 2
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return (low + high) / 2
 
 
 def vertex(before: float, here: float, after: float) -> tuple[float, float]:

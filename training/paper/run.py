@@ -5,11 +5,13 @@ from __future__ import annotations
 import base64
 import sys
 from collections.abc import Callable
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
-import matplotlib as mpl
+import matplotlib.style
+import pandas as pd
 from jinja2 import Environment, StrictUndefined
 from matplotlib.figure import Figure
 from tqdm import tqdm
@@ -18,25 +20,29 @@ from viapoint.training.config.configs import PaperConfig
 from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import MARK, check_ours, versions, write_bytes, write_json
 from viapoint.training.paper import figures
-from viapoint.training.paper.claim import SUBJECTS, Claim, Reproduction
-from viapoint.training.paper.rows import alternatives, curved, double_step, obstacles, straight
-from viapoint.training.paper.rows.obstacles import check_agent
+from viapoint.training.paper.claim import Claim, Number, Reproduction
+from viapoint.training.paper.rows import alternatives, double_step, obstacles, one_via, straight
+from viapoint.training.paper.rows.one_via import ENDS, FAST, SLOW, THREE_POINTS
 
-ROWS: dict[int, Callable[[], list[Claim]]] = {
-    1: straight.point_to_point_claims,
-    2: straight.invariance_claims,
-    3: straight.joint_claims,
-    4: curved.passage_claims,
-    5: curved.valley_claims,
-    6: curved.place_claims,
-    7: curved.isochrony_claims,
-    8: curved.scaling_claims,
-    9: alternatives.alternative_claims,
-    10: alternatives.limit_claims,
-    11: double_step.replanning_claims,
-    13: double_step.double_step_claims,
+ROWS: dict[int, tuple[str, Callable[..., list[Claim]]]] = {
+    1: ("Point to point", straight.point_to_point_claims),
+    2: ("Invariance of hand paths", straight.invariance_claims),
+    3: ("Joints and torques", straight.joint_claims),
+    4: ("Free passage time", one_via.passage_claims),
+    5: ("Speed valley and curvature", one_via.valley_claims),
+    6: ("Place of the via-point", one_via.place_claims),
+    7: ("Isochrony", one_via.isochrony_claims),
+    8: ("Scaling with time", one_via.scaling_claims),
+    9: ("Alternatives to minimum jerk", alternatives.alternative_claims),
+    10: ("Repetitive and performance-limited movements", alternatives.limit_claims),
+    11: ("The primer and its replanned version", double_step.replanning_claims),
+    12: ("Obstacle avoidance", obstacles.obstacle_claims),
+    13: ("A target that jumps on the way (Flash & Henis 1991)", double_step.double_step_claims),
 }
-"""Functions of the rows; row 12 needs movements around obstacles."""
+"""Titles and functions of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991.
+
+That of row 12 takes the movements around obstacles.
+"""
 
 
 class Drawing(NamedTuple):
@@ -58,20 +64,26 @@ DRAWINGS = (
     Drawing("fig04_joints", "Joint angles, joint velocities and torques of two straight movements (Fig. 4): what is "
             "the same for the hand is not for the joints.", figures.joints),
     Drawing("fig05_height", "A larger d3 gives a deeper valley and a higher curvature peak (Fig. 5); d1 = d2; lengths "
-            "relative to d1 + d2. Dotted: passage of the via-point.", figures.height),
-    Drawing("fig06_place", "The longer side has the higher speed peak (Fig. 6).", figures.place),
-    Drawing("fig07_turned", "The same in other directions (Fig. 7).", figures.turned),
+            "relative to d1 + d2. Dotted: passage of the via-point.",
+            partial(figures.pair, (*ENDS, 0.5, -0.52), (*ENDS, 0.5, -0.35), ("$d_3$ = 0.52", "$d_3$ = 0.35"))),
+    Drawing("fig06_place", "The longer side has the higher speed peak (Fig. 6).",
+            partial(figures.pair, (*ENDS, 0.3, -0.45), (*ENDS, 0.7, -0.45), ("$d_1$ = 0.3", "$d_1$ = 0.7"))),
+    Drawing("fig07_turned", "The same in other directions (Fig. 7).",
+            partial(figures.pair, ("T2", "T5", 0.35, 0.5), ("T3", "T6", 0.65, -0.5),
+                    ("$T_2$ to $T_5$", "$T_3$ to $T_6$"))),
     Drawing("fig08_obstacles", "Around a row of lights (Fig. 8): the movement with the deepest valley (A) and a "
             "median one (B), each with the model through its point of greatest curvature.",
-            figures.obstacles, around_lights=True),
+            figures.around_lights, around_lights=True),
     Drawing("fig10_isochrony", "Passage times (Fig. 10). A: against d1, for three d3; C: against d3, for three d1. "
             "B, D: difference from the model. Grey squares: movements around rows of lights.",
             figures.isochrony, around_lights=True),
-    Drawing("fig11_scaling", "The same three points in 1.1 s and 0.85 s (Fig. 11).", figures.scaling),
+    Drawing("fig11_scaling", "The same three points in 1.1 s and 0.85 s (Fig. 11).",
+            partial(figures.pair, (*ENDS, *THREE_POINTS, SLOW), (*ENDS, *THREE_POINTS, FAST),
+                    (f"{SLOW} s", f"{FAST} s"))),
     Drawing("valleys", "Where there is a speed valley at all (A), and how much later the curvature has its peak (B).",
             figures.valleys),
     Drawing("alternatives", "Least acceleration, jerk and snap (A, B); least jerk of the hand (C) and of the joints "
-            "(D).", figures.alternatives),
+            "(D).", figures.orders_and_spaces),
     Drawing("limits", "A repetitive movement beside a sinusoid (A); T3 to T6 at the torque limit and faster (B), with "
             "the torques of both (C, D; limits dotted).", figures.limits),
     Drawing("double_step", "The target jumps from T4 to T5 and the movement is revised (orange) 50, 100, 200 or 300 ms "
@@ -84,27 +96,25 @@ DRAWINGS = (
 """Figures in the order of the paper."""
 
 
+STEPS = len(ROWS) + 1 + len(DRAWINGS)
+
+
 def reproduce(out: Path, agent: Path | None, report_step: Callable[[str], None]) -> Reproduction:
     """Compute every row, row 12 with an agent or a search, and draw every figure; each step is reported."""
-    claims: list[Claim] = []
-    for row, compute in ROWS.items():
-        report_step(f"row {row}")
-        claims += compute()
-    report_step("row 12")
+    report_step("movements around lights")
     avoidance = obstacles.light_movements(agent)
-    claims += obstacles.obstacle_claims(avoidance)
-    claims.sort(key=lambda claim: claim.row)
+    claims: list[Claim] = []
+    for row, (_, compute) in ROWS.items():
+        report_step(f"row {row}")
+        claims += compute(avoidance) if compute is obstacles.obstacle_claims else compute()
     pictures = []
     for drawing in DRAWINGS:
         report_step(drawing.name)
-        with mpl.rc_context(figures.STYLE):
+        with matplotlib.style.context(figures.STYLE):
             figure = drawing.draw(avoidance) if drawing.around_lights else drawing.draw()
             picture, _ = figures.save(figure, out, drawing.name)
         pictures.append((picture, drawing.caption))
     return Reproduction(claims, pictures)
-
-
-STEPS = len(ROWS) + 1 + len(DRAWINGS)
 
 
 TITLE = "Flash & Hogan 1985, reproduced with viapoint"
@@ -124,68 +134,46 @@ NOTE = (
 
 def write(reproduction: Reproduction, out: Path) -> list[Path]:
     """Write the tables and the page to a folder."""
-    paths = [out / name for name in PAGES]
-    write_bytes(paths[0], markdown(reproduction.claims).encode())
+    claims, pictures = reproduction
+    summary = summary_of(claims)
+    table = pd.DataFrame([cells(claim) for claim in claims], columns=HEADINGS)
+    aligned = ["left"] * 4 + ["right"] * 5 + ["left"]
+    text = table.replace("|", r"\|").to_markdown(index=False, disable_numparse=True, colalign=aligned)
+    markdown = f"# {TITLE}\n\n{summary} {NOTE}\n\n{text}\n\n<!-- {MARK.decode()} -->\n"
     record = {"viapoint": versions()["viapoint"], "title": TITLE, "holds": not reproduction.failed}
-    write_json(paths[1], {**record, "claims": [claim.as_json() for claim in reproduction.claims]})
-    write_bytes(paths[2], page(reproduction).encode())
+    page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = page.from_string(
+        (files("viapoint.training") / "paper/templates/page.html.j2").read_text("utf-8")
+    )
+    html = template.render(
+        title=TITLE, note=NOTE, summary=summary, headings=HEADINGS[1:], claims=claims, cells=cells, rows=ROWS,
+        figures=[(base64.b64encode(path.read_bytes()).decode(), caption) for path, caption in pictures],
+    )  # fmt: skip
+    paths = [out / name for name in PAGES]
+    write_bytes(paths[0], markdown.encode())
+    write_json(paths[1], {**record, "claims": [claim.as_json() for claim in claims]})
+    write_bytes(paths[2], html.encode())
     return paths
 
 
 def cells(claim: Claim) -> list[str]:
     """Return the cells of one line."""
-    return [
-        str(claim.row),
-        claim.claim,
-        claim.figure,
-        claim.paper,
-        _number(claim.model, claim.unit),
-        _or_dash(claim.expected),
-        _number(claim.arm, claim.unit),
-        _or_dash(claim.arm_expected),
-        "-" if claim.deviation is None else f"{claim.deviation:.2f}",
-        claim.verdict,
-    ]
+    deviation = "-" if claim.deviation is None else f"{claim.deviation:.2f}"
+    model, arm = (_number_and_range(number, claim.unit) for number in (claim.model, claim.arm))
+    return [str(claim.row), claim.claim, claim.figure, claim.paper, *model, *arm, deviation, claim.verdict]
 
 
-def markdown(claims: list[Claim]) -> str:
-    """Return the table as a Markdown document."""
-    lines = [list(HEADINGS), ["---"] * 4 + ["---:"] * 5 + ["---"]]
-    lines += [[cell.replace("|", "\\|") for cell in cells(claim)] for claim in claims]
-    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    return f"# {TITLE}\n\n{summary(claims)} {NOTE}\n\n{table}\n\n<!-- {MARK.decode()} -->\n"
-
-
-def summary(claims: list[Claim]) -> str:
-    """Return a sentence with the number of claims that hold."""
-    return f"{sum(claim.holds for claim in claims)} of {len(claims)} claims hold."
-
-
-def page(reproduction: Reproduction) -> str:
-    """Return an HTML page with embedded pictures."""
-    source = files("viapoint.training") / "paper" / "templates" / "page.html.j2"
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    pictures = [
-        (base64.b64encode(path.read_bytes()).decode(), caption) for path, caption in reproduction.pictures
-    ]
-    claims = reproduction.claims
-    return environment.from_string(source.read_text(encoding="utf-8")).render(
-        title=TITLE, note=NOTE, summary=summary(claims), headings=HEADINGS[1:], claims=claims, cells=cells,
-        subjects=SUBJECTS, figures=pictures,
-    )  # fmt: skip
-
-
-def _number(value: float | None, unit: str) -> str:
-    if value is None:
-        return "-"
+def _number_and_range(number: Number | None, unit: str) -> tuple[str, str]:
+    if number is None:
+        return "-", "-"
+    value, expected = number
     text = f"{value:.1e}" if value != 0 and abs(value) < 1e-3 else f"{value:.4g}"
-    return f"{text} {unit}".rstrip()
+    return f"{text} {unit}".rstrip(), str(expected)
 
 
-def _or_dash(value: object) -> str:
-    return "-" if value is None else str(value)
+def summary_of(claims: list[Claim]) -> str:
+    """Return a sentence with the number of claims that hold."""
+    return f"{sum(claim.verdict == 'holds' for claim in claims)} of {len(claims)} claims hold."
 
 
 class ClaimsFailedError(Exception):
@@ -197,7 +185,7 @@ class ClaimsFailedError(Exception):
 def run(config: PaperConfig) -> None:
     """Compute the claims, draw and write them, and raise an error if a claim does not hold."""
     if config.agent is not None:
-        check_agent(config.agent)
+        obstacles.check_agent(config.agent)
     pictures = [f"{drawing.name}{suffix}" for drawing in DRAWINGS for suffix in (".png", ".svg")]
     for name in (*PAGES, *pictures):
         check_ours(config.out / name)
@@ -209,7 +197,7 @@ def run(config: PaperConfig) -> None:
 
         result = reproduce(config.out, config.agent, report_step)
     pages = write(result, config.out)
-    print(f"{summary(result.claims)} The page: {pages[-1]}")
+    print(f"{summary_of(result.claims)} The page: {pages[-1]}")
     if result.failed:
         names = "; ".join(f"row {claim.row}, {claim.claim}" for claim in result.failed)
         raise ClaimsFailedError(f"{len(result.failed)} of {len(result.claims)} claims fail: {names}")

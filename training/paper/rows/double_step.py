@@ -16,14 +16,14 @@ direction of the jump changes; and as the plan is the minimum, this difference i
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory, minimum_jerk_coefficients, point_to_point, retarget
-from viapoint.training.paper.claim import Claim, ExpectedRange, at_least, at_most, near
-from viapoint.training.paper.movements import SimulatedMovements, instants, straight, target, track
+from viapoint.training.paper.claim import Claim, at_least, at_most, near
+from viapoint.training.paper.movements import TARGETS, SimulatedMovements, instants, straight, track
 
 STEP_DURATION = 0.7
 """Duration of the first movement and of the second one, [s]."""
@@ -79,11 +79,7 @@ class DoubleStep(NamedTuple):
 
 
 def double_step(
-    moment: float,
-    *,
-    goal: Float | None = None,
-    duration: float = STEP_DURATION,
-    remaining: float = STEP_DURATION,
+    moment: float, *, goal: Any = None, duration: float = STEP_DURATION, remaining: float = STEP_DURATION
 ) -> DoubleStep:
     """Return a movement from T1 towards T4 whose target jumps to T5.
 
@@ -94,9 +90,9 @@ def double_step(
         remaining: Duration of the second movement, which ends at moment + remaining >= duration, [s].
     """
     start, corner, last = NAMES
-    goal = target(last) if goal is None else goal
+    goal = TARGETS[last] if goal is None else goal
     first = straight(start, corner, duration)
-    second = point_to_point(target(corner), goal, remaining)
+    second = point_to_point(TARGETS[corner], goal, remaining)
     return DoubleStep(first, second, retarget(first, moment, goal, moment + remaining), moment)
 
 
@@ -127,95 +123,9 @@ def excess_cost(distance: float, moment: float, duration: float, remaining: floa
     time.
     """
     u = moment / duration
-    left = (1.0 - u) * duration
-    state = np.array(
-        [10 * u**3 - 15 * u**4 + 6 * u**5, 30 * u**2 * (1 - u) ** 2, 60 * u * (1 - u) * (1 - 2 * u)]
-    )
-    state *= distance / duration ** np.arange(3)
-    return _rest_cost(distance, state, left) - _rest_cost(distance, state, remaining)
-
-
-def double_step_claims() -> list[Claim]:
-    """Return the claims of row 13: sum and plan compared."""
-    every = [double_step(moment) for moment in MOMENTS]
-    same = double_step(0.3, remaining=STEP_DURATION - 0.3)
-    alike = simulate_double(same)
-    claims = [
-        _claim("Both continue position, velocity and acceleration at the revision: greatest jump, relative to the "
-               "peak of each", max(_jump(each) for each in every), at_most(1e-12)),
-        _claim("Arrival as planned at first (revised at 300 ms, due at 700 ms): distance between sum and plan",
-               1e3 * greatest_distance(same), at_most(1e-9), unit="mm",
-               arm=(_hands_apart(alike), at_most(1e-6)), worst=alike.worst),
-        _claim("Revised at 200 ms towards 100 second targets: what the sum costs beyond the plan, relative spread",
-               _spread(), at_most(1e-9)),
-    ]  # fmt: skip
-    for moment, each in zip(MOMENTS, every, strict=True):
-        claims += _claims_at(moment, each)
-    return claims
-
-
-def _claims_at(moment: float, movement: DoubleStep) -> list[Claim]:
-    """Return the claims of one moment of revision; the second movement takes as long as the first."""
-    when = f"Revised at {1e3 * moment:.0f} ms"
-    amplitude = float(np.linalg.norm(target(NAMES[1]) - target(NAMES[0])))
-    expected = 1.0 + excess_cost(amplitude, moment, STEP_DURATION, STEP_DURATION) / movement.cost("planned")
-    distance = greatest_distance(movement)
-    found = peak_speed(movement, "superposed") / peak_speed(movement, "planned")
-    motion = simulate_double(movement)
-    arm = motion.peak_speed()
-    return [
-        _claim(f"{when}: jerk cost of the sum / of the plan, from there on", movement.ratio, near(expected, 1e-9)),
-        _claim(f"{when}: peak speed of the sum / of the plan", found, at_least(1.0 - 1e-12), worst=motion.worst,
-               arm=(float(arm[0] / arm[1]), near(found, 0.01))),
-        _claim(f"{when}: greatest distance between sum and plan, the same for a jump to T2", 1e3 * distance,
-               near(1e3 * greatest_distance(double_step(moment, goal=target("T2"))), 1e-9), unit="mm",
-               worst=motion.worst, arm=(_hands_apart(motion), near(1e3 * distance, 1.0))),
-    ]  # fmt: skip
-
-
-def _claim(
-    text: str,
-    model: float,
-    expected: ExpectedRange,
-    *,
-    unit: str = "",
-    arm: tuple[float, ExpectedRange] | None = None,
-    worst: float | None = None,
-) -> Claim:
-    number, arm_expected = arm or (None, None)
-    return Claim(
-        row=13, claim=text, unit=unit, model=model, expected=expected, arm=number, arm_expected=arm_expected,
-        deviation=worst,
-    )  # fmt: skip
-
-
-def _hands_apart(motion: SimulatedMovements) -> float:
-    """Return the greatest distance between the hands of two movements, [mm]."""
-    return float(1e3 * np.linalg.norm(motion.hand[0] - motion.hand[1], axis=-1).max())
-
-
-def _jump(movement: DoubleStep) -> float:
-    """Return the greatest jump of position, velocity and acceleration at the revision, relative to their peaks."""
-    now, time = np.array([movement.moment]), np.linspace(0.0, movement.arrival, 501)
-    jumps = []
-    for nu in range(3):
-        scale = float(np.abs(movement.first(time, nu)).max())
-        jumps += [
-            float(np.abs(getattr(movement, way)(now, nu) - movement.first(now, nu)).max()) / scale
-            for way in ("superposed", "planned")
-        ]
-    return max(jumps)
-
-
-def _spread() -> float:
-    """Return the greatest relative deviation of the excess from its closed form over random second targets."""
-    generator, moment = np.random.default_rng(0), 0.2
-    distance = float(np.linalg.norm(target(NAMES[1]) - target(NAMES[0])))
-    expected = excess_cost(distance, moment, STEP_DURATION, STEP_DURATION)
-    goals = target(NAMES[1]) + generator.uniform(-0.4, 0.4, (100, 2))
-    movements = [double_step(moment, goal=goal) for goal in goals]
-    found = np.array([each.cost("superposed") - each.cost("planned") for each in movements])
-    return float(np.abs(found / expected - 1.0).max())
+    q = np.array([10 * u**3 - 15 * u**4 + 6 * u**5, 30 * u**2 * (1 - u) ** 2, 60 * u * (1 - u) * (1 - 2 * u)])
+    state = distance * q / duration ** np.arange(3)
+    return _rest_cost(distance, state, duration - moment) - _rest_cost(distance, state, remaining)
 
 
 def _rest_cost(distance: float, state: Float, time: float) -> float:
@@ -228,46 +138,107 @@ def _rest_cost(distance: float, state: Float, time: float) -> float:
     return float(square / (2.0 * time**5))
 
 
+def double_step_claims() -> list[Claim]:
+    """Return the claims of row 13: sum and plan compared."""
+    every = [double_step(moment) for moment in MOMENTS]
+    same = double_step(0.3, remaining=STEP_DURATION - 0.3)
+    alike = simulate_double(same)
+    claims = [
+        Claim(13, "Both continue position, velocity and acceleration at the revision: greatest jump, relative to the "
+              "peak of each", model=(max(_jump(each) for each in every), at_most(1e-12))),
+        Claim(13, "Arrival as planned at first (revised at 300 ms, due at 700 ms): distance between sum and plan",
+              model=(1e3 * greatest_distance(same), at_most(1e-9)), arm=(_hands_apart(alike), at_most(1e-6)),
+              deviation=alike.worst, unit="mm"),
+        Claim(13, "Revised at 200 ms towards 100 second targets: what the sum costs beyond the plan, relative spread",
+              model=(_spread(), at_most(1e-9))),
+    ]  # fmt: skip
+    for each in every:
+        claims += _claims_at(each)
+    return claims
+
+
+def _claims_at(movement: DoubleStep) -> list[Claim]:
+    """Return the claims of one moment of revision; the second movement takes as long as the first."""
+    when = f"Revised at {1e3 * movement.moment:.0f} ms"
+    expected = 1.0 + _excess_of(movement.moment) / movement.cost("planned")
+    distance = 1e3 * greatest_distance(movement)
+    to_T2 = 1e3 * greatest_distance(double_step(movement.moment, goal=TARGETS["T2"]))
+    found = peak_speed(movement, "superposed") / peak_speed(movement, "planned")
+    motion = simulate_double(movement)
+    arm = motion.peak_speed()
+    return [
+        Claim(13, f"{when}: jerk cost of the sum / of the plan, from there on",
+              model=(movement.ratio, near(expected, 1e-9))),
+        Claim(13, f"{when}: peak speed of the sum / of the plan", model=(found, at_least(1.0 - 1e-12)),
+              arm=(arm[0] / arm[1], near(found, 0.01)), deviation=motion.worst),
+        Claim(13, f"{when}: greatest distance between sum and plan, the same for a jump to T2",
+              model=(distance, near(to_T2, 1e-9)), arm=(_hands_apart(motion), near(distance, 1.0)),
+              deviation=motion.worst, unit="mm"),
+    ]  # fmt: skip
+
+
+def _hands_apart(motion: SimulatedMovements) -> float:
+    """Return the greatest distance between the hands of two movements, [mm]."""
+    return float(1e3 * np.linalg.norm(motion.hand[0] - motion.hand[1], axis=-1).max())
+
+
+def _jump(movement: DoubleStep) -> float:
+    """Return the greatest jump of position, velocity and acceleration at the revision, relative to their peaks."""
+    now, time = np.array([movement.moment]), np.linspace(0.0, movement.arrival, 501)
+    jumps = []
+    for nu in range(3):
+        before, scale = movement.first(now, nu), np.abs(movement.first(time, nu)).max()
+        for after in (movement.superposed(now, nu), movement.planned(now, nu)):
+            jumps.append(float(np.abs(after - before).max() / scale))
+    return max(jumps)
+
+
+def _excess_of(moment: float) -> float:
+    """Return the excess cost of the sum in closed form for movements of the usual targets and durations."""
+    distance = float(np.linalg.norm(TARGETS[NAMES[1]] - TARGETS[NAMES[0]]))
+    return excess_cost(distance, moment, STEP_DURATION, STEP_DURATION)
+
+
+def _spread() -> float:
+    """Return the greatest relative deviation of the excess from its closed form over random second targets."""
+    generator, moment = np.random.default_rng(0), 0.2
+    goals = TARGETS[NAMES[1]] + generator.uniform(-0.4, 0.4, (100, 2))
+    movements = [double_step(moment, goal=goal) for goal in goals]
+    found = np.array([each.cost("superposed") - each.cost("planned") for each in movements])
+    return float(np.abs(found / _excess_of(moment) - 1.0).max())
+
+
 def replanning_claims() -> list[Claim]:
     """Return the claims of row 11: the quintic of the primer, and replanning."""
     movement = double_step(SWITCH, duration=WHOLE_DURATION)
     state = movement.first.sample(np.array([SWITCH]))
-    fresh = _solved(state, target("T5"), STEP_DURATION)
-    apart = np.abs(fresh - movement.replanned.sample(201, 0)[0]).max()
     begun = movement.replanned.sample(np.array([0.0]))
-    jumps = [float(np.abs(a - b).max() / np.abs(a).max()) for a, b in zip(state, begun, strict=True)]
+    jump = max(np.abs(a - b).max() / np.abs(a).max() for a, b in zip(state, begun, strict=True))
+    fresh = _solved(state, TARGETS["T5"], STEP_DURATION)
+    apart = 1e3 * np.abs(fresh - movement.replanned.sample(201, 0)[0]).max()
     motion = simulate_double(movement)
-    missed = float(np.linalg.norm(motion.hand[1, -1] - target("T5")))
+    missed = 1e3 * np.linalg.norm(motion.hand[1, -1] - TARGETS["T5"])
     return [
-        Claim(
-            row=11, claim="Quintic from 1,000 random boundary values, T from 1 ms to 1000 s: greatest relative error "
-            "at the ends", figure="primer", paper="Eqs. 16 to 24", model=_boundary_error(), expected=at_most(1e-12),
-        ),
-        Claim(
-            row=11, claim="Replanned 200 times on the way, target unchanged: distance from the one plan",
-            figure="primer", paper="Eqs. 25 to 27", unit="mm", model=1e3 * _replanned(200), expected=at_most(1e-9),
-        ),
-        Claim(
-            row=11, claim="Target and arrival change on the way: jump of position, velocity, acceleration, relative",
-            figure="primer", paper="smooth", model=max(jumps), expected=at_most(1e-12),
-        ),
-        Claim(
-            row=11, claim="The same against a fresh solution from that state (arm: distance from the new target at the "
-            "end)", figure="primer", paper="the same", unit="mm", model=1e3 * float(apart), expected=at_most(1e-9),
-            arm=1e3 * missed, arm_expected=at_most(1.0), deviation=float(motion.deviation[1]),
-        ),
+        Claim(11, "Quintic from 1,000 random boundary values, T from 1 ms to 1000 s: greatest relative error at the "
+              "ends", "primer", "Eqs. 16 to 24", (_boundary_error(), at_most(1e-12))),
+        Claim(11, "Replanned 200 times on the way, target unchanged: distance from the one plan", "primer",
+              "Eqs. 25 to 27", (1e3 * _replanned(200), at_most(1e-9)), unit="mm"),
+        Claim(11, "Target and arrival change on the way: jump of position, velocity, acceleration, relative", "primer",
+              "smooth", (jump, at_most(1e-12))),
+        Claim(11, "The same against a fresh solution from that state (arm: distance from the new target at the end)",
+              "primer", "the same", (apart, at_most(1e-9)), (missed, at_most(1.0)), motion.deviation[1], "mm"),
     ]  # fmt: skip
 
 
 def _solved(state: tuple[Float, ...], goal: Float, duration: float) -> Float:
     """Solve the six boundary equations of the primer; return positions at 201 instants from a state to rest."""
     powers = np.arange(6)
-    u = np.linspace(0.0, 1.0, 201)[:, None] ** powers  # in unit time
     matrix = np.zeros((6, 6))
-    matrix[0, 0], matrix[1, 1], matrix[2, 2] = 1.0, 1.0, 2.0
+    matrix[0, 0], matrix[1, 1], matrix[2, 2] = 1.0, 1.0, 2.0  # in unit time
     matrix[3:] = np.ones(6), powers, powers * (powers - 1)
     given = [state[0][0], state[1][0] * duration, state[2][0] * duration**2, goal, 0.0 * goal, 0.0 * goal]
-    return np.asarray(u @ np.linalg.solve(matrix, np.array(given)))
+    coefficients = np.linalg.solve(matrix, np.array(given))
+    return np.asarray(np.linspace(0.0, 1.0, 201)[:, None] ** powers @ coefficients)
 
 
 def _boundary_error() -> float:
@@ -275,22 +246,15 @@ def _boundary_error() -> float:
     generator = np.random.default_rng(0)
     duration = 10.0 ** generator.uniform(-3.0, 3.0, 1000)
     values = generator.normal(size=(6, 1000))  # x0, V0, A0, xT, VT, AT in unit time
-    scale = np.stack((np.ones_like(duration), 1.0 / duration, 1.0 / duration**2))
-    given = values * np.concatenate((scale, scale))
-    x0, dx0, ddx0, xT, dxT, ddxT = given
+    scale = np.tile([duration**0, 1.0 / duration, 1.0 / duration**2], (2, 1))
+    x0, dx0, ddx0, xT, dxT, ddxT = values * scale
     coefficients = minimum_jerk_coefficients(x0, dx0, ddx0, xT, dxT, ddxT, duration)
-    end = duration[:, None] ** np.arange(6)
     powers = np.arange(6)
-    reached = [
-        coefficients[:, 0],
-        coefficients[:, 1],
-        2.0 * coefficients[:, 2],
-        (coefficients * end).sum(axis=-1),
-        (coefficients * end * powers).sum(axis=-1) / duration,
-        (coefficients * end * powers * (powers - 1)).sum(axis=-1) / duration**2,
-    ]
-    error = np.abs(np.stack(reached) - given) / np.concatenate((scale, scale))
-    return float((error / np.abs(values).max(axis=0)).max())
+    terms = coefficients * duration[:, None] ** powers
+    first, second = (terms * powers).sum(axis=-1), (terms * powers * (powers - 1)).sum(axis=-1)
+    start = [coefficients[:, 0], coefficients[:, 1] * duration, 2.0 * coefficients[:, 2] * duration**2]
+    reached = np.stack([*start, terms.sum(axis=-1), first, second])
+    return float((np.abs(reached - values) / np.abs(values).max(axis=0)).max())
 
 
 def _replanned(times: int) -> float:
@@ -298,7 +262,7 @@ def _replanned(times: int) -> float:
     whole = straight("T1", "T4", 0.8)
     plan, begun, apart = whole, 0.0, 0.0
     for now in np.linspace(0.0, 0.75, times + 1)[1:]:
-        plan, begun = retarget(plan, now - begun, target("T4"), 0.8 - begun), now
+        plan, begun = retarget(plan, now - begun, TARGETS["T4"], 0.8 - begun), now
         ahead = np.linspace(now, 0.8, 11)
         apart = max(apart, float(np.abs(plan(ahead - now) - whole(ahead)).max()))
     return apart

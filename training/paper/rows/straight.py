@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory, point_to_point
+from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
-from viapoint.training.paper.movements import (
-    SimulatedMovements,
-    joint_motion,
-    minimum_jerk_through,
-    required_torque,
-    simulate,
-    straight,
-    target,
-)
+from viapoint.training.paper.movements import TARGETS, SimulatedMovements, minimum_jerk_through, simulate
 
 DIAGONALS = (("T3", "T6"), ("T1", "T4"), ("T2", "T5"))
 """The straight movements of Figs. 3 and 4."""
@@ -23,10 +19,22 @@ DURATION = 0.8
 """Duration of the straight movements, within the paper's 0.5 to 1 s, [s]."""
 
 
+def diagonal_ends() -> Float:
+    """Return the ends of the straight movements of Figs. 3 and 4, shape (3, 2, 2), [m]."""
+    return np.array([[TARGETS[a], TARGETS[b]] for a, b in DIAGONALS])
+
+
 def diagonals(order: int = 3) -> Trajectory:
     """Return the three straight movements of the figures as a batch."""
-    ends = np.array([[target(a), target(b)] for a, b in DIAGONALS])
+    ends = diagonal_ends()
     return point_to_point(ends[:, 0], ends[:, 1], DURATION, order=order)
+
+
+def relative_peak(speed: Float, peak: float) -> float:
+    """Return that peak speed of the three movements, in units of A / t_f, which is farthest from `peak`."""
+    amplitude = np.linalg.norm(np.diff(diagonal_ends(), axis=1)[:, 0], axis=-1)
+    factor = speed * (DURATION / amplitude)
+    return float(factor[np.abs(factor - peak).argmax()])
 
 
 def bow(position: Float) -> Float:
@@ -41,39 +49,22 @@ def point_to_point_claims() -> list[Claim]:
     """Return the claims of row 1: straight path and bell-shaped speed."""
     movement = diagonals()
     motion = simulate(movement)
-    amplitude = np.linalg.norm(
-        movement(np.array([DURATION]))[:, 0] - movement(np.array([0.0]))[:, 0], axis=-1
-    )
-    scale = DURATION / amplitude
-    factor, arm_factor = np.asarray(movement.peak(1)) * scale, motion.peak_speed() * scale
+    peak, arm_peak = relative_peak(movement.peak(1), 1.875), relative_peak(motion.peak_speed(), 1.875)
     speed = np.linalg.norm(movement.sample(801, 1)[0], axis=-1)
-    skew = np.abs(speed - speed[:, ::-1]).max() / speed.max()
-    inside = motion.time <= DURATION
-    arm_speed = np.linalg.norm(motion.velocity(), axis=-1)[:, inside]
-    arm_skew = np.abs(arm_speed - arm_speed[:, ::-1]).max() / arm_speed.max()
-    worst, arm_worst = (values[np.abs(values - 1.875).argmax()] for values in (factor, arm_factor))
+    arm_speed = np.linalg.norm(motion.velocity(), axis=-1)[:, motion.time <= DURATION]
+    skew, arm_skew = (100 * np.abs(each - each[:, ::-1]).max() / each.max() for each in (speed, arm_speed))
+    worst = motion.worst
     return [
-        Claim(
-            row=1, claim="Path is straight: greatest distance from the chord / length", figure="1A, 3",
-            paper="approximately straight", unit="%", model=100 * float(bow(movement.sample(401, 0)[0]).max()),
-            expected=at_most(1e-9), arm=100 * float(bow(motion.hand).max()), arm_expected=at_most(0.2),
-            deviation=motion.worst,
-        ),
-        Claim(
-            row=1, claim="Peak speed C in V_max = C A/t_f", figure="1A, 3", paper="1.875; measured 1.805 ± 0.153",
-            model=float(worst), expected=near(1.875, 1e-9), arm=float(arm_worst), arm_expected=near(1.875, 0.01),
-            deviation=motion.worst,
-        ),
-        Claim(
-            row=1, claim="Distance of C from the subjects' mean, in their standard deviations", figure="3",
-            paper="(1.875 - 1.805)/0.153 = 0.458", model=float((worst - 1.805) / 0.153), expected=at_most(1.0),
-            arm=float((arm_worst - 1.805) / 0.153), arm_expected=at_most(1.0), deviation=motion.worst,
-        ),
-        Claim(
-            row=1, claim="Speed is bell-shaped and symmetric: difference from its mirror image / peak", figure="1A, 3",
-            paper="bell-shaped, single-peaked", unit="%", model=100 * float(skew), expected=at_most(1e-9),
-            arm=100 * float(arm_skew), arm_expected=at_most(2.0), deviation=motion.worst,
-        ),
+        Claim(1, "Path is straight: greatest distance from the chord / length", "1A, 3", "approximately straight",
+              (100 * bow(movement.sample(401, 0)[0]).max(), at_most(1e-9)),
+              (100 * bow(motion.hand).max(), at_most(0.2)), worst, unit="%"),
+        Claim(1, "Peak speed C in V_max = C A/t_f", "1A, 3", "1.875; measured 1.805 ± 0.153",
+              (peak, near(1.875, 1e-9)), (arm_peak, near(1.875, 0.01)), worst),
+        Claim(1, "Distance of C from the subjects' mean, in their standard deviations", "3",
+              "(1.875 - 1.805)/0.153 = 0.458", ((peak - 1.805) / 0.153, at_most(1.0)),
+              ((arm_peak - 1.805) / 0.153, at_most(1.0)), worst),
+        Claim(1, "Speed is bell-shaped and symmetric: difference from its mirror image / peak", "1A, 3",
+              "bell-shaped, single-peaked", (skew, at_most(1e-9)), (arm_skew, at_most(2.0)), worst, unit="%"),
     ]  # fmt: skip
 
 
@@ -81,16 +72,11 @@ def invariance_claims() -> list[Claim]:
     """Return the claim of row 2: random movements are invariant to translation, rotation, size and duration."""
     generator = np.random.default_rng(0)
     model = max(_invariance(generator, 67, vias) for vias in (1, 2, 3))
-    shapes, motion = placed_shapes()
-    spread = max(float(np.abs(shape - shapes[0]).max()) for shape in shapes)
+    shapes, worst = _placed_shapes()
     return [
-        Claim(
-            row=2, figure="1", paper="invariant",
-            claim="Translation, rotation, amplitude and time scaling of 201 random movements "
-            "commute with planning: greatest difference / amplitude (arm: one shape in five places, sizes, times)",
-            unit="%", model=100 * model, expected=at_most(1e-9), arm=100 * spread, arm_expected=at_most(0.5),
-            deviation=motion.worst,
-        )
+        Claim(2, "Translation, rotation, amplitude and time scaling of 201 random movements commute with planning: "
+              "greatest difference / amplitude (arm: one shape in five places, sizes, times)", "1", "invariant",
+              (100 * model, at_most(1e-9)), (100 * np.abs(shapes - shapes[0]).max(), at_most(0.5)), worst, unit="%"),
     ]  # fmt: skip
 
 
@@ -99,64 +85,54 @@ def _invariance(generator: np.random.Generator, count: int, vias: int) -> float:
     points = generator.normal(size=(count, vias + 2, 2))
     angle, scale = generator.uniform(-np.pi, np.pi, count), np.exp(generator.normal(size=count))
     shift, pace = generator.normal(size=(count, 1, 2)), np.exp(generator.normal(size=count))
-    cosine, sine = np.cos(angle), np.sin(angle)
-    rotation = np.stack((np.stack((cosine, -sine), -1), np.stack((sine, cosine), -1)), -2)
-    moved = scale[:, None, None] * points @ np.swapaxes(rotation, -1, -2) + shift
-    first, second = (
-        minimum_jerk_through(points).sample(201, 0)[0],
-        minimum_jerk_through(moved, pace).sample(201, 0)[0],
-    )
-    image = scale[:, None, None] * first @ np.swapaxes(rotation, -1, -2) + shift
-    size = np.ptp(image, axis=(1, 2))[:, None, None]
-    return float((np.abs(second - image) / size).max())
+    rotation = Rotation.from_euler("z", angle[:, None]).as_matrix()[:, :2, :2]
+
+    def image(path: Float) -> Any:
+        return scale[:, None, None] * path @ np.swapaxes(rotation, -1, -2) + shift
+
+    expected = image(minimum_jerk_through(points).sample(201, 0)[0])
+    found = minimum_jerk_through(image(points), pace).sample(201, 0)[0]
+    return float((np.abs(found - expected) / np.ptp(expected, axis=(1, 2))[:, None, None]).max())
 
 
-def placed_shapes() -> tuple[list[Float], SimulatedMovements]:
-    """Simulate one shape in five places, directions, sizes and durations, and return the paths in one frame."""
+def _placed_shapes() -> tuple[Float, float]:
+    """Simulate one shape in five places, directions, sizes and durations.
+
+    Returns:
+        Paths in the frame of their ends, shape (5, 201, 2), and the greatest deviation from the plan, [mm].
+    """
     pairs = (("T1", "T4"), ("T4", "T1"), ("T2", "T5"), ("T6", "T3"), ("T3", "T4"))
-    durations = np.array([0.8, 0.7, 1.0, 1.2, 0.6])
-    ends = np.array([[target(a), target(b)] for a, b in pairs])
-    line = ends[:, 1] - ends[:, 0]
-    left = np.stack((-line[:, 1], line[:, 0]), axis=-1)
-    via = ends[:, 0] + 0.35 * line + 0.2 * left
-    motion = simulate(minimum_jerk_through(np.stack((ends[:, 0], via, ends[:, 1]), axis=1), durations))
+    waypoints = [movements.via_waypoints(TARGETS[a], TARGETS[b], 0.35, 0.2) for a, b in pairs]
+    motion = simulate(minimum_jerk_through(np.stack(waypoints), np.array([0.8, 0.7, 1.0, 1.2, 0.6])))
     shapes = []
-    for row in range(len(pairs)):
-        offset = motion.at(row, np.linspace(0.0, 1.0, 201)) - ends[row, 0]
-        axes = np.stack((line[row], left[row])) / (line[row] @ line[row])
-        shapes.append(offset @ axes.T)
-    return shapes, motion
+    for row, (start, _, goal) in enumerate(waypoints):
+        line = goal - start
+        axes = np.stack((line, movements.left_of(line))) / (line @ line)
+        shapes.append((motion.at(row, np.linspace(0.0, 1.0, 201)) - start) @ axes.T)
+    return np.stack(shapes), motion.worst
 
 
 def joint_claims() -> list[Claim]:
     """Return the claims of row 3: movements that are equal for the hand differ for the joints."""
-    movements = [straight("T3", "T6", DURATION), straight("T2", "T5", DURATION)]
-    model = [_profiles(each) for each in movements]
-    motions = [simulate(each) for each in movements]
-    arm = [_arm_profiles(each) for each in motions]
-    hand = [float(np.abs(pair[0][0] - pair[1][0]).max()) for pair in (model, arm)]
-    joints = [float(np.abs(pair[0][1] - pair[1][1]).max(axis=0).min()) for pair in (model, arm)]
+    plans = [movements.straight(*ends, DURATION) for ends in (DIAGONALS[0], DIAGONALS[2])]
+    motions = [simulate(each) for each in plans]
+    hand = _differences([np.linalg.norm(each.sample(401, 1)[0], axis=-1) for each in plans]).max()
+    arm_hand = _differences([np.linalg.norm(each.velocity()[0], axis=-1) for each in motions]).max()
+    joints = _differences([movements.joint_motion(each).velocity for each in plans]).min()
+    arm_joints = _differences([each.joint_rates()[0] for each in motions]).min()
     places, placed = same_movement_elsewhere()
-    peak = np.abs(required_torque(places)).max(axis=1)
-    arm_peak = np.abs(placed.torque).max(axis=1)
-    ratios = [float((each.max(axis=0) / each.min(axis=0)).max()) for each in (peak, arm_peak)]
+    peaks = [np.abs(torque).max(axis=1) for torque in (movements.required_torque(places), placed.torque)]
+    torque, arm_torque = ((each.max(axis=0) / each.min(axis=0)).max() for each in peaks)
     worst = max(each.worst for each in motions)
     return [
-        Claim(
-            row=3, claim="Hand speed profiles of T3-T6 and T2-T5, each / its peak: greatest difference", figure="4",
-            paper="invariant", model=hand[0], expected=at_most(1e-9), arm=hand[1], arm_expected=at_most(0.02),
-            deviation=worst,
-        ),
-        Claim(
-            row=3, claim="Joint velocity profiles of the same movements, each / its peak: greatest difference, "
-            "of the joint where it is smaller", figure="4", paper="not invariant", model=joints[0],
-            expected=at_least(0.1), arm=joints[1], arm_expected=at_least(0.1), deviation=worst,
-        ),
-        Claim(
-            row=3, claim="Peak torque for one and the same hand movement in six places: greatest / least", figure="4",
-            paper="very different patterns of joint torques", model=ratios[0], expected=at_least(1.5), arm=ratios[1],
-            arm_expected=at_least(1.5), deviation=placed.worst,
-        ),
+        Claim(3, "Hand speed profiles of T3-T6 and T2-T5, each / its peak: greatest difference", "4", "invariant",
+              (hand, at_most(1e-9)), (arm_hand, at_most(0.02)), worst),
+        Claim(3, "Joint velocity profiles of the same movements, each / its peak: greatest difference, of the joint "
+              "where it is smaller", "4", "not invariant",
+              (joints, at_least(0.1)), (arm_joints, at_least(0.1)), worst),
+        Claim(3, "Peak torque for one and the same hand movement in six places: greatest / least", "4",
+              "very different patterns of joint torques",
+              (torque, at_least(1.5)), (arm_torque, at_least(1.5)), placed.worst),
     ]  # fmt: skip
 
 
@@ -167,16 +143,7 @@ def same_movement_elsewhere() -> tuple[Trajectory, SimulatedMovements]:
     return movement, simulate(movement)
 
 
-def _profiles(movement: Trajectory) -> tuple[Float, Float]:
-    """Return hand speed (T,) and joint velocities (T, 2) of the plan, each relative to its peak."""
-    speed = np.linalg.norm(movement.sample(401, 1)[0], axis=-1)
-    return _relative(speed), _relative(joint_motion(movement).velocity)
-
-
-def _arm_profiles(motion: SimulatedMovements) -> tuple[Float, Float]:
-    rates = np.gradient(motion.joints[0], motion.time, axis=0)
-    return _relative(np.linalg.norm(motion.velocity()[0], axis=-1)), _relative(rates)
-
-
-def _relative(values: Float) -> Float:
-    return np.asarray(values / np.abs(values).max(axis=0))
+def _differences(pair: list[Float]) -> Float:
+    """Return the greatest difference of two profiles (T, ...), each relative to its peak, shape (...)."""
+    first, second = (values / np.abs(values).max(axis=0) for values in pair)
+    return np.asarray(np.abs(first - second).max(axis=0))
