@@ -16,7 +16,7 @@ import yaml
 
 from viapoint.training import Study, run_study
 from viapoint.training.study.run import StudyFailedError, _connected, _import_libraries
-from viapoint.training.study.tables import COLUMNS, markdown
+from viapoint.training.study.trials import COLUMNS, markdown
 
 ENV = "viapoint/PlanarObstacles-v0"
 FEW = {"learning_starts": 64, "gradient_steps": 1}

@@ -564,8 +564,6 @@ class DoctorConfig(Config):
 
     out: Path = Path("runs")
     """Folder for runs, which is checked for write access."""
-    json: bool = False
-    """Print JSON instead of text."""
 
 
 @dataclass(frozen=True, kw_only=True)

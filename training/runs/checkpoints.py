@@ -34,8 +34,6 @@ from viapoint.training.io.files import (
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 FORMAT = 2
-READABLE = (1, 2)
-"""Readable formats; the first has no hash of the numbers in `state.json`."""
 COUNTERS = (
     "seed",
     "num_timesteps",
@@ -118,10 +116,9 @@ def _verified_state(folder: Path) -> dict[str, Any]:
     """Return the content of `state.json` after checking the hashes of both files."""
     path, tensors = folder / "state.json", folder / "tensors.safetensors"
     state = read_json(path)
-    if state.get("format") not in READABLE or not isinstance(state.get("model"), dict):
-        known = " or ".join(map(str, READABLE))
-        raise BadFileError(path, f"must have format {known}, got {state.get('format')!r}")
-    if state["format"] != 1 and state.get("digest") != _digest(state):
+    if state.get("format") != FORMAT or not isinstance(state.get("model"), dict):
+        raise BadFileError(path, f"must have format {FORMAT}, got {state.get('format')!r}")
+    if state.get("digest") != _digest(state):
         raise BadFileError(path, "is damaged: it does not have the hash that it states")
     if hashlib.sha256(read_bytes(tensors)).hexdigest() != state.get("sha256"):
         raise BadFileError(tensors, "is torn: its hash is not the one that state.json states")

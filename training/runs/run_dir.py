@@ -45,6 +45,8 @@ from viapoint.training.runs.checkpoints import (
 )
 
 KEPT_CHECKPOINTS = 2
+PATIENCE = 10.0
+"""Time to wait for a folder in use, [s]: workers of a study that was killed end within seconds."""
 
 MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
 """Fields that may differ when a run is resumed."""
@@ -234,7 +236,7 @@ def _lock(folder: Path) -> Iterator[None]:
     """Lock a folder for this process; see :meth:`Run.locked`."""
     lock, owner = FileLock(folder / "lock"), folder / "lock.pid"
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=PATIENCE)
     except Timeout:
         pid = owner.read_text() if owner.exists() else "unknown"
         raise BadFileError(folder, f"is in use by the process with number {pid}") from None
