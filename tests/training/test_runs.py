@@ -68,26 +68,6 @@ def test_an_agent_of_ones_own_arm_is_loaded_by_whoever_makes_the_arm_known(tmp_p
         load_model(tmp_path)
 
 
-def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
-    path = tmp_path / "file"
-    files.write_bytes(path, b"old")
-
-    def full(handle):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(files.os, "fsync", full)
-    for write in (
-        lambda: files.write_bytes(path, b"new"),
-        lambda: files.write_folder(
-            tmp_path / "folder", lambda folder: files.write_bytes(folder / "a", b"new")
-        ),
-    ):
-        with pytest.raises(OSError):
-            write()
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]
-    assert path.read_bytes() == b"old"
-
-
 def test_a_crash_amid_a_replacement_is_undone(tmp_path):
     one, other = 32 * "a", 32 * "b"
     (tmp_path / f".best.{one}.old").mkdir()
@@ -176,3 +156,23 @@ def test_a_checkpoint_is_of_one_model(env, tmp_path):
     assert read_checkpoint(same, tmp_path / "checkpoint") == {}
     for name, array in weights(model).items():
         np.testing.assert_array_equal(weights(same)[name], array)
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    files.write_bytes(path, b"old")
+
+    def full(handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    for write in (
+        lambda: files.write_bytes(path, b"new"),
+        lambda: files.write_folder(
+            tmp_path / "folder", lambda folder: files.write_bytes(folder / "a", b"new")
+        ),
+    ):
+        with pytest.raises(OSError):
+            write()
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+    assert path.read_bytes() == b"old"

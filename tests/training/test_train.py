@@ -51,8 +51,7 @@ def config(folder, algo="viaq", **changes):
 
 
 def curve(run):
-    measured = ("seconds", "wall_seconds", "decision_time")
-    return [{name: value for name, value in record.items() if name not in measured} for record in run.curve]
+    return [{**record, "seconds": None} for record in run.curve]
 
 
 def same_result(one, other):
@@ -106,16 +105,10 @@ def test_a_run_is_the_same_watched_or_not(tmp_path):
     assert alone.best.name == "final"
 
 
-def test_another_seed_is_another_run(tmp_path):
-    runs = [train(config(tmp_path / str(seed), seed=seed, eval_every=0)) for seed in (0, 1)]
-    first, second = (read_arrays(run.folder / "final" / "weights.safetensors") for run in runs)
-    assert any((first[name] != second[name]).any() for name in first)
-
-
 def test_what_a_run_leaves(tmp_path):
     run = train(config(tmp_path / "run"))
     assert [record["decisions"] for record in run.curve] == [0, 64, 128, 192]
-    for name in ("physics_steps", "seconds", "wall_seconds"):
+    for name in ("physics_steps", "seconds"):
         assert (np.diff([record[name] for record in run.curve]) > 0.0).all()
     best = max(record["success"]["rate"] for record in run.curve)
     model = load_model(run.best)
@@ -211,10 +204,12 @@ def test_a_stalling_run_is_the_same_with_and_without_interruption(tmp_path, monk
     assert (killed.stopped, killed.decisions) == ("stalled", 320)
 
 
-def test_a_training_that_goes_on_rising_spends_its_budget(tmp_path, monkeypatch, shipped):
-    with_success(monkeypatch, [0.1 * i for i in range(6)])
-    run = train(config(tmp_path / "run", **{**STALLING, "n_timesteps": 320}))
-    assert (run.stopped, run.decisions) == ("budget", 320)
+def test_learning_happens(tmp_path):
+    settings = {"n_timesteps": 768, "n_envs": 64, "eval_every": 768, "eval_scenes": 200}
+    learning = {"learning_starts": 128, "gradient_steps": 20}
+    run = train(config(tmp_path / "run", hyperparameters=learning, **settings))
+    first, last = run.curve[0]["success"], run.curve[-1]["success"]
+    assert last["low"] > first["high"]
 
 
 def test_a_run_keeps_its_settings_when_the_presets_change(tmp_path, monkeypatch):
@@ -222,11 +217,3 @@ def test_a_run_keeps_its_settings_when_the_presets_change(tmp_path, monkeypatch)
     preset = dataclasses.replace(PRESETS["viaq"], n_envs=3, hyperparameters=(("learning_rate", 0.5),))
     monkeypatch.setitem(PRESETS, "viaq", preset)
     assert train(TrainConfig(out=run.folder, resume=True, n_timesteps=128, progress=False)).decisions == 128
-
-
-def test_learning_happens(tmp_path):
-    settings = {"n_timesteps": 768, "n_envs": 64, "eval_every": 768, "eval_scenes": 200}
-    learning = {"learning_starts": 128, "gradient_steps": 20}
-    run = train(config(tmp_path / "run", hyperparameters=learning, **settings))
-    first, last = run.curve[0]["success"], run.curve[-1]["success"]
-    assert last["low"] > first["high"]

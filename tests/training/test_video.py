@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from viapoint.envs import Box, Capsule, ConvexMesh, Cylinder, HalfSpace, PointCloud, ReachEnv, Sphere
+from viapoint.envs import Box, Capsule, ConvexMesh, Cylinder, PointCloud, ReachEnv, Sphere
 from viapoint.envs.rendering.renderer import GLUnavailableError
 from viapoint.training import GeometrySearch
 from viapoint.training.plotting.gallery import gallery, play
@@ -122,9 +122,3 @@ def test_a_footprint_is_the_shadow_of_the_shape(shape, rim):
         for x, y in polygon[::5]:
             line = np.column_stack((np.full_like(heights, x), np.full_like(heights, y), heights))
             assert shape.distance(line).min() == pytest.approx(rim, abs=1e-3)
-
-
-def test_a_wall_has_a_footprint_and_a_floor_has_none():
-    (wall,) = footprint(HalfSpace.facing((-1.0, 0.0, 0.0), position=(0.8, 0.0, 0.0)))
-    assert wall[:, 0].min() == pytest.approx(0.8)
-    assert not footprint(HalfSpace(position=(0.0, 0.0, -0.1)))

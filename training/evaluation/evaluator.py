@@ -226,9 +226,11 @@ def evaluate(
             check_whole("checks", number, 0)
     if isinstance(agent, str | Path):
         agent = load_agent(agent)
-    env_id, kwargs = environment_of(agent, env, env_kwargs)
+    env_id, kwargs = _environment_of(agent, env, env_kwargs)
     task = registered_task(env_id, **kwargs)
-    check_baselines(baselines, agent, task)
+    for each in baselines:
+        if isinstance(each, str) and not (each == "untrained" and isinstance(agent, BaseAlgorithm)):
+            check_method(each, task)
     chosen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(str(scenes), task, n_scenes)
     methods = [*_rows_of(agent, checks), *_baselines(baselines, agent, checks, env_id, kwargs)]
     return evaluate_methods(
@@ -247,7 +249,7 @@ def evenly_spread(number: int, count: int | None) -> Int:
     return np.linspace(0, number - 1, kept).round().astype(np.int64)
 
 
-def environment_of(
+def _environment_of(
     agent: BaseAlgorithm | Method | None, env: str | None, env_kwargs: Mapping[str, Any] | None
 ) -> tuple[str, dict[str, Any]]:
     """Return id and arguments of the environment whose scenes are evaluated, in which an action is a whole movement.
@@ -264,15 +266,6 @@ def environment_of(
     if env not in (None, mine):
         raise ValueError(f"env must be {mine}, on which the agent was trained, or be left out, got {env!r}")
     return mine, whole_task(mine, kwargs if env_kwargs is None else env_kwargs)
-
-
-def check_baselines(
-    baselines: Sequence[str | Method], agent: BaseAlgorithm | Method | None, task: Task
-) -> None:
-    """Check that the named baselines exist for a task."""
-    for each in baselines:
-        if isinstance(each, str) and not (each == "untrained" and isinstance(agent, BaseAlgorithm)):
-            check_method(each, task)
 
 
 def _rows_of(

@@ -226,10 +226,14 @@ def _check_content(content: Mapping[str, NDArray[Any]]) -> None:
     number, joints = content["start"].shape
     rows = content["kind"].shape[1]
     like = resting(content["start"], np.empty((number, joints)), no_obstacles(number, rows))
-    wanted = {name: np.shape(array) for name, array in {**like._asdict(), **like.obstacles._asdict()}.items()}
-    wanted |= {"share": (number,), "family": (number,)}
+    arrays = {
+        **like._asdict(),
+        **like.obstacles._asdict(),
+        "share": np.empty(number),
+        "family": np.empty(number),
+    }
     for name in CONTENT:
-        shape, numbers = wanted[name], content[name].dtype.kind in "fi"
+        shape, numbers = arrays[name].shape, content[name].dtype.kind in "fi"
         if content[name].shape != shape or numbers is (name == "family"):
             raise ValueError(
                 f"{name} of {number} scenes is {content[name].dtype} of shape {content[name].shape}"
