@@ -15,6 +15,7 @@ from viapoint.training.agents.model_io import load_model
 from viapoint.training.cli import main as cli
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import BadFileError, read_arrays
+from viapoint.training.runs import run_dir
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import TrainingFailedError, train
 
@@ -61,7 +62,8 @@ def wait_for(process, what):
         time.sleep(0.02)
 
 
-def test_ctrl_c_in_training_saves_and_leaves_and_nobody_else_gets_in(start, tmp_path, capsys):
+def test_ctrl_c_in_training_saves_and_nobody_else_gets_in(start, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(run_dir, "PATIENCE", 0.0)
     folder = tmp_path / "run"
     words = "--algo sac --n-timesteps 1000000 --n-envs 32 --eval-every 0 --checkpoint-every 64 --env-kwargs threads=1"
     more = [f"{name}={json.dumps(value)}" for name, value in SMALL.items()]

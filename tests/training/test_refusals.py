@@ -34,7 +34,6 @@ from viapoint.training.paper.claim import Claim
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.plotting import plots
-from viapoint.training.plotting.gallery import gallery
 from viapoint.training.plotting.video import record_video
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.rollouts.vec_env import ViaVecEnv
@@ -264,7 +263,6 @@ CALLS = [
     lambda: film("film"),
     lambda: film(mode=None),
     lambda: film(number=0),
-    lambda: gallery("gallery.png", []),
     lambda: plots.learning_curve("none.png", []),
     lambda: statistics.wilson(5, 4),
     lambda: statistics.wilson(-1, 4),

@@ -16,6 +16,7 @@ from viapoint.training.config.presets import PRESETS
 from viapoint.training.io import files
 from viapoint.training.io.files import BadFileError
 from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs import run_dir
 from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
 from viapoint.training.runs.run_dir import Run
 
@@ -95,7 +96,8 @@ def test_a_run_comes_back_with_its_configuration_and_its_curve(run):
     assert again.curve == [{"decisions": 1}]
 
 
-def test_a_folder_in_use_is_refused_and_a_dead_process_holds_nothing(run):
+def test_a_folder_in_use_is_refused_and_a_dead_process_holds_nothing(run, monkeypatch):
+    monkeypatch.setattr(run_dir, "PATIENCE", 0.0)
     script = (
         "import sys; from pathlib import Path; from viapoint.training.runs.run_dir import Run\n"
         f"with Run(Path({str(run.folder)!r})).locked():\n    print('in', flush=True); sys.stdin.read()"

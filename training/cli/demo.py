@@ -111,8 +111,9 @@ def _draw_gallery(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
     chosen = frozen.take(by_difficulty[evenly_spread(len(by_difficulty), PICTURES)])
     titles = [f"share {BANDS[band]}" for band in chosen.band]
     decide = agent_method("agent", agent, 0).decide
-    entries = play(agent.env_id, chosen.scenes, titles, decide, **agent.env_kwargs)
-    gallery(path, entries, heading=f"The agent alone in {frozen.name} scenes, easy to hard")
+    task = registered_task(agent.env_id, **agent.env_kwargs)
+    episodes = play(agent.env_id, chosen.scenes, decide, **agent.env_kwargs)
+    gallery(path, task, episodes, titles, heading=f"The agent alone in {frozen.name} scenes, easy to hard")
 
 
 def _film(path: Path, agent: Agent, frozen: FrozenScenes) -> None:

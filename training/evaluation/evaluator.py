@@ -396,36 +396,28 @@ def single_decision_times(
 
     In tasks with replanning, they are all decisions of whole episodes: those in motion take longer than the first ones.
     """
-    began, stopwatch = time.perf_counter(), _Stopwatch(method)
+    seconds: list[float] = []
+
+    def decide(observation: Observation, scenes: Scenes) -> Float:
+        before = time.perf_counter()
+        decided = method.decide(observation, scenes)
+        seconds.append(time.perf_counter() - before)
+        return decided
+
+    began = time.perf_counter()
     replanning = simulation.task.replanning and not hasattr(method, "execute")
     alone = SceneSimulation(simulation.env_id, 1, **simulation.kwargs) if replanning else None
     with closing(alone) if alone else nullcontext():
         for row in range(min(most, len(scenes.start))):
             one = scenes.take(slice(row, row + 1))
-            decided = stopwatch.decide(simulation.observe(one), one)
+            decided = decide(simulation.observe(one), one)
             if alone is not None:
-                alone.play(stopwatch, one, decided)
-            yield from stopwatch.seconds
-            most -= len(stopwatch.seconds)
-            stopwatch.seconds.clear()
+                alone.episodes(one, decided, decide)
+            yield from seconds
+            most -= len(seconds)
+            seconds.clear()
             if most <= 0 or time.perf_counter() - began > budget:
                 break
-
-
-class _Stopwatch:
-    """Method whose decisions are timed."""
-
-    def __init__(self, method: Method) -> None:
-        self.name, self._method = method.name, method
-        self.seconds: list[float] = []
-        """Wall times of the decisions, [s]."""
-
-    def decide(self, observation: Observation, scenes: Any) -> Float:
-        """Return the decision of the method."""
-        before = time.perf_counter()
-        decided = self._method.decide(observation, scenes)
-        self.seconds.append(time.perf_counter() - before)
-        return decided
 
 
 @contextmanager

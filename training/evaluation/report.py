@@ -105,8 +105,8 @@ def show(record: Record, console: Console | None = None) -> None:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """Show a progress bar over the scenes of each method."""
-    with tqdm(unit=" scenes", file=sys.stderr, dynamic_ncols=True) as bar:
+    """Show a progress bar over the scenes of each method, from the first finished ones on."""
+    with tqdm(unit=" scenes", file=sys.stderr, dynamic_ncols=True, delay=0.01) as bar:
 
         def progress(name: str, done: int, total: int) -> None:
             if bar.desc != f"{name}: ":

@@ -303,4 +303,5 @@ def _settings(config: TrainConfig) -> dict[str, Any]:
     values = json.loads(json.dumps(config.as_json()))
     for name in MAY_CHANGE:
         del values[name]
-    return {**values, **values.pop("env_kwargs"), **values.pop("hyperparameters")}
+    env_kwargs, hyperparameters = values.pop("env_kwargs"), values.pop("hyperparameters")
+    return {**values, **env_kwargs, **hyperparameters}
