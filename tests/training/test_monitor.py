@@ -42,21 +42,3 @@ def test_the_log_says_what_the_learning_curve_says(run, log):
     assert {"rollout/success_rate", "rollout/collision_rate", "rollout/duration"} <= set(log)
     for record in run.curve:
         assert record["simulated_seconds"] == pytest.approx(0.002 * record["physics_steps"])
-
-
-def test_the_bar_shows_the_last_validation(shipped, tmp_path, capsys):
-    run = train(
-        TrainConfig(
-            n_timesteps=64,
-            n_envs=32,
-            eval_every=32,
-            eval_scenes=4,
-            checkpoint_every=32,
-            out=tmp_path / "run",
-            env_kwargs={"threads": 1},
-            hyperparameters={"learning_starts": 32},
-        )
-    )
-    success = f"{100.0 * run.curve[-1]['success']['rate']:.1f} %"
-    assert f"validation={success}" in capsys.readouterr().err.rstrip().splitlines()[-1]
-    assert f"success {success}" in repr(run)

@@ -313,8 +313,6 @@ def test_folders_that_are_no_runs(tmp_path):
         lambda: find_model(tmp_path),
         lambda: train(TrainConfig(out=tmp_path / "nothing", resume=True)),
         lambda: train(TrainConfig(out=run.folder, resume=True, seed=7)),
-        lambda: train(TrainConfig(out=run.folder, resume=True, n_envs=8)),
-        lambda: train(TrainConfig(out=run.folder, resume=True, env_kwargs={"n_via": 2})),
     ):
         with pytest.raises(ValueError):
             call()

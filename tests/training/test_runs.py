@@ -114,6 +114,21 @@ def test_a_folder_in_use_is_refused_and_a_dead_process_holds_nothing(run, monkey
         pass
 
 
+def test_two_that_begin_at_the_same_time_do_not_mix(tmp_path, monkeypatch):
+    """The second finds a free folder, but the first is faster."""
+    folder, check = tmp_path / "run", run_dir.check_free
+
+    def slow(path):
+        check(path)
+        monkeypatch.setattr(run_dir, "check_free", check)
+        Run.create(TrainConfig(out=path, seed=1))
+
+    monkeypatch.setattr(run_dir, "check_free", slow)
+    with pytest.raises(BadFileError):
+        Run.create(TrainConfig(out=folder, seed=2))
+    assert Run(folder).config.seed == 1
+
+
 def test_checkpoints_are_kept_two_deep_and_torn_ones_passed_over(env, run):
     model = new("td3", env)
     model._setup_learn(100)
