@@ -125,4 +125,4 @@ def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys):
     assert "--resume" in failed(capsys, *begun)
     run(*begun, "--resume")
     run("train", "--out", folder, "--resume", "--n-timesteps", 96, "--no-progress")
-    assert "trained for 96 decisions" in capsys.readouterr().out
+    assert "96 of 96 decisions" in capsys.readouterr().out

@@ -289,3 +289,9 @@ def test_a_forged_checkpoint_is_refused(change, env, checkpoint, tmp_path):
     forged(checkpoint, tmp_path, change)
     with pytest.raises(BadFileError):
         read_checkpoint(new(env), tmp_path)
+
+
+def test_a_newer_format_says_which_version_wrote_it(model):
+    edit(model, format=9, viapoint="7.1.0")
+    with pytest.raises(BadFileError, match=r"7\.1\.0"):
+        load_model(model)

@@ -218,7 +218,7 @@ def test_learning_happens(tmp_path):
 
 def test_a_run_keeps_its_settings_when_the_presets_change(tmp_path, monkeypatch):
     run = train(config(tmp_path / "run", n_timesteps=64))
-    preset = dataclasses.replace(PRESETS["viaq"], n_envs=3, hyperparameters=(("learning_rate", 0.5),))
+    preset = dataclasses.replace(PRESETS["viaq"], n_envs=3, hyperparameters={"learning_rate": 0.5})
     monkeypatch.setitem(PRESETS, "viaq", preset)
     assert train(TrainConfig(out=run.folder, resume=True, n_timesteps=128, progress=False)).decisions == 128
 

@@ -22,25 +22,11 @@ from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets.scene_set import scenes_for
 
 
-class EvaluationStoppedError(Exception):
-    """An evaluation was stopped by Ctrl-C; what it had finished is written and marked as partial."""
-
-    exit_code = 130
-    """Exit code of shells for Ctrl-C."""
-
-
 def train(config: TrainConfig) -> None:
-    """Train, and print where the run is."""
+    """Train, and print the run."""
     if config.resume:
-        run = Run(config.folder)
-        what = f"{run.config.algo} on {run.config.env}, seed {run.config.seed},"
-        print(f"going on with {what} after {run.decisions} decisions")
-    run = training.train(config)
-    last = run.curve[-1] if run.curve else None
-    reached = f", success {100.0 * last['success']['rate']:.1f} % on validation scenes" if last else ""
-    stalled = run.stopped == "stalled"
-    number = run.decisions if stalled else run.config.total_timesteps
-    print(f"trained for {number} decisions{' until it stalled' * stalled}{reached}: {run.folder}")
+        print(f"going on with {Run(config.folder)}")
+    print(training.train(config))
 
 
 def evaluate(config: EvaluateConfig) -> None:
@@ -70,7 +56,8 @@ def evaluate(config: EvaluateConfig) -> None:
         write_json(config.json, record)
         print(f"results, scene by scene: {config.json}")
     if result.partial:
-        raise EvaluationStoppedError("stopped: the results are partial")
+        print("the results are partial")
+        raise KeyboardInterrupt
 
 
 def _measure_planners(config: EvaluateConfig) -> None:

@@ -6,8 +6,6 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -96,24 +94,11 @@ class RunCallback(BaseCallback):
         """Wall time of training, with earlier parts of the run and without validation, [s]."""
         return self._seconds_before + time.monotonic() - self._began
 
-    @property
-    def _title(self) -> str:
-        return f"{self.config.algo} on {self.config.env.rpartition('/')[2]}"
-
-    @contextmanager
-    def _progress_title(self, work: str) -> Iterator[None]:
-        """Show the current work in the progress bar."""
-        self._bar.set_description(work)
-        try:
-            yield
-        finally:
-            self._bar.set_description(self._title)
-
     def __enter__(self) -> RunCallback:
         self._bar = tqdm(
             total=self.config.total_timesteps,
             unit=" decisions",
-            desc=self._title,
+            desc=f"{self.config.algo} on {self.config.env.rpartition('/')[2]}",
             disable=not self.config.progress,
             file=sys.stderr,
             dynamic_ncols=True,
@@ -178,22 +163,20 @@ class RunCallback(BaseCallback):
         return True
 
     def _save_checkpoint(self) -> None:
-        with self._progress_title("saving a checkpoint"):
-            self.run.checkpoint(self.model, self.state())
+        self.run.checkpoint(self.model, self.state())
 
     def _validate(self, frozen: FrozenScenes) -> None:
         """Evaluate the policy, extend the learning curve, and save the model if it is the best so far."""
         if self.curve and self.curve[-1]["decisions"] == self.num_timesteps:
             return
         seconds, began = self.seconds, time.monotonic()
-        with self._progress_title(f"validating in {len(frozen.share)} scenes"):
-            result = evaluate_methods(
-                [agent_method("agent", self.model)],
-                frozen,
-                self.config.env,
-                env_kwargs=whole_task(self.config.env, self.config.env_kwargs),
-                time_decisions=False,
-            ).results[0]
+        result = evaluate_methods(
+            [agent_method("agent", self.model)],
+            frozen,
+            self.config.env,
+            env_kwargs=whole_task(self.config.env, self.config.env_kwargs),
+            time_decisions=False,
+        ).results[0]
         if result.partial:
             return
         record = self._record(result, seconds)
@@ -202,8 +185,7 @@ class RunCallback(BaseCallback):
         ranking = (record["success"]["rate"], -(record["jerk_ratio"] or 0.0))
         if ranking > self._best:
             self._best = ranking
-            with self._progress_title("saving the best model"):
-                self.run.save("best", self.model)
+            self.run.save("best", self.model)
         self._show_progress()
         self._began += time.monotonic() - began
 

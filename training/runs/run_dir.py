@@ -94,10 +94,11 @@ class Run:
 
     def __repr__(self) -> str:
         config, curve = self.config, self.curve
+        stalled = " until it stalled" if self.stopped == "stalled" else ""
         rate = f", success {100.0 * curve[-1]['success']['rate']:.1f} % on validation scenes" if curve else ""
         return (
             f"Run({str(self.folder)!r}: {config.algo} on {config.env}, seed {config.seed}, "
-            f"{self.decisions} of {config.total_timesteps} decisions{rate})"
+            f"{self.decisions} of {config.total_timesteps} decisions{stalled}{rate})"
         )
 
     @classmethod
