@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import sys
 
 import numpy as np
 import pytest
@@ -93,9 +92,8 @@ def test_a_difference_is_told_by_the_exit_status_and_replaces_nothing(same, monk
     frozen, before = load(path), path.read_bytes()
     other = dataclasses.replace(frozen, scenes=frozen.scenes._replace(goal=0.99 * frozen.scenes.goal))
     monkeypatch.setattr(make.Maker, "make", lambda *_: frozen if same else other)
-    monkeypatch.setattr(sys, "argv", ["make", "--env", REACH, "--sets", "test", "--check"])
     with pytest.raises(SystemExit) as left:
-        make.main()
+        make.make_sets(env=(REACH,), sets=("test",), check=True)
     assert left.value.code == (0 if same else 1)
     assert ("DIFFERENT" in capsys.readouterr().out) is not same
     assert path.read_bytes() == before

@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import pickle
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -67,6 +69,11 @@ def test_an_agent_of_ones_own_arm_is_loaded_by_whoever_makes_the_arm_known(tmp_p
     registry._OWN.clear()
     with pytest.raises(BadFileError, match=r"'mine'.*register_arm"):
         load_model(tmp_path)
+
+
+def test_an_error_of_a_file_reaches_other_processes():
+    error = pickle.loads(pickle.dumps(BadFileError(Path("a"), "is missing")))
+    assert (error.path, str(error)) == (Path("a"), "a: is missing")
 
 
 def test_a_crash_amid_a_replacement_is_undone(tmp_path):

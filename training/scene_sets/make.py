@@ -14,7 +14,6 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 
 import numpy as np
 import tyro
@@ -58,18 +57,6 @@ RANDOM_ACTIONS = 512
 """Number of random actions for the solution share."""
 HARD_SHARE = 0.01
 """Solution share below which scenes are hard."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MakeConfig:
-    """Make the frozen sets of scenes."""
-
-    env: tuple[str, ...] = field(default_factory=lambda: _ids())
-    """Ids of environments."""
-    sets: tuple[str, ...] = SETS
-    """Names of sets."""
-    check: bool = False
-    """Make the sets that ship again, and compare their hashes."""
 
 
 def _ids() -> tuple[str, ...]:
@@ -204,20 +191,25 @@ def _hardest(found: list[FrozenScenes], number: int) -> FrozenScenes:
     return scenes.take(np.sort(np.argsort(scenes.share, kind="stable")[:number]))
 
 
-def main() -> None:
-    """Make or check the sets, and print what was made."""
-    config = tyro.cli(MakeConfig)
+def make_sets(env: tuple[str, ...] = (), sets: tuple[str, ...] = SETS, check: bool = False) -> None:
+    """Make the frozen sets of scenes, and print what was made.
+
+    Args:
+        env: Ids of environments; all if none is given.
+        sets: Names of sets.
+        check: Make the sets that ship again, and compare their hashes; the exit code is 1 if one differs.
+    """
     different = 0
-    for env_id in config.env:
+    for env_id in env or _ids():
         maker = Maker(env_id)
-        for name in [each for each in config.sets if each in maker.numbers()]:
+        for name in [each for each in sets if each in maker.numbers()]:
             path = shipped_path(name, env_id)
-            if path.is_file() and not config.check:
+            if path.is_file() and not check:
                 continue
             made = maker.make(name)
             counts = np.bincount(made.band, minlength=len(BANDS))
             told = ", ".join(f"{band}: {count}" for band, count in zip(BANDS, counts, strict=True))
-            if config.check:
+            if check:
                 same = path.is_file() and load(path).sha256 == made.sha256
                 different += not same
                 print(f"{path.name}: {'as it ships' if same else 'DIFFERENT'} ({told})", flush=True)
@@ -229,4 +221,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(make_sets)
