@@ -40,7 +40,7 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "sac": OFF_POLICY,
     "ppo": {"n_steps": 2, "batch_size": 16, "n_epochs": 2},
 }
-CLOCK = ("seconds", "wall_seconds", "validating", "decision_time", "t")
+CLOCK = ("seconds", "t")
 """Names of entries that hold real time."""
 DECISIONS, COPIES, EVERY = 480, 16, 32
 

@@ -36,9 +36,9 @@ def draw_families(path: Path) -> None:
         frozen = scenes_for("hard", search.task)
         for axes, family in zip(line, FAMILIES, strict=True):
             some = frozen.take(np.flatnonzero(frozen.family == family)[:TRIED])
-            entries = play(f"viapoint/{task}-v0", some.scenes, some.family, search.decide)
-            first = next(row for row, entry in enumerate(entries) if entry.success)
-            draw_movement(axes, search.task, entries[first].recorded, view=VIEW, scale=0.6)
+            episodes = play(f"viapoint/{task}-v0", some.scenes, search.decide)
+            first = next(row for row, (_, success) in enumerate(episodes) if success)
+            draw_movement(axes, search.task, episodes[first][0], view=VIEW, scale=0.6)
             share = f"{family}, {100.0 * some.share[first]:.1f} %"
             axes.set_title(share, fontsize=9, color=PALETTE.joint, pad=3)
         line[0].set_ylabel(condition, fontsize=9, color=PALETTE.joint)

@@ -1,6 +1,5 @@
 """The command, from the words to the files."""
 
-import io
 import json
 
 import pytest
@@ -32,20 +31,14 @@ def test_every_command_has_help(words, capsys):
     assert "Example: viapoint" in capsys.readouterr().out
 
 
-def test_an_error_is_the_same_where_the_output_knows_ascii_only(capsys, monkeypatch):
-    framed = failed(capsys, "train", "--seed", "-1")
-    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), "ascii"))
-    assert failed(capsys, "train", "--seed", "-1") == framed
-
-
 @pytest.mark.parametrize(
     ("error", "code"), [(ZeroDivisionError("over nothing"), 2), (KeyboardInterrupt(), 130)]
 )
 def test_an_end_in_the_middle_is_one_line_and_a_code(error, code, capsys, monkeypatch):
-    def broken(self, config):
+    def broken(config):
         raise error
 
-    monkeypatch.setattr(cli.Command, "__call__", broken)
+    monkeypatch.setattr(cli, "run_command", broken)
     assert str(error) in failed(capsys, "doctor", code=code)
     if code == 2:
         with pytest.raises(ZeroDivisionError):
@@ -73,8 +66,8 @@ def test_train_then_evaluate_then_play(trained, shipped, tmp_path, capsys):
     assert [each["scenes"] for each in record["methods"].values()] == [12, 12]
     assert record["env"] == ENV
     run("evaluate", trained, "--baselines", "--checks", 0, 8, "--n-scenes", 4)
-    kept = json.loads((trained / "evaluations" / "test.first-4.json").read_text())
-    assert list(kept["methods"]) == ["agent", "agent, 8 checks"]
+    kept = [json.loads(path.read_text()) for path in (trained / "evaluations").glob("test-*.json")]
+    assert ["agent", "agent, 8 checks"] in [list(each["methods"]) for each in kept]
     video = tmp_path / "film" / "a.mp4"
     run("play", trained, "--video", video, "--n-scenes", 1)
     assert video.stat().st_size > 1000
@@ -90,31 +83,8 @@ def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, 
         ("validation", "--n-scenes", 40),
     ):
         run("evaluate", trained, "--baselines", "straight", "--scenes", *words)
-    kept = {
-        path.name: json.loads(path.read_text())["methods"]["straight line"]["scenes"]
-        for path in (trained / "evaluations").glob("validation*.json")
-    }
-    assert kept == {
-        "validation.json": 40,
-        "validation.first-4.json": 4,
-        f"validation.{few.sha256[:8]}.json": 3,
-    }
-
-
-def test_a_shipped_agent_has_two_names(shipped, tmp_path):
-    for name, words in (("a", [ENV, "--env", ENV]), ("b", ["--pretrained", ENV])):
-        run(
-            "evaluate",
-            *words,
-            "--baselines",
-            "straight",
-            "--n-scenes",
-            2,
-            "--json",
-            tmp_path / f"{name}.json",
-        )
-    first, second = (json.loads((tmp_path / f"{name}.json").read_text())["outcomes"] for name in "ab")
-    assert first == second
+    kept = [json.loads(path.read_text()) for path in (trained / "evaluations").glob("validation-*.json")]
+    assert sorted(each["methods"]["straight line"]["scenes"] for each in kept) == [3, 4, 40]
 
 
 def test_an_agent_of_another_task_meets_scenes_of_that_task(tmp_path, capsys):
@@ -124,7 +94,8 @@ def test_an_agent_of_another_task_meets_scenes_of_that_task(tmp_path, capsys):
         "--env-kwargs", "n_obstacles=3", "threads=1",
     )  # fmt: skip
     run("evaluate", folder, "--baselines", "straight", "--n-scenes", 3)
-    record = json.loads((folder / "evaluations" / "test.first-3.json").read_text())
+    (path,) = (folder / "evaluations").iterdir()
+    record = json.loads(path.read_text())
     assert [each["scenes"] for each in record["methods"].values()] == [3, 3]
     run("play", folder, "--n-scenes", 1, "--video", tmp_path / "film.mp4")
     assert (tmp_path / "film.mp4").stat().st_size > 1000
@@ -141,11 +112,11 @@ def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys):
     run(*begun)
     before = (folder / "config.json").read_bytes()
     for words, named in (
-        ("--seed 7 --algo ppo", ("algo", "seed 3", "seed 7")),
-        ("--seed 0", ("seed 0",)),  # as usual, but not here
-        (f"--env {ENV}", (ENV,)),
-        ("--env-kwargs threads=2", ("threads 1", "threads 2")),
-        ("--hyperparameters tau=0.1", ("the usual tau", "tau 0.1")),
+        ("--seed 7 --algo ppo", ("algo viaq", "seed 3")),
+        ("--seed 0", ("seed 3",)),  # as usual, but not here
+        (f"--env {ENV}", (REACH,)),
+        ("--env-kwargs threads=2", ("threads 1",)),
+        ("--hyperparameters tau=0.1", ("tau as usual",)),
         ("--n-timesteps 32", ("64 decisions", "got 32")),
     ):
         told = failed(capsys, "train", "--out", folder, "--resume", *words.split())
@@ -154,4 +125,4 @@ def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys):
     assert "--resume" in failed(capsys, *begun)
     run(*begun, "--resume")
     run("train", "--out", folder, "--resume", "--n-timesteps", 96, "--no-progress")
-    assert "trained for 96 decisions" in capsys.readouterr().out
+    assert "96 of 96 decisions" in capsys.readouterr().out

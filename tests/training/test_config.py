@@ -5,7 +5,6 @@ import json
 import shlex
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
@@ -43,13 +42,6 @@ def test_configurations_survive_json_and_are_frozen(config):
     assert type(config).from_json(json.loads(json.dumps(config.as_json()))) == config
     with pytest.raises(dataclasses.FrozenInstanceError):
         config.env = "other"
-
-
-def test_nothing_is_shared_between_two_configurations():
-    TrainConfig().env_kwargs["n_via"] = 2
-    assert TrainConfig().env_kwargs == {}
-    PRESETS["sac"].arguments()["policy_kwargs"]["net_arch"] = []
-    assert PRESETS["sac"].arguments()["policy_kwargs"]["net_arch"] == [256, 256]
 
 
 @pytest.mark.parametrize(
@@ -104,17 +96,3 @@ def test_every_algorithm_has_presets_that_fit():
     for algo, preset in PRESETS.items():
         assert TrainConfig(algo=algo).total_timesteps == preset.n_timesteps
         assert TrainConfig(algo=algo, n_timesteps=7, n_envs=3).copies == 3
-
-
-def test_values_of_numpy_are_plain_values_and_others_are_refused_by_name():
-    config = TrainConfig(env_kwargs={"n_obstacles": np.int64(3), "duration_range": np.array((0.7, 1.1))})
-    assert config == TrainConfig(env_kwargs={"n_obstacles": 3, "duration_range": [0.7, 1.1]})
-    assert config == TrainConfig.from_json(json.loads(json.dumps(config.as_json())))
-    with pytest.raises(ValueError, match="n_obstacles in env_kwargs"):
-        TrainConfig(env_kwargs={"n_obstacles": object()})
-
-
-def test_a_tilde_is_the_home_folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert TrainConfig(out="~/run").folder == tmp_path / "run"
-    assert EvaluateConfig(agent="a", json="~/a.json").json == tmp_path / "a.json"

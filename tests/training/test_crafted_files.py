@@ -121,8 +121,6 @@ CONTENTS = {
     WEIGHTS: [
         b"",
         struct.pack("<Q", 2**63) + b"{}",
-        struct.pack("<Q", 10**9) + b"{}",
-        struct.pack("<Q", 2**64 - 1),
         with_header(tensor(shape=[2**62, 2**62])),
         with_header(tensor(shape=[10**9], data_offsets=[0, 4 * 10**9])),
         with_header(tensor(shape=[-1])),
@@ -130,17 +128,13 @@ CONTENTS = {
         with_header(tensor(data_offsets=[0, 10**18]), bytes(8)),
         with_header({**tensor(), "v": tensor()["w"]}, bytes(8)),
         with_header(tensor(dtype="PICKLE"), bytes(8)),
-        with_header({"w": {"dtype": "F32"}}),
         with_header(b"[" * 100_000),
-        with_header(b"\xff\xfe"),
-        with_header([1, 2]),
         with_header(tensor(), bytes(4)),
         with_header(tensor(), bytes(12)),
     ],
     RECORD: [
         b"",
         b"[" * 200_000,
-        b'{"a":' * 100_000,
         b'{"format": ' + b"9" * 100_000 + b"}",
         b'{"format": 1e999}',
         b'{"format": NaN}',
@@ -244,12 +238,6 @@ def test_what_is_cut_damaged_missing_or_would_be_read_for_ever_is_refused(name, 
     check_refused(model, name)
 
 
-def test_a_newer_format_says_which_version_wrote_it(model):
-    edit(model, format=9, viapoint="7.1.0")
-    with pytest.raises(BadFileError, match=r"7\.1\.0"):
-        load_model(model)
-
-
 @pytest.fixture(scope="module")
 def checkpoint(env, tmp_path_factory):
     model = new(env)
@@ -301,3 +289,9 @@ def test_a_forged_checkpoint_is_refused(change, env, checkpoint, tmp_path):
     forged(checkpoint, tmp_path, change)
     with pytest.raises(BadFileError):
         read_checkpoint(new(env), tmp_path)
+
+
+def test_a_newer_format_says_which_version_wrote_it(model):
+    edit(model, format=9, viapoint="7.1.0")
+    with pytest.raises(BadFileError, match=r"7\.1\.0"):
+        load_model(model)

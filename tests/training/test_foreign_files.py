@@ -1,7 +1,5 @@
 """Nothing that this package did not write is deleted or overwritten, and what it wrote is replaced."""
 
-import json
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ from viapoint.training.agents.agent import find_model
 from viapoint.training.agents.model_io import weights
 from viapoint.training.cli import demo
 from viapoint.training.cli import main as cli
-from viapoint.training.config.configs import DemoConfig, EvaluateConfig, PaperConfig, PlayConfig, TrainConfig
+from viapoint.training.config.configs import DemoConfig, PaperConfig, TrainConfig
 from viapoint.training.io.files import BadFileError
 from viapoint.training.paper import run as paper
 from viapoint.training.paper.figures import save as save_figure
@@ -103,58 +101,41 @@ def test_an_own_model_is_replaced_also_behind_a_link(tmp_path):
     assert load_agent(tmp_path / "new").env_id == "viapoint/PlanarObstacles-v0"
 
 
-@pytest.mark.parametrize("content", [NOTES, b"", FOREIGN_JSON])
-def test_an_evaluation_replaces_an_evaluation_alone(content, tmp_path):
-    evaluate(tmp_path / "own.json")
-    evaluate(tmp_path / "own.json")
-    assert json.loads((tmp_path / "own.json").read_text())["env"] == REACH
-    put(tmp_path, "foreign.json", content)
+def begin_demo(path):
+    demo.run(DemoConfig(out=path.parent, env=REACH))
+
+
+def begin_paper(path):
+    paper.run(PaperConfig(out=path.parent))
+
+
+OVER = [
+    *((evaluate, "foreign.json", content) for content in (NOTES, b"", FOREIGN_JSON)),
+    (film, "wedding.mp4", NOTES),
+    *((begin_demo, name, NOTES) for name in demo.FILES),
+    *((begin_paper, name, NOTES) for name in (*paper.PAGES, "fig01_model.svg", "limits.png")),
+]
+
+
+@pytest.mark.parametrize(("write", "name", "content"), OVER)
+def test_no_file_of_something_else_is_written_over(write, name, content, tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "train_or_resume", pytest.fail)
+    monkeypatch.setattr(paper, "reproduce", pytest.fail)
+    put(tmp_path, name, content)
     before = content_of(tmp_path)
-    with pytest.raises(SystemExit) as end:
-        evaluate(tmp_path / "foreign.json")
-    assert end.value.code == 2
-    with pytest.raises(BadFileError):
-        EvaluateConfig(env=REACH, json=tmp_path / "foreign.json")
+    with pytest.raises((BadFileError, SystemExit)):
+        write(tmp_path / name)
     assert content_of(tmp_path) == before
 
 
-def test_a_film_replaces_a_film_alone(tmp_path):
-    film(tmp_path / "own.mp4")
-    film(tmp_path / "own.mp4")
-    put(tmp_path, "wedding.mp4")
-    before = content_of(tmp_path)
-    with pytest.raises(BadFileError):
-        film(tmp_path / "wedding.mp4")
-    with pytest.raises(BadFileError):
-        PlayConfig(agent=REACH, video=tmp_path / "wedding.mp4")
-    assert content_of(tmp_path) == before
+@pytest.mark.parametrize(("write", "name"), [(evaluate, "own.json"), (film, "own.mp4")])
+def test_an_own_file_is_replaced(write, name, tmp_path):
+    write(tmp_path / name)
+    write(tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-@pytest.mark.parametrize(
-    ("name", "begun"), [*((each, True) for each in demo.FILES), ("table.md", False), ("notes.txt", False)]
-)
-def test_a_demo_writes_over_no_file_of_something_else(name, begun, tmp_path, monkeypatch):
-    monkeypatch.setattr(demo, "train", pytest.fail if begun else train)
-    if begun:
-        Run.create(tiny(tmp_path))
-    put(tmp_path, name)
-    before = content_of(tmp_path)
-    with pytest.raises(BadFileError):
-        demo.run(DemoConfig(out=tmp_path, env=REACH))
-    assert content_of(tmp_path) == before
-
-
-@pytest.mark.parametrize("name", [*paper.PAGES, "fig01_model.svg", "limits.png"])
-def test_the_paper_is_written_over_no_file_of_something_else(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(paper, "reproduce", lambda *_: pytest.fail("began to work"))
-    put(tmp_path, name)
-    before = content_of(tmp_path)
-    with pytest.raises(BadFileError):
-        paper.run(PaperConfig(out=tmp_path))
-    assert content_of(tmp_path) == before
-
-
-def test_what_the_paper_and_the_demo_wrote_can_be_written_again(tmp_path, monkeypatch):
+def test_what_the_paper_wrote_can_be_written_again(tmp_path, monkeypatch):
     from matplotlib.figure import Figure
 
     claims = [paper.Claim(1, "one", model=(1.0, paper.straight.near(1.0, 0.1)))]

@@ -45,17 +45,9 @@ def test_the_document_holds_every_method_and_metric(record, tmp_path):
     assert search["clearance [mm]"] == f"{1e3 * summary['min_clearance']:.1f}"
     assert json.loads(data.read_text()) == record
     assert record["sha256"][:12] in document.read_text()
-
-
-def test_the_printed_table_loses_nothing_to_markup(record):
     console = Console(width=100, record=True, file=io.StringIO())
     report.show(record, console)
-    text = console.export_text()
-    assert "[bold]" in text
-
-
-def pixels(path):
-    return np.asarray(Image.open(path).convert("L"))
+    assert "[bold]" in console.export_text()
 
 
 def test_pictures_are_drawn(record, tmp_path):
@@ -67,5 +59,4 @@ def test_pictures_are_drawn(record, tmp_path):
     line = plots.learning_curve(tmp_path / "a" / "curve.png", curve)
     bars = plots.success_by_band(tmp_path / "bars.png", record)
     for path in (line, bars):
-        assert pixels(path).shape[0] > 300
-        assert pixels(path).std() > 5.0
+        assert np.asarray(Image.open(path).convert("L")).std() > 5.0

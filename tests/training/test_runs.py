@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import pickle
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from viapoint.training.config.presets import PRESETS
 from viapoint.training.io import files
 from viapoint.training.io.files import BadFileError
 from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.runs import run_dir
 from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
 from viapoint.training.runs.run_dir import Run
 
@@ -68,24 +71,9 @@ def test_an_agent_of_ones_own_arm_is_loaded_by_whoever_makes_the_arm_known(tmp_p
         load_model(tmp_path)
 
 
-def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
-    path = tmp_path / "file"
-    files.write_bytes(path, b"old")
-
-    def full(handle):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(files.os, "fsync", full)
-    for write in (
-        lambda: files.write_bytes(path, b"new"),
-        lambda: files.write_folder(
-            tmp_path / "folder", lambda folder: files.write_bytes(folder / "a", b"new")
-        ),
-    ):
-        with pytest.raises(OSError):
-            write()
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]
-    assert path.read_bytes() == b"old"
+def test_an_error_of_a_file_reaches_other_processes():
+    error = pickle.loads(pickle.dumps(BadFileError(Path("a"), "is missing")))
+    assert (error.path, str(error)) == (Path("a"), "a: is missing")
 
 
 def test_a_crash_amid_a_replacement_is_undone(tmp_path):
@@ -115,7 +103,8 @@ def test_a_run_comes_back_with_its_configuration_and_its_curve(run):
     assert again.curve == [{"decisions": 1}]
 
 
-def test_a_folder_in_use_is_refused_and_a_dead_process_holds_nothing(run):
+def test_a_folder_in_use_is_refused_and_a_dead_process_holds_nothing(run, monkeypatch):
+    monkeypatch.setattr(run_dir, "PATIENCE", 0.0)
     script = (
         "import sys; from pathlib import Path; from viapoint.training.runs.run_dir import Run\n"
         f"with Run(Path({str(run.folder)!r})).locked():\n    print('in', flush=True); sys.stdin.read()"
@@ -130,6 +119,21 @@ def test_a_folder_in_use_is_refused_and_a_dead_process_holds_nothing(run):
     other.communicate()
     with run.locked():
         pass
+
+
+def test_two_that_begin_at_the_same_time_do_not_mix(tmp_path, monkeypatch):
+    """The second finds a free folder, but the first is faster."""
+    folder, check = tmp_path / "run", run_dir.check_free
+
+    def slow(path):
+        check(path)
+        monkeypatch.setattr(run_dir, "check_free", check)
+        Run.create(TrainConfig(out=path, seed=1))
+
+    monkeypatch.setattr(run_dir, "check_free", slow)
+    with pytest.raises(BadFileError):
+        Run.create(TrainConfig(out=folder, seed=2))
+    assert Run(folder).config.seed == 1
 
 
 def test_checkpoints_are_kept_two_deep_and_torn_ones_passed_over(env, run):
@@ -176,3 +180,23 @@ def test_a_checkpoint_is_of_one_model(env, tmp_path):
     assert read_checkpoint(same, tmp_path / "checkpoint") == {}
     for name, array in weights(model).items():
         np.testing.assert_array_equal(weights(same)[name], array)
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    files.write_bytes(path, b"old")
+
+    def full(handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    for write in (
+        lambda: files.write_bytes(path, b"new"),
+        lambda: files.write_folder(
+            tmp_path / "folder", lambda folder: files.write_bytes(folder / "a", b"new")
+        ),
+    ):
+        with pytest.raises(OSError):
+            write()
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+    assert path.read_bytes() == b"old"

@@ -50,17 +50,6 @@ def test_mcnemar_is_the_exact_binomial_test():
     assert five.p_value == pytest.approx(2 / 2**5)
 
 
-def test_interquartile_mean_is_the_trimmed_mean():
-    generator = np.random.default_rng(3)
-    for shape in ((5, 4), (7, 3), (1, 2)):
-        scores = generator.normal(size=shape)
-        ordered, cut = sorted(scores.ravel()), scores.size // 4
-        assert statistics.interquartile_mean(scores) == pytest.approx(
-            np.mean(ordered[cut : scores.size - cut])
-        )
-    assert statistics.interquartile_mean([0, 1, 2, 1000]) == 1.5
-
-
 def test_across_seeds_draws_whole_agents():
     """Three agents, each the same in all scenes: all 27 draws of three of them can be written down."""
     rates = np.array([0.2, 0.5, 0.6])

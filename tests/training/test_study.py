@@ -16,7 +16,7 @@ import yaml
 
 from viapoint.training import Study, run_study
 from viapoint.training.study.run import StudyFailedError, _connected, _import_libraries
-from viapoint.training.study.tables import COLUMNS, markdown
+from viapoint.training.study.trials import COLUMNS
 
 ENV = "viapoint/PlanarObstacles-v0"
 FEW = {"learning_starts": 64, "gradient_steps": 1}
@@ -255,14 +255,3 @@ def test_what_cannot_be_run_is_an_error_when_the_file_is_read(change, tmp_path):
     path.write_text(yaml.safe_dump({**GIVEN, **change}))
     with pytest.raises(ValueError, match=r"study\.yaml"):
         Study.from_yaml(path)
-
-
-def test_an_unknown_field_comes_with_the_closest_one():
-    with pytest.raises(ValueError, match="did you mean 'seeds'"):
-        Study.from_dict({**GIVEN, "seedz": [0]})
-
-
-def test_pages_show_intervals_in_percent(whole):
-    text = markdown(whole[1], "small")
-    assert text.startswith("# small")
-    assert "| 0.0 % (0.0-24.2) " in text  # Wilson's interval of 0 of 12

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import pandas as pd
 
 from viapoint.training.agents.agent import load_agent
 from viapoint.training.config.configs import USUAL_BASELINES, EvaluateConfig, PlayConfig, TrainConfig
 from viapoint.training.evaluation import report
-from viapoint.training.evaluation.evaluator import check_baselines, environment_of, evenly_spread
 from viapoint.training.evaluation.evaluator import evaluate as measure
+from viapoint.training.evaluation.evaluator import evenly_spread
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planning import benchmark_report
 from viapoint.training.planning.baselines import agent_method
@@ -21,28 +19,14 @@ from viapoint.training.planning.benchmark import benchmark_problems, read_proble
 from viapoint.training.planning.search import registered_task
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.scene_sets.scene_set import NUMBERS, SETS, FrozenScenes, scenes_for
-
-
-class EvaluationStoppedError(Exception):
-    """An evaluation was stopped by Ctrl-C; what it had finished is written and marked as partial."""
-
-    exit_code = 130
-    """Exit code of shells for Ctrl-C."""
+from viapoint.training.scene_sets.scene_set import scenes_for
 
 
 def train(config: TrainConfig) -> None:
-    """Train, and print where the run is."""
+    """Train, and print the run."""
     if config.resume:
-        run = Run(config.folder)
-        what = f"{run.config.algo} on {run.config.env}, seed {run.config.seed},"
-        print(f"going on with {what} after {run.decisions} decisions")
-    run = training.train(config)
-    last = run.curve[-1] if run.curve else None
-    reached = f", success {100.0 * last['success']['rate']:.1f} % on validation scenes" if last else ""
-    stalled = run.stopped == "stalled"
-    number = run.decisions if stalled else run.config.total_timesteps
-    print(f"trained for {number} decisions{' until it stalled' * stalled}{reached}: {run.folder}")
+        print(f"going on with {Run(config.folder)}")
+    print(training.train(config))
 
 
 def evaluate(config: EvaluateConfig) -> None:
@@ -50,31 +34,30 @@ def evaluate(config: EvaluateConfig) -> None:
     if config.of_planners:
         _measure_planners(config)
         return
-    agent = None if config.agent is None else load_agent(config.agent)
-    run = (
-        Run(str(config.agent))
-        if config.agent and (Path(config.agent).expanduser() / "config.json").is_file()
-        else None
-    )
-    env_id, env_kwargs = environment_of(agent, config.env, None)
-    task = registered_task(env_id, **env_kwargs)
-    check_baselines(config.baselines, agent, task)
-    whole = scenes_for(config.scenes, task, config.n_scenes)
-    scenes = whole.take(evenly_spread(len(whole.share), config.n_scenes))
     with report.progress_bar() as progress:
-        given: Any = {"checks": config.checks, "baselines": config.baselines, "progress": progress}
-        result = measure(agent, env=config.env, scenes=scenes, **given)
+        result = measure(
+            config.agent,
+            env=config.env,
+            scenes=config.scenes,
+            n_scenes=config.n_scenes,
+            checks=config.checks,
+            baselines=config.baselines,
+            progress=progress,
+        )
     record = result.to_dict()
     report.show(record)
-    if run is not None:
+    if config.agent is not None and (Path(config.agent).expanduser() / "config.json").is_file():
+        run = Run(config.agent)
         record["weights_sha256"] = read_json(run.best / "model.json").get("weights_sha256")
-        name = _evaluation_name(config.scenes, whole, len(scenes.share), partial=result.partial)
+        partial = ".partial" if result.partial else ""
+        name = f"{Path(config.scenes).stem}-{result.sha256[:8]}{partial}"  # the hash is that of the scenes
         print(f"kept as {run.write_evaluation(name, record)}")
     if config.json is not None:
         write_json(config.json, record)
         print(f"results, scene by scene: {config.json}")
     if result.partial:
-        raise EvaluationStoppedError("stopped: the results are partial")
+        print("the results are partial")
+        raise KeyboardInterrupt
 
 
 def _measure_planners(config: EvaluateConfig) -> None:
@@ -90,15 +73,6 @@ def _measure_planners(config: EvaluateConfig) -> None:
     if config.json is not None:
         write_json(config.json, pd.concat(lines).to_dict("records"))
         print(f"results, problem by problem: {config.json}")
-
-
-def _evaluation_name(scenes: str, whole: FrozenScenes, number: int, *, partial: bool) -> str:
-    """Return a file name that is unique to the scenes of an evaluation and to their number."""
-    name = Path(scenes).stem + ("" if scenes in SETS else f".{whole.sha256[:8]}")
-    is_drawn = bool(np.isnan(whole.share).any())  # no more of them than are asked for
-    every = NUMBERS[scenes] if is_drawn and scenes in NUMBERS else len(whole.share)
-    name += "" if number == every else f".first-{number}"
-    return name + (".partial" if partial else "")
 
 
 def play(config: PlayConfig) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,26 +14,26 @@ from viapoint.training.agents.model_io import untrained
 from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate_methods, evenly_spread
-from viapoint.training.io.files import BadFileError, check_ours, read_json
+from viapoint.training.io.files import check_ours, read_json
 from viapoint.training.planning.baselines import Method, agent_method, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plotting import plots
-from viapoint.training.plotting.gallery import Entry, gallery, play
+from viapoint.training.plotting.gallery import gallery, play
 from viapoint.training.plotting.video import record_video
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import train
+from viapoint.training.runs.trainer import train_or_resume
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, scenes_for
 
 BASELINES = ("search16", "search512", "straight", "random")
-FILES = (
-    "table.md",
-    "table.json",
-    "learning_curve.png",
-    "success_by_band.png",
-    "gallery.png",
-    "movements.mp4",
-)
-"""Files besides those of the run."""
+FILES = {
+    "table.md": "the table",
+    "table.json": "the table with every outcome",
+    "learning_curve.png": "success during training",
+    "success_by_band.png": "success by difficulty",
+    "gallery.png": "test scenes, planned and executed",
+    "movements.mp4": "movements",
+}
+"""Files besides those of the run, and what they show."""
 PICTURES = 12
 """Number of movements in the gallery."""
 MOVEMENTS = 4
@@ -51,67 +50,32 @@ def run(config: DemoConfig) -> None:
     for name in FILES:
         check_ours(folder / name)
     trained = _trained(config)
-    model_folder = find_model(folder)
-    agent = load_agent(model_folder)
+    agent = load_agent(trained.best)
     frozen = scenes_for("test", registered_task(config.env), config.n_scenes)
     frozen = frozen.take(evenly_spread(len(frozen.share), config.n_scenes))
     record = _measured(config, agent, frozen)
-    heading = f"The agent alone in {frozen.name} scenes, easy to hard"
-    files: dict[str, tuple[str, Callable[[Path], Any] | None]] = {
-        "table.md": ("the table", None),
-        "table.json": ("the table with every outcome", None),
-        "learning_curve.png": (
-            "success during training",
-            lambda path: plots.learning_curve(path, trained.curve),
-        ),
-        "success_by_band.png": ("success by difficulty", lambda path: plots.success_by_band(path, record)),
-        "gallery.png": (
-            "test scenes, planned and executed",
-            lambda path: gallery(path, entries(agent, frozen, PICTURES), heading=heading),
-        ),
-        "movements.mp4": ("movements", lambda path: _film(path, agent, frozen)),
-        model_folder.name: ("the trained agent", None),
-    }
-    weights = model_folder / "weights.safetensors"
-    for name, (_, draw) in files.items():
-        path = folder / name
-        if draw and (not path.exists() or path.stat().st_mtime < weights.stat().st_mtime):
-            draw(path)
+    last = folder / "movements.mp4"  # written after all others
+    if not last.exists() or last.stat().st_mtime < (folder / "table.json").stat().st_mtime:
+        plots.learning_curve(folder / "learning_curve.png", trained.curve)
+        plots.success_by_band(folder / "success_by_band.png", record)
+        _draw_gallery(folder / "gallery.png", agent, frozen)
+        _film(last, agent, frozen)
     report.show(record)
-    for name, (what, _) in files.items():
+    for name, what in {**FILES, trained.best.name: "the trained agent"}.items():
         print(f"  {folder / name!s:<34} {what}")
     print(f"done in {time.monotonic() - began:.0f} s")
 
 
-def entries(agent: Agent, frozen: FrozenScenes, count: int) -> list[Entry]:
-    """Return the agent's movements in scenes of all difficulties for the gallery."""
-    by_difficulty = np.argsort(-frozen.share, kind="stable")
-    chosen = frozen.take(by_difficulty[evenly_spread(len(by_difficulty), count)])
-    titles = [f"share {BANDS[band]}" for band in chosen.band]
-    decide = agent_method("agent", agent, 0).decide
-    return play(agent.env_id, chosen.scenes, titles, decide, **agent.env_kwargs)
-
-
 def _trained(config: DemoConfig) -> Run:
     """Return the completed run in the folder, trained now if necessary."""
-    asked = TrainConfig(env=config.env, seed=config.seed, n_timesteps=config.total_timesteps, out=config.out)
-    if not (config.out / "config.json").exists():
-        print(f"training for {asked.total_timesteps} decisions; Ctrl-C saves, and the same command goes on")
-        return train(asked)
-    found = Run(config.out)
-    for name in ("env", "seed"):
-        if getattr(found.config, name) != getattr(config, name):
-            raise BadFileError(
-                config.out,
-                f"holds a run with {name} {getattr(found.config, name)!r}, not {getattr(config, name)!r}; "
-                "name another folder with --out",
-            )
-    done = found.decisions
-    if done >= (config.n_timesteps or found.config.total_timesteps):
-        print(f"{config.out} holds an agent trained for {done} decisions: starting from it")
-        return found
-    print(f"{config.out} holds a training stopped after {done} decisions: going on with it")
-    return train(TrainConfig(env=config.env, n_timesteps=config.n_timesteps, out=config.out, resume=True))
+    number = config.total_timesteps
+    if (config.out / "config.json").is_file():
+        found = Run(config.out)
+        number = config.n_timesteps or found.config.total_timesteps
+        print(f"{config.out} holds a training of {found.decisions} decisions: starting from it")
+    else:
+        print(f"training for {number} decisions; Ctrl-C saves, and the same command goes on")
+    return train_or_resume(TrainConfig(env=config.env, seed=config.seed, n_timesteps=number, out=config.out))
 
 
 def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[str, Any]:
@@ -125,7 +89,6 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
     if path.exists():
         record = read_json(path)
         if not record.get("partial") and {name: record.get(name) for name in identity} == identity:
-            print(f"{path} holds its evaluation: starting from it")
             return record
     methods: list[Method] = [
         agent_method("agent", agent, 0),
@@ -140,6 +103,17 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
     if result.partial:
         raise KeyboardInterrupt
     return record
+
+
+def _draw_gallery(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
+    """Draw movements in scenes of all difficulties."""
+    by_difficulty = np.argsort(-frozen.share, kind="stable")
+    chosen = frozen.take(by_difficulty[evenly_spread(len(by_difficulty), PICTURES)])
+    titles = [f"share {BANDS[band]}" for band in chosen.band]
+    decide = agent_method("agent", agent, 0).decide
+    task = registered_task(agent.env_id, **agent.env_kwargs)
+    episodes = play(agent.env_id, chosen.scenes, decide, **agent.env_kwargs)
+    gallery(path, task, episodes, titles, heading=f"The agent alone in {frozen.name} scenes, easy to hard")
 
 
 def _film(path: Path, agent: Agent, frozen: FrozenScenes) -> None:

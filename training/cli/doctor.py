@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import json
 import os
 import platform
 import re
@@ -15,10 +14,8 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, NoReturn
+from typing import Any, NamedTuple
 
 PATIENCE = 120.0
 """Time limit of a check in a separate process, [s]."""
@@ -55,38 +52,28 @@ print("the shipped agent of", agent.env_id, "loads")
 """
 
 
-@dataclass(frozen=True, kw_only=True)
-class Finding:
+class Finding(NamedTuple):
     """Result of one check."""
 
     name: str
     works: bool
-    needed: bool
-    """Mark of a check that must pass."""
     found: str
-    remedy: str = ""
+    remedy: str
     """Advice if it fails."""
+    needed: bool = True
+    """False for a check that may fail."""
 
 
 def run(config: Any) -> None:
-    """Check everything and print it; exit code 1 where something that is needed does not work."""
-    findings = list(examine(config.out))
-    works = all(finding.works for finding in findings if finding.needed)
-    if config.json:
-        print(json.dumps({"works": works, "findings": [asdict(each) for each in findings]}, indent=1))
-    else:
-        for finding in findings:
-            state = "ok" if finding.works else "MISSING" if finding.needed else "without"
-            print(f"{state:<8} {finding.name:<18} {finding.found}")
-            if not finding.works:
-                print(f"{'':<8} {'':<18} -> {finding.remedy}")
+    """Check everything for the folder of runs `config.out` and print it; exit code 1 where something needed fails."""
+    works = True
+    for finding in examine(config.out):
+        works &= finding.works or not finding.needed
+        state = "ok" if finding.works else "MISSING" if finding.needed else "without"
+        print(f"{state:<8} {finding.name:<18} {finding.found}")
+        if not finding.works:
+            print(f"{'':<8} {'':<18} -> {finding.remedy}")
     raise SystemExit(0 if works else 1)
-
-
-def run_without_command(words: Sequence[str]) -> NoReturn:
-    """Check everything where what reads the command line cannot be imported."""
-    run(SimpleNamespace(out=Path("runs"), json="--json" in words))
-    raise AssertionError  # run exits
 
 
 def explain_import_error(error: ImportError, subject: str = "the command") -> str:
@@ -110,14 +97,11 @@ def examine(folder: Path) -> Iterator[Finding]:
     if not missing_packages():
         # Some versions of triton crash if they are imported after a frame was rendered.
         yield in_a_process("agents", FRAME + LEARN, INSTALL_TRAINING)
-    place = next(filter(None, map(shutil.which, BROWSERS)), None)
-    yield Finding(
-        name="browser",
-        works=place is not None,
-        needed=False,
-        found=place or "none for `viapoint live`",
-        remedy="on Debian and Ubuntu: apt-get install chromium; or open the page from elsewhere by an SSH tunnel",
+    place = next(filter(None, map(shutil.which, BROWSERS)), "")
+    remedy = (
+        "on Debian and Ubuntu: apt-get install chromium; or open the page from elsewhere by an SSH tunnel"
     )
+    yield Finding("browser", bool(place), place or "none for `viapoint live`", remedy, needed=False)
     yield disk(folder)
 
 
@@ -158,7 +142,7 @@ def packages(lines: Sequence[str]) -> Iterator[Finding]:
         remedy = INSTALL_TRAINING if extra else f"install {name} {least} or newer"
         found = f"{version or 'not installed'}, {least} or newer wanted"
         works = bool(version) and at_least(version, least)
-        yield Finding(name=name, works=works, needed=True, found=found, remedy=remedy)
+        yield Finding(name, works, found, remedy)
 
 
 def at_least(version: str, least: str) -> bool:
@@ -174,11 +158,10 @@ def in_a_process(name: str, script: str, remedy: str, *, needed: bool = True) ->
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE)
     except subprocess.TimeoutExpired:
-        found = f"no answer within {PATIENCE:.0f} s"
-        return Finding(name=name, works=False, needed=needed, found=found, remedy=remedy)
+        return Finding(name, False, f"no answer within {PATIENCE:.0f} s", remedy, needed)
     works = done.returncode == 0
     said = (done.stdout if works else done.stderr).strip() or f"ended with code {done.returncode}"
-    return Finding(name=name, works=works, needed=needed, found=said.splitlines()[-1], remedy=remedy)
+    return Finding(name, works, said.splitlines()[-1], remedy, needed)
 
 
 def disk(folder: Path) -> Finding:
@@ -187,6 +170,4 @@ def disk(folder: Path) -> Finding:
     works = place.is_dir() and os.access(place, os.W_OK)
     free = shutil.disk_usage(place).free / 1e9
     found = f"{place} can be written, {free:.1f} GB free" if works else f"{place} cannot be written"
-    return Finding(
-        name="disk", works=works, needed=True, found=found, remedy=f"name another folder than {folder}"
-    )
+    return Finding("disk", works, found, f"name another folder than {folder}")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 from viapoint.training.cli import doctor
 
@@ -13,7 +15,7 @@ def main() -> None:
         from viapoint.training.cli.main import main as run
     except ImportError as error:
         if sys.argv[1:2] == ["doctor"]:
-            doctor.run_without_command(sys.argv[2:])
+            doctor.run(SimpleNamespace(out=Path("runs")))
         if "--debug" in sys.argv:
             raise
         print(f"viapoint: {doctor.explain_import_error(error)}", file=sys.stderr)

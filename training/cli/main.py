@@ -9,7 +9,7 @@ import importlib
 import io
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple, Union
+from typing import Annotated, Any, Union
 
 import tyro
 
@@ -32,30 +32,18 @@ class UsageError(ValueError):
     """Error of an invalid command line; the message is one line."""
 
 
-class Command(NamedTuple):
-    """Subcommand: its configuration and its function, which is imported when it is called."""
-
-    config: type[Any]
-    module: str
-    function: str
-
-    def __call__(self, config: Any) -> None:
-        """Run the subcommand."""
-        getattr(importlib.import_module(self.module), self.function)(config)
-
-
-COMMANDS: dict[str, Command] = {
-    "train": Command(TrainConfig, "viapoint.training.cli.commands", "train"),
-    "evaluate": Command(EvaluateConfig, "viapoint.training.cli.commands", "evaluate"),
-    "plan": Command(PlanConfig, "viapoint.training.cli.plan", "run"),
-    "play": Command(PlayConfig, "viapoint.training.cli.commands", "play"),
-    "paper": Command(PaperConfig, "viapoint.training.paper.run", "run"),
-    "demo": Command(DemoConfig, "viapoint.training.cli.demo", "run"),
-    "study": Command(StudyConfig, "viapoint.training.study.run", "run"),
-    "live": Command(LiveConfig, "viapoint.training.live.page", "run"),
-    "doctor": Command(DoctorConfig, "viapoint.training.cli.doctor", "run"),
+COMMANDS: dict[str, tuple[type[Any], str]] = {
+    "train": (TrainConfig, "cli.commands:train"),
+    "evaluate": (EvaluateConfig, "cli.commands:evaluate"),
+    "plan": (PlanConfig, "cli.plan:run"),
+    "play": (PlayConfig, "cli.commands:play"),
+    "paper": (PaperConfig, "paper.run:run"),
+    "demo": (DemoConfig, "cli.demo:run"),
+    "study": (StudyConfig, "study.run:run"),
+    "live": (LiveConfig, "live.page:run"),
+    "doctor": (DoctorConfig, "cli.doctor:run"),
 }
-"""Subcommands by name."""
+"""Configuration and function of each subcommand; the function is imported when it is called."""
 
 DESCRIPTION = (
     "Agents that reach around obstacles by placing via-points of minimum-jerk movements. "
@@ -73,13 +61,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
         config = parse(words)
         if isinstance(config, TrainConfig) and config.resume:
             _check_resumed(config, words)
-        next(command for command in COMMANDS.values() if type(config) is command.config)(config)
+        run_command(config)
     except KeyboardInterrupt:
         _leave("stopped", 130)
     except Exception as error:
         if debug:
             raise
         _leave(_one_line(error), getattr(error, "exit_code", 2))
+
+
+def run_command(config: Any) -> None:
+    """Run the subcommand of a configuration."""
+    place = next(place for kind, place in COMMANDS.values() if type(config) is kind)
+    module, function = place.split(":")
+    getattr(importlib.import_module(f"viapoint.training.{module}"), function)(config)
 
 
 def parse(words: Sequence[str], usual: Any = None) -> Any:
@@ -94,7 +89,7 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
         UsageError: A word is not understood or not allowed.
     """
     kinds = []
-    for name, (kind, *_) in COMMANDS.items():
+    for name, (kind, _) in COMMANDS.items():
         default = {"default": usual} if isinstance(usual, kind) else {}
         kinds.append(Annotated[kind, tyro.conf.subcommand(name=name, **default)])
     union: Any = functools.reduce(lambda some, one: Union[some, one], kinds)  # noqa: UP007 - built at run time

@@ -143,15 +143,13 @@ class Config:
 
     def as_json(self) -> dict[str, Any]:
         """Return the configuration as plain values; :meth:`from_json` is the inverse."""
-        values = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
-        return {
-            name: f"{value}"
-            if isinstance(value, Path)
-            else list(value)
-            if isinstance(value, tuple)
-            else value
-            for name, value in values.items()
-        }
+        values: dict[str, Any] = {}
+        for each in dataclasses.fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, Path):
+                value = str(value)
+            values[each.name] = list(value) if isinstance(value, tuple) else value
+        return values
 
     @classmethod
     def from_json(cls, record: Mapping[str, Any]) -> Self:
@@ -564,8 +562,6 @@ class DoctorConfig(Config):
 
     out: Path = Path("runs")
     """Folder for runs, which is checked for write access."""
-    json: bool = False
-    """Print JSON instead of text."""
 
 
 @dataclass(frozen=True, kw_only=True)

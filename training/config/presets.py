@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -26,7 +27,7 @@ class Preset:
     """Decisions between two evaluations on the validation scenes."""
     checkpoint_every: int = 5_000
     """Decisions between two checkpoints."""
-    hyperparameters: tuple[tuple[str, Any], ...]
+    hyperparameters: Mapping[str, Any]
     """Hyperparameters; schedules and noise as :mod:`viapoint.training.agents.model_io` writes them."""
 
     def arguments(self) -> dict[str, Any]:
@@ -37,7 +38,7 @@ class Preset:
 def _preset(n_timesteps: int, policy: str = "MultiInputPolicy", **values: Any) -> Preset:
     """Return a preset from its fields and hyperparameters."""
     fields = {name: values.pop(name) for name in ("eval_every", "checkpoint_every") if name in values}
-    return Preset(policy=policy, n_timesteps=n_timesteps, **fields, hyperparameters=tuple(values.items()))
+    return Preset(policy=policy, n_timesteps=n_timesteps, **fields, hyperparameters=values)
 
 
 _NETWORK: dict[str, Any] = {
@@ -108,7 +109,7 @@ REACH_PRESETS: dict[str, Preset] = {"viaq": dataclasses.replace(PRESETS["viaq"],
 REPLANNING_PRESETS: dict[str, Preset] = {
     "viaq": dataclasses.replace(
         PRESETS["viaq"],
-        hyperparameters=(*PRESETS["viaq"].hyperparameters, ("gradient_steps", 6), ("next_candidates", 4)),
+        hyperparameters={**PRESETS["viaq"].hyperparameters, "gradient_steps": 6, "next_candidates": 4},
     )
 }
 """Presets of replanning tasks."""

@@ -226,9 +226,11 @@ def evaluate(
             check_whole("checks", number, 0)
     if isinstance(agent, str | Path):
         agent = load_agent(agent)
-    env_id, kwargs = environment_of(agent, env, env_kwargs)
+    env_id, kwargs = _environment_of(agent, env, env_kwargs)
     task = registered_task(env_id, **kwargs)
-    check_baselines(baselines, agent, task)
+    for each in baselines:
+        if isinstance(each, str) and not (each == "untrained" and isinstance(agent, BaseAlgorithm)):
+            check_method(each, task)
     chosen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(str(scenes), task, n_scenes)
     methods = [*_rows_of(agent, checks), *_baselines(baselines, agent, checks, env_id, kwargs)]
     return evaluate_methods(
@@ -247,7 +249,7 @@ def evenly_spread(number: int, count: int | None) -> Int:
     return np.linspace(0, number - 1, kept).round().astype(np.int64)
 
 
-def environment_of(
+def _environment_of(
     agent: BaseAlgorithm | Method | None, env: str | None, env_kwargs: Mapping[str, Any] | None
 ) -> tuple[str, dict[str, Any]]:
     """Return id and arguments of the environment whose scenes are evaluated, in which an action is a whole movement.
@@ -264,15 +266,6 @@ def environment_of(
     if env not in (None, mine):
         raise ValueError(f"env must be {mine}, on which the agent was trained, or be left out, got {env!r}")
     return mine, whole_task(mine, kwargs if env_kwargs is None else env_kwargs)
-
-
-def check_baselines(
-    baselines: Sequence[str | Method], agent: BaseAlgorithm | Method | None, task: Task
-) -> None:
-    """Check that the named baselines exist for a task."""
-    for each in baselines:
-        if isinstance(each, str) and not (each == "untrained" and isinstance(agent, BaseAlgorithm)):
-            check_method(each, task)
 
 
 def _rows_of(
@@ -403,36 +396,28 @@ def single_decision_times(
 
     In tasks with replanning, they are all decisions of whole episodes: those in motion take longer than the first ones.
     """
-    began, stopwatch = time.perf_counter(), _Stopwatch(method)
+    seconds: list[float] = []
+
+    def decide(observation: Observation, scenes: Scenes) -> Float:
+        before = time.perf_counter()
+        decided = method.decide(observation, scenes)
+        seconds.append(time.perf_counter() - before)
+        return decided
+
+    began = time.perf_counter()
     replanning = simulation.task.replanning and not hasattr(method, "execute")
     alone = SceneSimulation(simulation.env_id, 1, **simulation.kwargs) if replanning else None
     with closing(alone) if alone else nullcontext():
         for row in range(min(most, len(scenes.start))):
             one = scenes.take(slice(row, row + 1))
-            decided = stopwatch.decide(simulation.observe(one), one)
+            decided = decide(simulation.observe(one), one)
             if alone is not None:
-                alone.play(stopwatch, one, decided)
-            yield from stopwatch.seconds
-            most -= len(stopwatch.seconds)
-            stopwatch.seconds.clear()
+                alone.episodes(one, decided, decide)
+            yield from seconds
+            most -= len(seconds)
+            seconds.clear()
             if most <= 0 or time.perf_counter() - began > budget:
                 break
-
-
-class _Stopwatch:
-    """Method whose decisions are timed."""
-
-    def __init__(self, method: Method) -> None:
-        self.name, self._method = method.name, method
-        self.seconds: list[float] = []
-        """Wall times of the decisions, [s]."""
-
-    def decide(self, observation: Observation, scenes: Any) -> Float:
-        """Return the decision of the method."""
-        before = time.perf_counter()
-        decided = self._method.decide(observation, scenes)
-        self.seconds.append(time.perf_counter() - before)
-        return decided
 
 
 @contextmanager

@@ -52,7 +52,11 @@ class BadFileError(ValueError):
 
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(f"{path}: {reason}")
-        self.path = path
+        self.path, self.reason = path, reason
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what makes the error again, in another process of a study."""
+        return type(self), (self.path, self.reason)
 
 
 def check_ours(path: Path) -> None:

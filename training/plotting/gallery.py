@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,64 +32,52 @@ PLANE_VIEW: View = ((-0.53, 0.45), (-0.14, 0.75))
 """View of the arm in the plane: limits of x and y, [m]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Entry:
-    """Movement of a gallery."""
-
-    task: Task
-    recorded: Recorded
-    """Episode."""
-    title: str
-    """Text beside the outcome, such as the difficulty of the scene."""
-    success: bool
-
-    @property
-    def outcome(self) -> str:
-        """Outcome in one word."""
-        if self.success:
-            return "success"
-        return "collision" if self.recorded.rollout.contact.any() else "missed"
+Episode = tuple[Recorded, bool]
+"""Episode, and whether it succeeded."""
 
 
-def play(env_id: str, scenes: Scenes, titles: Sequence[str], decide: Decide, **kwargs: Any) -> list[Entry]:
+def play(env_id: str, scenes: Scenes, decide: Decide, **kwargs: Any) -> list[Episode]:
     """Simulate an episode in each of N scenes.
 
     Args:
         env_id: Id of an environment.
         scenes: Scenes.
-        titles: Title of each scene.
         decide: Function of observations and scenes that returns actions, shape (N, m).
         **kwargs: Keyword arguments of the environment.
     """
-    envs: Any = gym.make_vec(env_id, num_envs=len(titles), **kwargs)
+    number = len(scenes.start)
+    envs: Any = gym.make_vec(env_id, num_envs=number, **kwargs)
     inner = envs.unwrapped
     observation = inner.begin(scenes)
-    running, success = np.ones(len(titles), bool), np.zeros(len(titles), bool)
+    running, success = np.ones(number, bool), np.zeros(number, bool)
     while running.any():
         decision = inner.execute_actions(decide(observation, scenes), running)
         observation = decision.observation
         success = np.where(running, decision.info["is_success"], success)
         running &= ~(decision.terminated | decision.truncated)
-    entries = []
-    for row, title in enumerate(titles):
+    episodes = []
+    for row in range(number):
         recorded = Recorded(scenes.take([row]), inner.last_plans[row], inner.last_rollout[row])
-        entry = Entry(task=inner.task, recorded=recorded, title=title, success=bool(success[row]))
-        entries.append(entry)
+        episodes.append((recorded, bool(success[row])))
     envs.close()
-    return entries
+    return episodes
 
 
-def gallery(path: Path, entries: Sequence[Entry], *, heading: str = "") -> Path:
-    """Draw movements in a grid, each titled with its outcome, and save the page as a PNG file in an existing folder.
+def gallery(
+    path: Path, task: Task, episodes: Sequence[Episode], titles: Sequence[str], *, heading: str = ""
+) -> Path:
+    """Draw episodes in a grid, each titled with its outcome, and save the page as a PNG file in an existing folder.
 
-    Raises:
-        ValueError: There is no entry.
+    Args:
+        path: PNG file.
+        task: Task of the episodes.
+        episodes: Episodes of :func:`play`, at least one.
+        titles: Text beside the outcome of each, such as the difficulty of the scene.
+        heading: Heading of the page.
     """
-    if not entries:
-        raise ValueError("entries must hold at least one movement")
-    columns = min(COLUMNS, len(entries))
-    rows = -(-len(entries) // columns)
-    plane = entries[0].task.space_name == "hand"
+    columns = min(COLUMNS, len(episodes))
+    rows = -(-len(episodes) // columns)
+    plane = task.space_name == "hand"
     (left, right), (low, high) = PLANE_VIEW if plane else ((0.0, 1.0), (0.0, 1.0))
     tall = TILE * (high - low) / (right - left) + 0.3
     lines = textwrap.wrap(heading, LINE * columns)
@@ -98,14 +85,16 @@ def gallery(path: Path, entries: Sequence[Entry], *, heading: str = "") -> Path:
     figure = Figure(figsize=(TILE * columns, tall * rows + margin), dpi=RESOLUTION)
     figure.set_layout_engine("constrained", w_pad=0.03, h_pad=0.03)
     grid = figure.subplots(rows, columns, squeeze=False)
-    for axes in grid.flat[len(entries) :]:
+    for axes in grid.flat[len(episodes) :]:
         axes.set_axis_off()
-    for axes, entry in zip(grid.flat, entries, strict=False):
-        view = PLANE_VIEW if plane else None
-        draw_movement(axes, entry.task, entry.recorded, view=view, scale=0.7)
-        colour = PALETTE.goal if entry.success else PALETTE.contact
-        axes.set_title(entry.outcome, loc="left", fontsize=8.5, color=colour, fontweight="bold", pad=3)
-        axes.set_title(entry.title, loc="right", fontsize=8, color=PALETTE.joint, pad=3)
+    view = PLANE_VIEW if plane else None
+    for axes, (recorded, success), title in zip(grid.flat, episodes, titles, strict=False):
+        draw_movement(axes, task, recorded, view=view, scale=0.7)
+        failure = "collision" if recorded.rollout.contact.any() else "missed"
+        colour = PALETTE.goal if success else PALETTE.contact
+        outcome = "success" if success else failure
+        axes.set_title(outcome, loc="left", fontsize=8.5, color=colour, fontweight="bold", pad=3)
+        axes.set_title(title, loc="right", fontsize=8, color=PALETTE.joint, pad=3)
     _legend(figure, columns)
     if lines:
         figure.suptitle("\n".join(lines), fontsize=11, color=PALETTE.executed)

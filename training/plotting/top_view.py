@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -36,15 +36,6 @@ CONTACT_TOLERANCE = 0.01
 """Greatest clearance of an obstacle that counts as the one in contact, [m]."""
 CIRCLE = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]
 """Angles of the points of a drawn circle, [rad]."""
-
-
-class Contact(NamedTuple):
-    """First contact of a movement."""
-
-    obstacle: int
-    """Index among the obstacles of the scene; -1 if the arm touched itself."""
-    position: Float
-    """Centre of the nearest sphere of the arm, shape (3,), [m]."""
 
 
 def draw_movement(
@@ -80,14 +71,14 @@ def draw_movement(
     _draw_paths(axes, picture, scale)
     rim = HAND_RADIUS if plane and not task.whole_arm else 0.0
     for number, shape in enumerate(unpack(picture.obstacles, 0)):
-        hit = contact is not None and contact.obstacle == number
+        hit = contact is not None and contact[0] == number
         _draw_obstacle(axes, shape, PALETTE.contact if hit else PALETTE.obstacle, rim)
     if arm_shown:
         _draw_arm(axes, task.arm, picture.joints, 0.38 if rim else 0.75)
         colour = PALETTE.executed if contact is None else PALETTE.contact
         axes.add_patch(Circle(_xy(picture.done[-1]), HAND_RADIUS, color=colour, linewidth=0, zorder=7))
     if contact is not None:
-        _draw_cross(axes, contact.position, scale)
+        _draw_cross(axes, contact[1], scale)
 
 
 def planned_only(scene: Scenes, plan: Plan | None = None) -> Recorded:
@@ -120,15 +111,19 @@ def view_of(task: Task, recorded: Recorded) -> View:
     return (x - half, x + half), (y - half, y + half)
 
 
-def first_contact(arm: Arm, picture: Picture) -> Contact:
-    """Return the obstacle that is nearest to a moving link of the arm in a picture of a contact."""
+def first_contact(arm: Arm, picture: Picture) -> tuple[int, Float]:
+    """Return the obstacle that is nearest to a moving link of the arm in a picture of a contact.
+
+    Returns:
+        Index among the obstacles, -1 if the arm touched itself, and the centre of the nearest sphere of the arm, [m].
+    """
     moving = np.repeat(arm.spheres.link, np.diff(arm.spheres.first)) > 0
     centres = sphere_centres(arm.chain, arm.spheres, picture.joints)[moving]
-    found, least = Contact(-1, picture.done[-1]), CONTACT_TOLERANCE
+    found, least = (-1, picture.done[-1]), CONTACT_TOLERANCE
     for number, shape in enumerate(unpack(picture.obstacles, 0)):
         clearance = shape.distance(centres) - arm.spheres.radius[moving]
         if clearance.min() < least:
-            found, least = Contact(number, centres[clearance.argmin()]), float(clearance.min())
+            found, least = (number, centres[clearance.argmin()]), float(clearance.min())
     return found
 
 

@@ -22,7 +22,8 @@ from viapoint.envs.common.types import Frame
 from viapoint.envs.episodes import Recorded
 from viapoint.envs.rendering.renderer import EpisodeRenderer, GLUnavailableError, frame_steps
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.io.files import MARK, check_ours
+from viapoint.training.config.checks import check_file
+from viapoint.training.io.files import MARK
 from viapoint.training.planning.motion_plan import MotionPlan, executed
 from viapoint.training.plotting.top_view import draw_movement, view_of
 from viapoint.training.rollouts.rollout import Decide
@@ -60,9 +61,7 @@ def record_video(
             mode, or there is no scene.
     """
     path = Path(path).expanduser()
-    check_ours(path)
-    if path.suffix.lower() != ".mp4":
-        raise ValueError(f"path must end in .mp4, got {path}")
+    check_file("path", path, ".mp4")
     if env.render_mode != "rgb_array_list":
         raise ValueError(f"env must be made with render_mode='rgb_array_list', got {env.render_mode!r}")
     if not len(scenes.start):
@@ -89,9 +88,7 @@ def record_plan(path: str | Path, plan: MotionPlan) -> int:
         GLUnavailableError: There is no OpenGL library.
     """
     path = Path(path).expanduser()
-    check_ours(path)
-    if path.suffix.lower() != ".mp4":
-        raise ValueError(f"path must end in .mp4, got {path}")
+    check_file("path", path, ".mp4")
     outcome, episodes = executed([plan])
     info = {name: value[0] for name, value in outcome._asdict().items()}
     film = EpisodeRenderer(episodes, 0, "rgb_array_list", *PLAN_SIZE, PLAN_FPS)

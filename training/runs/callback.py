@@ -6,8 +6,6 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -21,37 +19,16 @@ from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, scenes_for
+from viapoint.training.scene_sets.scene_set import FrozenScenes, scenes_for
 
 LOG_EVERY = 1_000
 """Decisions between two entries of the log."""
 RECENT = 20
 """Steps of all environments over which outcomes are averaged for log and progress bar."""
-TIMED_DECISIONS = 11
-"""Single decisions that are timed at each validation."""
-OUTCOMES = {
-    "rollout/collision_rate": "collision",
-    "rollout/reachable_rate": "reachable",
-    "rollout/min_clearance": "min_clearance",
-    "rollout/jerk_ratio": "jerk_ratio",
-    "rollout/duration": "duration",
-}
-"""Tags of the TensorBoard log besides those of Stable-Baselines3, and the metrics that they average."""
-VALIDATED = {
-    "validation/success_rate": "success",
-    "validation/collision_rate": "collision",
-    "validation/min_clearance": "min_clearance",
-    "validation/goal_error": "goal_error",
-    "validation/jerk_ratio": "jerk_ratio",
-    "validation/duration": "duration",
-    "validation/decision_time": "decision_time",
-}
-"""Tags of validation, and the entries of a learning-curve record that they show; medians in [m] and [s]."""
-BAND_TAGS = {
-    band: f"validation/success_rate_share_{words}"
-    for band, words in zip(BANDS, ("above_20", "5_to_20", "1_to_5", "below_1"), strict=True)
-}
-"""Tags of the success rate in each difficulty band."""
+RATES = ("collision", "reachable")
+"""Metrics of an episode that are true or false; Stable-Baselines3 logs the success itself."""
+VALIDATED = ("success", "collision", "min_clearance", "goal_error", "jerk_ratio", "duration")
+"""Metrics of a validation in the log and in the learning curve; medians in [m] and [s]."""
 
 
 class TrainingStoppedError(Exception):
@@ -80,7 +57,6 @@ class RunCallback(BaseCallback):
         """Learning curve: one record for each evaluation so far."""
         self._best = (-1.0, 0.0)
         self._seconds_before, self._began = 0.0, time.monotonic()
-        self._validating = 0.0
         checkpoint, evaluation = self.config.checkpoint_interval, self.config.evaluation_interval
         self._every = {"log": LOG_EVERY, "checkpoint": checkpoint, "evaluation": evaluation}
         self._next = {**self._every, "evaluation": 0}
@@ -91,13 +67,11 @@ class RunCallback(BaseCallback):
     def state(self) -> dict[str, Any]:
         """Return the state as plain values for :meth:`restore`."""
         best, following = list(self._best), dict(self._next)
-        times = {"seconds": self.seconds, "validating": self._validating}
-        return {"curve": self.curve, "best": best, **times, "next": following}
+        return {"curve": self.curve, "best": best, "seconds": self.seconds, "next": following}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a state that :meth:`state` returned."""
         self.curve, self._seconds_before = list(state["curve"]), float(state["seconds"])
-        self._validating = float(state.get("validating", 0.0))
         self._best = (float(state["best"][0]), float(state["best"][1]))
         self._next = {name: int(state["next"][name]) for name in self._next}
 
@@ -120,24 +94,11 @@ class RunCallback(BaseCallback):
         """Wall time of training, with earlier parts of the run and without validation, [s]."""
         return self._seconds_before + time.monotonic() - self._began
 
-    @property
-    def _title(self) -> str:
-        return f"{self.config.algo} on {self.config.env.rpartition('/')[2]}"
-
-    @contextmanager
-    def _progress_title(self, work: str) -> Iterator[None]:
-        """Show the current work in the progress bar."""
-        self._bar.set_description(work)
-        try:
-            yield
-        finally:
-            self._bar.set_description(self._title)
-
     def __enter__(self) -> RunCallback:
         self._bar = tqdm(
             total=self.config.total_timesteps,
             unit=" decisions",
-            desc=self._title,
+            desc=f"{self.config.algo} on {self.config.env.rpartition('/')[2]}",
             disable=not self.config.progress,
             file=sys.stderr,
             dynamic_ncols=True,
@@ -202,37 +163,31 @@ class RunCallback(BaseCallback):
         return True
 
     def _save_checkpoint(self) -> None:
-        with self._progress_title("saving a checkpoint"):
-            self.run.checkpoint(self.model, self.state())
+        self.run.checkpoint(self.model, self.state())
 
     def _validate(self, frozen: FrozenScenes) -> None:
         """Evaluate the policy, extend the learning curve, and save the model if it is the best so far."""
         if self.curve and self.curve[-1]["decisions"] == self.num_timesteps:
             return
         seconds, began = self.seconds, time.monotonic()
-        with self._progress_title(f"validating in {len(frozen.share)} scenes"):
-            result = evaluate_methods(
-                [agent_method("agent", self.model)],
-                frozen,
-                self.config.env,
-                env_kwargs=whole_task(self.config.env, self.config.env_kwargs),
-                time_decisions=False,
-            ).results[0]
+        result = evaluate_methods(
+            [agent_method("agent", self.model)],
+            frozen,
+            self.config.env,
+            env_kwargs=whole_task(self.config.env, self.config.env_kwargs),
+            time_decisions=False,
+        ).results[0]
         if result.partial:
             return
         record = self._record(result, seconds)
-        record["wall_seconds"] = round(seconds + self._validating + time.monotonic() - began, 3)
         self.curve.append(record)
         self.run.write_curve(self.curve)
-        summary = result.summary()
-        ranking = (summary["success"]["rate"], -(summary["jerk_ratio"] or 0.0))
+        ranking = (record["success"]["rate"], -(record["jerk_ratio"] or 0.0))
         if ranking > self._best:
             self._best = ranking
-            with self._progress_title("saving the best model"):
-                self.run.save("best", self.model)
+            self.run.save("best", self.model)
         self._show_progress()
-        took = time.monotonic() - began
-        self._began, self._validating = self._began + took, self._validating + took
+        self._began += time.monotonic() - began
 
     def _record(self, result: MethodResult, seconds: float) -> dict[str, Any]:
         env, summary = self.training_env, result.summary()
@@ -242,35 +197,19 @@ class RunCallback(BaseCallback):
             "physics_steps": steps,
             "simulated_seconds": round(steps * _timestep(env), 6) if steps else 0.0,
             "seconds": round(seconds, 3),
-            "decision_time": self._decision_time(),
             "success_by_band": summary["success_by_band"],
-            **{name: summary[name] for name in VALIDATED.values() if name != "decision_time"},
+            **{name: summary[name] for name in VALIDATED},
         }
-        for tag, name in VALIDATED.items():
-            self._log_value(tag, record[name])
-        for band, rate in record["success_by_band"].items():
-            self._log_value(BAND_TAGS[band], rate)
+        for name in VALIDATED:
+            if isinstance(record[name], dict):
+                self.logger.record(f"validation/{name}_rate", record[name]["rate"])
+            elif record[name] is not None:  # the median of no values
+                self.logger.record(f"validation/{name}", record[name])
         return record
 
-    def _decision_time(self) -> float:
-        """Return the median wall time of single decisions without the first one, [s]."""
-        observation: Any = self.model._last_obs
-        one = {name: part[:1] for name, part in observation.items()}
-        times = []
-        for _ in range(TIMED_DECISIONS):
-            began = time.perf_counter()
-            self.model.predict(one, deterministic=True)
-            times.append(time.perf_counter() - began)
-        return float(np.median(times[1:]))
-
-    def _log_value(self, tag: str, value: Any) -> None:
-        """Log a number or a rate; None, the median of no values, is skipped."""
-        number = value["rate"] if isinstance(value, dict) else value
-        if number is not None:
-            self.logger.record(tag, number)
-
     def _log(self) -> None:
-        for tag, name in OUTCOMES.items() if self._recent else ():
+        for name in {name for each in self._recent for name in each} - {"is_success"}:
+            tag = f"rollout/{name}_rate" if name in RATES else f"rollout/{name}"
             self.logger.record(tag, self._average(name))
         env = self.training_env
         if isinstance(env, ViaVecEnv) and env.physics_steps:

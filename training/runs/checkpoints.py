@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
@@ -34,8 +35,6 @@ from viapoint.training.io.files import (
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 FORMAT = 2
-READABLE = (1, 2)
-"""Readable formats; the first has no hash of the numbers in `state.json`."""
 COUNTERS = (
     "seed",
     "num_timesteps",
@@ -47,6 +46,8 @@ COUNTERS = (
 """Counters of Stable-Baselines3's algorithms."""
 FILES = ("state.json", "tensors.safetensors")
 """Files of a checkpoint."""
+MAY_DIFFER = ("num_timesteps", "viapoint")
+"""Entries of a model's description that say nothing about which model it is."""
 ARRAYS = ("_last_obs", "_last_episode_starts")
 DEQUES = ("ep_info_buffer", "ep_success_buffer")
 
@@ -101,9 +102,10 @@ def read_checkpoint(model: BaseAlgorithm, folder: Path) -> dict[str, Any]:
     """
     state = _verified_state(folder)
     written_by = f"was written by viapoint {state['model'].get('viapoint')} and"
-    difference = _difference(state["model"], describe(model))
-    if difference:
-        raise BadFileError(folder / "state.json", f"{written_by} is of another model: {difference}")
+    mine = describe(model)
+    others = [name for name in mine if name not in MAY_DIFFER and mine[name] != state["model"].get(name)]
+    if others:
+        raise BadFileError(folder / "state.json", f"{written_by} is of another model: {', '.join(others)}")
     tensors = read_arrays(folder / "tensors.safetensors")
     try:
         _restore(model, state, tensors)
@@ -118,10 +120,9 @@ def _verified_state(folder: Path) -> dict[str, Any]:
     """Return the content of `state.json` after checking the hashes of both files."""
     path, tensors = folder / "state.json", folder / "tensors.safetensors"
     state = read_json(path)
-    if state.get("format") not in READABLE or not isinstance(state.get("model"), dict):
-        known = " or ".join(map(str, READABLE))
-        raise BadFileError(path, f"must have format {known}, got {state.get('format')!r}")
-    if state["format"] != 1 and state.get("digest") != _digest(state):
+    if state.get("format") != FORMAT or not isinstance(state.get("model"), dict):
+        raise BadFileError(path, f"must have format {FORMAT}, got {state.get('format')!r}")
+    if state.get("digest") != _digest(state):
         raise BadFileError(path, "is damaged: it does not have the hash that it states")
     if hashlib.sha256(read_bytes(tensors)).hexdigest() != state.get("sha256"):
         raise BadFileError(tensors, "is torn: its hash is not the one that state.json states")
@@ -157,43 +158,39 @@ def _variables(model: BaseAlgorithm) -> dict[str, Any]:
     return {name: recursive_getattr(model, name).detach() for name in model._get_torch_save_params()[1]}
 
 
+def _buffer_arrays(buffer: BaseBuffer) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a replay buffer by name, those of observations by `name/part`."""
+    arrays = {}
+    for name, value in vars(buffer).items():
+        parts = value if isinstance(value, dict) else {"": value}
+        for part, array in parts.items():
+            if isinstance(array, np.ndarray):
+                arrays[f"{name}/{part}" if part else name] = array
+    return arrays
+
+
 def _buffer_state(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return the filled part of the replay buffer's arrays; a rollout buffer is empty between two collections."""
+    """Return the filled part of the replay buffer; a rollout buffer is empty between two collections."""
     buffer: BaseBuffer | None = getattr(model, "replay_buffer", None)
     if buffer is None:
         return {}
-    size = buffer.size()
-    arrays = {
-        name: {key: array[:size] for key, array in value.items()} if isinstance(value, dict) else value[:size]
-        for name, value in vars(buffer).items()
-        if _is_storage(value)
-    }
-    return {"pos": buffer.pos, "full": buffer.full, "arrays": arrays}
+    filled = {name: array[: buffer.size()] for name, array in _buffer_arrays(buffer).items()}
+    return {"pos": buffer.pos, "full": buffer.full, "arrays": filled}
 
 
 def _restore_buffer(model: BaseAlgorithm, state: dict[str, Any]) -> None:
     buffer: BaseBuffer | None = getattr(model, "replay_buffer", None)
     if buffer is None:
         return
-    for name, kept in vars(buffer).items():
-        if not _is_storage(kept):
-            continue
+    for name, mine in _buffer_arrays(buffer).items():
         saved = state["arrays"][name]
-        pairs = [(kept[key], saved[key]) for key in kept] if isinstance(kept, dict) else [(kept, saved)]
-        for mine, theirs in pairs:
-            if mine.shape[1:] != theirs.shape[1:] or mine.dtype != theirs.dtype or len(theirs) > len(mine):
-                must, got = (f"{array.dtype} {array.shape}" for array in (mine, theirs))
-                raise ValueError(f"{name} of the replay buffer must fit into {must}, is {got}")
-            mine[: len(theirs)] = theirs
+        if mine.shape[1:] != saved.shape[1:] or mine.dtype != saved.dtype or len(saved) > len(mine):
+            must, got = (f"{array.dtype} {array.shape}" for array in (mine, saved))
+            raise ValueError(f"{name} of the replay buffer must fit into {must}, is {got}")
+        mine[: len(saved)] = saved
     if not 0 <= state["pos"] < buffer.buffer_size:
         raise ValueError(f"the replay buffer has {buffer.buffer_size} rows, no row {state['pos']}")
     buffer.pos, buffer.full = int(state["pos"]), bool(state["full"])
-
-
-def _is_storage(value: Any) -> bool:
-    return isinstance(value, np.ndarray) or (
-        isinstance(value, dict) and bool(value) and all(isinstance(v, np.ndarray) for v in value.values())
-    )
 
 
 def _random_state(model: BaseAlgorithm) -> dict[str, Any]:
@@ -247,11 +244,3 @@ def _insert_arrays(value: Any, tensors: Mapping[str, Any]) -> Any:
     if set(value) == {"whole_numbers"}:
         return {int(key): _insert_arrays(each, tensors) for key, each in value["whole_numbers"].items()}
     return {key: _insert_arrays(each, tensors) for key, each in value.items()}
-
-
-def _difference(saved: Any, mine: Any, name: str = "the model") -> str:
-    """Return the first difference between two descriptions in words, or an empty string."""
-    if isinstance(saved, dict) and isinstance(mine, dict):
-        names = [each for each in sorted({*saved, *mine}) if each not in ("num_timesteps", "viapoint")]
-        return next(filter(None, (_difference(saved.get(each), mine.get(each), each) for each in names)), "")
-    return "" if saved == mine else f"{name} was {saved!r}, is {mine!r}"

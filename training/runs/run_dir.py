@@ -45,9 +45,13 @@ from viapoint.training.runs.checkpoints import (
 )
 
 KEPT_CHECKPOINTS = 2
+PATIENCE = 10.0
+"""Time to wait for a folder in use, [s]: workers of a study that was killed end within seconds."""
 
-MAY_CHANGE = {"n_timesteps", "out", "resume", "progress"}
+MAY_CHANGE = ("n_timesteps", "out", "resume", "progress")
 """Fields that may differ when a run is resumed."""
+UNSET = object()
+"""Value of a setting that is not there."""
 
 
 class Run:
@@ -90,10 +94,11 @@ class Run:
 
     def __repr__(self) -> str:
         config, curve = self.config, self.curve
+        stalled = " until it stalled" if self.stopped == "stalled" else ""
         rate = f", success {100.0 * curve[-1]['success']['rate']:.1f} % on validation scenes" if curve else ""
         return (
             f"Run({str(self.folder)!r}: {config.algo} on {config.env}, seed {config.seed}, "
-            f"{self.decisions} of {config.total_timesteps} decisions{rate})"
+            f"{self.decisions} of {config.total_timesteps} decisions{stalled}{rate})"
         )
 
     @classmethod
@@ -234,7 +239,7 @@ def _lock(folder: Path) -> Iterator[None]:
     """Lock a folder for this process; see :meth:`Run.locked`."""
     lock, owner = FileLock(folder / "lock"), folder / "lock.pid"
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=PATIENCE)
     except Timeout:
         pid = owner.read_text() if owner.exists() else "unknown"
         raise BadFileError(folder, f"is in use by the process with number {pid}") from None
@@ -268,26 +273,36 @@ def write_config(folder: Path, config: TrainConfig) -> None:
     write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False})
 
 
-def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig) -> None:
-    """Check that a run is resumed with its own settings; `usual` has defaults for all that the call does not name."""
-    begun, asked, default = (each.as_json() for each in (run.config, config, usual))
-    others = []
-    for name in asked.keys() - MAY_CHANGE:
-        values = asked[name] if isinstance(asked[name], dict) else {name: asked[name]}
-        known = begun[name] if isinstance(asked[name], dict) else begun
-        if asked[name] != default[name]:
-            others += [(name, each) for each in values if each not in known or known[each] != values[each]]
+def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = None) -> None:
+    """Check that a run goes on with its own settings.
+
+    Args:
+        run: Run.
+        config: Settings that are asked for.
+        usual: Settings of a call that names none; where it is given, equal settings of the call are left to the run.
+
+    Raises:
+        BadFileError: Settings differ; the message names them.
+    """
+    begun, asked = _settings(run.config), _settings(config)
+    names = asked.keys() | begun.keys()
+    if usual is not None:
+        default = _settings(usual)
+        names = {name for name, value in asked.items() if value != default.get(name, UNSET)}
+    others = sorted(name for name in names if asked.get(name, UNSET) != begun.get(name, UNSET))
     if others:
-        had = ", ".join(_in_words(begun, *each) for each in sorted(others))
-        wanted = ", ".join(_in_words(asked, *each) for each in sorted(others))
+        had = ", ".join(f"{name} {begun.get(name, 'as usual')}" for name in others)
         raise BadFileError(
             run.folder,
-            f"holds a run with {had}, not with {wanted}; --resume goes on with what it began with: "
-            "leave these flags out, or name another folder",
+            f"holds a run with {had}; --resume goes on with what it began with: leave these flags out, or name "
+            "another folder for other settings",
         )
 
 
-def _in_words(record: dict[str, Any], field: str, name: str) -> str:
-    """Return a setting in words: a field, or one name in a field with several."""
-    values = record if field == name else record[field]
-    return f"{name} {json.dumps(values[name])}" if name in values else f"the usual {name}"
+def _settings(config: TrainConfig) -> dict[str, Any]:
+    """Return the settings that may not change, those in fields with several by their own names."""
+    values = json.loads(json.dumps(config.as_json()))
+    for name in MAY_CHANGE:
+        del values[name]
+    env_kwargs, hyperparameters = values.pop("env_kwargs"), values.pop("hyperparameters")
+    return {**values, **env_kwargs, **hyperparameters}

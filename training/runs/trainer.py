@@ -18,7 +18,7 @@ from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import BadFileError, versions
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.callback import RunCallback, TrainingStalledError
-from viapoint.training.runs.run_dir import MAY_CHANGE, Run, check_free, check_unchanged, write_config
+from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, write_config
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
 
@@ -95,12 +95,7 @@ def train_or_resume(config: TrainConfig, callback: Callbacks = None) -> Run:
     if not (config.folder / "config.json").is_file():
         return train(config, callback)
     run = Run(config.folder)
-    wanted, found = (json.loads(json.dumps(each.as_json())) for each in (resolved(config), run.config))
-    pace = {*MAY_CHANGE, "eval_every", "checkpoint_every"}
-    others = [name for name in wanted if name not in pace and wanted[name] != found[name]]
-    if others:
-        names = ", ".join(others)
-        raise BadFileError(config.folder, f"was trained with other settings ({names}); name another folder")
+    check_unchanged(run, resolved(config))
     if run.stopped is not None and run.config.total_timesteps == config.total_timesteps:
         return run
     again = TrainConfig(

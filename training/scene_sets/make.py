@@ -14,7 +14,6 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 
 import numpy as np
 import tyro
@@ -38,10 +37,10 @@ from viapoint.training.scene_sets.scene_set import (
     DRAWN,
     SETS,
     FrozenScenes,
-    bands,
     load,
     rounded,
     shipped_path,
+    together,
 )
 
 SEEDS = {"validation": 11, "test": 12, "hard": 13, "uniform": 14}
@@ -60,33 +59,12 @@ HARD_SHARE = 0.01
 """Solution share below which scenes are hard."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class MakeConfig:
-    """Make the frozen sets of scenes."""
-
-    env: tuple[str, ...] = field(default_factory=lambda: _ids())
-    """Ids of environments."""
-    sets: tuple[str, ...] = SETS
-    """Names of sets."""
-    check: bool = False
-    """Make the sets that ship again, and compare their hashes."""
-
-
 def _ids() -> tuple[str, ...]:
     """Return the ids of environments whose scenes differ; a set fits every task with the same scenes."""
     first: dict[str, str] = {}
     for env_id in dict.fromkeys(twin_of(each) for each in ENV_IDS):
         first.setdefault(str(TASKS[env_id]), env_id)
     return tuple(first.values())
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """Drawn scenes with their solution shares."""
-
-    scenes: Scenes
-    share: Float
-    family: str
 
 
 class Maker:
@@ -111,40 +89,33 @@ class Maker:
             kept = self._first(name, number)
         else:
             kept = self._by_band(name, number)
-        family = np.concatenate([np.full(len(each.share), each.family) for each in kept])
-        return FrozenScenes(
-            name=name,
-            task=self.task.as_dict(),
-            scenes=Scenes.together([each.scenes for each in kept]),
-            share=np.concatenate([each.share for each in kept]),
-            family=family,
-        )
+        return together(kept)
 
-    def _first(self, name: str, number: int) -> list[Candidates]:
+    def _first(self, name: str, number: int) -> list[FrozenScenes]:
         """Return the first scenes that are solved."""
         kept, found = [], 0
         for drawn in self._drawn(name, self.task, DRAWN, number):
-            some = _take(drawn, self._solved(drawn))
-            kept.append(_take(some, np.arange(len(some.share)) < number - found))
+            solved = np.flatnonzero(self._solved(drawn))
+            kept.append(drawn.take(solved[: number - found]))
             found += len(kept[-1].share)
             if found == number:
                 break
         return kept
 
-    def _by_band(self, name: str, number: int) -> list[Candidates]:
+    def _by_band(self, name: str, number: int) -> list[FrozenScenes]:
         """Return as many solved scenes from each band of the solution share, as far as there are."""
         wanted = np.full(len(BANDS), number // len(BANDS))
         kept, spare = [], []
         for drawn in self._drawn(name, self.task, DRAWN, number):
             rank = np.zeros(len(drawn.share), np.int64)
-            band = bands(drawn.share)
+            band = drawn.band
             solved = self._solved(drawn, wanted[band] > 0)
             for each in range(len(BANDS)):
                 rows = np.flatnonzero(solved & (band == each))
                 rank[rows] = np.arange(len(rows))
             fits = solved & (rank < wanted[band])
-            kept.append(_take(drawn, fits))
-            spare.append(_take(drawn, solved & ~fits))
+            kept.append(drawn.take(fits))
+            spare.append(drawn.take(solved & ~fits))
             wanted -= np.bincount(band[fits], minlength=len(BANDS))
             if not wanted.any():
                 break
@@ -154,7 +125,7 @@ class Maker:
             kept.append(_hardest(spare, missing))
         return kept
 
-    def _hard(self, number: int) -> list[Candidates]:
+    def _hard(self, number: int) -> list[FrozenScenes]:
         """Return solved scenes with the least shares, as many of each family."""
         plane = is_planar(self.task.arm)
         families = [
@@ -166,22 +137,23 @@ class Maker:
         for place, name in enumerate(families):
             share = number * (place + 1) // len(families) - number * place // len(families)
             task = dataclasses.replace(self.task, families=(name,))
-            found: list[Candidates] = []
+            found: list[FrozenScenes] = []
             for drawn in self._drawn("hard", task, name, share):
-                found.append(_take(drawn, self._solved(drawn, drawn.share < 0.05)))
+                found.append(drawn.take(self._solved(drawn, drawn.share < 0.05)))
                 if sum((each.share < HARD_SHARE).sum() for each in found) >= share:
                     break
             kept.append(_hardest(found, share))
         return kept
 
-    def _drawn(self, name: str, task: Task, family: str, number: int) -> Iterator[Candidates]:
+    def _drawn(self, name: str, task: Task, family: str, number: int) -> Iterator[FrozenScenes]:
         """Yield drawn scenes, whose numbers are rounded to what a file holds."""
         sampler = task.sampler()
         for first in range(0, MOST_DRAWN * number, TOGETHER):
             seeds = [(SEEDS[name], *family.encode(), first + each) for each in range(TOGETHER)]
             scenes = rounded(sampler([np.random.default_rng(seed) for seed in seeds]))
             scenes = scenes.take([row for row in range(TOGETHER) if self._is_possible(scenes.take([row]))])
-            yield Candidates(scenes, self._share(scenes), family)
+            share = self._share(scenes)
+            yield FrozenScenes(name=name, task=self.task.as_dict(), scenes=scenes, share=share, family=family)
 
     def _is_possible(self, scene: Scenes) -> bool:
         """Return True for one scene that rounding left possible."""
@@ -202,7 +174,7 @@ class Maker:
         clearance = plan_clearances(self.task, problem, every, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
         return np.asarray((clearance >= CLEARANCE_MARGIN).mean(axis=-1))
 
-    def _solved(self, drawn: Candidates, wanted: Bool | None = None) -> Bool:
+    def _solved(self, drawn: FrozenScenes, wanted: Bool | None = None) -> Bool:
         """Return True for scenes, of those that are wanted, in which a movement of the search succeeds."""
         solved = np.zeros(len(drawn.share), bool)
         rows = np.arange(len(solved)) if wanted is None else np.flatnonzero(wanted)
@@ -213,33 +185,31 @@ class Maker:
         return solved
 
 
-def _take(candidates: Candidates, rows: Bool) -> Candidates:
-    """Return some of the candidates."""
-    return dataclasses.replace(candidates, scenes=candidates.scenes.take(rows), share=candidates.share[rows])
+def _hardest(found: list[FrozenScenes], number: int) -> FrozenScenes:
+    """Return the scenes with the least shares."""
+    scenes = together(found)
+    return scenes.take(np.sort(np.argsort(scenes.share, kind="stable")[:number]))
 
 
-def _hardest(found: list[Candidates], number: int) -> Candidates:
-    """Return the candidates with the least shares."""
-    scenes = Scenes.together([each.scenes for each in found])
-    share = np.concatenate([each.share for each in found])
-    rows = np.sort(np.argsort(share, kind="stable")[:number])
-    return Candidates(scenes.take(rows), share[rows], found[0].family)
+def make_sets(env: tuple[str, ...] = (), sets: tuple[str, ...] = SETS, check: bool = False) -> None:
+    """Make the frozen sets of scenes, and print what was made.
 
-
-def main() -> None:
-    """Make or check the sets, and print what was made."""
-    config = tyro.cli(MakeConfig)
+    Args:
+        env: Ids of environments; all if none is given.
+        sets: Names of sets.
+        check: Make the sets that ship again, and compare their hashes; the exit code is 1 if one differs.
+    """
     different = 0
-    for env_id in config.env:
+    for env_id in env or _ids():
         maker = Maker(env_id)
-        for name in [each for each in config.sets if each in maker.numbers()]:
+        for name in [each for each in sets if each in maker.numbers()]:
             path = shipped_path(name, env_id)
-            if path.is_file() and not config.check:
+            if path.is_file() and not check:
                 continue
             made = maker.make(name)
             counts = np.bincount(made.band, minlength=len(BANDS))
             told = ", ".join(f"{band}: {count}" for band, count in zip(BANDS, counts, strict=True))
-            if config.check:
+            if check:
                 same = path.is_file() and load(path).sha256 == made.sha256
                 different += not same
                 print(f"{path.name}: {'as it ships' if same else 'DIFFERENT'} ({told})", flush=True)
@@ -251,4 +221,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(make_sets)

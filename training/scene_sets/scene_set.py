@@ -7,7 +7,7 @@ import hashlib
 import json
 import sys
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import KINDS, MESH, no_obstacles
-from viapoint.envs.scenes.scene import MOST_JUMPS, NEVER, Scenes
+from viapoint.envs.scenes.scene import Scenes, resting
 from viapoint.envs.task import Task
 
 SETS = ("validation", "test", "hard", "uniform")
@@ -34,10 +34,11 @@ NUMBERS = {"validation": 500, "test": 1_000}
 """Number of scenes of such a set."""
 LARGEST = 1 << 30
 """Limit of the memory of a file's arrays, [bytes]: a small archive can claim any size."""
-CONTENT = (
-    "start", "goal", "kind", "centre", "rotation", "size", "velocity", "jumps", "turn_time", "turn_velocity",
-    "share", "family",
-)  # fmt: skip
+OWN = ("start", "goal", "jumps", "turn_time", "turn_velocity")
+"""Arrays of :class:`Scenes` in a file."""
+MOVING = ("centre", "rotation", "size", "velocity")
+"""Arrays of :class:`Obstacles` in a file, besides their kind."""
+CONTENT = ("start", "goal", "kind", *MOVING, "jumps", "turn_time", "turn_velocity", "share", "family")
 """Arrays of a file, with one entry for each scene."""
 SCENE_FIELDS = ("arm", "n_obstacles", "whole_arm", "moving_obstacles", "n_jumps")
 """Fields of a task that say which scenes are scenes of it, besides kinds and families of obstacles."""
@@ -110,18 +111,26 @@ class FrozenScenes:
         )
 
 
+def together(parts: Sequence[FrozenScenes]) -> FrozenScenes:
+    """Return the scenes of several sets of one task under the name of the first."""
+    return dataclasses.replace(
+        parts[0],
+        scenes=Scenes.together([part.scenes for part in parts]),
+        share=np.concatenate([part.share for part in parts]),
+        family=np.concatenate([part.family for part in parts]),
+    )
+
+
 def rounded(scenes: Scenes) -> Scenes:
     """Return scenes whose numbers single precision represents."""
     obstacles = scenes.obstacles
-    single = {
-        name: getattr(obstacles, name).astype(np.float32).astype(np.float64)
-        for name in ("centre", "rotation", "size", "velocity")
-    }
-    others = {
-        name: getattr(scenes, name).astype(np.float32).astype(np.float64)
-        for name in ("start", "goal", "jumps", "turn_time", "turn_velocity")
-    }
-    return scenes._replace(obstacles=obstacles._replace(**single), **others)
+    obstacles = obstacles._replace(**_single(obstacles, MOVING))
+    return scenes._replace(obstacles=obstacles, **_single(scenes, OWN))
+
+
+def _single(record: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Return fields of a record in numbers that single precision represents."""
+    return {name: getattr(record, name).astype(np.float32).astype(np.float64) for name in names}
 
 
 def shipped_path(name: str, env_id: str) -> Path:
@@ -160,14 +169,9 @@ def load(path: Path, name: str = "") -> FrozenScenes:
     if not path.is_file():
         raise ValueError(f"there is no file of scenes {path}")
     content = _read(path)
-    obstacles = no_obstacles(*content["kind"].shape)._replace(
-        kind=content["kind"],
-        centre=content["centre"],
-        rotation=content["rotation"],
-        size=content["size"],
-        velocity=content["velocity"],
-    )
-    own = {part: content[part] for part in ("start", "goal", "jumps", "turn_time", "turn_velocity")}
+    packed: dict[str, Any] = {part: content[part] for part in ("kind", *MOVING)}
+    obstacles = no_obstacles(*content["kind"].shape)._replace(**packed)
+    own = {part: content[part] for part in OWN}
     frozen = FrozenScenes(
         name=name or str(path),
         task=json.loads(str(content["task"])),
@@ -221,22 +225,15 @@ def _check_content(content: Mapping[str, NDArray[Any]]) -> None:
         raise ValueError("it holds no scenes")
     number, joints = content["start"].shape
     rows = content["kind"].shape[1]
-    wanted: dict[str, tuple[int, ...]] = {
-        "start": (number, joints),
-        "goal": (number, joints),
-        "kind": (number, rows),
-        "centre": (number, rows, 3),
-        "rotation": (number, rows, 3, 3),
-        "size": (number, rows, 3),
-        "velocity": (number, rows, 3),
-        "jumps": (number, MOST_JUMPS, joints + 1),
-        "turn_time": (number, rows),
-        "turn_velocity": (number, rows, 3),
-        "share": (number,),
-        "family": (number,),
+    like = resting(content["start"], np.empty((number, joints)), no_obstacles(number, rows))
+    arrays = {
+        **like._asdict(),
+        **like.obstacles._asdict(),
+        "share": np.empty(number),
+        "family": np.empty(number),
     }
-    for name, shape in wanted.items():
-        numbers = content[name].dtype.kind in "fi"
+    for name in CONTENT:
+        shape, numbers = arrays[name].shape, content[name].dtype.kind in "fi"
         if content[name].shape != shape or numbers is (name == "family"):
             raise ValueError(
                 f"{name} of {number} scenes is {content[name].dtype} of shape {content[name].shape}"
@@ -286,17 +283,11 @@ def scenes_for(name_or_path: str | Path, task: Task, number: int | None = None) 
 
 def _padded(scenes: Scenes, rows: int) -> Scenes:
     """Return scenes with room for a number of obstacles."""
-    number, present = scenes.obstacles.kind.shape
-    if present == rows:
-        return scenes
-    larger = no_obstacles(number, rows)
-    for name in ("kind", "centre", "rotation", "size", "velocity"):
-        getattr(larger, name)[:, :present] = getattr(scenes.obstacles, name)
-    turn_time = np.full((number, rows), NEVER)
-    turn_time[:, :present] = scenes.turn_time
-    turn_velocity = np.zeros((number, rows, 3))
-    turn_velocity[:, :present] = scenes.turn_velocity
-    return scenes._replace(obstacles=larger, turn_time=turn_time, turn_velocity=turn_velocity)
+    present = scenes.obstacles.kind.shape[1]
+    padded = resting(scenes.start, scenes.goal, scenes.obstacles.with_rows(rows))
+    padded.turn_time[:, :present] = scenes.turn_time
+    padded.turn_velocity[:, :present] = scenes.turn_velocity
+    return padded._replace(jumps=scenes.jumps)
 
 
 def _check_fit(frozen: FrozenScenes, task: Task) -> None:

@@ -25,7 +25,7 @@ from viapoint.training.config.presets import preset_of
 from viapoint.training.io.files import read_json, read_yaml
 from viapoint.training.planning.baselines import check_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.scene_sets.scene_set import SETS, shipped_set
+from viapoint.training.scene_sets.scene_set import SEEDS, SETS, shipped_set
 
 Values = Mapping[str, Any]
 Made = TypeVar("Made")
@@ -35,15 +35,17 @@ TRAINING_FIELDS = tuple(
     if each.name not in ("env", "seed", "out", "resume", "progress")
 )
 """Fields of a training that an agent may set."""
+MEASURED = ("test", "hard", "uniform")
+"""Sets that are measured by default; models are selected on `validation`."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Environment:
-    """Environment of a study with its scenes."""
+class Trial:
+    """One row of the results for one seed: what a worker trains and measures."""
 
-    name: str
-    """Name in folders and tables."""
-    id: str
+    environment: str
+    """Name of the environment in folders and tables."""
+    env_id: str
     """Id of the registered environment."""
     env_kwargs: Values = field(default_factory=dict)
     """Arguments of the environment."""
@@ -51,13 +53,6 @@ class Environment:
     """Names of the measured sets, or files of scenes."""
     n_scenes: int | None = None
     """Number of scenes of each set, from the first on; None for all."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Trial:
-    """One row of the results for one seed: what a worker trains and measures."""
-
-    env: Environment
     row: str
     """Name of the row, which is also that of its folder."""
     seed: int = 0
@@ -74,19 +69,19 @@ class Trial:
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the trial."""
-        return out / self.env.name.rpartition("/")[2] / self.row / f"seed-{self.seed}"
+        return out / self.environment.rpartition("/")[2] / self.row / f"seed-{self.seed}"
 
     def config(self, out: Path) -> TrainConfig:
         """Return the configuration of the training; `policy_kwargs` are merged with those of the preset."""
         given = dict(self.training)
-        given["env_kwargs"] = {**self.env.env_kwargs, **given.get("env_kwargs", {})}
+        given["env_kwargs"] = {**self.env_kwargs, **given.get("env_kwargs", {})}
         hyperparameters = dict(given.pop("hyperparameters", {}))
         if "policy_kwargs" in hyperparameters:
-            task = registered_task(self.env.id, **given["env_kwargs"])
+            task = registered_task(self.env_id, **given["env_kwargs"])
             usual = preset_of(task, given.get("algo", "viaq")).arguments().get("policy_kwargs", {})
             hyperparameters["policy_kwargs"] = {**usual, **hyperparameters["policy_kwargs"]}
         return TrainConfig(
-            env=self.env.id,
+            env=self.env_id,
             seed=self.seed,
             out=self.folder(out),
             progress=False,
@@ -99,9 +94,8 @@ class Trial:
 class Search:
     """Search for hyperparameters of one algorithm in one environment."""
 
-    name: str
     trial: Trial
-    """Training that all trials of the search share."""
+    """Training that all trials of the search share, with the name of the search."""
     parameters: Values
     """Range or list of values by the path of a field, such as `hyperparameters.learning_rate`."""
     trials: int = 20
@@ -111,15 +105,13 @@ class Search:
 
     def with_parameters(self, values: Values) -> Trial:
         """Return the trial with these parameters, under a name that equal parameters share."""
-        training: Values = self.trial.training
-        for path, value in values.items():
-            training = _with(training, path.split("."), value)
-        return dataclasses.replace(self.trial, training=training, row=f"{self.name}/{_hash(training)}")
+        training = _with(self.trial.training, values)
+        return dataclasses.replace(self.trial, training=training, row=f"{self.trial.row}/{_hash(training)}")
 
     @property
     def key(self) -> str:
         """Name that changes with the description of the search."""
-        return f"{self.name}-{_hash(dataclasses.asdict(self))}"
+        return f"{self.trial.row}-{_hash(dataclasses.asdict(self))}"
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the search."""
@@ -191,12 +183,10 @@ def _made(where: str, make: Callable[..., Made], fields: Any, *args: Any) -> Mad
     """
     if not isinstance(fields, Mapping):
         raise ValueError(f"{where} must be values by name, got {fields!r}")
-    allowed = {
-        name: each
-        for name, each in inspect.signature(make).parameters.items()
-        if each.kind == each.KEYWORD_ONLY
-    }
-    known = [*allowed, *(TRAINING_FIELDS if make in (_agent, _search) else ())]
+    parameters = inspect.signature(make).parameters
+    known = [name for name, each in parameters.items() if each.kind == each.KEYWORD_ONLY]
+    if "training" in parameters:
+        known += TRAINING_FIELDS
     for name in fields:
         if name not in known:
             raise ValueError(unknown_name(f"{where}: fields", name, known))
@@ -221,14 +211,14 @@ def _study(
     n_scenes: int | None = None,
 ) -> Study:
     """Return a study; the fields are those of the file."""
-    known = {}
-    for name, fields in _points(environments):
+    known: dict[str, Values] = {}
+    for name, fields in _entries(environments):
         fields = {"scenes": scenes, "n_scenes": n_scenes, **fields}
         known[name] = _made(f"environments.{name}", _environment, fields, name, folder)
     found: list[Trial | Search] = []
     rows: set[str] = set()
     for make, given in ((_agent, agents), (_baseline, baselines), (_search, searches)):
-        for name, fields in _points(given or {}):
+        for name, fields in _entries(given or {}):
             if name in rows:
                 raise ValueError(f"rows must have different names, {name} is there twice")
             rows.add(name)
@@ -236,43 +226,45 @@ def _study(
                 if env not in known:
                     raise ValueError(unknown_name(f"{name}: environments", env, known))
                 shared = {} if make is _baseline else {"seeds": seeds or [0]}
-                found += _made(f"{name}", make, {**shared, **fields}, known[env], name)
+                found += _made(name, make, {**shared, **fields}, known[env], name)
     if not found:
         raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
-    trials = sorted((each for each in found if isinstance(each, Trial)), key=lambda each: each.seed)
-    every = tuple(each for each in found if isinstance(each, Search))
+    trials = [each for each in found if isinstance(each, Trial)]
     return Study(
-        name=default, out=Path(out or f"runs/{default}").expanduser(), trials=tuple(trials), searches=every
+        name=default,
+        out=Path(out or f"runs/{default}").expanduser(),
+        trials=tuple(sorted(trials, key=lambda trial: trial.seed)),
+        searches=tuple(each for each in found if isinstance(each, Search)),
     )
 
 
-def _points(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+def _entries(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield name and fields of each entry of a list or mapping, one for each point of its grid."""
     if not isinstance(given, list | Mapping):
-        raise ValueError(
-            f"environments, agents and so on must be a list of names or values by name, got {given!r}"
-        )
+        raise ValueError(f"there must be a list of names, or values by name, got {given!r}")
     entries = dict.fromkeys(given) if isinstance(given, list) else given
-    for pattern, fields in entries.items():
-        if not str(pattern).strip("/. ") or ".." in str(pattern) or str(pattern).startswith("/"):
-            raise ValueError(f"names must be words, got {pattern!r}")
+    for name, fields in entries.items():
+        if not str(name).strip("/. ") or ".." in str(name) or str(name).startswith("/"):
+            raise ValueError(f"names must be words, got {name!r}")
         if not isinstance(fields, Mapping | None):
-            raise ValueError(f"{pattern} must be values by name, got {fields!r}")
-        grid = (fields or {}).get("grid", {})
+            raise ValueError(f"{name} must be values by name, got {fields!r}")
+        rest = dict(fields or {})
+        grid = rest.pop("grid", {})
         if not isinstance(grid, Mapping) or not all(isinstance(values, list) for values in grid.values()):
-            raise ValueError(f"grid of {pattern} must be lists by the path of a field, got {grid!r}")
+            raise ValueError(f"grid of {name} must be lists by the path of a field, got {grid!r}")
         for values in itertools.product(*grid.values()):
-            point, name = {key: value for key, value in (fields or {}).items() if key != "grid"}, str(pattern)
-            for path, value in zip(grid, values, strict=True):
-                point = _with(point, path.split("."), value)
-                name = f"{name}-{path.rpartition('.')[2]}={value}"
-            yield name, point
+            point = dict(zip(grid, values, strict=True))
+            ends = [f"-{path.rpartition('.')[2]}={value}" for path, value in point.items()]
+            yield f"{name}{''.join(ends)}", _with(rest, point)
 
 
-def _with(fields: Values, path: list[str], value: Any) -> dict[str, Any]:
-    """Return fields in which the one at a path has another value."""
-    first, *rest = path
-    return {**fields, first: _with(fields.get(first) or {}, rest, value) if rest else value}
+def _with(fields: Values, changes: Values) -> dict[str, Any]:
+    """Return fields with other values by paths such as `hyperparameters.learning_rate`."""
+    changed = dict(fields)
+    for path, value in changes.items():
+        first, _, rest = path.partition(".")
+        changed[first] = _with(changed.get(first) or {}, {rest: value}) if rest else value
+    return changed
 
 
 def _environment(
@@ -283,34 +275,36 @@ def _environment(
     env_kwargs: dict[str, Any] | None = None,
     scenes: list[str] | None = None,
     n_scenes: int | None = None,
-) -> Environment:
-    """Return an environment with its sets of scenes: by default those that are shipped for it."""
+) -> Values:
+    """Return the fields of trials in an environment; its sets of scenes are by default those shipped for it."""
     env_id = id or name
     kwargs = env_kwargs or {}
     check_env_kwargs(kwargs)
     task = registered_task(env_id, **kwargs)
     if n_scenes is not None:
         check_whole("n_scenes", n_scenes, 1)
-    # Models are selected on `validation`, so it is measured only where it is asked for.
     places = []
-    for each in [name for name in SETS if name != "validation"] if scenes is None else scenes:
+    for each in MEASURED if scenes is None else scenes:
         if each in SETS:
-            drawn = each in ("test", "validation")  # the other sets exist only where they are shipped
-            places += [each] if drawn or shipped_set(each, task) is not None else []
+            if each in SEEDS or shipped_set(each, task) is not None:  # the others cannot be drawn
+                places.append(each)
         elif (folder / each).is_file():
             places.append(str((folder / each).absolute()))
         else:
             raise ValueError(f"{unknown_name('scenes', each, SETS)}; or the path of a file of scenes")
     if not places:
-        there = [each for each in SETS if shipped_set(each, task) is not None]
-        raise ValueError(
-            f"no set among {', '.join(scenes or SETS)} is shipped for {env_id}; there are {', '.join(there)}"
-        )
-    return Environment(name=name, id=env_id, env_kwargs=kwargs, scenes=tuple(places), n_scenes=n_scenes)
+        raise ValueError(f"none of {', '.join(scenes or ())} is shipped for {env_id}")
+    return {
+        "environment": name,
+        "env_id": env_id,
+        "env_kwargs": kwargs,
+        "scenes": tuple(places),
+        "n_scenes": n_scenes,
+    }
 
 
 def _agent(
-    env: Environment,
+    env: Values,
     row: str,
     *,
     seeds: list[int],
@@ -325,29 +319,23 @@ def _agent(
         raise ValueError(f"checks are those of viaq; {training['algo']} has no proposals to check")
     if not seeds or len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must hold at least one number and none twice, got {seeds}")
-    shared = Trial(
-        env=env,
-        row=row,
-        training=training,
-        checks=numbers,
-        untrained=untrained,
-        resources={"cpu": 1, **(resources or {})},
-    )
-    trials = [dataclasses.replace(shared, seed=seed) for seed in seeds]
+    own: dict[str, Any] = {"training": training, "checks": numbers, "untrained": untrained}
+    own["resources"] = {"cpu": 1, **(resources or {})}
+    trials = [Trial(**env, row=row, seed=seed, **own) for seed in seeds]
     for trial in trials:
         config = trial.config(Path())
         check_hyperparameters(config.algo, config.hyperparameters)
     return trials
 
 
-def _baseline(env: Environment, row: str, *, method: str = "") -> list[Trial]:
+def _baseline(env: Values, row: str, *, method: str = "") -> list[Trial]:
     """Return the trial of a baseline that exists in its environment."""
-    check_method(method or row, registered_task(env.id, **env.env_kwargs))
-    return [Trial(env=env, row=row, method=method or row)]
+    check_method(method or row, registered_task(env["env_id"], **env["env_kwargs"]))
+    return [Trial(**env, row=row, method=method or row)]
 
 
 def _search(
-    env: Environment,
+    env: Values,
     row: str,
     *,
     seeds: list[int],
@@ -357,25 +345,19 @@ def _search(
     **training: Any,
 ) -> list[Search]:
     """Return a search whose values, or whose lowest and highest ones, are allowed."""
-    search = Search(
-        name=row,
-        trial=_agent(env, row, seeds=seeds[:1], **training)[0],
-        parameters=parameters,
-        trials=check_whole("trials", trials, 1),
-        first=tuple(first or ()),
-    )
+    (trial,) = _agent(env, row, seeds=seeds[:1], **training)
     if not parameters:
         raise ValueError("parameters must hold at least one list or range")
-    if not search.trial.config(Path()).evaluation_interval:
+    if not trial.config(Path()).evaluation_interval:
         raise ValueError("eval_every must be 1 or more in a search, which compares success in validation")
-    for path in [path for each in search.first for path in each if path not in parameters]:
-        raise ValueError(unknown_name("first", path, parameters))
+    for path in {path for values in first or [] for path in values}:
+        if path not in parameters:
+            raise ValueError(unknown_name("first", path, parameters))
     for path, given in parameters.items():
-        if path.partition(".")[0] not in TRAINING_FIELDS:
-            raise ValueError(unknown_name("parameters", path.partition(".")[0], TRAINING_FIELDS))
         for value in _ends(path, given):  # an impossible value is an error now, and not in the last trial
-            _agent(env, row, seeds=seeds[:1], **search.with_parameters({path: value}).training)
-    return [search]
+            _made("parameters", _agent, {"seeds": [0], **_with(training, {path: value})}, env, row)
+    number = check_whole("trials", trials, 1)
+    return [Search(trial=trial, parameters=parameters, trials=number, first=tuple(first or ()))]
 
 
 def _ends(path: str, given: Any) -> list[Any]:

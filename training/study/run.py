@@ -1,4 +1,4 @@
-"""Command `study`: run trials with Ray Tune, search hyperparameters with Optuna, and write tables."""
+"""Command `study`: run trials with Ray, search hyperparameters with Optuna, and write tables."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from stable_baselines3.common.callbacks import BaseCallback
 
 from viapoint.training.cli.doctor import explain_import_error
 from viapoint.training.config.configs import StudyConfig
 from viapoint.training.io.files import BadFileError, read_json, write_bytes, write_json
+from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
 from viapoint.training.study.config import Search, Study, Trial, Values
-from viapoint.training.study.tables import markdown, tables, write_results
-from viapoint.training.study.trials import ReportCallback, finished_record, run_trial
+from viapoint.training.study.trials import finished_record, markdown, run_trial, tables, write_results
 
 RETRIES = 2
 """Number of times that a trial whose worker died is begun again."""
@@ -57,7 +58,7 @@ def run_study(
 ) -> pd.DataFrame:
     """Run what a study has not run yet, and write its tables.
 
-    Ray Tune places the trials. The same call continues a study that was stopped or killed: complete trials are kept,
+    Ray places the trials. The same call continues a study that was stopped or killed: complete trials are kept,
     and interrupted trainings go on from their last checkpoints.
 
     Args:
@@ -93,7 +94,7 @@ def run_study(
             f"{len(missing)} trials and {len(searches)} searches to do; Ctrl-C stops, the same command goes on"
         )
         with _connected(address, workers):
-            failed += _fit(missing, folder, workers, told) if missing else []
+            failed += _run_trials(missing, folder, workers, told)
             for search in searches:
                 failed += _search(search, folder, workers, told)
     table = tables(study.trials, folder)
@@ -155,31 +156,52 @@ def _connected(address: str | None, workers: int | None) -> Iterator[None]:
         ray.shutdown()
 
 
-def _fit(trials: list[Trial], folder: Path, workers: int | None, told: Told) -> list[str]:
-    """Run trials with Ray Tune, and return a line for each that failed."""
-    _, tune = _import_libraries()
-
-    def work(config: Values) -> None:
-        metrics = {"label": config["trial"].folder(Path()).as_posix()}
+def _run_trials(trials: list[Trial], folder: Path, workers: int | None, told: Told) -> list[str]:
+    """Run trials as tasks of Ray, and return a line for each that failed."""
+    ray, _ = _import_libraries()
+    task = ray.remote(max_retries=RETRIES)(run_trial)
+    waiting = list(reversed(trials))
+    running: dict[Any, Trial] = {}
+    failed = []
+    while waiting or running:
+        while waiting and len(running) < (workers or len(trials)):
+            trial = waiting.pop()
+            others = dict(trial.resources)
+            placed = task.options(num_cpus=others.pop("cpu"), num_gpus=others.pop("GPU", 0), resources=others)
+            running[placed.remote(trial, folder)] = trial
+        (done,), _ = ray.wait(list(running))
+        label = running.pop(done).folder(Path()).as_posix()
         try:
-            first = run_trial(config["trial"], folder)["rows"][0]
+            first = ray.get(done)["rows"][0]
             rate = 100.0 * first["solved"].count("1") / len(first["solved"])
-            metrics["label"] += f": {rate:.1f} % of {first['set']}"
-        except Exception as error:  # worth no second try, unlike a worker that died
-            metrics["error"] = _one_line(error)
-        tune.report(metrics)
+            told(f"{label}: {rate:.1f} % of {first['set']}")
+        except Exception as error:
+            failed.append(f"{label}: {_one_line(getattr(error, 'cause', error))}")
+            told(f"{label} failed")
+    return failed
 
-    tuner = tune.Tuner(
-        tune.with_resources(work, lambda config: config["trial"].resources),
-        param_space={"trial": tune.grid_search(trials)},
-        tune_config=tune.TuneConfig(max_concurrent_trials=workers, reuse_actors=True),
-        run_config=_run_config(tune, "trials", folder, told),
-    )
-    return _fitted(tuner, len(trials))[1]
+
+class ReportCallback(BaseCallback):
+    """Callback that reports the validations of a run, each once, to a function that may raise to end the training."""
+
+    def __init__(self, folder: Path, report: Callable[[dict[str, Any]], None]) -> None:
+        super().__init__()
+        self.folder, self.report = folder, report
+        self._reported = 0
+
+    def _on_rollout_start(self) -> None:
+        curve = Run(self.folder).curve
+        for each in curve[self._reported :]:
+            if each["decisions"]:  # the validation before training says nothing about it
+                self.report({"success": each["success"]["rate"], "decisions": each["decisions"]})
+        self._reported = len(curve)
+
+    def _on_step(self) -> bool:
+        return True
 
 
 def _search(search: Search, folder: Path, workers: int | None, told: Told) -> list[str]:
-    """Search for hyperparameters, write the best ones, and return a line for each trial that failed.
+    """Search for hyperparameters, write the best ones, and return a line for each trial if all of them failed.
 
     Optuna chooses the parameters, and successive halving (ASHA) stops trainings that are behind in validation.
     """
@@ -190,78 +212,51 @@ def _search(search: Search, folder: Path, workers: int | None, told: Told) -> li
     total = search.trial.config(folder).total_timesteps
 
     def work(config: Values) -> None:
-        trial = search.with_parameters(config)
         try:
-            settings = trial.config(folder)
+            settings = search.with_parameters(config).config(folder)
             run = train_or_resume(settings, ReportCallback(settings.folder, tune.report))
-            metrics = {"success": run.curve[-1]["success"]["rate"], "decisions": run.decisions}
-        except Exception as error:
-            metrics = {"success": 0.0, "decisions": total, "error": _one_line(error)}
-        tune.report({**metrics, "label": f"{trial.row}: {100.0 * metrics['success']:.1f} %"})
+            tune.report({"success": run.curve[-1]["success"]["rate"], "decisions": run.decisions})
+        except Exception as error:  # settings that cannot be trained do not end a search
+            tune.report({"success": 0.0, "decisions": total, "error": _one_line(error)})
 
     trainable = tune.with_resources(work, dict(search.trial.resources))
-    config = _run_config(tune, f"search-{search.key}", folder, told)
-    path = Path(config.storage_path) / config.name
+    path = folder / "tune" / f"search-{search.key}"
     if tune.Tuner.can_restore(path):
         tuner = tune.Tuner.restore(str(path), trainable, resume_unfinished=True, restart_errored=True)
     else:
         # Trainings end by themselves, before max_t.
         scheduler = ASHAScheduler(time_attr="decisions", max_t=2 * total, grace_period=max(total // 4, 1))
+        first = [dict(each) for each in search.first] or None
         tuner = tune.Tuner(
             trainable,
-            param_space={path: _domain(tune, given) for path, given in search.parameters.items()},
+            param_space={name: _domain(tune, given) for name, given in search.parameters.items()},
             tune_config=tune.TuneConfig(
                 metric="success",
                 mode="max",
                 num_samples=search.trials,
                 max_concurrent_trials=workers,
-                search_alg=OptunaSearch(
-                    points_to_evaluate=[dict(each) for each in search.first] or None, seed=0
-                ),
+                search_alg=OptunaSearch(points_to_evaluate=first, seed=0),
                 scheduler=scheduler,
             ),
-            run_config=config,
+            run_config=tune.RunConfig(
+                name=path.name,
+                storage_path=str(path.parent),
+                failure_config=tune.FailureConfig(max_failures=RETRIES),
+                verbose=0,
+            ),
         )
-    results, failed = _fitted(tuner, search.trials)
-    if len(failed) == search.trials:
-        return failed
-    told(_write_search(search, results, folder))  # settings that cannot be trained do not end a search
-    return []
-
-
-def _run_config(tune: Any, name: str, folder: Path, told: Told) -> Any:
-    """Return the settings of Ray Tune that all trials share."""
-
-    class Lines(tune.Callback):  # type: ignore[misc]
-        """Callback that prints one line for each trial that ends."""
-
-        def on_trial_complete(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
-            label, error = trial.last_result.get("label"), trial.last_result.get("error")
-            if label is not None:  # of a training that was not stopped early
-                told(f"{label} failed: {error}" if error else label)
-
-    return tune.RunConfig(
-        name=name,
-        storage_path=str(folder / "tune"),
-        failure_config=tune.FailureConfig(max_failures=RETRIES),
-        callbacks=[Lines()],
-        verbose=0,
-    )
-
-
-def _fitted(tuner: Any, expected: int) -> tuple[Any, list[str]]:
-    """Run trials, and return their results and a line for each that failed."""
     handler = signal.getsignal(signal.SIGINT)
     results = tuner.fit()
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, handler)  # Ray Tune leaves its own
-    if sum(each.error is not None or each.metrics.get("done", False) for each in results) < expected:
+    if sum(each.error is not None or each.metrics.get("done", False) for each in results) < search.trials:
         raise KeyboardInterrupt  # after Ctrl-C, Ray Tune returns
     failed = [_one_line(error) for error in results.errors]
-    for each in results:
-        if each.error is None and "error" in each.metrics:
-            failed.append(f"{each.metrics['label']}: {each.metrics['error']}")
-    return results, failed
+    failed += [each.metrics["error"] for each in results if each.error is None and "error" in each.metrics]
+    if len(failed) < search.trials:
+        told(_write_search(search, results, folder))
+        return []
+    return [f"{search.trial.row}: {reason}" for reason in failed]
 
 
 def _domain(tune: Any, given: Any) -> Any:
@@ -286,7 +281,7 @@ def _write_search(search: Search, results: Any, folder: Path) -> str:
     config = dataclasses.replace(chosen.config(folder), out=None)
     record = {"viapoint": "search", "key": search.key, "success": best["success"], "command": config.command}
     write_json(search.folder(folder) / "best.json", {**record, "training": config.as_json()})
-    return f"best of {search.name}, {100.0 * best['success']:.1f} %: {config.command}"
+    return f"best of {search.trial.row}, {100.0 * best['success']:.1f} %: {config.command}"
 
 
 def _one_line(error: BaseException) -> str:
