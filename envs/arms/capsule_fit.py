@@ -36,7 +36,7 @@ LEAST_SHARE = 0.3
 """Least length along an axis across which a body is cut, as a share of the greatest."""
 FIRST_STEP, LAST_STEP, COARSE_STEP = 0.25, 5e-4, 0.05
 """First and last step of the search for the ends, and last one where cuts are compared, as shares of the size."""
-MOST_CAPSULES = 64
+MOST_CAPSULES = 48
 """Greatest number of capsules for one geom."""
 _ONE_WAY = np.concatenate((np.eye(6), np.kron([[1.0, 1.0], [1.0, -1.0]], np.eye(3))))
 MOVES = np.concatenate((_ONE_WAY, -_ONE_WAY)).reshape(-1, 2, 3)
@@ -71,10 +71,10 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
     """Return capsules and spheres that together contain a geom, in the geom's frame.
 
     Spheres and capsules are returned as they are. Boxes, cylinders, ellipsoids and the convex hulls of meshes are
-    covered so that no capsule reaches farther than `tolerance`, [m], from the geom.
+    covered so that no capsule reaches farther than `tolerance`, [m], from the geom, if MOST_CAPSULES suffice for that.
 
     Raises:
-        ValueError: The geom is of another type, needs more than MOST_CAPSULES capsules, or is flat.
+        ValueError: The geom is of another type, or is flat.
     """
     size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
     if kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE):
@@ -86,11 +86,6 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
         found = cover_points(corners, tolerance - larger)
     except ValueError as error:
         raise ValueError(f"geom {model.geom(geom).name or geom}: {error}") from None
-    if found is None:
-        raise ValueError(
-            f"geom {model.geom(geom).name or geom}: tolerance {tolerance:.4g} m takes more than "
-            f"{MOST_CAPSULES} capsules; allow a greater one, or give the link simpler geoms"
-        )
     return [each._replace(excess=each.excess + larger) for each in found]
 
 
@@ -144,22 +139,18 @@ def _rim(number: int) -> Float:
     return np.stack((wide * np.cos(angle), wide * np.sin(angle), 0.0 * angle), axis=-1)
 
 
-def cover_points(points: Float, tolerance: float) -> list[FittedCapsule] | None:
+def cover_points(points: Float, tolerance: float) -> list[FittedCapsule]:
     """Return capsules and spheres that together contain the convex hull of points, shape (n, 3), [m].
 
-    None stands for more than MOST_CAPSULES of them.
+    Their excess is at most the tolerance, if MOST_CAPSULES suffice for that.
     """
     body = _body(points)
-    pieces = [fit_capsule(np.asarray(body.shape.vertices), body)]
-    found: list[FittedCapsule] = []
-    while pieces:
-        capsule = pieces.pop()
-        if capsule.excess <= tolerance:
-            found.append(capsule)
-            continue
-        if len(pieces) + len(found) + 2 > MOST_CAPSULES:
-            return None
-        pieces += _best_halves(capsule.corners, body, tolerance)
+    found = [fit_capsule(np.asarray(body.shape.vertices), body)]
+    while len(found) < MOST_CAPSULES:
+        worst = max(range(len(found)), key=lambda index: found[index].excess)
+        if found[worst].excess <= tolerance:
+            break
+        found += _best_halves(found.pop(worst).corners, body, tolerance)
     return found
 
 

@@ -35,7 +35,7 @@ MIN_JOINTS = 2
 """Least number of joints."""
 MIN_TOLERANCE, MAX_TOLERANCE = 0.005, 1.0
 """Bounds of the tolerance of fitted capsules, [m]."""
-BASE_SHARE = 0.1
+BASE_SHARE = 0.05
 """Least tolerance of geoms of the base, as a share of their size: bases may be large."""
 LEFT_SHARE, LEFT_MOST = 0.25, 0.002
 """Distance at home that capsules leave between bodies, as a share of that of the geoms, and at most, [m]."""
@@ -93,7 +93,7 @@ def load_arm(
     joint_range: Any = None,
     torque_limit: Any = None,
     velocity_limit: Any = None,
-    tolerance: float = 0.025,
+    tolerance: float = 0.02,
 ) -> Arm:
     """Load an arm from an MJCF or URDF file.
 
@@ -611,9 +611,9 @@ def _fitted(
     for body, geoms in parsed.geoms.items():
         fits[body] = []
         for geom in geoms:
-            least = 0.0 if parsed.links[body] else BASE_SHARE * 2.0 * float(parsed.model.geom_rbound[geom])
-            found = cover_geom(parsed.model, geom, max(tolerance, least))
-            fits[body] += [Fit(geom, capsule) for capsule in found]
+            size = 2.0 * float(parsed.model.geom_rbound[geom])
+            allowed = tolerance if parsed.links[body] else max(tolerance, BASE_SHARE * size)
+            fits[body] += [Fit(geom, capsule) for capsule in cover_geom(parsed.model, geom, allowed)]
     while True:
         xml = _write(parsed, ranges, origin, fits)
         near = _near_capsules(parsed, xml, home, distances)

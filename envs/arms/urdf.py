@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,16 +41,12 @@ class Urdf(NamedTuple):
 def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
     """Return the content of a URDF file; paths of meshes become absolute ones.
 
-    `package://NAME/REST` is looked for in `packages`, in a folder NAME or in the folder itself, and in the folders
-    above the file.
+    See :func:`_places` for where meshes are looked for.
 
     Raises:
         ValueError: The file is no URDF, or a mesh for collisions is missing.
     """
-    try:
-        root = ET.fromstring(path.read_bytes())
-    except ET.ParseError as error:
-        raise ValueError(f"{path} is not XML: {error}") from None
+    root = _root(path)
     if root.tag != "robot":
         raise ValueError(f"{path} is no URDF: its first element is {root.tag!r}, not 'robot'")
     if not root.findall("link"):
@@ -61,18 +59,11 @@ def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
         for visual in link.findall("visual"):
             link.remove(visual)
         for collision in link.findall("collision"):
-            mesh = collision.find("geometry/mesh")
-            if mesh is None:
-                continue
-            found = _find(mesh.get("filename", ""), path, packages)
-            if found.suffix.lower() not in READ_MESHES:
+            geometry = collision.find("geometry")
+            fault = "no geometry" if geometry is None else _prepared(geometry, path, packages)
+            if fault:
                 link.remove(collision)
-                notes.append(
-                    f"the collision mesh {found.name} of {link.get('name')} is left out: MuJoCo reads "
-                    f"{', '.join(READ_MESHES)}; convert it, for example with trimesh"
-                )
-                continue
-            mesh.set("filename", str(found))
+                notes.append(f"a collision geom of {link.get('name')} is left out: {fault}")
     velocity = {}
     for joint in root.findall("joint"):
         limit = joint.find("limit")
@@ -90,34 +81,67 @@ def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
     return Urdf(text, root.get("name") or path.stem, velocity, _srdf(path), tuple(notes))
 
 
-def _find(file: str, path: Path, packages: tuple[str | Path, ...]) -> Path:
-    """Return the path of a mesh file.
+def _root(path: Path) -> ET.Element:
+    """Return the first element of a file; prefixes without a namespace, as in `xacro:macro`, are ignored.
 
     Raises:
-        ValueError: It is not there.
+        ValueError: The file is no XML.
     """
-    tried = []
-    if file.startswith("package://"):
-        package, _, rest = file.removeprefix("package://").partition("/")
-        for folder in (*(Path(each).expanduser() for each in packages), *path.resolve().parents):
-            tried += [folder / package / rest, *([folder / rest] if folder.name == package else [])]
-            if folder in map(Path, packages):
-                tried.append(folder / rest)
-    else:
-        tried = [path.parent / file.removeprefix("file://")]
-    for each in tried:
-        if each.is_file():
-            return each.resolve()
-    hint = "; packages= names folders to look in" if file.startswith("package://") else ""
-    raise ValueError(f"{path.name}: there is no file {file!r}{hint}")
+    content = path.read_bytes()
+    try:
+        return ET.fromstring(content)
+    except ET.ParseError as error:
+        if "unbound prefix" not in str(error):
+            raise ValueError(f"{path} is not XML: {error}") from None
+    return ET.fromstring(re.sub(rb"(</?|\s)[\w.-]+:([\w.-]+)(?=[\s=/>])", rb"\1\2", content))
+
+
+def _prepared(geometry: ET.Element, path: Path, packages: tuple[str | Path, ...]) -> str:
+    """Make the path of a mesh absolute, and return what is wrong with a geometry, empty for nothing."""
+    for element in geometry:
+        sizes = " ".join(element.get(name, "") for name in ("size", "radius", "length")).split()
+        if any(float(size) <= 0.0 for size in sizes):
+            return f"its {element.tag} has no size"
+        if element.tag != "mesh":
+            continue
+        file = element.get("filename", "")
+        if not file.lower().endswith(READ_MESHES):
+            return (
+                f"MuJoCo reads {', '.join(READ_MESHES)}, not {Path(file).name}; convert it, for example with "
+                "trimesh: trimesh.load(FILE, force='mesh').export('x.stl')"
+            )
+        found = next((place for place in _places(file, path, packages) if place.is_file()), None)
+        if found is None:
+            raise ValueError(f"{path.name}: there is no file {file!r}; packages= names folders to look in")
+        element.set("filename", str(found.resolve()))
+    return ""
+
+
+def _places(file: str, path: Path, packages: tuple[str | Path, ...]) -> Iterator[Path]:
+    """Yield the places where a mesh of a URDF may be.
+
+    A relative path begins at the file. `package://NAME/REST`, then REST, then what is left without the first folder of
+    it, and so on, are looked for in the folders of `packages` and above the file: copies often have other names.
+    """
+    parts = file.removeprefix("package://").removeprefix("file://").split("/")
+    if not file.startswith("package://"):
+        yield path.parent / "/".join(parts)
+    folders = [*(Path(each).expanduser() for each in packages), *path.resolve().parents]
+    for first in range(len(parts)):
+        for folder in folders:
+            yield folder / "/".join(part for part in parts[first:] if part != "..")
 
 
 def _srdf(path: Path) -> tuple[tuple[str, str], ...]:
-    """Return the pairs of links that an SRDF file does not compare: one of the same name, or the only one beside it."""
-    beside, files = path.with_suffix(".srdf"), list(path.parent.glob("*.srdf"))
-    if len(files) == 1:
-        beside = files[0]
-    if not beside.is_file():
-        return ()
-    pairs = ET.fromstring(beside.read_bytes()).findall("disable_collisions")
-    return tuple((pair.get("link1", ""), pair.get("link2", "")) for pair in pairs)
+    """Return the pairs of links that an SRDF file does not compare.
+
+    It has the same name and is beside the URDF or in the folder srdf beside that folder; or it is the only one beside.
+    """
+    beside = list(path.parent.glob("*.srdf"))
+    places = [path.with_suffix(".srdf"), path.resolve().parents[1] / "srdf" / f"{path.stem}.srdf"]
+    places += beside if len(beside) == 1 else []
+    for place in places:
+        if place.is_file():
+            pairs = _root(place).findall("disable_collisions")
+            return tuple((pair.get("link1", ""), pair.get("link2", "")) for pair in pairs)
+    return ()
