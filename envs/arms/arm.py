@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -173,7 +173,7 @@ def arm_from_xml(
     torque_limit: Any,
     space: SpaceName = "joints",
     bandwidth: float = 50.0,
-    exclude: Sequence[tuple[str, str]] = (),
+    exclude: Mapping[frozenset[str], str] | None = None,
 ) -> Arm:
     """Return the arm of an MJCF text in which all collision geoms are capsules and spheres.
 
@@ -187,7 +187,7 @@ def arm_from_xml(
         torque_limit: Greatest torques, shape (J,).
         space: Space in which movements are planned.
         bandwidth: Natural frequency of the critically damped joint servos, [rad/s].
-        exclude: Pairs of bodies that may pass through one another.
+        exclude: Pairs of bodies that may pass through one another, with the reason.
 
     Raises:
         ValueError: Bodies that are apart at home cannot be told apart.
@@ -202,7 +202,7 @@ def arm_from_xml(
     bodies = [model.body(i).name for i in range(1, model.nbody) if model.body(i).name in links]
     touching = touching_at_home(model, data, bodies)
     capsules = _capsules(model, chain, tuple(joints), links)
-    covered = cover(chain, capsules, links, home, touching, {frozenset(pair) for pair in exclude})
+    covered = cover(chain, capsules, links, home, touching, exclude or {})
     ranges = np.array([model.joint(each).range for each in joints])
     covered = _without_distant_pairs(chain, covered, ranges)
     inertia = _greatest_inertia(model, data, tuple(joints))

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 READ_MESHES = (".stl", ".obj", ".msh")
 """Suffixes of meshes that MuJoCo reads."""
 COMPILER = {
@@ -19,6 +21,10 @@ COMPILER = {
     "strippath": "false",
 }
 """Options of MuJoCo's compiler: links without inertia get little, and fixed links stay bodies."""
+INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+"""Entries of an inertia."""
+BALL = 0.05
+"""Radius of the ball whose inertia a link gets that has none, [m]."""
 LEFT_OUT = ("transmission", "gazebo", "material")
 """Elements that MuJoCo does not need."""
 
@@ -30,6 +36,8 @@ class Urdf(NamedTuple):
     """Text for MuJoCo."""
     name: str
     """Name of the robot."""
+    assets: dict[str, bytes]
+    """Meshes that MuJoCo cannot read as they are, by the names in the text."""
     velocity_limits: dict[str, float]
     """Velocity limits of joints by name, [rad/s] or [m/s]."""
     never_touch: tuple[tuple[str, str], ...]
@@ -51,16 +59,18 @@ def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
         raise ValueError(f"{path} is no URDF: its first element is {root.tag!r}, not 'robot'")
     if not root.findall("link"):
         raise ValueError(f"{path} has no links; expand a xacro file first: xacro FILE > arm.urdf")
-    notes = []
+    notes: list[str] = []
+    assets: dict[str, bytes] = {}
     for name in LEFT_OUT:
         for element in root.findall(name):
             root.remove(element)
     for link in root.findall("link"):
+        _mend_inertia(link, notes)
         for visual in link.findall("visual"):
             link.remove(visual)
         for collision in link.findall("collision"):
             geometry = collision.find("geometry")
-            fault = "no geometry" if geometry is None else _prepared(geometry, path, packages)
+            fault = "no geometry" if geometry is None else _prepared(geometry, path, packages, assets)
             if fault:
                 link.remove(collision)
                 notes.append(f"a collision geom of {link.get('name')} is left out: {fault}")
@@ -78,7 +88,7 @@ def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
     compiler.attrib.pop("meshdir", None)
     compiler.attrib.update(COMPILER)
     text = ET.tostring(root, encoding="unicode")
-    return Urdf(text, root.get("name") or path.stem, velocity, _srdf(path), tuple(notes))
+    return Urdf(text, root.get("name") or path.stem, assets, velocity, _srdf(path), tuple(notes))
 
 
 def _root(path: Path) -> ET.Element:
@@ -96,7 +106,23 @@ def _root(path: Path) -> ET.Element:
     return ET.fromstring(re.sub(rb"(</?|\s)[\w.-]+:([\w.-]+)(?=[\s=/>])", rb"\1\2", content))
 
 
-def _prepared(geometry: ET.Element, path: Path, packages: tuple[str | Path, ...]) -> str:
+def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
+    """Replace an inertia that no body has by that of a ball of the same mass."""
+    inertia, mass = link.find("inertial/inertia"), link.find("inertial/mass")
+    if inertia is None or mass is None:
+        return
+    xx, xy, xz, yy, yz, zz = (float(inertia.get(name, 0.0)) for name in INERTIA)
+    if np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[0] < 0.0:
+        moment = 0.4 * float(mass.get("value", 0.0)) * BALL**2
+        inertia.attrib.update(
+            dict.fromkeys(INERTIA, "0") | dict.fromkeys(("ixx", "iyy", "izz"), f"{moment:g}")
+        )
+        notes.append(f"inertia of {link.get('name')}, which is not positive: that of a ball of {BALL:g} m")
+
+
+def _prepared(
+    geometry: ET.Element, path: Path, packages: tuple[str | Path, ...], assets: dict[str, bytes]
+) -> str:
     """Make the path of a mesh absolute, and return what is wrong with a geometry, empty for nothing."""
     for element in geometry:
         sizes = " ".join(element.get(name, "") for name in ("size", "radius", "length")).split()
@@ -114,7 +140,24 @@ def _prepared(geometry: ET.Element, path: Path, packages: tuple[str | Path, ...]
         if found is None:
             raise ValueError(f"{path.name}: there is no file {file!r}; packages= names folders to look in")
         element.set("filename", str(found.resolve()))
+        if found.suffix.lower() == ".stl":
+            content = found.read_bytes()
+            if content[:6] == b"solid ":
+                _add_text_stl(element, content, assets)
+            elif not any(content[80:84]):  # the number of triangles
+                return f"there is no triangle in {found.name}"
     return ""
+
+
+def _add_text_stl(mesh: ET.Element, content: bytes, assets: dict[str, bytes]) -> None:
+    """Add a mesh to assets as binary STL, which MuJoCo reads, if its file is text."""
+    corners = np.array(re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", content), "<f4").reshape(-1, 9)
+    if len(corners):  # many binary files begin like text
+        facets = np.zeros(len(corners), [("normal", "<f4", 3), ("corners", "<f4", 9), ("spare", "<u2")])
+        facets["corners"] = corners
+        name = f"text_{len(assets)}.stl"
+        assets[name] = bytes(80) + np.uint32(len(corners)).tobytes() + facets.tobytes()
+        mesh.set("filename", name)
 
 
 def _places(file: str, path: Path, packages: tuple[str | Path, ...]) -> Iterator[Path]:

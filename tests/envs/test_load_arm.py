@@ -22,7 +22,7 @@ CUBE = " ".join(f"{x} {y} {z}" for x, y, z in np.ndindex(2, 2, 2))
 
 
 def ur5e(file=TEXT, **changes):
-    arguments = {"hand_site": "hand", "joints": JOINTS, "home": HOME, "velocity_limit": np.pi}
+    arguments = {"tool": "hand", "joints": JOINTS, "home": HOME, "velocity_limit": np.pi}
     return load_arm(file, **{**arguments, **changes})
 
 
@@ -148,7 +148,7 @@ def test_a_slide_is_fixed_as_in_the_keyframe_or_is_a_joint(moves):
 
 def test_an_arm_of_two_joints_and_a_home_in_the_middle_of_the_ranges(arm):
     text = changed(('name="shoulder_lift"', 'name="shoulder_lift" range="0.5 1.5"'))
-    two = ur5e(text, joints=JOINTS[:2], hand_site="hand", home=None, torque_limit=500.0)
+    two = ur5e(text, joints=JOINTS[:2], tool="hand", home=None, torque_limit=500.0)
     np.testing.assert_allclose(two.home, [0.0, 1.0], atol=1e-5)
     assert {"shoulder", "upper_arm", "wrist_3"} <= set(two.group_names)
 
@@ -185,7 +185,7 @@ def test_bodies_that_are_near_at_home_are_compared_and_fitted_closely():
 
 def test_bodies_that_touch_at_home_are_left_out_and_bodies_too_close_are_refused():
     arguments = {
-        "hand_site": "tool",
+        "tool": "tool",
         "joints": ("one", "two", "three"),
         "velocity_limit": 1.0,
         "torque_limit": 1e3,
@@ -229,7 +229,7 @@ def test_without_velocity_limits_a_warning_names_the_default():
 REFUSED = [
     ({"file": 5}, TypeError), ({"file": None}, TypeError), ({"file": b"arm.xml"}, TypeError),
     ({"file": ""}, ValueError), ({"file": "none.xml"}, ValueError),
-    ({"hand_site": "tool"}, ValueError), ({"name": 5}, ValueError), ({"name": ""}, ValueError),
+    ({"tool": "tool"}, ValueError), ({"name": 5}, ValueError), ({"name": ""}, ValueError),
     *[({"joints": joints}, ValueError) for joints in (
         5, "elbow", JOINTS[:1], (*JOINTS[:5], "wrist_4"), (*JOINTS[:5], JOINTS[0]), (JOINTS[1], JOINTS[0], *JOINTS[2:]),
     )],
