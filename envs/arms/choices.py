@@ -141,12 +141,12 @@ def chain_joints(model: mujoco.MjModel, body: int, base: str | None = None) -> l
     """Return the names of the hinges and slides that carry a body, from the base, whose own count, too, to it."""
     end = int(model.body(base).id) if base is not None else 0
     names: list[str] = []
-    for body in (body, *ancestors(model, body)):
-        first = int(model.body_jntadr[body])
-        for joint in range(first, first + int(model.body_jntnum[body])):
+    for each in (body, *ancestors(model, body)):
+        first = int(model.body_jntadr[each])
+        for joint in range(first, first + int(model.body_jntnum[each])):
             if model.jnt_type[joint] in MOVES:
                 names.insert(0, model.joint(joint).name)
-        if body == end:
+        if each == end:
             break
     return names
 

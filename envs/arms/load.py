@@ -40,7 +40,9 @@ WEIGHTS, LEAST_TORQUE = 3.0, 1.0
 WEIGHED = 200
 """Number of configurations in which the arm is weighed."""
 LOOKED_AT, NEAR_LOOKED_AT = 16, 1000
-"""Numbers of configurations in which bodies that always touch are looked for, and contacts of near ones."""
+"""Numbers of configurations in which bodies that are always near are looked for, and contacts of these."""
+NEAR, FINE = 0.03, 0.008
+"""Distance within which bodies are near in at least half of the configurations, and tolerance for these, [m]."""
 WARNING = "warning: "
 """Beginning of notes that are told as warnings, too."""
 GENERIC_NAMES = ("arm", "model", "robot", "scene")
@@ -212,13 +214,28 @@ def _load(
     keyframe = _keyframe(whole, names)
     parsed = _parse(spec, whole, names, notes)
     exclude = dict.fromkeys(_excluded(parsed, urdf.never_touch), "excluded in the file")
-    home = _home(parsed, ranges, home, keyframe, exclude, notes)
+    never = f"in contact in none of {NEAR_LOOKED_AT:,} configurations, though always near"
+    pairs = _compared_pairs(parsed, exclude)
+    drawn = np.random.default_rng(0).uniform(*ranges.T, (NEAR_LOOKED_AT, len(names)))
+    looked_at = np.array([[*_distances(parsed, each, pairs).values()] for each in drawn[:LOOKED_AT]])
+    near = [pair for pair, away in zip(pairs, looked_at.T, strict=True) if np.median(away) < NEAR]
+    apart = _apart(parsed, near, drawn)
+    meeting = set(near) - set(apart)
+    exclude |= dict.fromkeys((_names(parsed, pair) for pair in apart), never)
+    movable = [pair for pair, away in zip(pairs, looked_at.T, strict=True) if away.max() > 0.0]
+    movable = [pair for pair in movable if _names(parsed, pair) not in exclude]
+    home = _home(parsed, ranges, home, keyframe, movable, notes)
     zero = np.zeros(3) if origin is None else finite_array("origin", origin, (3,))
-    distances = _home_distances(parsed, home, exclude)
-    for pair in _near_but_apart(parsed, distances, ranges):
-        del distances[pair]
-        exclude[_names(parsed, pair)] = f"near, but in contact in none of {NEAR_LOOKED_AT:,} configurations"
-    xml, excess = _fitted(parsed, ranges, zero, home, distances, tolerance)
+    distances = _distances(parsed, home, _compared_pairs(parsed, exclude))
+    near = [pair for pair, away in distances.items() if 0.0 < away < LEAST_GAP]
+    exclude |= dict.fromkeys((_names(parsed, pair) for pair in _apart(parsed, near, drawn)), never)
+    distances = {
+        pair: away for pair, away in distances.items() if away > 0.0 and _names(parsed, pair) not in exclude
+    }
+    tolerances = dict.fromkeys(parsed.geoms, tolerance)
+    for pair in meeting:
+        tolerances.update(dict.fromkeys(pair, min(FINE, tolerance)))
+    xml, excess = _fitted(parsed, ranges, zero, home, distances, tolerances)
     arm = arm_from_xml(
         name,
         xml,
@@ -450,10 +467,10 @@ def _home(
     ranges: Float,
     given: Any,
     keyframe: Float | None,
-    exclude: Mapping[frozenset[str], str],
+    pairs: list[tuple[int, int]],
     notes: list[str],
 ) -> Float:
-    """Return the home configuration, shape (J,)."""
+    """Return the home configuration, shape (J,), in which some pairs of bodies do not touch."""
     joints = parsed.joints
     if given is not None:
         home = _per_joint("home", given, joints)
@@ -461,7 +478,6 @@ def _home(
         if outside.any():
             raise ValueError(f"home is outside the range of {', '.join(itertools.compress(joints, outside))}")
         return home
-    pairs = _pairs_that_move(parsed, ranges, exclude)
 
     def apart(home: Float) -> float:
         return min(_distances(parsed, home, pairs).values(), default=1.0)
@@ -471,19 +487,6 @@ def _home(
     home, origin = choose_home(ranges, candidates, apart)
     notes.append(f"home: {origin}")
     return home
-
-
-def _pairs_that_move(
-    parsed: Parsed, ranges: Float, exclude: Mapping[frozenset[str], str]
-) -> list[tuple[int, int]]:
-    """Return the pairs of bodies that are compared, without those that touch in every one of some configurations."""
-    pairs = _compared_pairs(parsed, exclude)
-    low, high = ranges.T
-    rng = np.random.default_rng(0)
-    free: set[tuple[int, int]] = set()
-    for home in rng.uniform(low, high, (LOOKED_AT, len(ranges))):
-        free.update(pair for pair, away in _distances(parsed, home, pairs).items() if away > 0.0)
-    return [pair for pair in pairs if pair in free]
 
 
 def _parse(spec: mujoco.MjSpec, whole: mujoco.MjModel, joints: tuple[str, ...], notes: list[str]) -> Parsed:
@@ -673,7 +676,7 @@ def _fitted(
     origin: Float,
     home: Float,
     distances: dict[tuple[int, int], float],
-    tolerance: float,
+    tolerances: dict[int, float],
 ) -> tuple[str, float]:
     """Return the text of the arm's model, and the greatest excess of its capsules, [m].
 
@@ -687,7 +690,7 @@ def _fitted(
         fits[body] = []
         for geom in geoms:
             size = 2.0 * float(parsed.model.geom_rbound[geom])
-            allowed = tolerance if parsed.links[body] else max(tolerance, BASE_SHARE * size)
+            allowed = tolerances[body] if parsed.links[body] else max(tolerances[body], BASE_SHARE * size)
             fits[body] += [Fit(geom, capsule) for capsule in cover_geom(parsed.model, geom, allowed)]
     while True:
         xml = _write(parsed, ranges, origin, fits)
@@ -710,26 +713,13 @@ def _fitted(
     return xml, max(fit.capsule.excess for some in fits.values() for fit in some)
 
 
-def _home_distances(
-    parsed: Parsed, home: Float, exclude: Mapping[frozenset[str], str]
-) -> dict[tuple[int, int], float]:
-    """Return the distance at home of each pair of bodies that must stay apart, [m]; at most 0.1."""
-    pairs = _compared_pairs(parsed, exclude)
-    return {pair: away for pair, away in _distances(parsed, home, pairs).items() if away > 0.0}
-
-
-def _near_but_apart(
-    parsed: Parsed, distances: dict[tuple[int, int], float], ranges: Float
-) -> list[tuple[int, int]]:
-    """Return the pairs of bodies that are near at home, but in contact in none of many configurations."""
-    near = [pair for pair, away in distances.items() if away < LEAST_GAP]
-    rng = np.random.default_rng(0)
-    for joints in rng.uniform(*ranges.T, (NEAR_LOOKED_AT, len(ranges))):
-        if not near:
-            break
-        away = _distances(parsed, joints, near)
-        near = [pair for pair in near if away[pair] > 0.0]
-    return near
+def _apart(parsed: Parsed, pairs: Iterable[tuple[int, int]], configurations: Float) -> list[tuple[int, int]]:
+    """Return the pairs of bodies that are in contact in none of some configurations, shape (N, J)."""
+    pairs = list(pairs)
+    for joints in configurations:
+        away = _distances(parsed, joints, pairs)
+        pairs = [pair for pair in pairs if away[pair] > 0.0]
+    return pairs
 
 
 def _distances(

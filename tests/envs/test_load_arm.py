@@ -215,7 +215,7 @@ def near_arm(gap):
 
 def test_without_velocity_limits_a_warning_names_the_default():
     with pytest.warns(UserWarning, match="2 rad/s"):
-        arm = ur5e(velocity_limit=None, name="other")
+        arm = ur5e(changed(("ur5e-like", "other")), velocity_limit=None)
     np.testing.assert_array_equal(arm.velocity_limit, 2.0)
     custom = (
         "<worldbody>",

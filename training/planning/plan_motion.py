@@ -233,16 +233,19 @@ def plan_motion(
     goals = _goals(problem, goal)
     given, number = _seeds(seeds, n_via, where.dimension)
     generator = np.random.default_rng(rng if rng is not None else 0)
-    best: MotionPlan | None = None
     number = -(-number // len(goals))
     until = time.perf_counter() + time_limit
-    for each in goals:
-        plan = _plan(problem._replace(goal=each), n_via, given, number, enough, until, generator, ompl)
-        if best is None or _worth(plan) > _worth(best):
-            best = plan
-        if time.perf_counter() > until:
+    plans = []
+    if len(goals) > 1:  # straight movements cost next to nothing, and many goals cannot be reached otherwise either
+        for each in goals:
+            plans.append(_plan(problem._replace(goal=each), n_via, given[:0], 0, enough, 0.0, generator, False))
+    for rank, each in enumerate(goals):
+        if any(plan.success for plan in plans):
             break
-    assert best is not None
+        now = time.perf_counter()
+        share = now + (until - now) / (len(goals) - rank)
+        plans.append(_plan(problem._replace(goal=each), n_via, given, number, enough, share, generator, ompl))
+    best = max(plans, key=_worth)
     return dataclasses.replace(best, milliseconds=1e3 * (time.perf_counter() - began))
 
 
