@@ -136,10 +136,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folders", nargs="+", type=Path, help="roots of copies of the projects")
-    parser.add_argument("--only", default="", help="measure paths that contain this text, and write nothing")
+    parser.add_argument("--only", default="", help="measure paths that contain this text; other rows stay")
     asked = parser.parse_args()
     warnings.filterwarnings("ignore", module="viapoint")
-    lines = []
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder
         for project, file, arguments in FILES:
@@ -147,15 +146,25 @@ def main() -> None:
             if path is None or asked.only not in file:
                 continue
             line = {"project": project, "file": file, "arguments": len(arguments)}
-            lines.append({**line, **measure(path, arguments)})
-            print(lines[-1], flush=True)
-    found = pd.DataFrame(lines)
-    print(found.drop(columns=["file", "fault"]).to_markdown(index=False, floatfmt=".3g"))
-    if not asked.only:
-        found.to_csv(TABLE, index=False, float_format="%.4g", lineterminator="\n")
-        before, _, after = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-        _, _, after = after.partition(END)
-        PAGE.write_text(f"{before}{BEGIN}\n{page_table(found)}\n{END}{after}", encoding="utf-8")
+            line.update(measure(path, arguments))
+            print(line, flush=True)
+            write(line)
+
+
+def write(line: dict[str, Any]) -> None:
+    """Write a line into the table and the page, in the place of an older one."""
+    known = (
+        pd.read_csv(TABLE, keep_default_na=False, na_values=[""])
+        if TABLE.is_file()
+        else pd.DataFrame({"file": []})
+    )
+    found = pd.concat([known[known.file != line["file"]], pd.DataFrame([line])])
+    order = {file: row for row, (_, file, _) in enumerate(FILES)}
+    found = found.sort_values("file", key=lambda files: files.map(order)).fillna({"fault": ""})
+    found.to_csv(TABLE, index=False, float_format="%.4g", lineterminator="\n")
+    before, _, after = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+    _, _, after = after.partition(END)
+    PAGE.write_text(f"{before}{BEGIN}\n{page_table(found)}\n{END}{after}", encoding="utf-8")
 
 
 def measure(path: Path, arguments: dict[str, Any]) -> dict[str, Any]:

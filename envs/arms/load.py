@@ -41,7 +41,7 @@ WEIGHED = 200
 """Number of configurations in which the arm is weighed."""
 LOOKED_AT, NEAR_LOOKED_AT = 16, 1000
 """Numbers of configurations in which bodies that are always near are looked for, and contacts of these."""
-NEAR, FINE = 0.03, 0.008
+NEAR, FINE = 0.03, 0.005
 """Distance within which bodies are near in at least half of the configurations, and tolerance for these, [m]."""
 WARNING = "warning: "
 """Beginning of notes that are told as warnings, too."""
@@ -690,7 +690,8 @@ def _fitted(
         fits[body] = []
         for geom in geoms:
             size = 2.0 * float(parsed.model.geom_rbound[geom])
-            allowed = tolerances[body] if parsed.links[body] else max(tolerances[body], BASE_SHARE * size)
+            large = not parsed.links[body] and tolerances[body] > FINE
+            allowed = max(tolerances[body], BASE_SHARE * size) if large else tolerances[body]
             fits[body] += [Fit(geom, capsule) for capsule in cover_geom(parsed.model, geom, allowed)]
     while True:
         xml = _write(parsed, ranges, origin, fits)

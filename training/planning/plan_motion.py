@@ -236,9 +236,13 @@ def plan_motion(
     number = -(-number // len(goals))
     until = time.perf_counter() + time_limit
     plans = []
-    if len(goals) > 1:  # straight movements cost next to nothing, and many goals cannot be reached otherwise either
+    if (
+        len(goals) > 1
+    ):  # straight movements cost next to nothing, and many goals cannot be reached otherwise either
         for each in goals:
-            plans.append(_plan(problem._replace(goal=each), n_via, given[:0], 0, enough, 0.0, generator, False))
+            plans.append(
+                _plan(problem._replace(goal=each), n_via, given[:0], 0, enough, 0.0, generator, False)
+            )
     for rank, each in enumerate(goals):
         if any(plan.success for plan in plans):
             break
