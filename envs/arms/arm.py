@@ -89,11 +89,12 @@ class Arm:
     def report(self) -> str:
         """Return what the arm is, and what was chosen for it, as a text of several lines."""
         lines = [repr(self)]
-        for name, (low, high), velocity, torque, home in zip(
-            self.joint_names, self.joint_range, self.velocity_limit, self.torque_limit, self.home, strict=True
-        ):
+        for j, name in enumerate(self.joint_names):
+            unit, effort = ("m", "N") if self.chain.sliding[j] else ("rad", "N m")
+            low, high = self.joint_range[j]
             lines.append(
-                f"{name}: {low:.4g} to {high:.4g}, at most {velocity:.4g}/s and {torque:.4g} N m, home {home:.4g}"
+                f"{name}: {low:.4g} to {high:.4g} {unit}, at most {self.velocity_limit[j]:.4g} {unit}/s and "
+                f"{self.torque_limit[j]:.4g} {effort}, home {self.home[j]:.4g} {unit}"
             )
         lines += self.notes
         lines += [f"{pair.first} and {pair.second} are not compared: {pair.reason}" for pair in self.left_out]
