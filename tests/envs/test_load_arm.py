@@ -531,7 +531,8 @@ def test_a_tool_on_a_finger_moves_with_the_last_joint_of_the_arm():
 
 
 def test_a_mobile_base_is_fixed():
-    carriage = '<body name="carriage"><joint name="x" type="slide" limited="false"/><joint name="turn"/><geom size=".05" mass="2"/>'
+    slide = '<joint name="x" type="slide" limited="false"/>'
+    carriage = f'<body name="carriage">{slide}<joint name="turn"/><geom size=".05" mass="2"/>'
     text = changed((SHOULDER, carriage + SHOULDER), ("</body>\n  </worldbody>", "</body></body></worldbody>"))
     arm = load_arm(text)
     assert arm.joint_names == JOINTS
