@@ -58,7 +58,9 @@ def read_arm(key: str) -> Arm | None:
     """Return the arm of a key; None if there is none, or if its file is broken."""
     try:
         with np.load(_folder() / f"{key}.npz", allow_pickle=False) as stored:
-            parts = {name: np.ascontiguousarray(stored[name]) for name in stored.files if name != "text"}
+            parts: dict[str, Any] = {
+                name: np.ascontiguousarray(stored[name]) for name in stored.files if name != "text"
+            }
             text = json.loads(str(stored["text"]))
         for kind in (Chain, Spheres):
             name = kind.__name__.lower()

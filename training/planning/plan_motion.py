@@ -235,20 +235,22 @@ def plan_motion(
     generator = np.random.default_rng(rng if rng is not None else 0)
     number = -(-number // len(goals))
     until = time.perf_counter() + time_limit
-    plans = []
-    if (
-        len(goals) > 1
-    ):  # straight movements cost next to nothing, and many goals cannot be reached otherwise either
-        for each in goals:
-            plans.append(
-                _plan(problem._replace(goal=each), n_via, given[:0], 0, enough, 0.0, generator, False)
-            )
+    # Straight movements are cheap, and the first goal that is reached bounds what others may cost.
+    straight = [
+        _plan(problem._replace(goal=each), n_via, given[:0], 0, enough, 0.0, generator, False)
+        for each in (goals if len(goals) > 1 else goals[:0])
+    ]
+    plans = list(straight)
     for rank, each in enumerate(goals):
-        if any(plan.success for plan in plans):
-            break
+        least = min((plan.duration for plan in plans if plan.success), default=np.inf)
+        if straight and straight[rank].duration >= least:
+            continue
+        # A goal that cannot be reached costs its share of the time, or a few seeds if another one is reached.
         now = time.perf_counter()
         share = now + (until - now) / (len(goals) - rank)
-        plans.append(_plan(problem._replace(goal=each), n_via, given, number, enough, share, generator, ompl))
+        few = number if np.isinf(least) else min(number, NARROW)
+        tree = ompl and bool(np.isinf(least))
+        plans.append(_plan(problem._replace(goal=each), n_via, given, few, enough, share, generator, tree))
     best = max(plans, key=_worth)
     return dataclasses.replace(best, milliseconds=1e3 * (time.perf_counter() - began))
 
