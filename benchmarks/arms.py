@@ -175,7 +175,7 @@ def measure(path: Path, arguments: dict[str, Any]) -> dict[str, Any]:
         try:
             arm = load_arm(path, **arguments)
         except ValueError as error:
-            return {"fault": str(error)}
+            return {"fault": str(error)[:300]}
         seconds.append(time.perf_counter() - begin)
     known: dict[str, Any] = {
         "arm": arm.name,
@@ -241,7 +241,7 @@ def page_table(found: pd.DataFrame) -> str:
         parts.append(f"### {PROJECTS[project]}\n\n{text}\n")
         for file, fault in zip(files, rows.fault, strict=True):
             if fault:
-                parts.append(f"`{file}`: {fault:.300}\n")
+                parts.append(f"`{file}`: {fault}\n")
     return "\n".join(parts)
 
 
