@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import tempfile
 import time
 import warnings
@@ -238,6 +239,7 @@ def page_table(found: pd.DataFrame) -> str:
         table.columns = pd.Index(heads)
         digits = ("", ".0f", ".1f", ".1f", ".0f", ".0f", ".0f", ".2f", ".0f", ".1f", ".0f")
         text = table.to_markdown(index=False, floatfmt=digits, missingval="")
+        text = re.sub(r"\bnan\b", "   ", text)
         parts.append(f"### {PROJECTS[project]}\n\n{text}\n")
         for file, fault in zip(files, rows.fault, strict=True):
             if fault:
