@@ -128,7 +128,7 @@ def own_arm(path: Path, seed: int = 7, side: int = 480) -> None:
     """Render the arm of the page on arms of one's own: the plan of a search beside the straight movement."""
     ur5e = load_arm(
         ROOT / "docs" / "ur5e.xml",
-        hand_site="hand",
+        tool="hand",
         joints=("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"),
         home=(0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28),
         velocity_limit=np.pi,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -89,11 +89,12 @@ class Arm:
     def report(self) -> str:
         """Return what the arm is, and what was chosen for it, as a text of several lines."""
         lines = [repr(self)]
-        for name, (low, high), velocity, torque, home in zip(
-            self.joint_names, self.joint_range, self.velocity_limit, self.torque_limit, self.home, strict=True
-        ):
+        for j, name in enumerate(self.joint_names):
+            unit, effort = ("m", "N") if self.chain.sliding[j] else ("rad", "N m")
+            low, high = self.joint_range[j]
             lines.append(
-                f"{name}: {low:.4g} to {high:.4g}, at most {velocity:.4g}/s and {torque:.4g} N m, home {home:.4g}"
+                f"{name}: {low:.4g} to {high:.4g} {unit}, at most {self.velocity_limit[j]:.4g} {unit}/s and "
+                f"{self.torque_limit[j]:.4g} {effort}, home {self.home[j]:.4g} {unit}"
             )
         lines += self.notes
         lines += [f"{pair.first} and {pair.second} are not compared: {pair.reason}" for pair in self.left_out]
@@ -173,7 +174,7 @@ def arm_from_xml(
     torque_limit: Any,
     space: SpaceName = "joints",
     bandwidth: float = 50.0,
-    exclude: Sequence[tuple[str, str]] = (),
+    exclude: Mapping[frozenset[str], str] | None = None,
 ) -> Arm:
     """Return the arm of an MJCF text in which all collision geoms are capsules and spheres.
 
@@ -187,7 +188,7 @@ def arm_from_xml(
         torque_limit: Greatest torques, shape (J,).
         space: Space in which movements are planned.
         bandwidth: Natural frequency of the critically damped joint servos, [rad/s].
-        exclude: Pairs of bodies that may pass through one another.
+        exclude: Pairs of bodies that may pass through one another, with the reason.
 
     Raises:
         ValueError: Bodies that are apart at home cannot be told apart.
@@ -202,7 +203,7 @@ def arm_from_xml(
     bodies = [model.body(i).name for i in range(1, model.nbody) if model.body(i).name in links]
     touching = touching_at_home(model, data, bodies)
     capsules = _capsules(model, chain, tuple(joints), links)
-    covered = cover(chain, capsules, links, home, touching, {frozenset(pair) for pair in exclude})
+    covered = cover(chain, capsules, links, home, touching, exclude or {})
     ranges = np.array([model.joint(each).range for each in joints])
     covered = _without_distant_pairs(chain, covered, ranges)
     inertia = _greatest_inertia(model, data, tuple(joints))

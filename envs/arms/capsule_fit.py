@@ -34,10 +34,13 @@ CUTS = (0.35, 0.5, 0.65)
 """Places of the planes that cut a body, as shares of its length along a principal axis."""
 LEAST_SHARE = 0.3
 """Least length along an axis across which a body is cut, as a share of the greatest."""
-FIRST_STEP, LAST_STEP = 0.25, 5e-4
-"""First and last step of the search for the ends, as shares of the size of the body."""
-MOST_CAPSULES = 64
+FIRST_STEP, LAST_STEP, COARSE_STEP = 0.25, 5e-4, 0.05
+"""First and last step of the search for the ends, and last one where cuts are compared, as shares of the size."""
+MOST_CAPSULES = 48
 """Greatest number of capsules for one geom."""
+_ONE_WAY = np.concatenate((np.eye(6), np.kron([[1.0, 1.0], [1.0, -1.0]], np.eye(3))))
+MOVES = np.concatenate((_ONE_WAY, -_ONE_WAY)).reshape(-1, 2, 3)
+"""Directions in which the search moves one end of a capsule, or both, shape (24, 2, 3)."""
 
 
 class FittedCapsule(NamedTuple):
@@ -68,10 +71,10 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
     """Return capsules and spheres that together contain a geom, in the geom's frame.
 
     Spheres and capsules are returned as they are. Boxes, cylinders, ellipsoids and the convex hulls of meshes are
-    covered so that no capsule reaches farther than `tolerance`, [m], from the geom.
+    covered so that no capsule reaches farther than `tolerance`, [m], from the geom, if MOST_CAPSULES suffice for that.
 
     Raises:
-        ValueError: The geom is of another type, needs more than MOST_CAPSULES capsules, or is flat.
+        ValueError: The geom is of another type, or is flat.
     """
     size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
     if kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE):
@@ -83,11 +86,6 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
         found = cover_points(corners, tolerance - larger)
     except ValueError as error:
         raise ValueError(f"geom {model.geom(geom).name or geom}: {error}") from None
-    if found is None:
-        raise ValueError(
-            f"geom {model.geom(geom).name or geom}: tolerance {tolerance:.4g} m takes more than "
-            f"{MOST_CAPSULES} capsules; allow a greater one, or give the link simpler geoms"
-        )
     return [each._replace(excess=each.excess + larger) for each in found]
 
 
@@ -141,22 +139,18 @@ def _rim(number: int) -> Float:
     return np.stack((wide * np.cos(angle), wide * np.sin(angle), 0.0 * angle), axis=-1)
 
 
-def cover_points(points: Float, tolerance: float) -> list[FittedCapsule] | None:
+def cover_points(points: Float, tolerance: float) -> list[FittedCapsule]:
     """Return capsules and spheres that together contain the convex hull of points, shape (n, 3), [m].
 
-    None stands for more than MOST_CAPSULES of them.
+    Their excess is at most the tolerance, if MOST_CAPSULES suffice for that.
     """
     body = _body(points)
-    pieces = [fit_capsule(np.asarray(body.shape.vertices), body)]
-    found: list[FittedCapsule] = []
-    while pieces:
-        capsule = pieces.pop()
-        if capsule.excess <= tolerance:
-            found.append(capsule)
-            continue
-        if len(pieces) + len(found) + 2 > MOST_CAPSULES:
-            return None
-        pieces += _best_halves(capsule.corners, body, tolerance)
+    found = [fit_capsule(np.asarray(body.shape.vertices), body)]
+    while len(found) < MOST_CAPSULES:
+        worst = max(range(len(found)), key=lambda index: found[index].excess)
+        if found[worst].excess <= tolerance:
+            break
+        found += _best_halves(found.pop(worst).corners, body, tolerance)
     return found
 
 
@@ -167,52 +161,69 @@ def _body(points: Float) -> Body:
     return Body(shape, np.ascontiguousarray(equations[:, :3]), -equations[:, 3])
 
 
-def fit_capsule(corners: Float, body: Body) -> FittedCapsule:
+def fit_capsule(corners: Float, body: Body, last_step: float = LAST_STEP) -> FittedCapsule:
     """Return a capsule that contains points, shape (n, 3), [m], with little excess over a convex body around them."""
     centre, axes, low, high = _principal_frame(corners)
     size = high - low
+    away = ((corners - 0.5 * (corners.max(axis=0) + corners.min(axis=0))) ** 2).sum(axis=1)
+    sorted_corners = np.ascontiguousarray(corners[np.argsort(-away)])
     best, least = np.empty((2, 3)), np.inf
     for i in range(3):
         # Along each principal axis, begin with ends that are half a width inside.
         inset = 0.5 * min(float(np.delete(size, i).max()), float(size[i]))
         ends = np.tile(0.5 * (low + high), (2, 1))
         ends[:, i] = low[i] + inset, high[i] - inset
-        ends, excess = _refine(centre + ends @ axes.T, corners, body, float(size.max()))
+        ends = centre + ends @ axes.T
+        excess = _refine(
+            ends, sorted_corners, (body.normals, body.offsets), MOVES, float(size.max()), last_step
+        )
         if excess < least:
             best, least = ends, excess
     if np.linalg.norm(best[1] - best[0]) < SHORTEST:
         best = np.tile(best.mean(axis=0), (2, 1))
-    radius = _radius(best, corners) + ROUNDING
+    radius = _radius(best, sorted_corners, np.inf) + ROUNDING
     return FittedCapsule(best, radius, radius + float(body.shape.distance(best).max()), corners)
 
 
-def _refine(ends: Float, corners: Float, body: Body, size: float) -> tuple[Float, float]:
-    """Return ends of the least excess (1) near some ends, by a compass search, and the excess without rounding."""
-    each_end = np.eye(6)
-    both_ends = np.kron([[1.0, 1.0], [1.0, -1.0]], np.eye(3))
-    moves = np.concatenate((each_end, both_ends, -each_end, -both_ends)).reshape(-1, 2, 3)
-    corners = np.ascontiguousarray(corners)
-    step, least = FIRST_STEP * size, _excess(ends, corners, body.normals, body.offsets)
-    while step > LAST_STEP * size:
-        best, where = least, ends
-        for move in moves:
-            probe = ends + step * move
-            value = _excess(probe, corners, body.normals, body.offsets)
-            if value < best:
-                best, where = value, probe
-        if best < least - 1e-9:
-            ends, least = where, best
+@compiled
+def _refine(
+    ends: Float, corners: Float, body: tuple[Float, Float], moves: Float, size: float, last_step: float
+) -> float:
+    """Move ends to the least excess (1) near them, by a compass search, and return the excess without rounding.
+
+    Args:
+        ends: Ends of the axis, shape (2, 3), which are changed, [m].
+        corners: Points that the capsule contains, shape (n, 3), those far from the middle first, [m].
+        body: Outward normals of the faces of the body, shape (F, 3), and their distances from the origin, shape (F,).
+        moves: Directions of the search, shape (m, 2, 3).
+        size: Size of the body, [m].
+        last_step: Last step, as a share of the size.
+    """
+    probe, best = np.empty((2, 3)), np.empty((2, 3))
+    step, least = FIRST_STEP * size, _excess(ends, corners, body, np.inf)
+    while step > last_step * size:
+        lowest = least - 1e-9
+        for move in range(len(moves)):
+            probe[:] = ends + step * moves[move]
+            value = _excess(probe, corners, body, lowest)
+            if value < lowest:
+                lowest = value
+                best[:] = probe
+        if lowest < least - 1e-9:
+            ends[:] = best
+            least = lowest
         else:
             step *= 0.5
-    return ends, least
+    return least
 
 
 @compiled
-def _excess(ends: Float, corners: Float, normals: Float, offsets: Float) -> float:
-    """Return the excess (1) of a capsule with some ends around points, shape (n, 3), [m].
+def _excess(ends: Float, corners: Float, body: tuple[Float, Float], bound: float) -> float:
+    """Return the excess (1) of a capsule with some ends around points, shape (n, 3), or a number above a bound, [m].
 
     The height above the highest face is d for ends inside the body, and less than d outside.
     """
+    normals, offsets = body
     highest = -1e9
     for end in range(2):
         for face in range(len(offsets)):
@@ -220,12 +231,16 @@ def _excess(ends: Float, corners: Float, normals: Float, offsets: Float) -> floa
             for a in range(3):
                 height += normals[face, a] * ends[end, a]
             highest = max(highest, height)
-    return highest + _radius(ends, corners)
+    return highest + _radius(ends, corners, bound - highest)
 
 
 @compiled
-def _radius(ends: Float, corners: Float) -> float:
-    """Return the greatest distance of points, shape (n, 3), from a segment with the ends (2, 3), [m]."""
+def _radius(ends: Float, corners: Float, bound: float) -> float:
+    """Return the greatest distance of points, shape (n, 3), from a segment with the ends (2, 3), [m].
+
+    Once it is above a bound, it need not be the greatest.
+    """
+    most = max(bound, 0.0) ** 2
     length = 1e-18
     for a in range(3):
         length += (ends[1, a] - ends[0, a]) ** 2
@@ -239,6 +254,8 @@ def _radius(ends: Float, corners: Float) -> float:
         for a in range(3):
             square += (corners[corner, a] - ends[0, a] - share * (ends[1, a] - ends[0, a])) ** 2
         greatest = max(greatest, square)
+        if greatest > most:
+            break
     return float(np.sqrt(greatest))
 
 
@@ -252,12 +269,12 @@ def _best_halves(corners: Float, body: Body, tolerance: float) -> list[FittedCap
         for share in CUTS:
             level = float(centre @ axes[:, i] + low[i] + share * size[i])
             pieces = _cut(corners, hull.simplices, axes[:, i], level)
-            halves = [fit_capsule(piece, body) for piece in pieces]
+            halves = [fit_capsule(piece, body, COARSE_STEP) for piece in pieces]
             excess = [capsule.excess for capsule in halves]
             merit = sum(each > tolerance for each in excess), max(excess)
             if not best or merit < least:
                 best, least = halves, merit
-    return best
+    return [fit_capsule(half.corners, body) for half in best]
 
 
 def _cut(corners: Float, triangles: Float, normal: Float, offset: float) -> tuple[Float, Float]:

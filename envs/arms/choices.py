@@ -20,12 +20,16 @@ TOOL_NAMES = (
     r"(right_|left_)?hand(_?(site|link))?", r"flange.*", r"link_(tcp|eef)",
 )  # fmt: skip
 """Usual names of tools, the most telling first; prefixes that end in `_`, `/` or `:` may precede them."""
+GRIPPERS = re.compile(r"grip|jaw|finger|fngr|claw|knuckle", re.IGNORECASE)
+"""Words in the names of bodies and joints of a gripper, which is not part of a chain whose tool has no usual name."""
 LEAST_CHAIN = 3
 """Least number of joints of a branch that is an arm and not a finger."""
 HOMES = 64
 """Number of random configurations among which a home is looked for."""
 INSET = 0.1
 """Least distance of home from the joint limits, as a share of the ranges."""
+LEAST_GAP = 0.002
+"""Distance of bodies at home below which another home is looked for, [m]."""
 KNOWN_VELOCITIES: dict[str, tuple[float, ...]] = {
     "panda": (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),
     "fr3": (2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
@@ -35,10 +39,19 @@ KNOWN_VELOCITIES: dict[str, tuple[float, ...]] = {
     "iiwa14": (1.48, 1.48, 1.75, 1.31, 2.27, 2.36, 2.36),
     "gen3": (1.39, 1.39, 1.39, 1.39, 1.22, 1.22, 1.22),
     "xarm7": (3.14,) * 7,
+    "lite6": (3.14,) * 6,
     "sawyer": (1.74, 1.33, 1.96, 1.96, 3.49, 3.49, 4.55),
+    "rizon4": (2.09, 2.09, 2.44, 2.44, 4.89, 4.89, 4.89),
+    "piper": (3.14, 3.4, 3.14, 3.93, 3.93, 3.93),
+    "z1": (3.14,) * 6,
+    "tiago": (0.07, 2.7, 3.66, 4.58, 4.58, 1.95, 1.76, 1.76),
+    "j2s7s300": (0.628, 0.628, 0.628, 0.628, 0.838, 0.838, 0.838),
 }
-"""Velocity limits of well-known arms by a part of their name, [rad/s]: data sheets of Franka Robotics (Panda, FR3),
-Universal Robots (e-Series), KUKA (LBR iiwa 14 R820), Kinova (Gen3), UFACTORY (xArm 7) and Rethink Robotics (Sawyer)."""
+"""Velocity limits of well-known arms by a part of their name, [rad/s] or [m/s]: data sheets of Franka Robotics (Panda,
+FR3), Universal Robots (e-Series), KUKA (LBR iiwa 14 R820), Kinova (Gen3), UFACTORY (xArm 7, Lite 6), Rethink Robotics
+(Sawyer), Flexiv (Rizon 4) and AgileX (PiPER); URDF files of Unitree (Z1), PAL Robotics (TIAGo) and Kinova (Jaco)."""
+KNOWN_TORQUES: dict[str, tuple[float, ...]] = {"iiwa14": (320.0, 320.0, 176.0, 176.0, 110.0, 40.0, 40.0)}
+"""Torque limits of well-known arms that MuJoCo models often lack, [N m]: data sheet of KUKA (LBR iiwa 14 R820)."""
 
 
 class Tool(NamedTuple):
@@ -125,30 +138,53 @@ def _tool_at_point(model: mujoco.MjModel, given: Any) -> Tool:
 
 
 def chain_joints(model: mujoco.MjModel, body: int, base: str | None = None) -> list[str]:
-    """Return the names of the hinges and slides that carry a body, from the base to it."""
+    """Return the names of the hinges and slides that carry a body, from the base, whose own count, too, to it."""
     end = int(model.body(base).id) if base is not None else 0
     names: list[str] = []
-    while body not in (0, end):
-        first = int(model.body_jntadr[body])
-        for joint in range(first, first + int(model.body_jntnum[body])):
+    for each in (body, *ancestors(model, body)):
+        first = int(model.body_jntadr[each])
+        for joint in range(first, first + int(model.body_jntnum[each])):
             if model.jnt_type[joint] in MOVES:
                 names.insert(0, model.joint(joint).name)
-        body = int(model.body_parentid[body])
+        if each == end:
+            break
     return names
 
 
 def arm_joints(model: mujoco.MjModel, chain: list[str], notes: list[str]) -> list[str]:
-    """Return the joints of a chain without those of a mobile base: several of one body, or slides without an end."""
-    kept = []
-    for name in chain:
-        joint = model.joint(name)
-        several = model.body_jntnum[int(joint.bodyid[0])] > 1
-        endless = joint.type[0] == MOVES[1] and not model.jnt_limited[joint.id]
-        if several or endless:
-            notes.append(f"left out: {name}, which seems to move a mobile base")
-        else:
-            kept.append(name)
-    return kept
+    """Return the joints of a chain without those of a mobile base, and without those of fingers.
+
+    A body with a slide that has no end is a mobile base. Fingers are what hangs on a body from
+    which several short branches move.
+    """
+    carriers = {name: int(model.joint(name).bodyid[0]) for name in chain}
+    endless = (model.jnt_type == MOVES[1]) & (model.jnt_limited == 0)
+    mobile = {name for name in chain if endless[model.jnt_bodyid == carriers[name]].any()}
+    below = {body: _joints_below(model, body) for body in range(model.nbody)}
+    hands = set()
+    for body in range(1, model.nbody):
+        moving = [each for each in _children(model, body) if below[each]]
+        if len(moving) > 1 and not any(_is_branch(model, each, below) for each in moving):
+            hands.add(body)
+    fingers = {name for name in chain if hands & set(ancestors(model, carriers[name]))}
+    for some, what in ((mobile, "which seem to move a mobile base"), (fingers, "which seem to move fingers")):
+        if some:
+            notes.append(f"fixed: {', '.join(sorted(some))}, {what}")
+    return [name for name in chain if name not in mobile | fingers]
+
+
+def _children(model: mujoco.MjModel, body: int) -> list[int]:
+    """Return the bodies that hang on a body."""
+    return [each for each in range(1, model.nbody) if model.body_parentid[each] == body]
+
+
+def ancestors(model: mujoco.MjModel, body: int) -> list[int]:
+    """Return the bodies that carry a body, the nearest first."""
+    found = []
+    while body:
+        body = int(model.body_parentid[body])
+        found.append(body)
+    return found
 
 
 def _under(model: mujoco.MjModel, base: str | None) -> Callable[[int], bool]:
@@ -165,13 +201,7 @@ def _under(model: mujoco.MjModel, base: str | None) -> Callable[[int], bool]:
             f"there is no body {base!r} in the file; there are: {', '.join(filter(None, names))}"
         )
     root = int(model.body(base).id)
-
-    def hangs(body: int) -> bool:
-        while body not in (0, root):
-            body = int(model.body_parentid[body])
-        return body == root
-
-    return hangs
+    return lambda body: root in (body, *ancestors(model, body))
 
 
 def _tip(model: mujoco.MjModel, base: str | None) -> int:
@@ -183,9 +213,8 @@ def _tip(model: mujoco.MjModel, base: str | None) -> int:
     below = {body: _joints_below(model, body) for body in range(model.nbody)}
     body = int(model.body(base).id) if base is not None else 0
     while True:
-        children = [each for each in range(1, model.nbody) if model.body_parentid[each] == body]
-        moving = [each for each in children if below[each]]
-        arms = [each for each in moving if below[each] >= LEAST_CHAIN]
+        moving = [each for each in _children(model, body) if below[each]]
+        arms = [each for each in moving if _is_branch(model, each, below)]
         if (
             len(arms) > 1
             and max(below[each] for each in arms) - min(below[each] for each in arms) < LEAST_CHAIN
@@ -194,7 +223,7 @@ def _tip(model: mujoco.MjModel, base: str | None) -> int:
             raise ValueError(f"the chain branches into {names}; name one with base=, or a tool with tool=")
         if arms:
             body = max(arms, key=lambda each: below[each])
-        elif len(moving) == 1:
+        elif len(moving) == 1 and not _is_gripper(model, moving[0]):
             body = moving[0]
         else:  # nothing more that moves, or fingers
             break
@@ -203,18 +232,31 @@ def _tip(model: mujoco.MjModel, base: str | None) -> int:
     return body
 
 
+def _is_branch(model: mujoco.MjModel, body: int, below: dict[int, int]) -> bool:
+    """Return True if a body is the first of an arm, and not of a finger."""
+    return below[body] >= LEAST_CHAIN and not _is_gripper(model, body)
+
+
+def _is_gripper(model: mujoco.MjModel, body: int) -> bool:
+    """Return True if a joint of a body is named after a part of a gripper; or the body, where nothing moves on it."""
+    first, number = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+    names = [model.joint(joint).name for joint in range(first, first + number)]
+    if names and _joints_below(model, body) == number:
+        names.append(model.body(body).name)
+    return any(GRIPPERS.search(name) for name in names)
+
+
 def _joints_below(model: mujoco.MjModel, body: int) -> int:
     """Return the greatest number of hinges and slides on a way from a body to a leaf, its own included."""
     first, number = int(model.body_jntadr[body]), int(model.body_jntnum[body])
     own = sum(model.jnt_type[joint] in MOVES for joint in range(first, first + number))
-    children = (each for each in range(1, model.nbody) if model.body_parentid[each] == body)
-    return own + max((_joints_below(model, each) for each in children), default=0)
+    return own + max((_joints_below(model, each) for each in _children(model, body)), default=0)
 
 
-def known_velocities(name: str, number: int) -> Float | None:
-    """Return the velocity limits of a well-known arm by its name, shape (J,), [rad/s]; None for others."""
+def known_limits(table: dict[str, tuple[float, ...]], name: str, number: int) -> Float | None:
+    """Return the limits of a well-known arm by its name, shape (J,); None for others."""
     plain = re.sub(r"[^a-z0-9]", "", name.lower())
-    for known, limits in KNOWN_VELOCITIES.items():
+    for known, limits in table.items():
         if known in plain and len(limits) == number:
             return np.array(limits)
     return None
@@ -227,18 +269,15 @@ def choose_home(
 
     Args:
         ranges: Ranges of the joints, shape (J, 2).
-        candidates: Configurations of the file that are tried first, by their names.
+        candidates: Configurations that are tried first, by their names.
         apart: Function that returns the least distance of bodies that should not touch, [m].
     """
     low, high = ranges.T
+    candidates = {**candidates, "the middle of the ranges": 0.5 * (low + high)}
     for origin, configuration in candidates.items():
         inside = (configuration >= low) & (configuration <= high)
-        if inside.all() and apart(configuration) > 0.0:
-            return configuration, f"the file's {origin}"
-    middle = 0.5 * (low + high)
-    if apart(middle) > 0.0:
-        return middle, "the middle of the ranges"
+        if inside.all() and apart(configuration) >= LEAST_GAP:
+            return configuration, origin
     inset = INSET * (high - low)
     drawn = np.random.default_rng(0).uniform(low + inset, high - inset, (HOMES, len(low)))
-    best = max([middle, *drawn], key=apart)
-    return best, "the one that is farthest from touching itself, of random ones"
+    return max(drawn, key=apart), "the one that is farthest from touching itself, of random ones"

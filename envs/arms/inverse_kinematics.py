@@ -10,7 +10,7 @@ import numpy as np
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.chain import Chain
-from viapoint.envs.arms.kinematics import forward, link_frames, tool_jacobian, transform
+from viapoint.envs.arms.kinematics import jacobians, link_frames, tool_jacobian, transform
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.compiled import compiled
@@ -28,6 +28,8 @@ STALLED = 1e-9
 """Greatest step of the joints that ends the iterations, [rad]."""
 SAME = 1e-3
 """Greatest difference of joints in solutions that count as the same, [rad]."""
+NEAREST, INSIDE = 8, 1e-6
+"""Number of configurations from which the nearest place is looked for, and their distance from the limits, [rad]."""
 REACHED = 1e-9
 """Greatest distance of the hand from a target in the plane, [m]."""
 
@@ -289,6 +291,24 @@ def planar_motion(
     return out[0].reshape(shape), out[1].reshape(shape), out[2].reshape(shape)
 
 
+def _least_distance(arm: Arm, position: Float, begin: Float) -> float:
+    """Return the least distance between tool and a place that is found from some configurations, (N, J), [m]."""
+    from scipy.optimize import least_squares  # here, because it is needed where nothing was found only
+
+    low, high = arm.joint_range.T
+    order = np.argsort(np.linalg.norm(arm.hand(begin) - position, axis=-1))
+    least = np.inf
+    for configuration in begin[order[:NEAREST]]:
+        found = least_squares(
+            lambda joints: arm.hand(joints) - position,
+            np.clip(configuration, low + INSIDE, high - INSIDE),
+            jac=lambda joints: jacobians(arm.chain, joints)[:3],
+            bounds=(low, high),
+        )
+        least = min(least, float(np.linalg.norm(found.fun)))
+    return least
+
+
 def inverse_kinematics(
     arm: Arm,
     position: Any,
@@ -335,8 +355,7 @@ def inverse_kinematics(
     joints = len(low)
     rotation, origin = np.empty((joints + 1, 3, 3)), np.empty((joints + 1, 3))
     found: list[Float] = []
-    nearest, where = np.inf, begin[0]
-    for configuration in begin:
+    for configuration in begin.copy():
         error = _descend(
             arm.chain,
             arm.joint_range,
@@ -347,17 +366,14 @@ def inverse_kinematics(
             rotation,
             origin,
         )
-        if error == 0.0:
-            if all(np.abs(configuration - other).max() > SAME for other in found):
-                found.append(configuration)
-        elif error < nearest:
-            nearest, where = error, configuration
+        if error == 0.0 and all(np.abs(configuration - other).max() > SAME for other in found):
+            found.append(configuration)
     if not found:
-        away = float(np.linalg.norm(forward(arm.chain, where)[0] - position))
+        away = _least_distance(arm, position, begin)
         pose = "position" if quaternion is None else "pose"
-        raise ValueError(
-            f"the {pose} {position.tolist()} m cannot be reached: the nearest place found is {1e3 * away:.1f} mm away"
-            f"{'' if quaternion is None else ', and the orientation counts, too'}"
-        )
+        nearest = f"the nearest place found is {1e3 * away:.1f} mm away"
+        if quaternion is not None and away < PLACE_TOLERANCE:
+            nearest = "its position can be, but not with this orientation"
+        raise ValueError(f"the {pose} {position.tolist()} m cannot be reached: {nearest}")
     found.sort(key=lambda each: float(np.abs(each - first).max()))
     return np.array(found)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,8 +15,19 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
+from viapoint.envs.arms.cache import key_of, read_arm, write_arm
 from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
-from viapoint.envs.arms.choices import arm_joints, chain_joints, choose_home, choose_tool, known_velocities
+from viapoint.envs.arms.choices import (
+    KNOWN_TORQUES,
+    KNOWN_VELOCITIES,
+    LEAST_GAP,
+    ancestors,
+    arm_joints,
+    chain_joints,
+    choose_home,
+    choose_tool,
+    known_limits,
+)
 from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.arms.urdf import Urdf, read_urdf
 from viapoint.envs.common.types import Float
@@ -27,15 +39,21 @@ WEIGHTS, LEAST_TORQUE = 3.0, 1.0
 """Torque limit of joints without one, as a multiple of the torque that gravity needs, and at least, [N m] or [N]."""
 WEIGHED = 200
 """Number of configurations in which the arm is weighed."""
-LOOKED_AT = 16
-"""Number of configurations in which bodies that always touch are looked for."""
+LOOKED_AT, NEAR_LOOKED_AT = 16, 1000
+"""Numbers of configurations in which bodies that are always near are looked for, and contacts of these."""
+NEAR, FINE = 0.03, 0.005
+"""Distance within which bodies are near in at least half of the configurations, and tolerance for these, [m]."""
+WARNING = "warning: "
+"""Beginning of notes that are told as warnings, too."""
+GENERIC_NAMES = ("arm", "model", "robot", "scene")
+"""Names of files that do not tell the arm; it gets the name of the model."""
 TOOL = "viapoint_tool"
 """Name of the site that is added for the tool."""
 MIN_JOINTS = 2
 """Least number of joints."""
 MIN_TOLERANCE, MAX_TOLERANCE = 0.005, 1.0
 """Bounds of the tolerance of fitted capsules, [m]."""
-BASE_SHARE = 0.1
+BASE_SHARE = 0.05
 """Least tolerance of geoms of the base, as a share of their size: bases may be large."""
 LEFT_SHARE, LEFT_MOST = 0.25, 0.002
 """Distance at home that capsules leave between bodies, as a share of that of the geoms, and at most, [m]."""
@@ -65,7 +83,6 @@ class Parsed(NamedTuple):
     rest: mujoco.MjData
     """Places with all joints at 0."""
     joints: tuple[str, ...]
-    hand_site: str
     links: dict[int, int]
     """Link of each body of the arm, 0 for the base, in the order of the file."""
     geoms: dict[int, list[int]]
@@ -86,21 +103,20 @@ def load_arm(
     joints: Sequence[str] | None = None,
     base: str | None = None,
     packages: Sequence[str | Path] = (),
-    hand_site: str | None = None,
     name: str | None = None,
     home: Any = None,
     origin: Any = None,
     joint_range: Any = None,
     torque_limit: Any = None,
     velocity_limit: Any = None,
-    tolerance: float = 0.025,
+    tolerance: float = 0.02,
 ) -> Arm:
     """Load an arm from an MJCF or URDF file.
 
     The arm keeps the file's joints, inertias, damping and limits, and the spheres and capsules of its bodies. Capsules
     cover the other geoms: nothing sticks out of them. Other joints are fixed as in the file's first keyframe. The base
     is what is fixed to the world and carries the arm; everything else is left out. `arm.notes` tells what was chosen
-    where no argument was given.
+    where no argument was given. The arm is stored in a cache folder, so that it loads faster the next time.
 
     Args:
         file: MJCF or URDF file, the text of an MJCF file, or a specification.
@@ -109,19 +125,18 @@ def load_arm(
         joints: Names of the hinges and slides from the base to the tool, two or more; by default all of the chain.
         base: Body that the chain begins at; needed where a file has two arms.
         packages: Folders for `package://` in a URDF; the folders above the file are always looked in.
-        hand_site: Former name of `tool`.
         name: Name of the arm; by default that of the file or the model.
         home: Home configuration, shape (J,); by default the file's first keyframe if it is free, or else one that is
             looked for.
         origin: Point of the file's world that becomes the origin, [m]; by default its origin.
         joint_range: Lowest and highest position of each joint, shape (J, 2); by default those of the file, and +-pi for
             continuous joints.
-        torque_limit: Torque limit of each joint or of all; by default those of the file's joints or actuators, or
-            several times the arm's weight with a warning.
+        torque_limit: Torque limit of each joint or of all; by default those of the file's joints or actuators, those of
+            a well-known arm, or several times the arm's weight with a warning.
         velocity_limit: Velocity limit of each joint or of all; by default that of the URDF, the file's custom number of
             that name, that of a well-known arm, or 2 with a warning.
-        tolerance: Greatest distance by which the capsules that cover a geom reach beyond it, 0.005 or more, [m]; for
-            the base at least a tenth of the size of the geom.
+        tolerance: Greatest distance by which the capsules that cover a geom reach beyond it, 0.005 or more, [m]; where
+            that takes too many, and for large geoms of the base, they reach farther. `arm.excess` tells how far.
 
     Raises:
         TypeError: The file is neither a name, nor text, nor a specification.
@@ -134,38 +149,94 @@ def load_arm(
         (('shoulder_pan', 'shoulder_lift', 'elbow'), "tool: 'hand'")
     """
     spec, own_name, urdf = _read(file, tuple(packages))
-    tolerance = number_of_at_least("tolerance", tolerance, MIN_TOLERANCE, MAX_TOLERANCE)
     name = own_name if name is None else name
     if not isinstance(name, str) or not name:
         raise ValueError(f"name must be a string of one or more characters, got {name!r}")
-    try:
-        whole = spec.compile()
-    except ValueError as error:
-        raise ValueError(f"MuJoCo cannot read the file: {error}") from None
+    given = {
+        "tool": tool,
+        "joints": None if joints is None else _joint_names(joints),
+        "base": base,
+        "home": home,
+        "origin": origin,
+        "joint_range": joint_range,
+        "torque_limit": torque_limit,
+        "velocity_limit": velocity_limit,
+        "tolerance": number_of_at_least("tolerance", tolerance, MIN_TOLERANCE, MAX_TOLERANCE),
+    }
     notes = list(urdf.notes)
-    chosen = choose_tool(whole, hand_site if tool is None else tool, base)
+    whole = _compiled(spec, notes)
+    key = key_of(whole, {**given, "name": name, "notes": notes, "urdf": urdf[2:]})
+    arm = read_arm(key)
+    if arm is None:
+        arm = _load(spec, whole, name, urdf, notes, **given)
+        write_arm(key, arm)
+    for note in arm.notes:
+        if note.startswith(WARNING):
+            warnings.warn(note.removeprefix(WARNING), stacklevel=2)
+    return arm
+
+
+def _load(
+    spec: mujoco.MjSpec,
+    whole: mujoco.MjModel,
+    name: str,
+    urdf: Urdf,
+    notes: list[str],
+    *,
+    tool: Any,
+    joints: tuple[str, ...] | None,
+    base: str | None,
+    home: Any,
+    origin: Any,
+    joint_range: Any,
+    torque_limit: Any,
+    velocity_limit: Any,
+    tolerance: float,
+) -> Arm:
+    """Return the arm of a compiled specification, which is changed; see :func:`load_arm`."""
+    chosen = choose_tool(whole, tool, base)
     notes.insert(0, f"tool: {chosen.name!r}")
     if joints is None:
         names = _joint_names(arm_joints(whole, chain_joints(whole, chosen.body, base), notes))
         notes.append(f"joints: {', '.join(names)}")
     else:
-        names = _joint_names(joints)
+        names = joints
         _check_exist("joint", names, [joint.name for joint in spec.joints])
     carrier = next(body for body in spec.bodies if body.id == chosen.body)
     carrier.add_site(name=TOOL, pos=chosen.position, quat=chosen.quaternion)
-    whole = spec.compile()
     ranges = _ranges(whole, names, joint_range, notes)
-    velocity = _velocities(whole, names, velocity_limit, urdf.velocity_limits, name, notes)
-    torque, stated = _torques(whole, names, torque_limit, notes)
+    known_as = f"{name} {spec.modelname}"
+    velocity = _velocities(whole, names, velocity_limit, urdf.velocity_limits, known_as, notes)
+    torque, stated = _torques(whole, names, torque_limit, known_as, notes)
     for what, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
         if not (limit > 0.0).all():
             raise ValueError(f"{what} must be positive, got {limit}")
     keyframe = _keyframe(whole, names)
-    parsed = _parse(spec, whole, names, TOOL)
-    exclude = _excluded(parsed) + [pair for pair in urdf.never_touch if set(pair) <= _names_of(parsed)]
-    home = _home(parsed, ranges, home, keyframe, exclude, notes)
+    parsed = _parse(spec, whole, names, notes)
+    exclude = dict.fromkeys(_excluded(parsed, urdf.never_touch), "excluded in the file")
+    never = f"in contact in none of {NEAR_LOOKED_AT:,} configurations, though always near"
+    pairs = _compared_pairs(parsed, exclude)
+    low, high = ranges.T
+    drawn = np.random.default_rng(0).uniform(low, high, (NEAR_LOOKED_AT, len(names)))
+    looked_at = np.array([[*_distances(parsed, each, pairs).values()] for each in drawn[:LOOKED_AT]])
+    near = [pair for pair, away in zip(pairs, looked_at.T, strict=True) if np.median(away) < NEAR]
+    apart = _apart(parsed, near, drawn)
+    meeting = set(near) - set(apart)
+    exclude |= dict.fromkeys((_names(parsed, pair) for pair in apart), never)
+    movable = [pair for pair, away in zip(pairs, looked_at.T, strict=True) if away.max() > 0.0]
+    movable = [pair for pair in movable if _names(parsed, pair) not in exclude]
+    home = _home(parsed, ranges, home, keyframe, movable, notes)
     zero = np.zeros(3) if origin is None else finite_array("origin", origin, (3,))
-    xml, excess = _fitted(parsed, ranges, zero, home, exclude, tolerance)
+    distances = _distances(parsed, home, _compared_pairs(parsed, exclude))
+    near = [pair for pair, away in distances.items() if 0.0 < away < LEAST_GAP]
+    exclude |= dict.fromkeys((_names(parsed, pair) for pair in _apart(parsed, near, drawn)), never)
+    distances = {
+        pair: away for pair, away in distances.items() if away > 0.0 and _names(parsed, pair) not in exclude
+    }
+    tolerances = dict.fromkeys(parsed.geoms, tolerance)
+    for pair in meeting:
+        tolerances.update(dict.fromkeys(pair, min(FINE, tolerance)))
+    xml, excess = _fitted(parsed, ranges, zero, home, distances, tolerances)
     arm = arm_from_xml(
         name,
         xml,
@@ -178,26 +249,30 @@ def load_arm(
     )
     weight = np.abs(torques(arm.chain, home, 0.0 * home, 0.0 * home))
     weak = weight > torque
-    if weak.any() and not stated:
-        # A spring or a counterweight may bear it, which the file does not have.
-        some = ", ".join(itertools.compress(names, weak))
-        notes.append(
-            f"torque limits of {some}: {WEIGHTS:g} times the weight at home, which those of the file do not hold"
-        )
-        warnings.warn(f"{notes[-1]}; give torque_limit", stacklevel=2)
-        arm = replace(arm, torque_limit=np.where(weak, WEIGHTS * weight, torque))
-    elif weak.any():
-        some = ", ".join(itertools.compress(names, weak))
+    some = ", ".join(itertools.compress(names, weak))
+    if some and stated:
         raise ValueError(
             f"the torque limits of {some} do not hold the arm's own weight at home; raise torque_limit"
         )
+    if some:  # a spring or a counterweight may bear it, which the file does not have
+        notes.append(
+            f"{WARNING}torque limits of {some}: {WEIGHTS:g} times the weight at home, which those of the file do not "
+            "hold; give torque_limit"
+        )
+        torque = np.where(weak, WEIGHTS * weight, torque)
     endless = [name for name in names if joint_range is None and not whole.jnt_limited[whole.joint(name).id]]
-    return replace(arm, excess=arm.excess + excess, notes=tuple(notes), continuous=tuple(endless))
+    return replace(
+        arm,
+        excess=arm.excess + excess,
+        notes=tuple(notes),
+        continuous=tuple(endless),
+        torque_limit=torque,
+    )
 
 
 def _read(file: Any, packages: tuple[str | Path, ...]) -> tuple[mujoco.MjSpec, str, Urdf]:
     """Return a specification that may be changed, its name, and what MuJoCo does not take from a URDF."""
-    nothing = Urdf("", "", {}, (), ())
+    nothing = Urdf("", "", {}, {}, (), ())
     if isinstance(file, mujoco.MjSpec):
         return file.copy(), file.modelname, nothing
     if not isinstance(file, str | os.PathLike) or isinstance(os.fspath(file), bytes):
@@ -213,10 +288,32 @@ def _read(file: Any, packages: tuple[str | Path, ...]) -> tuple[mujoco.MjSpec, s
         urdf = read_urdf(path, packages)
     try:
         as_text = urdf.text or (text if is_text else "")
-        spec = mujoco.MjSpec.from_string(as_text) if as_text else mujoco.MjSpec.from_file(text)
+        spec = (
+            mujoco.MjSpec.from_string(as_text, assets=urdf.assets)
+            if as_text
+            else mujoco.MjSpec.from_file(text)
+        )
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot read {text!r:.60} as MJCF or URDF: {error}") from None
-    return spec, urdf.name or (spec.modelname if is_text else path.stem), urdf
+    named_after_model = is_text or path.stem.lower() in GENERIC_NAMES
+    return spec, urdf.name or (spec.modelname if named_after_model else path.stem), urdf
+
+
+def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
+    """Return the model of a specification without its visual geoms whose meshes are missing, which are noted."""
+    while True:
+        try:
+            return spec.compile()
+        except ValueError as error:
+            missing = re.search(r"Error opening file '(.+)'", str(error))
+            lost = [mesh for mesh in spec.meshes if missing and mesh.file and missing[1].endswith(mesh.file)]
+            names = [mesh.name or Path(mesh.file).stem for mesh in lost]
+            geoms = [geom for geom in spec.geoms if geom.meshname in names]
+            if not lost or any(geom.contype or geom.conaffinity for geom in geoms):
+                raise ValueError(f"MuJoCo cannot read the file: {error}") from None
+            notes.append(f"left out: visual mesh {lost[0].file}, which is missing")
+            for part in (*geoms, *lost):
+                spec.delete(part)
 
 
 def _joint_names(joints: Any) -> tuple[str, ...]:
@@ -247,7 +344,7 @@ def _per_joint(name: str, values: Any, joints: tuple[str, ...]) -> Float:
 
 def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: list[str]) -> Float:
     """Return the range of each joint, shape (J, 2)."""
-    found = []
+    found, endless = [], []
     for name in joints:
         joint = model.joint(name).id
         if not np.isin(model.jnt_type[joint], JOINT_TYPES):
@@ -258,8 +355,10 @@ def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: l
                 f"joint {name!r} has no limits; give it a range in the file, or give joint_range"
             )
         if given is None and not limited:
-            notes.append(f"range of {name}, which is continuous: +-pi")
+            endless.append(name)
         found.append(model.jnt_range[joint] if limited else (-np.pi, np.pi))
+    if endless:
+        notes.append(f"range of {', '.join(endless)}, continuous: +-pi")
     if given is None:
         return np.array(found)
     ranges = finite_array("joint_range", given, (len(joints), 2))
@@ -269,7 +368,7 @@ def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: l
 
 
 def _torques(
-    model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: list[str]
+    model: mujoco.MjModel, joints: tuple[str, ...], given: Any, arm: str, notes: list[str]
 ) -> tuple[Float, bool]:
     """Return the torque limit of each joint, its own, or the greatest of the actuators that drive it; True if given."""
     if given is not None:
@@ -285,15 +384,18 @@ def _torques(
         found.append(max(limits, default=0.0))
     torque = np.array(found)
     missing = torque <= 0.0
-    if missing.any():
+    known = known_limits(KNOWN_TORQUES, arm, len(joints))
+    if missing.any() and known is not None:
+        notes.append("torque limits: those of the arm of this name")
+        torque = np.where(missing, known, torque)
+    elif missing.any():
         weight = _greatest_weight(model, joints)
         torque[missing] = np.maximum(WEIGHTS * weight[missing], LEAST_TORQUE)
         some = ", ".join(itertools.compress(joints, missing))
-        text = (
-            f"the file has no torque limits of {some}; they get {WEIGHTS:g} times what the arm's weight needs"
+        notes.append(
+            f"{WARNING}the file has no torque limits of {some}; they get {WEIGHTS:g} times what the arm's weight "
+            "needs; give torque_limit"
         )
-        notes.append(text)
-        warnings.warn(f"{text}; give torque_limit", stacklevel=3)
     return torque, False
 
 
@@ -338,21 +440,20 @@ def _velocities(
     """Return the velocity limit of each joint, shape (J,)."""
     if given is not None:
         return _per_joint("velocity_limit", given, joints)
-    if all(name in in_urdf for name in joints):
-        return np.array([in_urdf[name] for name in joints])
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
         return _per_joint("velocity_limit", model.numeric("velocity_limit").data, joints)
-    known = known_velocities(arm, len(joints))
-    if known is not None:
-        notes.append(f"velocity limits: those of the arm that {arm!r} is named after")
-        return known
-    text = (
-        f"the file has no velocity limits, so all joints get {DEFAULT_VELOCITY_LIMIT:g} rad/s (slides "
-        f"{DEFAULT_VELOCITY_LIMIT:g} m/s)"
-    )
-    notes.append(text)
-    warnings.warn(f"{text}; give velocity_limit", stacklevel=3)
-    return np.full(len(joints), DEFAULT_VELOCITY_LIMIT)
+    found = np.array([in_urdf.get(name, 0.0) for name in joints])
+    missing = found <= 0.0
+    known = known_limits(KNOWN_VELOCITIES, arm, len(joints))
+    if missing.any() and known is not None:
+        notes.append("velocity limits: those of the arm of this name")
+        return np.where(missing, known, found)
+    if missing.any():
+        notes.append(
+            f"{WARNING}the file has no velocity limits of {', '.join(itertools.compress(joints, missing))}; they get "
+            f"{DEFAULT_VELOCITY_LIMIT:g} rad/s (slides {DEFAULT_VELOCITY_LIMIT:g} m/s); give velocity_limit"
+        )
+    return np.where(missing, DEFAULT_VELOCITY_LIMIT, found)
 
 
 def _keyframe(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float | None:
@@ -367,10 +468,10 @@ def _home(
     ranges: Float,
     given: Any,
     keyframe: Float | None,
-    exclude: Sequence[tuple[str, str]],
+    pairs: list[tuple[int, int]],
     notes: list[str],
 ) -> Float:
-    """Return the home configuration, shape (J,)."""
+    """Return the home configuration, shape (J,), in which some pairs of bodies do not touch."""
     joints = parsed.joints
     if given is not None:
         home = _per_joint("home", given, joints)
@@ -378,40 +479,21 @@ def _home(
         if outside.any():
             raise ValueError(f"home is outside the range of {', '.join(itertools.compress(joints, outside))}")
         return home
-    pairs = _pairs_that_move(parsed, ranges, exclude)
 
     def apart(home: Float) -> float:
         return min(_distances(parsed, home, pairs).values(), default=1.0)
 
-    candidates = {"keyframe": keyframe} if keyframe is not None else {}
+    candidates = {"the file's keyframe": keyframe} if keyframe is not None else {}
     candidates["zeros"] = np.zeros(len(joints))
     home, origin = choose_home(ranges, candidates, apart)
     notes.append(f"home: {origin}")
     return home
 
 
-def _pairs_that_move(
-    parsed: Parsed, ranges: Float, exclude: Sequence[tuple[str, str]]
-) -> list[tuple[int, int]]:
-    """Return the pairs of bodies that are compared, without those that touch in every one of some configurations."""
-    pairs = _compared_pairs(parsed, exclude)
-    low, high = ranges.T
-    rng = np.random.default_rng(0)
-    free: set[tuple[int, int]] = set()
-    for home in rng.uniform(low, high, (LOOKED_AT, len(ranges))):
-        free.update(pair for pair, away in _distances(parsed, home, pairs).items() if away > 0.0)
-    return [pair for pair in pairs if pair in free]
-
-
-def _names_of(parsed: Parsed) -> set[str]:
-    """Return the names of the bodies with geoms."""
-    return {_body_name(parsed, body) for body in parsed.geoms}
-
-
-def _parse(spec: mujoco.MjSpec, whole: mujoco.MjModel, joints: tuple[str, ...], hand_site: str) -> Parsed:
+def _parse(spec: mujoco.MjSpec, whole: mujoco.MjModel, joints: tuple[str, ...], notes: list[str]) -> Parsed:
     """Return the arm of a specification, which is changed."""
     model = _isolate(spec, joints, whole)
-    _check_order(model, joints, hand_site)
+    _check_order(model, joints)
     rest = mujoco.MjData(model)
     rest.qpos[:] = 0.0
     mujoco.mj_kinematics(model, rest)
@@ -425,8 +507,14 @@ def _parse(spec: mujoco.MjSpec, whole: mujoco.MjModel, joints: tuple[str, ...], 
             links[body] = 0
     geoms = _collision_geoms(model, links)
     if not any(links[body] for body in geoms):
-        raise ValueError(f"no geom moves with any of {', '.join(joints)}: nothing of the arm can collide")
-    return Parsed(whole, model, rest, joints, hand_site, links, geoms)
+        raise ValueError(
+            f"no geom moves with any of {', '.join(joints)}: nothing of the arm can collide; {'; '.join(notes)}"
+        )
+    collides = (model.geom_contype | model.geom_conaffinity) > 0
+    others = {model.body(body).name or str(body) for body in model.geom_bodyid[collides] if body not in links}
+    if others:
+        notes.append(f"left out, not part of the arm: {', '.join(sorted(others))}")
+    return Parsed(whole, model, rest, joints, links, geoms)
 
 
 def _collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, list[int]]:
@@ -513,7 +601,7 @@ def _check_fixed(
         )
 
 
-def _check_order(model: mujoco.MjModel, joints: tuple[str, ...], hand_site: str) -> None:
+def _check_order(model: mujoco.MjModel, joints: tuple[str, ...]) -> None:
     """Check that each joint carries the next one, and the last one the tool."""
     bodies = [int(model.joint(name).bodyid[0]) for name in joints]
     for i in range(1, len(joints)):
@@ -523,19 +611,10 @@ def _check_order(model: mujoco.MjModel, joints: tuple[str, ...], hand_site: str)
                 f"joints {first!r} and {second!r} belong to one body; leave one out to fix it, or give each a body of "
                 "its own in the file"
             )
-        if bodies[i - 1] not in _ancestors(model, bodies[i]):
+        if bodies[i - 1] not in ancestors(model, bodies[i]):
             raise ValueError(f"joints must be in order from the base: {first!r} does not carry {second!r}")
-    last = int(model.site(hand_site).bodyid[0])
-    if model.body_weldid[last] != bodies[-1]:
-        raise ValueError(f"site {hand_site!r} does not move with the last joint, {joints[-1]!r}")
-
-
-def _ancestors(model: mujoco.MjModel, body: int) -> list[int]:
-    found = []
-    while body:
-        body = int(model.body_parentid[body])
-        found.append(body)
-    return found
+    if model.body_weldid[int(model.site(TOOL).bodyid[0])] != bodies[-1]:
+        raise ValueError(f"the tool does not move with the last joint, {joints[-1]!r}")
 
 
 def _body_name(parsed: Parsed, body: int) -> str:
@@ -572,23 +651,24 @@ def _distant_pairs(parsed: Parsed) -> Iterator[tuple[int, int]]:
             yield first, second
 
 
-def _compared_pairs(parsed: Parsed, exclude: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
+def _compared_pairs(parsed: Parsed, exclude: Mapping[frozenset[str], str]) -> list[tuple[int, int]]:
     """Return the distant pairs of bodies that are not excluded by name."""
-    excluded = {frozenset(pair) for pair in exclude}
-    return [
-        pair
-        for pair in _distant_pairs(parsed)
-        if frozenset(_body_name(parsed, body) for body in pair) not in excluded
-    ]
+    return [pair for pair in _distant_pairs(parsed) if _names(parsed, pair) not in exclude]
 
 
-def _excluded(parsed: Parsed) -> list[tuple[str, str]]:
-    """Return the names of pairs of bodies that the file does not let collide."""
-    return [
-        (_body_name(parsed, first), _body_name(parsed, second))
-        for first, second in _distant_pairs(parsed)
-        if not _collide_in_file(parsed, first, second)
-    ]
+def _names(parsed: Parsed, pair: tuple[int, int]) -> frozenset[str]:
+    """Return the names of a pair of bodies."""
+    return frozenset(_body_name(parsed, body) for body in pair)
+
+
+def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> list[frozenset[str]]:
+    """Return the names of pairs of bodies that the file does not let collide, or an SRDF file."""
+    silent = {frozenset(pair) for pair in never_touch}
+    found = []
+    for pair in _distant_pairs(parsed):
+        if not _collide_in_file(parsed, *pair) or _names(parsed, pair) in silent:
+            found.append(_names(parsed, pair))
+    return found
 
 
 def _fitted(
@@ -596,8 +676,8 @@ def _fitted(
     ranges: Float,
     origin: Float,
     home: Float,
-    exclude: Sequence[tuple[str, str]],
-    tolerance: float,
+    distances: dict[tuple[int, int], float],
+    tolerances: dict[int, float],
 ) -> tuple[str, float]:
     """Return the text of the arm's model, and the greatest excess of its capsules, [m].
 
@@ -606,14 +686,14 @@ def _fitted(
     Raises:
         ValueError: Bodies are too close for that.
     """
-    distances = _home_distances(parsed, home, exclude)
     fits: dict[int, list[Fit]] = {}
     for body, geoms in parsed.geoms.items():
         fits[body] = []
         for geom in geoms:
-            least = 0.0 if parsed.links[body] else BASE_SHARE * 2.0 * float(parsed.model.geom_rbound[geom])
-            found = cover_geom(parsed.model, geom, max(tolerance, least))
-            fits[body] += [Fit(geom, capsule) for capsule in found]
+            size = 2.0 * float(parsed.model.geom_rbound[geom])
+            large = not parsed.links[body] and tolerances[body] > FINE
+            allowed = max(tolerances[body], BASE_SHARE * size) if large else tolerances[body]
+            fits[body] += [Fit(geom, capsule) for capsule in cover_geom(parsed.model, geom, allowed)]
     while True:
         xml = _write(parsed, ranges, origin, fits)
         near = _near_capsules(parsed, xml, home, distances)
@@ -635,12 +715,13 @@ def _fitted(
     return xml, max(fit.capsule.excess for some in fits.values() for fit in some)
 
 
-def _home_distances(
-    parsed: Parsed, home: Float, exclude: Sequence[tuple[str, str]]
-) -> dict[tuple[int, int], float]:
-    """Return the distance at home of each pair of bodies that must stay apart, [m]; at most 0.1."""
-    pairs = _compared_pairs(parsed, exclude)
-    return {pair: away for pair, away in _distances(parsed, home, pairs).items() if away > 0.0}
+def _apart(parsed: Parsed, pairs: Iterable[tuple[int, int]], configurations: Float) -> list[tuple[int, int]]:
+    """Return the pairs of bodies that are in contact in none of some configurations, shape (N, J)."""
+    pairs = list(pairs)
+    for joints in configurations:
+        away = _distances(parsed, joints, pairs)
+        pairs = [pair for pair in pairs if away[pair] > 0.0]
+    return pairs
 
 
 def _distances(
@@ -706,7 +787,7 @@ def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[Fi
             _add_joint(written[body], parsed, carriers[body], ranges)
         for geom, capsule in fits.get(body, []):
             _add_capsule(written[body], model, geom, capsule)
-    site = model.site(parsed.hand_site)
+    site = model.site(TOOL)
     written[int(site.bodyid[0])].add_site(
         name="hand", pos=site.pos, quat=site.quat, size=(0.004, 0.0, 0.0), rgba=(0.0, 0.0, 0.0, 0.0)
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -62,7 +62,7 @@ def cover(
     links: dict[str, int],
     home: Float,
     touching: Collection[frozenset[str]],
-    exclude: Collection[frozenset[str]],
+    exclude: Mapping[frozenset[str], str],
 ) -> Cover:
     """Return spheres that contain all capsules, and the pairs of bodies that must not touch one another.
 
@@ -72,7 +72,7 @@ def cover(
         links: Link that each body moves with.
         home: Joint positions at home, shape (J,).
         touching: Pairs of bodies whose geoms are in contact at home.
-        exclude: Pairs that may pass through one another.
+        exclude: Pairs that may pass through one another, with the reason.
 
     Raises:
         ValueError: Spheres of bodies that are apart at home overlap there, however small they are.
@@ -120,7 +120,7 @@ def _pairs(
     names: Sequence[str],
     links: dict[str, int],
     touching: Collection[frozenset[str]],
-    exclude: Collection[frozenset[str]],
+    exclude: Mapping[frozenset[str], str],
 ) -> tuple[list[tuple[int, int]], tuple[LeftOut, ...]]:
     """Return the pairs of groups that are compared, and those of different links that are not."""
     pairs, left_out = [], []
@@ -132,7 +132,7 @@ def _pairs(
         if apart == 1:
             left_out.append(LeftOut(first, second, "consecutive links"))
         elif pair in exclude:
-            left_out.append(LeftOut(first, second, "excluded in the file"))
+            left_out.append(LeftOut(first, second, exclude[pair]))
         elif pair in touching:
             left_out.append(LeftOut(first, second, "in contact at home"))
         else:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 READ_MESHES = (".stl", ".obj", ".msh")
 """Suffixes of meshes that MuJoCo reads."""
@@ -17,6 +21,10 @@ COMPILER = {
     "strippath": "false",
 }
 """Options of MuJoCo's compiler: links without inertia get little, and fixed links stay bodies."""
+INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+"""Entries of an inertia."""
+BALL = 0.05
+"""Radius of the ball whose inertia a link gets that has none, [m]."""
 LEFT_OUT = ("transmission", "gazebo", "material")
 """Elements that MuJoCo does not need."""
 
@@ -28,6 +36,8 @@ class Urdf(NamedTuple):
     """Text for MuJoCo."""
     name: str
     """Name of the robot."""
+    assets: dict[str, bytes]
+    """Meshes that MuJoCo cannot read as they are, by the names in the text."""
     velocity_limits: dict[str, float]
     """Velocity limits of joints by name, [rad/s] or [m/s]."""
     never_touch: tuple[tuple[str, str], ...]
@@ -39,40 +49,31 @@ class Urdf(NamedTuple):
 def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
     """Return the content of a URDF file; paths of meshes become absolute ones.
 
-    `package://NAME/REST` is looked for in `packages`, in a folder NAME or in the folder itself, and in the folders
-    above the file.
+    See :func:`_places` for where meshes are looked for.
 
     Raises:
         ValueError: The file is no URDF, or a mesh for collisions is missing.
     """
-    try:
-        root = ET.fromstring(path.read_bytes())
-    except ET.ParseError as error:
-        raise ValueError(f"{path} is not XML: {error}") from None
+    root = _root(path)
     if root.tag != "robot":
         raise ValueError(f"{path} is no URDF: its first element is {root.tag!r}, not 'robot'")
     if not root.findall("link"):
         raise ValueError(f"{path} has no links; expand a xacro file first: xacro FILE > arm.urdf")
-    notes = []
+    notes: list[str] = []
+    assets: dict[str, bytes] = {}
     for name in LEFT_OUT:
         for element in root.findall(name):
             root.remove(element)
     for link in root.findall("link"):
+        _mend_inertia(link, notes)
         for visual in link.findall("visual"):
             link.remove(visual)
         for collision in link.findall("collision"):
-            mesh = collision.find("geometry/mesh")
-            if mesh is None:
-                continue
-            found = _find(mesh.get("filename", ""), path, packages)
-            if found.suffix.lower() not in READ_MESHES:
+            geometry = collision.find("geometry")
+            fault = "no geometry" if geometry is None else _prepared(geometry, path, packages, assets)
+            if fault:
                 link.remove(collision)
-                notes.append(
-                    f"the collision mesh {found.name} of {link.get('name')} is left out: MuJoCo reads "
-                    f"{', '.join(READ_MESHES)}; convert it, for example with trimesh"
-                )
-                continue
-            mesh.set("filename", str(found))
+                notes.append(f"a collision geom of {link.get('name')} is left out: {fault}")
     velocity = {}
     for joint in root.findall("joint"):
         limit = joint.find("limit")
@@ -87,37 +88,103 @@ def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
     compiler.attrib.pop("meshdir", None)
     compiler.attrib.update(COMPILER)
     text = ET.tostring(root, encoding="unicode")
-    return Urdf(text, root.get("name") or path.stem, velocity, _srdf(path), tuple(notes))
+    return Urdf(text, root.get("name") or path.stem, assets, velocity, _srdf(path), tuple(notes))
 
 
-def _find(file: str, path: Path, packages: tuple[str | Path, ...]) -> Path:
-    """Return the path of a mesh file.
+def _root(path: Path) -> ET.Element:
+    """Return the first element of a file; prefixes without a namespace, as in `xacro:macro`, are ignored.
 
     Raises:
-        ValueError: It is not there.
+        ValueError: The file is no XML.
     """
-    tried = []
-    if file.startswith("package://"):
-        package, _, rest = file.removeprefix("package://").partition("/")
-        for folder in (*(Path(each).expanduser() for each in packages), *path.resolve().parents):
-            tried += [folder / package / rest, *([folder / rest] if folder.name == package else [])]
-            if folder in map(Path, packages):
-                tried.append(folder / rest)
-    else:
-        tried = [path.parent / file.removeprefix("file://")]
-    for each in tried:
-        if each.is_file():
-            return each.resolve()
-    hint = "; packages= names folders to look in" if file.startswith("package://") else ""
-    raise ValueError(f"{path.name}: there is no file {file!r}{hint}")
+    content = path.read_bytes()
+    try:
+        return ET.fromstring(content)
+    except ET.ParseError as error:
+        if "unbound prefix" not in str(error):
+            raise ValueError(f"{path} is not XML: {error}") from None
+    return ET.fromstring(re.sub(rb"(</?|\s)[\w.-]+:([\w.-]+)(?=[\s=/>])", rb"\1\2", content))
+
+
+def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
+    """Replace an inertia that no body has by that of a ball of the same mass."""
+    inertia, mass = link.find("inertial/inertia"), link.find("inertial/mass")
+    if inertia is None or mass is None:
+        return
+    xx, xy, xz, yy, yz, zz = (float(inertia.get(name, 0.0)) for name in INERTIA)
+    if np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[0] < 0.0:
+        moment = 0.4 * float(mass.get("value", 0.0)) * BALL**2
+        inertia.attrib.update(
+            dict.fromkeys(INERTIA, "0") | dict.fromkeys(("ixx", "iyy", "izz"), f"{moment:g}")
+        )
+        notes.append(f"inertia of {link.get('name')}, which is not positive: that of a ball of {BALL:g} m")
+
+
+def _prepared(
+    geometry: ET.Element, path: Path, packages: tuple[str | Path, ...], assets: dict[str, bytes]
+) -> str:
+    """Make the path of a mesh absolute, and return what is wrong with a geometry, empty for nothing."""
+    for element in geometry:
+        sizes = " ".join(element.get(name, "") for name in ("size", "radius", "length")).split()
+        if any(float(size) <= 0.0 for size in sizes):
+            return f"its {element.tag} has no size"
+        if element.tag != "mesh":
+            continue
+        file = element.get("filename", "")
+        if not file.lower().endswith(READ_MESHES):
+            return (
+                f"MuJoCo reads {', '.join(READ_MESHES)}, not {Path(file).name}; convert it, for example with "
+                "trimesh: trimesh.load(FILE, force='mesh').export('x.stl')"
+            )
+        found = next((place for place in _places(file, path, packages) if place.is_file()), None)
+        if found is None:
+            raise ValueError(f"{path.name}: there is no file {file!r}; packages= names folders to look in")
+        element.set("filename", str(found.resolve()))
+        if found.suffix.lower() == ".stl":
+            content = found.read_bytes()
+            if content[:6] == b"solid ":
+                _add_text_stl(element, content, assets)
+            elif not any(content[80:84]):  # the number of triangles
+                return f"there is no triangle in {found.name}"
+    return ""
+
+
+def _add_text_stl(mesh: ET.Element, content: bytes, assets: dict[str, bytes]) -> None:
+    """Add a mesh to assets as binary STL, which MuJoCo reads, if its file is text."""
+    corners = np.array(re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", content), "<f4").reshape(-1, 9)
+    if len(corners):  # many binary files begin like text
+        facets = np.zeros(len(corners), [("normal", "<f4", 3), ("corners", "<f4", 9), ("spare", "<u2")])
+        facets["corners"] = corners
+        name = f"text_{len(assets)}.stl"
+        assets[name] = bytes(80) + np.uint32(len(corners)).tobytes() + facets.tobytes()
+        mesh.set("filename", name)
+
+
+def _places(file: str, path: Path, packages: tuple[str | Path, ...]) -> Iterator[Path]:
+    """Yield the places where a mesh of a URDF may be.
+
+    A relative path begins at the file. `package://NAME/REST`, then REST, then what is left without the first folder of
+    it, and so on, are looked for in the folders of `packages` and above the file: copies often have other names.
+    """
+    parts = file.removeprefix("package://").removeprefix("file://").split("/")
+    if not file.startswith("package://"):
+        yield path.parent / "/".join(parts)
+    folders = [*(Path(each).expanduser() for each in packages), *path.resolve().parents]
+    for first in range(len(parts)):
+        for folder in folders:
+            yield folder / "/".join(part for part in parts[first:] if part != "..")
 
 
 def _srdf(path: Path) -> tuple[tuple[str, str], ...]:
-    """Return the pairs of links that an SRDF file does not compare: one of the same name, or the only one beside it."""
-    beside, files = path.with_suffix(".srdf"), list(path.parent.glob("*.srdf"))
-    if len(files) == 1:
-        beside = files[0]
-    if not beside.is_file():
-        return ()
-    pairs = ET.fromstring(beside.read_bytes()).findall("disable_collisions")
-    return tuple((pair.get("link1", ""), pair.get("link2", "")) for pair in pairs)
+    """Return the pairs of links that an SRDF file does not compare.
+
+    It has the same name and is beside the URDF or in the folder srdf beside that folder; or it is the only one beside.
+    """
+    beside = list(path.parent.glob("*.srdf"))
+    places = [path.with_suffix(".srdf"), path.resolve().parents[1] / "srdf" / f"{path.stem}.srdf"]
+    places += beside if len(beside) == 1 else []
+    for place in places:
+        if place.is_file():
+            pairs = _root(place).findall("disable_collisions")
+            return tuple((pair.get("link1", ""), pair.get("link2", "")) for pair in pairs)
+    return ()

@@ -42,7 +42,7 @@ def test_built_in_arms_stick_out_by_five_millimetres_at_most_and_list_what_is_le
     assert {pair.reason for pair in arm.left_out} <= {
         "consecutive links",
         "in contact at home",
-        "excluded in the file",
+        "never in contact",
         "in contact in none of 100,000 configurations",
     }
     compared = {frozenset((arm.group_names[a], arm.group_names[b])) for a, b in arm.spheres.pairs}

@@ -1,5 +1,7 @@
 """Kinematics, dynamics and inverse kinematics agree with MuJoCo and with one another."""
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
@@ -101,9 +103,15 @@ def test_inverse_kinematics_finds_what_forward_kinematics_gives(arm):
         np.testing.assert_allclose(forward(arm.chain, joints)[1], frame, atol=1e-4)
 
 
-def test_a_pose_out_of_reach_is_an_error_with_the_nearest_distance():
-    with pytest.raises(ValueError, match=r"nearest place found is [0-9.]+ mm"):
-        inverse_kinematics(arm_of("panda"), (3.0, 0.0, 0.0))
+@pytest.mark.parametrize("place", [(3.0, 0.0, 0.2), (0.1, 1.8, 0.5), (0.0, 0.0, -2.0)])
+def test_a_pose_out_of_reach_is_an_error_with_the_nearest_distance(place):
+    arm = arm_of("panda")
+    with pytest.raises(ValueError, match=r"nearest place found is [0-9.]+ mm") as error:
+        inverse_kinematics(arm, place)
+    told = 1e-3 * float(re.search(r"is ([0-9.]+) mm", str(error.value))[1])
+    sampled = arm.hand(np.random.default_rng(0).uniform(*arm.joint_range.T, (20_000, 7)))
+    least = np.linalg.norm(sampled - place, axis=-1).min()
+    assert least - 0.2 < told < least + 1e-3
 
 
 def test_the_closed_form_moves_the_hand_as_it_should():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from self_contact import check_contact_implies_overlap, least_pair_distance
 
+from viapoint.envs.arms import load
 from viapoint.envs.arms.kinematics import forward, sphere_centres, torques
 from viapoint.envs.arms.load import load_arm
 from viapoint.envs.geometry.obstacles import pack
@@ -22,7 +23,7 @@ CUBE = " ".join(f"{x} {y} {z}" for x, y, z in np.ndindex(2, 2, 2))
 
 
 def ur5e(file=TEXT, **changes):
-    arguments = {"hand_site": "hand", "joints": JOINTS, "home": HOME, "velocity_limit": np.pi}
+    arguments = {"tool": "hand", "joints": JOINTS, "home": HOME, "velocity_limit": np.pi}
     return load_arm(file, **{**arguments, **changes})
 
 
@@ -33,6 +34,15 @@ def changed(*pairs):
         assert old in text, old
         text = text.replace(old, new)
     return text
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """Folder of stored arms, which is empty at first."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        yield folder
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +158,7 @@ def test_a_slide_is_fixed_as_in_the_keyframe_or_is_a_joint(moves):
 
 def test_an_arm_of_two_joints_and_a_home_in_the_middle_of_the_ranges(arm):
     text = changed(('name="shoulder_lift"', 'name="shoulder_lift" range="0.5 1.5"'))
-    two = ur5e(text, joints=JOINTS[:2], hand_site="hand", home=None, torque_limit=500.0)
+    two = ur5e(text, joints=JOINTS[:2], tool="hand", home=None, torque_limit=500.0)
     np.testing.assert_allclose(two.home, [0.0, 1.0], atol=1e-5)
     assert {"shoulder", "upper_arm", "wrist_3"} <= set(two.group_names)
 
@@ -173,19 +183,15 @@ def test_joints_and_bodies_may_have_any_names(arm):
     assert other.compile(2).nbody == arm.compile(2).nbody
 
 
-def test_bodies_that_are_near_at_home_are_compared_and_fitted_closely():
-    arguments = {"velocity_limit": 1.0, "torque_limit": 1e3}
-    arm = load_arm(near_arm(0.004), **arguments)
-    assert [(arm.group_names[a], arm.group_names[b]) for a, b in arm.spheres.pairs] == [("a", "c")]
-    assert 0.0 < least_pair_distance(arm, arm.home).min() < 0.004
-    # Farther away, they are in contact nowhere.
-    far = load_arm(near_arm(0.02), **arguments)
-    assert [pair[:2] for pair in far.left_out if "none of" in pair.reason] == [("a", "c")]
+@pytest.mark.parametrize("gap", [0.004, 0.02])
+def test_bodies_that_are_near_but_never_touch_are_left_out(gap):
+    arm = load_arm(near_arm(gap), velocity_limit=1.0, torque_limit=1e3)
+    assert [pair[:2] for pair in arm.left_out if "always near" in pair.reason] == [("a", "c")]
 
 
 def test_bodies_that_touch_at_home_are_left_out_and_bodies_too_close_are_refused():
     arguments = {
-        "hand_site": "tool",
+        "tool": "tool",
         "joints": ("one", "two", "three"),
         "velocity_limit": 1.0,
         "torque_limit": 1e3,
@@ -215,7 +221,7 @@ def near_arm(gap):
 
 def test_without_velocity_limits_a_warning_names_the_default():
     with pytest.warns(UserWarning, match="2 rad/s"):
-        arm = ur5e(velocity_limit=None, name="other")
+        arm = ur5e(changed(("ur5e-like", "other")), velocity_limit=None)
     np.testing.assert_array_equal(arm.velocity_limit, 2.0)
     custom = (
         "<worldbody>",
@@ -229,7 +235,7 @@ def test_without_velocity_limits_a_warning_names_the_default():
 REFUSED = [
     ({"file": 5}, TypeError), ({"file": None}, TypeError), ({"file": b"arm.xml"}, TypeError),
     ({"file": ""}, ValueError), ({"file": "none.xml"}, ValueError),
-    ({"hand_site": "tool"}, ValueError), ({"name": 5}, ValueError), ({"name": ""}, ValueError),
+    ({"tool": "tool"}, ValueError), ({"name": 5}, ValueError), ({"name": ""}, ValueError),
     *[({"joints": joints}, ValueError) for joints in (
         5, "elbow", JOINTS[:1], (*JOINTS[:5], "wrist_4"), (*JOINTS[:5], JOINTS[0]), (JOINTS[1], JOINTS[0], *JOINTS[2:]),
     )],
@@ -250,12 +256,12 @@ def test_invalid_arguments_are_refused(arguments, error):
         ur5e(**arguments)
 
 
-def test_a_tolerance_that_takes_too_many_capsules_is_named():
-    with pytest.raises(ValueError, match=r"tolerance 0\.005 m"):
-        ur5e(
-            changed((r'<geom type="box"', '<geom type="ellipsoid" size="0.3 0.02 0.1"/><geom type="box"')),
-            tolerance=0.005,
-        )
+def test_a_tolerance_that_takes_too_many_capsules_is_exceeded_and_told():
+    arm = ur5e(
+        changed((r'<geom type="box"', '<geom type="ellipsoid" size="0.3 0.02 0.1"/><geom type="box"')),
+        tolerance=0.005,
+    )
+    assert 0.01 < arm.excess < 0.05
 
 
 @pytest.mark.parametrize(
@@ -284,7 +290,7 @@ def test_nothing_but_the_file_is_needed(arm):
     np.testing.assert_array_equal(alone.hand(HOME), arm.hand(HOME))
     np.testing.assert_array_equal(alone.velocity_limit, 3.14)  # a well-known arm
     assert any(note.startswith("tool: 'hand'") for note in alone.notes)
-    assert "shoulder_pan: -6.283 to 6.283" in alone.report()
+    assert "shoulder_pan: -6.283 to 6.283 rad, at most 3.14 rad/s and 150 N m" in alone.report()
     searched = load_arm(UR5E)
     assert least_own_clearance(searched, searched.home) > 0.0
 
@@ -383,6 +389,7 @@ def test_urdf_files_are_arms(crane):
     np.testing.assert_array_equal(arm.torque_limit, (900.0, 80.0, 50.0))
     np.testing.assert_allclose(arm.joint_range, [(0.0, 0.4), (-np.pi, np.pi), (-1.0, 2.0)], atol=1e-5)
     assert "wrist" in arm.group_names
+    assert "lift: 0 to 0.4 m, at most 0.3 m/s and 900 N" in arm.report()
     joints = (0.2, np.pi / 2, 0.0)
     np.testing.assert_allclose(arm.hand(joints), (0.1, 0.65, 0.52), atol=1e-5)
     np.testing.assert_allclose(arm.hand((0.0, 0.0, np.pi / 2)), (0.52, 0.0, 0.05), atol=1e-5)
@@ -443,3 +450,165 @@ def test_of_two_arms_one_must_be_named():
     assert load_arm(text, tool="hand").joint_names == JOINTS
     with pytest.raises(ValueError, match="there is no body 'right'"):
         load_arm(text, base="right")
+
+
+def parts_of(arm):
+    """Numbers and texts of an arm."""
+    found = dataclasses.asdict(dataclasses.replace(arm, chain=None, spheres=None))
+    return {**found, **arm.chain._asdict(), **arm.spheres._asdict()}
+
+
+def test_the_second_time_an_arm_comes_from_the_cache(cache, monkeypatch):
+    changes = {"name": "stored", "velocity_limit": None}
+    text = changed(("ur5e-like", "other"))
+    with pytest.warns(UserWarning, match="2 rad/s"):
+        first = ur5e(text, **changes)
+    monkeypatch.setattr(load, "_load", None)  # would fail
+    with pytest.warns(UserWarning, match="2 rad/s"):
+        second = ur5e(text, **changes)
+    np.testing.assert_equal(parts_of(second), parts_of(first))
+    for other in ({**changes, "home": np.array(HOME) + 1e-9}, {**changes, "tolerance": 0.019}):
+        with pytest.raises(TypeError):
+            ur5e(text, **other)
+    with pytest.raises(TypeError):
+        ur5e(text.replace("0.1625", "0.1626"), **changes)
+
+
+@pytest.mark.parametrize("fault", ["broken", "file", "shape"])
+def test_a_cache_that_cannot_be_used_is_ignored(fault, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first = ur5e()
+    (stored,) = (tmp_path / "viapoint" / "arms").iterdir()
+    if fault == "broken":
+        stored.write_bytes(stored.read_bytes()[:1000])
+    elif fault == "shape":
+        np.savez(stored, text=np.array('{"left_out": []}'))
+    else:
+        (tmp_path / "file").write_text("")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    np.testing.assert_equal(parts_of(ur5e()), parts_of(first))
+
+
+HAND_OF_TEXT = '<site name="hand" pos="0 0 0.2596"/>'
+
+
+def gripper(number, joint="finger", depth=1):
+    """Fingers with joints in a row."""
+    open_ = [
+        f'<body name="{joint}_{side}_{k}" pos="0 {0.04 * side} .1"><joint name="{joint}_{side}_{k}" axis="1 0 0" '
+        'range="-1 1"/><geom size=".01" mass=".01"/>'
+        for side in range(number)
+        for k in range(depth)
+    ]
+    return "".join(
+        each + ("</body>" * depth if k % depth == depth - 1 else "") for k, each in enumerate(open_)
+    )
+
+
+@pytest.mark.parametrize(
+    "fingers",
+    [
+        gripper(2),
+        gripper(1, "jaw"),
+        gripper(2, "knuckle", depth=3),
+        gripper(2, "bar", depth=2),
+        gripper(1, "gripperMover"),
+    ],
+)
+def test_joints_of_grippers_are_not_part_of_the_arm(fingers):
+    assert load_arm(changed((HAND_OF_TEXT, fingers))).joint_names == JOINTS
+
+
+def test_a_tool_on_a_finger_moves_with_the_last_joint_of_the_arm():
+    fingers = gripper(2, "bar").replace("</body>", '<site name="pinch"/></body>', 1)
+    arm = load_arm(changed((HAND_OF_TEXT, fingers)))
+    assert arm.joint_names == JOINTS
+    assert any(note.startswith("fixed: bar_0_0") for note in arm.notes)
+
+
+def test_a_mobile_base_is_fixed():
+    slide = '<joint name="x" type="slide" limited="false"/>'
+    carriage = f'<body name="carriage">{slide}<joint name="turn"/><geom size=".05" mass="2"/>'
+    text = changed((SHOULDER, carriage + SHOULDER), ("</body>\n  </worldbody>", "</body></body></worldbody>"))
+    arm = load_arm(text)
+    assert arm.joint_names == JOINTS
+    assert any(note.startswith("fixed: turn, x") for note in arm.notes)
+
+
+def test_surroundings_are_left_out_and_told():
+    wall = '<body name="wall" pos="2 0 0"><geom type="box" size=".1 1 1"/></body></worldbody>'
+    arm = load_arm(changed(("</worldbody>", wall)))
+    assert "left out, not part of the arm: wall" in arm.notes
+    assert "wall" not in arm.group_names
+
+
+def test_a_visual_mesh_that_is_missing_is_left_out_and_one_that_collides_is_named(tmp_path):
+    mesh = '<asset><mesh name="cover" file="cover.obj"/></asset><worldbody>'
+    geom = '<geom type="mesh" mesh="cover" contype="{0}" conaffinity="{0}" mass="0"/>'
+    path = tmp_path / "arm.xml"
+    path.write_text(changed(("<worldbody>", mesh), (SHOULDER, SHOULDER + geom.format(0))))
+    arm = load_arm(path, name="covered")
+    assert "left out: visual mesh cover.obj, which is missing" in arm.notes
+    path.write_text(changed(("<worldbody>", mesh), (SHOULDER, SHOULDER + geom.format(1))))
+    with pytest.raises(ValueError, match=r"cover\.obj"):
+        load_arm(path)
+
+
+def test_files_of_several_parts_in_degrees(tmp_path):
+    (tmp_path / "links.xml").write_text(
+        '<mujoco><body name="fore" pos="0 0 .3"><joint name="two" axis="1 0 0" range="-90 90"/>'
+        '<geom type="capsule" fromto="0 0 0 0 0 .3" size=".03" mass="1"/>'
+        '<replicate count="2" offset="0 .05 0" sep="_"><site name="tip" pos="0 0 .3"/></replicate></body></mujoco>'
+    )
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        '<mujoco model="parts"><compiler angle="degree"/><default><joint damping="2" actuatorfrcrange="-90 90"/>'
+        '<default class="thin"><geom type="capsule" size=".03"/></default></default><worldbody>'
+        '<frame euler="180 0 0" pos="0 0 2"><body name="upper"><joint name="one" axis="1 0 0" range="-180 90"/>'
+        '<geom class="thin" fromto="0 0 0 0 0 .3" mass="1"/><include file="links.xml"/></body></frame>'
+        "</worldbody></mujoco>"
+    )
+    arm = load_arm(path, tool="tip_1", velocity_limit=2.0)
+    np.testing.assert_allclose(arm.joint_range, [(-np.pi, np.pi / 2), (-np.pi / 2, np.pi / 2)], atol=1e-5)
+    np.testing.assert_allclose(arm.hand((0.0, 0.0)), (0.0, -0.05, 1.4), atol=1e-5)  # hangs from the ceiling
+    np.testing.assert_array_equal(arm.torque_limit, 90.0)
+    assert arm.name == "parts"
+
+
+def test_an_attached_arm_is_an_arm(tmp_path):
+    (tmp_path / "ur5e.xml").write_text(TEXT)
+    path = tmp_path / "cell.xml"
+    path.write_text(
+        '<mujoco><asset><model name="robot" file="ur5e.xml"/></asset><worldbody><body name="stand" pos="0 0 1">'
+        '<geom type="box" size=".1 .1 .5" pos="0 0 -.5"/><attach model="robot" body="shoulder" prefix="r/"/></body>'
+        "</worldbody></mujoco>"
+    )
+    arm = load_arm(path, home=HOME, velocity_limit=3.0)
+    assert arm.joint_names == tuple(f"r/{name}" for name in JOINTS)
+    assert "stand" in arm.group_names
+
+
+def test_urdf_files_with_odd_parts_load(crane):
+    triangles = "solid s\n" + "".join(
+        "facet normal 0 0 0 outer loop "
+        + " ".join(f"vertex {x} {y} {z}" for x, y, z in corners)
+        + " endloop endfacet\n"
+        for corners in ([(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0)], [(0, 0, 0), (0.1, 0, 0), (0, 0, 0.1)],
+                        [(0, 0, 0), (0, 0.1, 0), (0, 0, 0.1)], [(0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1)])
+    )  # fmt: skip
+    (crane / "meshes" / "wrist.stl").write_text(triangles)
+    path = written(crane, "package://renamed_description/meshes/wrist.stl")
+    text = path.read_text().replace("</robot>", "<xacro:thing a:b='1'/></robot>")
+    text = text.replace(
+        '<mass value="2"/>\n    <inertia ixx="0.1"', '<mass value="2"/>\n    <inertia ixx="-0.1"'
+    )
+    text = text.replace(
+        "</collision></link>",
+        '</collision><collision><geometry><box size="0 0 0"/></geometry></collision></link>',
+        1,
+    )
+    path.write_text(text)
+    arm = load_arm(path)
+    assert "wrist" in arm.group_names
+    for told in ("inertia of boom", "its box has no size"):
+        assert any(told in note for note in arm.notes), told

@@ -278,7 +278,7 @@ def test_an_arm_of_ones_own_is_drawn_from_its_file():
     names = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
     home = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
     file = Path(__file__).parents[2] / "docs" / "ur5e.xml"
-    arm = ve.load_arm(file, hand_site="hand", joints=names, home=home, velocity_limit=np.pi)
+    arm = ve.load_arm(file, tool="hand", joints=names, home=home, velocity_limit=np.pi)
     drawn = drawing.ArmDrawing(arm, arm.compile(0), file)
     away = []
     for joints in arm.home + np.random.default_rng(0).uniform(-0.4, 0.4, (8, 6)):

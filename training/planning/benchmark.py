@@ -101,7 +101,11 @@ def benchmark_panda() -> Arm:
         home=PANDA_HOME,
         velocity_limit=(2.175,) * 4 + (2.61,) * 3,
         torque_limit=(87.0,) * 4 + (12.0,) * 3,
-        exclude=[(first, second) for first, others in NEVER_TOUCH.items() for second in others],
+        exclude={
+            frozenset((first, second)): "never in contact"
+            for first, others in NEVER_TOUCH.items()
+            for second in others
+        },
     )
 
 

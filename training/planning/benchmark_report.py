@@ -117,12 +117,12 @@ def measure_planner(
         if progress is not None:
             progress(name, number + 1, len(problems))
     if physics:
-        for row in _succeeding(plans):
+        for row in succeeding(plans):
             lines[row]["physics"] = True
     return pd.DataFrame(lines)
 
 
-def _succeeding(plans: Sequence[MotionPlan]) -> list[int]:
+def succeeding(plans: Sequence[MotionPlan]) -> list[int]:
     """Return the indices of the plans that succeed by geometry and in physics."""
     found = []
     for count in {len(plan.durations) for plan in plans}:

@@ -233,16 +233,25 @@ def plan_motion(
     goals = _goals(problem, goal)
     given, number = _seeds(seeds, n_via, where.dimension)
     generator = np.random.default_rng(rng if rng is not None else 0)
-    best: MotionPlan | None = None
     number = -(-number // len(goals))
     until = time.perf_counter() + time_limit
-    for each in goals:
-        plan = _plan(problem._replace(goal=each), n_via, given, number, enough, until, generator, ompl)
-        if best is None or _worth(plan) > _worth(best):
-            best = plan
-        if time.perf_counter() > until:
-            break
-    assert best is not None
+    # Straight movements are cheap, and the first goal that is reached bounds what others may cost.
+    straight = [
+        _plan(problem._replace(goal=each), n_via, given[:0], 0, enough, 0.0, generator, False)
+        for each in (goals if len(goals) > 1 else goals[:0])
+    ]
+    plans = list(straight)
+    for rank, each in enumerate(goals):
+        least = min((plan.duration for plan in plans if plan.success), default=np.inf)
+        if straight and straight[rank].duration >= least:
+            continue
+        # A goal that cannot be reached costs its share of the time, or a few seeds if another one is reached.
+        now = time.perf_counter()
+        share = now + (until - now) / (len(goals) - rank)
+        few = number if np.isinf(least) else min(number, NARROW)
+        tree = ompl and bool(np.isinf(least))
+        plans.append(_plan(problem._replace(goal=each), n_via, given, few, enough, share, generator, tree))
+    best = max(plans, key=_worth)
     return dataclasses.replace(best, milliseconds=1e3 * (time.perf_counter() - began))
 
 
