@@ -10,13 +10,19 @@ import numpy as np
 import pandas as pd
 
 from viapoint.training.agents.agent import load_agent
-from viapoint.training.config.configs import USUAL_BASELINES, EvaluateConfig, PlayConfig, TrainConfig
+from viapoint.training.config.configs import (
+    USUAL_BASELINES,
+    EvaluateConfig,
+    PlayConfig,
+    TrainConfig,
+    env_of_arm,
+)
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import check_baselines, environment_of, evenly_spread
 from viapoint.training.evaluation.evaluator import evaluate as measure
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planning import benchmark_report
-from viapoint.training.planning.baselines import agent_method
+from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.benchmark import benchmark_problems, read_problems
 from viapoint.training.planning.search import registered_task
 from viapoint.training.runs import trainer as training
@@ -56,14 +62,19 @@ def evaluate(config: EvaluateConfig) -> None:
         if config.agent and (Path(config.agent).expanduser() / "config.json").is_file()
         else None
     )
-    env_id, env_kwargs = environment_of(agent, config.env, None)
+    env, argument = config.env, None
+    if config.arm is not None:
+        own = agent.env_id if agent is not None else config.env
+        env, argument = env_of_arm(config.arm, own)
+        argument = {**(agent.env_kwargs if agent is not None else {}), **argument}
+    env_id, env_kwargs = environment_of(agent, env, argument)
     task = registered_task(env_id, **env_kwargs)
     check_baselines(config.baselines, agent, task)
     whole = scenes_for(config.scenes, task, config.n_scenes)
     scenes = whole.take(evenly_spread(len(whole.share), config.n_scenes))
     with report.progress_bar() as progress:
         given: Any = {"checks": config.checks, "baselines": config.baselines, "progress": progress}
-        result = measure(agent, env=config.env, scenes=scenes, **given)
+        result = measure(agent, env=env, env_kwargs=argument, scenes=scenes, **given)
     record = result.to_dict()
     report.show(record)
     if run is not None:
@@ -102,16 +113,21 @@ def _evaluation_name(scenes: str, whole: FrozenScenes, number: int, *, partial: 
 
 
 def play(config: PlayConfig) -> None:
-    """Record a video of an agent's movements."""
+    """Record a video of the movements of an agent, or of the geometry search."""
     from viapoint.training.plotting.video import record_video
 
-    agent = load_agent(str(config.agent))
-    scenes = scenes_for(config.scenes, registered_task(agent.env_id, **agent.env_kwargs)).scenes
+    agent = None if config.agent is None else load_agent(config.agent)
+    env_id, argument = env_of_arm(config.arm, agent.env_id if agent is not None else None)
+    assert env_id is not None
+    env_kwargs = {**(agent.env_kwargs if agent is not None else {}), **argument}
+    scenes = scenes_for(config.scenes, registered_task(env_id, **env_kwargs)).scenes
     rows = evenly_spread(len(scenes.start), config.n_scenes)
-    env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
-    method = agent_method(
-        f"agent, {config.checks} checks" if config.checks else "agent", agent, config.checks
-    )
+    env = gym.make(env_id, render_mode="rgb_array_list", **env_kwargs)
+    if agent is None:
+        method = make_method("search512", env_id, **env_kwargs)
+    else:
+        name = f"agent, {config.checks} checks" if config.checks else "agent"
+        method = agent_method(name, agent, config.checks)
     config.video.parent.mkdir(parents=True, exist_ok=True)
     record_video(config.video, env, scenes.take(rows), method.decide, name=method.name)
     env.close()
