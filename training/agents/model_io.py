@@ -101,6 +101,10 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
     arrays = read_arrays(tensors, LARGEST_WEIGHTS)
     try:
         hyperparameters = dict(record["hyperparameters"])
+        policy = hyperparameters.get("policy_kwargs", {})
+        if isinstance(policy, dict) and isinstance(policy.get("task"), dict):  # ViaQ's networks know the task
+            task = with_kept_arm(policy["task"], folder)
+            hyperparameters["policy_kwargs"] = {**policy, "task": task}
         with warnings.catch_warnings(), parameter_budget(arrays):
             warnings.simplefilter("ignore", UserWarning)  # PPO's batches do not fill one environment
             if env is None:

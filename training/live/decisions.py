@@ -80,8 +80,8 @@ MOTION = "motion planner"
 """Name of the method :func:`plan_motion`, the default of tasks in which plans are not revised."""
 AGENT, SEARCH = "agent", "geometry search"
 """Names of the other methods."""
-TIME_LIMIT = 0.03
-"""Time limit of the motion planner, [s]."""
+TIME_LIMIT, SECOND_LIMIT = 0.03, 1.0
+"""Time limits of the motion planner during a drag, and in a pause where that found no free movement, [s]."""
 
 
 class Decision(NamedTuple):
@@ -117,7 +117,14 @@ class DecisionMaker:
         self.checks = hasattr(policy, "checks")
         """True if the agent can check its proposals with computed geometry."""
 
-    def plan(self, scene: LiveScene, n_via: int, duration: float | None, last: MotionPlan | None) -> Decision:
+    def plan(
+        self,
+        scene: LiveScene,
+        n_via: int,
+        duration: float | None,
+        last: MotionPlan | None,
+        time_limit: float = TIME_LIMIT,
+    ) -> Decision:
         """Plan with the motion planner, which also says why there is no free movement.
 
         Args:
@@ -125,9 +132,11 @@ class DecisionMaker:
             n_via: Number of via-points, 1 to 3.
             duration: Duration, [s]; None for the shortest.
             last: Last plan, whose via-points are tried first.
+            time_limit: Time after which no further seed is tried, [s].
         """
         vias = None if last is None else last.waypoints[1:-1]
-        seeds = vias[None] if vias is not None and len(vias) == n_via else SEEDS
+        again = vias is not None and len(vias) == n_via and time_limit == TIME_LIMIT
+        seeds = vias[None] if vias is not None and again else SEEDS
         begin = time.perf_counter()
         motion = plan_motion(
             self.task.arm,
@@ -136,7 +145,7 @@ class DecisionMaker:
             scene.packed,
             n_via=n_via,
             seeds=seeds,
-            time_limit=TIME_LIMIT,
+            time_limit=time_limit,
             duration=duration,
             space=self.task.space_name,
             ompl=False,

@@ -214,6 +214,8 @@ class Panels:
     def _build_controls(self, env_id: str, scene_kinds: Sequence[str]) -> None:
         gui, setting, act = self._gui, self._setting, self._act
         title = env_id.removeprefix("viapoint/")
+        if setting.task.arm.file:
+            title += f", {setting.task.arm.name}"
         subtitle = "no agent"
         if setting.agent is not None:
             subtitle = f"agent: {type(setting.agent).__name__}"

@@ -18,6 +18,8 @@ from viapoint.training.live.comparison import MethodResult, compare
 from viapoint.training.live.decisions import (
     AGENT,
     MOTION,
+    SECOND_LIMIT,
+    TIME_LIMIT,
     Decision,
     Proposal,
     describe_plan,
@@ -150,6 +152,10 @@ class Session:
     def load(self, content: bytes) -> None:
         """Go to the scene of a JSON file; an impossible one is refused on the page."""
         self._act("load", content)
+
+    def choose(self, method: str) -> None:
+        """Choose the method that decides, one of the setting's `methods`."""
+        self._act("method", method)
 
     def turn(self, quaternion: Float) -> None:
         """Turn the tool at the goal to another orientation."""
@@ -377,10 +383,7 @@ class Session:
         self._scenes = None
         if self._method == MOTION and self._by_hand is None:
             n_via = min(max(self._n_via, 1), MOST_VIAS)
-            decision = self._setting.decisions.plan(self._scene, n_via, self._duration, self._last)
-            self._last, self._decision = decision.motion, decision
-            self._show_decision(decision.chosen)
-            self.post("later proposals", lambda: self._show_details_of(decision))
+            self._plan(n_via, TIME_LIMIT)
             return
         try:
             observation, _ = self._env.reset(options=self._scene.options())
@@ -409,17 +412,30 @@ class Session:
         self._show_decision(chosen)
         self.post("later proposals", lambda: self._add_proposals(observation, scenes, decision))
 
-    def _show_decision(self, chosen: Proposal) -> None:
+    def _show_decision(self, chosen: Proposal, *, timed: bool = True) -> None:
         """Show a new plan at once, and note the time since the change."""
         self._proposals = (chosen,)
         self._show_plan()
         self._client.flush()
         self.decisions += 1
-        self.latencies.append(time.perf_counter() - self._jobs.posted)
+        if timed:
+            self.latencies.append(time.perf_counter() - self._jobs.posted)
 
-    def _show_details_of(self, decision: Decision) -> None:
-        if decision is self._decision and self._playing is None:
+    def _plan(self, n_via: int, time_limit: float) -> None:
+        """Show a plan of the motion planner; where it is not free, a second one follows in the next pause."""
+        decisions = self._setting.decisions
+        decision = decisions.plan(self._scene, n_via, self._duration, self._last, time_limit)
+        self._last, self._decision = decision.motion, decision
+        self._show_decision(decision.chosen, timed=time_limit == TIME_LIMIT)
+
+        def follow() -> None:
+            if decision is not self._decision or self._playing is not None:
+                return
+            if decision.chosen.reason and time_limit < SECOND_LIMIT:
+                self._plan(n_via, SECOND_LIMIT)
             self._show_details()
+
+        self.post("later proposals", follow)
 
     def _show_plan(self) -> None:
         """Show the picked proposal, and say what it does."""
