@@ -120,7 +120,7 @@ def play(config: PlayConfig) -> None:
     env_id, argument = env_of_arm(config.arm, agent.env_id if agent is not None else None)
     assert env_id is not None
     env_kwargs = {**(agent.env_kwargs if agent is not None else {}), **argument}
-    scenes = scenes_for(config.scenes, registered_task(env_id, **env_kwargs)).scenes
+    scenes = scenes_for(config.scenes, registered_task(env_id, **env_kwargs), config.n_scenes).scenes
     rows = evenly_spread(len(scenes.start), config.n_scenes)
     env = gym.make(env_id, render_mode="rgb_array_list", **env_kwargs)
     if agent is None:

@@ -80,7 +80,7 @@ MOTION = "motion planner"
 """Name of the method :func:`plan_motion`, the default of tasks in which plans are not revised."""
 AGENT, SEARCH = "agent", "geometry search"
 """Names of the other methods."""
-TIME_LIMIT, SECOND_LIMIT = 0.03, 1.0
+TIME_LIMIT, SECOND_LIMIT = 0.03, 0.3
 """Time limits of the motion planner during a drag, and in a pause where that found no free movement, [s]."""
 
 

@@ -131,12 +131,13 @@ class Panels:
         head = _table(names, ("", "", "", "mm", "", "ms"), rows) if rows else ""
         self._methods.content = head + _note(note)
 
-    def show_decided(self, duration: float, n_via: int) -> None:
-        """Set the sliders to a decision."""
+    def show_decided(self, duration: float | None, n_via: int) -> None:
+        """Set the sliders to a decision; None leaves the duration as the user has set it."""
         self._quiet = True
         try:
             slider = self._duration
-            slider.value = float(np.clip(round(duration, 2), slider.min, slider.max))
+            if duration is not None:
+                slider.value = float(np.clip(round(duration, 2), slider.min, slider.max))
             self._vias.value = n_via
         finally:
             self._quiet = False

@@ -381,13 +381,18 @@ class Session:
         """Decide and show the plan; proposals and plots follow when nothing else is to be done."""
         self._decision, self._proposals, self._picked = None, (), 0
         self._scenes = None
+        n_via = min(max(self._n_via, 1), MOST_VIAS)
         if self._method == MOTION and self._by_hand is None:
-            n_via = min(max(self._n_via, 1), MOST_VIAS)
             self._plan(n_via, TIME_LIMIT)
             return
         try:
             observation, _ = self._env.reset(options=self._scene.options())
         except ValueError:
+            if MOTION in self._setting.methods:  # it says what is wrong, and shows the best plan in red
+                self._plan(n_via, TIME_LIMIT)
+                if not self._proposals[0].clear:
+                    return
+                raise
             self._view.show_plan(None, np.zeros((0, 3)), clear=False)
             self._view.show_proposals([])
             self._panels.show_proposals((), 0, "", 0.0)
@@ -451,7 +456,8 @@ class Session:
             self._view.show_plan(tool(plan.profile.coordinates), vias, clear=plan.clear)
             if self._proposals[1:] == ():
                 self._view.show_proposals([])
-            self._panels.show_decided(plan.duration, len(plan.plan.durations) - 1)
+            chosen = plan.duration if self._duration is None else None
+            self._panels.show_decided(chosen, len(plan.plan.durations) - 1)
             self._panels.tell(describe_plan(plan), GOOD if plan.clear else BAD, remark)
 
     def _add_proposals(self, observation: Observation, scenes: Scenes, decision: Decision) -> None:
