@@ -16,6 +16,19 @@ from viapoint.training.cli.main import main
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 
 
+def not_filmed(monkeypatch) -> list[str]:
+    """Let `play` decide without rendering; the arms of its videos are listed."""
+    filmed: list[str] = []
+
+    def record(path, env, scenes, decide, **_) -> None:
+        observation, _ = env.reset(seed=0)
+        decide({name: value[None] for name, value in observation.items()}, scenes)
+        filmed.append(env.unwrapped.task.arm.file)
+
+    monkeypatch.setattr("viapoint.training.plotting.video.record_video", record)
+    return filmed
+
+
 def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     shutil.copy(UR5E, tmp_path / "my_arm.xml")
     monkeypatch.chdir(tmp_path)
@@ -40,18 +53,21 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     assert Run(run).config.env_kwargs["arm"] == str(run / "arm.xml")
     np.testing.assert_array_equal(kept.predict(seen, deterministic=True)[0], action)
     main(["evaluate", str(run), "--baselines", "straight", "--n-scenes", "4", "--scenes", "validation"])
+    filmed = not_filmed(monkeypatch)
     main(["play", str(run), "--n-scenes", "1", "--scenes", "validation", "--video", str(tmp_path / "a.mp4")])
-    assert (tmp_path / "a.mp4").stat().st_size
+    assert filmed == [kept.env_kwargs["arm"]]
     main(["train", "--out", str(run), "--resume", "--n-timesteps", "80"])
     assert Run(run).decisions == 80
 
 
-def test_methods_are_measured_on_an_arm_of_a_file(tmp_path) -> None:
+def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     arm = ["--arm", str(UR5E), "--scenes", "validation"]
     out = tmp_path / "results.json"
     main(["evaluate", *arm, "--baselines", "straight", "plan_motion", "--n-scenes", "4", "--json", str(out)])
     assert out.is_file()
+    filmed = not_filmed(monkeypatch)
     main(["play", *arm, "--n-scenes", "1", "--video", str(tmp_path / "b.mp4")])
+    assert filmed == [str(UR5E)]
     with pytest.raises(SystemExit):
         main(["evaluate", "--arm", "nowhere.xml"])
 
