@@ -56,8 +56,6 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     filmed = not_filmed(monkeypatch)
     main(["play", str(run), "--n-scenes", "1", "--scenes", "validation", "--video", str(tmp_path / "a.mp4")])
     assert filmed == [kept.env_kwargs["arm"]]
-    main(["train", "--out", str(run), "--resume", "--n-timesteps", "80"])
-    assert Run(run).decisions == 80
 
 
 def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
