@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm, asset
-from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.arms.chain import Chain, FirstTwo, Spheres
 from viapoint.envs.arms.spheres import LeftOut
 
 UNREADABLE = (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile)
@@ -65,6 +65,7 @@ def read_arm(key: str) -> Arm | None:
         for kind in (Chain, Spheres):
             name = kind.__name__.lower()
             text[name] = kind(*(parts.pop(f"{name}.{part}") for part in kind._fields))
+        text["chain"] = text["chain"]._replace(first_two=FirstTwo(*text["chain"].first_two.tolist()))
         text["left_out"] = [LeftOut(*pair) for pair in text["left_out"]]
         lists = {name: tuple(value) for name, value in text.items() if type(value) is list}
         return Arm(**parts, **{**text, **lists})

@@ -12,6 +12,7 @@ import numpy as np
 
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
 from viapoint.envs.arms.load import load_arm
+from viapoint.envs.arms.stored import read_arm
 
 ARM_FILES = (".xml", ".mjcf", ".urdf")
 """Suffixes of files of arms."""
@@ -115,4 +116,5 @@ def arm_of(arm: Any) -> Arm:
 @functools.lru_cache(maxsize=16)
 def _of_file(path: Path, changed: int) -> Arm:
     """Return the arm of a file, which was last changed at some time."""
-    return dataclasses.replace(load_arm(path), file=str(path))
+    stored = read_arm(path)
+    return dataclasses.replace(load_arm(path) if stored is None else stored, file=str(path))

@@ -9,10 +9,24 @@ import numpy as np
 import pytest
 
 from viapoint.envs import arm_of
+from viapoint.envs.arms.stored import write_arm
 from viapoint.training import Run, evaluate, load_agent
 from viapoint.training.cli.main import main
 
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
+
+
+def not_filmed(monkeypatch) -> list[str]:
+    """Let `play` decide without rendering; the arms of its videos are listed."""
+    filmed: list[str] = []
+
+    def record(path, env, scenes, decide, **_) -> None:
+        observation, _ = env.reset(seed=0)
+        decide({name: value[None] for name, value in observation.items()}, scenes)
+        filmed.append(env.unwrapped.task.arm.file)
+
+    monkeypatch.setattr("viapoint.training.plotting.video.record_video", record)
+    return filmed
 
 
 def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
@@ -21,7 +35,7 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     run = tmp_path / "run"
     main(
         [
-            "train", "--env", "viapoint/Obstacles-v0", "--env-kwargs", "arm=my_arm.xml", "n_obstacles=2",
+            "train", "--arm", "my_arm.xml", "--env-kwargs", "n_obstacles=2",
             "--n-timesteps", "64", "--n-envs", "16", "--eval-every", "0", "--out", str(run),
         ]
     )  # fmt: skip
@@ -31,6 +45,41 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     agent = load_agent(run)
     result = evaluate(agent, baselines=["straight"], scenes="validation", n_scenes=4)
     assert len(result.rows) == 2
+
+    seen = agent.observation_space.sample()
+    action, _ = agent.predict(seen, deterministic=True)
+    (tmp_path / "my_arm.xml").unlink()  # the run keeps a copy
+    kept = load_agent(run)
+    assert Run(run).config.env_kwargs["arm"] == str(run / "arm.xml")
+    np.testing.assert_array_equal(kept.predict(seen, deterministic=True)[0], action)
+    main(["evaluate", str(run), "--baselines", "straight", "--n-scenes", "4", "--scenes", "validation"])
+    filmed = not_filmed(monkeypatch)
+    main(["play", str(run), "--n-scenes", "1", "--scenes", "validation", "--video", str(tmp_path / "a.mp4")])
+    assert filmed == [kept.env_kwargs["arm"]]
+
+
+def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
+    arm = ["--arm", str(UR5E), "--scenes", "validation"]
+    out = tmp_path / "results.json"
+    main(["evaluate", *arm, "--baselines", "straight", "plan_motion", "--n-scenes", "4", "--json", str(out)])
+    assert out.is_file()
+    filmed = not_filmed(monkeypatch)
+    main(["play", *arm, "--n-scenes", "1", "--video", str(tmp_path / "b.mp4")])
+    assert filmed == [str(UR5E)]
+    with pytest.raises(SystemExit):
+        main(["evaluate", "--arm", "nowhere.xml"])
+
+
+def test_a_copy_of_an_arm_is_the_same_arm(tmp_path) -> None:
+    arm = arm_of(str(UR5E))
+    write_arm(tmp_path / "copy.xml", arm)
+    copy = arm_of(str(tmp_path / "copy.xml"))
+    assert (copy.name, copy.group_names, copy.left_out) == (arm.name, arm.group_names, arm.left_out)
+    for mine, theirs in ((copy.spheres, arm.spheres), (copy.chain, arm.chain)):
+        for first, second in zip(mine, theirs, strict=True):
+            np.testing.assert_array_equal(first, second)
+    for name in ("joint_range", "velocity_limit", "torque_limit", "home", "stiffness", "damping"):
+        np.testing.assert_array_equal(getattr(copy, name), getattr(arm, name))
 
 
 def test_environments_take_files_and_say_what_is_missing() -> None:

@@ -2,6 +2,7 @@
 
 model.json             algorithm, policy, environment and hyperparameters
 weights.safetensors    tensors of the policy
+arm.xml                copy of the arm, if it was loaded from a file
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.stored import keep_arm, with_kept_arm
 from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES
 from viapoint.training.agents.extractors import EXTRACTORS
@@ -79,6 +81,7 @@ def save_model(model: BaseAlgorithm, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "weights.safetensors"
     write_arrays(path, weights(model))
+    keep_arm(folder, model.get_env().get_attr("task", [0])[0].arm)  # type: ignore[union-attr]
     write_json(folder / "model.json", {**describe(model), "weights_sha256": _digest(path)})
 
 
@@ -98,11 +101,15 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
     arrays = read_arrays(tensors, LARGEST_WEIGHTS)
     try:
         hyperparameters = dict(record["hyperparameters"])
+        policy = hyperparameters.get("policy_kwargs", {})
+        if isinstance(policy, dict) and isinstance(policy.get("task"), dict):  # ViaQ's networks know the task
+            task = with_kept_arm(policy["task"], folder)
+            hyperparameters["policy_kwargs"] = {**policy, "task": task}
         with warnings.catch_warnings(), parameter_budget(arrays):
             warnings.simplefilter("ignore", UserWarning)  # PPO's batches do not fill one environment
             if env is None:
                 hyperparameters = _to_decide(hyperparameters)
-            own = own_environment(record["env"])
+            own = own_environment(record["env"], folder)
             if env is not None:
                 check_for_correct_spaces(env, own.observation_space, own.action_space)
             model = build(record["algorithm"], record["policy"], env or own, hyperparameters)
@@ -248,8 +255,10 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
+def own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
     """Return one copy of the environment that a file names by `id` and `kwargs`, or by its `task` alone.
+
+    An arm file that is gone is replaced by its copy in the folder.
 
     The id of a user's own environment need not be registered where the model is loaded.
 
@@ -261,6 +270,7 @@ def own_environment(record: Mapping[str, Any]) -> ViaVecEnv:
         if "task" not in record:
             raise ValueError(f"environment {env_id!r} is not known")
         env_id, kwargs = ANY_TASK, record["task"]
+    kwargs = with_kept_arm(kwargs, folder)
     for name, most in LARGEST_ARGUMENTS.items():
         value = kwargs.get(name, 0)
         for each in value if isinstance(value, list | tuple) else (value,):

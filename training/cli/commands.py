@@ -8,13 +8,19 @@ import gymnasium as gym
 import pandas as pd
 
 from viapoint.training.agents.agent import load_agent
-from viapoint.training.config.configs import USUAL_BASELINES, EvaluateConfig, PlayConfig, TrainConfig
+from viapoint.training.config.configs import (
+    USUAL_BASELINES,
+    EvaluateConfig,
+    PlayConfig,
+    TrainConfig,
+    env_of_arm,
+)
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate as measure
 from viapoint.training.evaluation.evaluator import evenly_spread
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.planning import benchmark_report
-from viapoint.training.planning.baselines import agent_method
+from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.benchmark import benchmark_problems, read_problems
 from viapoint.training.planning.search import registered_task
 from viapoint.training.runs import trainer as training
@@ -34,10 +40,16 @@ def evaluate(config: EvaluateConfig) -> None:
     if config.of_planners:
         _measure_planners(config)
         return
+    agent = None if config.agent is None else load_agent(config.agent)
+    env, env_kwargs = config.env, None
+    if config.arm is not None:
+        env, argument = env_of_arm(config.arm, config.env if agent is None else agent.env_id)
+        env_kwargs = {**({} if agent is None else agent.env_kwargs), **argument}
     with report.progress_bar() as progress:
         result = measure(
-            config.agent,
-            env=config.env,
+            agent,
+            env=env,
+            env_kwargs=env_kwargs,
             scenes=config.scenes,
             n_scenes=config.n_scenes,
             checks=config.checks,
@@ -76,16 +88,21 @@ def _measure_planners(config: EvaluateConfig) -> None:
 
 
 def play(config: PlayConfig) -> None:
-    """Record a video of an agent's movements."""
+    """Record a video of the movements of an agent, or of the geometry search."""
     from viapoint.training.plotting.video import record_video
 
-    agent = load_agent(str(config.agent))
-    scenes = scenes_for(config.scenes, registered_task(agent.env_id, **agent.env_kwargs)).scenes
+    agent = None if config.agent is None else load_agent(config.agent)
+    env_id, argument = env_of_arm(config.arm, agent.env_id if agent is not None else None)
+    assert env_id is not None
+    env_kwargs = {**(agent.env_kwargs if agent is not None else {}), **argument}
+    scenes = scenes_for(config.scenes, registered_task(env_id, **env_kwargs), config.n_scenes).scenes
     rows = evenly_spread(len(scenes.start), config.n_scenes)
-    env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
-    method = agent_method(
-        f"agent, {config.checks} checks" if config.checks else "agent", agent, config.checks
-    )
+    env = gym.make(env_id, render_mode="rgb_array_list", **env_kwargs)
+    if agent is None:
+        method = make_method("search512", env_id, **env_kwargs)
+    else:
+        name = f"agent, {config.checks} checks" if config.checks else "agent"
+        method = agent_method(name, agent, config.checks)
     config.video.parent.mkdir(parents=True, exist_ok=True)
     record_video(config.video, env, scenes.take(rows), method.decide, name=method.name)
     env.close()

@@ -38,6 +38,9 @@ AGENT = tyro.conf.arg(
     help=f"Run folder, model folder, or id of an environment with a shipped agent: {', '.join(SHIPPED_IDS)}.",
 )
 PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent, one of {', '.join(SHIPPED_IDS)}.")
+ARM = tyro.conf.arg(metavar="ARM", help="Arm: panda, planar, or an MJCF or URDF file.")
+ARM_ENVS = {"planar": DEFAULT_ENV, "panda": "viapoint/PandaObstacles-v0"}
+"""Environments of the built-in arms; that of other arms is viapoint/Obstacles-v0."""
 EnvId = Annotated[str, ENV]
 """Id of an environment; the help of a command lists them."""
 
@@ -95,6 +98,16 @@ def _plain(name: str, value: Any) -> Any:
         f"{name} must be numbers, texts, lists and dictionaries, which a file can hold, or a registered arm, "
         f"got {value!r:.80}"
     )
+
+
+def env_of_arm(arm: Arm | str | None, env: str | None) -> tuple[str | None, dict[str, Any]]:
+    """Return the id of an environment for an arm, by default one with obstacles, and the argument for the arm."""
+    if arm is None:
+        return env, {}
+    if env is None and arm in ARM_ENVS:
+        return ARM_ENVS[arm], {}
+    found = arm_of(arm)  # a file that cannot be loaded is told here
+    return env or "viapoint/Obstacles-v0", {"arm": found if isinstance(arm, Arm) else found.file or arm}
 
 
 # tyro reads a dictionary of one type of values only.
@@ -189,6 +202,8 @@ class TrainConfig(Config):
 
     env: EnvId = DEFAULT_ENV
     """Id of the environment."""
+    arm: Annotated[str | None, ARM] = None
+    """Arm, which becomes one of the arguments of the environment; the usual environment is then one for any arm."""
     algo: Algorithm = "viaq"
     """Learning algorithm."""
     seed: int = 0
@@ -225,6 +240,11 @@ class TrainConfig(Config):
         if self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
         check_env_kwargs(self.env_kwargs)
+        if self.arm is not None:
+            env, argument = env_of_arm(self.arm, None if self.env == DEFAULT_ENV else self.env)
+            object.__setattr__(self, "env", env)
+            object.__setattr__(self, "env_kwargs", {**self.env_kwargs, **argument})
+            object.__setattr__(self, "arm", None)
         stepwise = self.task.stepwise
         if stepwise and self.algo not in STEP_PRESETS:
             raise ValueError(
@@ -359,6 +379,8 @@ class EvaluateConfig(AgentConfig):
     """JSON file for all results, scene by scene."""
     env: Annotated[str | None, ENV] = None
     """Id of the environment; default: that of the agent."""
+    arm: Annotated[str | None, ARM] = None
+    """Arm on which baselines are evaluated, or the one that replaces the arm of an agent."""
 
     least: ClassVar = {"n_scenes": 1}
 
@@ -374,12 +396,14 @@ class EvaluateConfig(AgentConfig):
         if self.env is not None:
             check_env(self.env)
         if self.of_planners:
-            if self.agent is not None or self.env is not None:
+            if not self.agent is self.env is self.arm is None:
                 raise ValueError(
                     "motionbenchmaker measures planners: name neither an agent nor an environment"
                 )
-        elif self.agent is None and self.env is None:
-            raise ValueError("name an agent (run folder, model folder or id), or an environment with --env")
+        elif self.agent is self.env is self.arm is None:
+            raise ValueError(
+                "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
+            )
         for number in self.checks:
             check_whole("checks", number, 0)
         if not self.checks:
@@ -396,6 +420,8 @@ class PlayConfig(AgentConfig):
     Example: viapoint play runs/first --video movements.mp4 --scenes hard
     """
 
+    arm: Annotated[str | None, ARM] = None
+    """Arm that the geometry search moves where no agent is named, or the one that replaces the arm of an agent."""
     video: Path = Path("movements.mp4")
     """MP4 file to write."""
     scenes: str = "test"
@@ -409,8 +435,10 @@ class PlayConfig(AgentConfig):
 
     def _check(self) -> None:
         super()._check()
-        if self.agent is None:
-            raise ValueError("name an agent: run folder, model folder or id")
+        if self.agent is self.arm is None:
+            raise ValueError("name an agent: run folder, model folder or id; or an arm with --arm")
+        if self.agent is None and self.checks:
+            raise ValueError("checks concerns an agent, and none is given")
         check_file("video", self.video, ".mp4")
 
 
@@ -479,15 +507,15 @@ class PlanConfig(Config):
 
 @dataclass(frozen=True, kw_only=True)
 class LiveConfig(AgentConfig):
-    """Serve a page in the browser on which scenes are changed by hand and the agent decides anew.
+    """Serve a page in the browser on which goal and obstacles are dragged and the movement is planned anew.
 
-    Example: viapoint live --pretrained viapoint/PlanarObstacles-v0
+    Example: viapoint live --arm panda
     """
 
     env: Annotated[str | None, ENV] = None
-    """Id of the environment; where no agent is shipped for it, the geometry search decides."""
-    host: str = "127.0.0.1"
-    """Address to listen on; other machines reach any but 127.0.0.1."""
+    """Id of the environment; an agent that is shipped for it can be chosen on the page."""
+    arm: Annotated[str | None, ARM] = None
+    """Arm of the page, in an environment with obstacles if none is named."""
     port: int = 8080
     """Port to listen on; 0 for a free one."""
     seed: int | None = None

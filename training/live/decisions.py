@@ -1,4 +1,4 @@
-"""Decisions on the live page: ranked proposals of an agent, or of the geometry search where there is none."""
+"""Decisions on the live page: plans of the motion planner, and ranked proposals of an agent or the geometry search."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.training.live.movements import Profile, plan_profile
 from viapoint.training.live.scene import LiveScene
 from viapoint.training.planning.candidates import candidate_actions
+from viapoint.training.planning.motion_plan import MotionPlan
+from viapoint.training.planning.plan_motion import SEEDS, plan_motion
 from viapoint.training.planning.problem import Problem, moves_of, worth_of
 from viapoint.training.planning.search import GeometrySearch, merits
 
@@ -50,6 +52,8 @@ class Proposal(NamedTuple):
     """True if the whole plan is within the arm's reach."""
     jerk_ratio: float
     """Jerk cost relative to that of the straight movement of the same duration."""
+    reason: str = ""
+    """Reason why the motion planner found no better plan; empty for a free plan and for other methods."""
 
     @property
     def clearance(self) -> float:
@@ -64,12 +68,20 @@ class Proposal(NamedTuple):
     @property
     def clear(self) -> bool:
         """True if the plan is within reach and touches nothing."""
-        return self.reachable and min(self.clearance, self.self_clearance) > 0.0
+        return not self.reason and self.reachable and min(self.clearance, self.self_clearance) > 0.0
 
     @property
     def duration(self) -> float:
         """Duration of the plan, [s]."""
         return float(self.plan.duration)
+
+
+MOTION = "motion planner"
+"""Name of the method :func:`plan_motion`, the default of tasks in which plans are not revised."""
+AGENT, SEARCH = "agent", "geometry search"
+"""Names of the other methods."""
+TIME_LIMIT, SECOND_LIMIT = 0.03, 0.3
+"""Time limits of the motion planner during a drag, and in a pause where that found no free movement, [s]."""
 
 
 class Decision(NamedTuple):
@@ -85,6 +97,8 @@ class Decision(NamedTuple):
     """Time that the decision took, [s]."""
     task: Task
     """Task whose actions were considered."""
+    motion: MotionPlan | None = None
+    """Plan of the motion planner; None for other methods."""
 
 
 class DecisionMaker:
@@ -103,21 +117,67 @@ class DecisionMaker:
         self.checks = hasattr(policy, "checks")
         """True if the agent can check its proposals with computed geometry."""
 
-    def choose(
-        self, observation: Observation, scenes: Scenes, *, n_via: int | None = None, checks: int = 0
+    def plan(
+        self,
+        scene: LiveScene,
+        n_via: int,
+        duration: float | None,
+        last: MotionPlan | None,
+        time_limit: float = TIME_LIMIT,
     ) -> Decision:
-        """Decide in one scene.
+        """Plan with the motion planner, which also says why there is no free movement.
+
+        Args:
+            scene: Scene, possible or not.
+            n_via: Number of via-points, 1 to 3.
+            duration: Duration, [s]; None for the shortest.
+            last: Last plan, whose via-points are tried first.
+            time_limit: Time after which no further seed is tried, [s].
+        """
+        vias = None if last is None else last.waypoints[1:-1]
+        again = vias is not None and len(vias) == n_via and time_limit == TIME_LIMIT
+        seeds = vias[None] if vias is not None and again else SEEDS
+        begin = time.perf_counter()
+        motion = plan_motion(
+            self.task.arm,
+            scene.start,
+            scene.goal,
+            scene.packed,
+            n_via=n_via,
+            seeds=seeds,
+            time_limit=time_limit,
+            duration=duration,
+            space=self.task.space_name,
+            ompl=False,
+        )
+        seconds = time.perf_counter() - begin
+        profile = plan_profile(self.task, scene.packed, motion.plan)
+        inside = bool(self.task.space.inside(profile.coordinates).all())
+        chosen = Proposal(1, motion.plan, None, None, profile, inside, motion.jerk, motion.reason)
+        return Decision(chosen, np.zeros(0), MOTION, seconds, self.task, motion)
+
+    def choose(
+        self,
+        observation: Observation,
+        scenes: Scenes,
+        *,
+        n_via: int | None = None,
+        checks: int = 0,
+        by_agent: bool = True,
+    ) -> Decision:
+        """Decide in one scene with the agent or the geometry search.
 
         Args:
             observation: Parts of the first observation, shape (1, .) each.
             scenes: Batch of this one scene.
             n_via: Number of via-points; with another number than the agent's, the geometry search decides.
             checks: Proposals that the agent checks with computed geometry.
+            by_agent: True for the agent, if there is one.
         """
         own = n_via in (None, self.task.n_via)
         task = self.task if own else dataclasses.replace(self.task, n_via=int(n_via or 0))
         begin = time.perf_counter()
-        if own and self._agent is not None:
+        if own and by_agent and self._agent is not None:
             action = self.action(observation, checks)[0]
             maker = f"agent, {checks} checks" if checks else "agent"
         else:
@@ -144,7 +204,7 @@ class DecisionMaker:
     def proposals(self, observation: Observation, scenes: Scenes, decision: Decision) -> tuple[Proposal, ...]:
         """Return the chosen plan and the best others that differ from it, with their ranks."""
         task, by_agent = decision.task, decision.maker.startswith("agent")
-        if by_agent and not self.ranks:
+        if decision.motion is not None or (by_agent and not self.ranks):
             return (decision.chosen,)
         if by_agent:
             with self._lock:
@@ -192,7 +252,7 @@ def evaluated(task: Task, scenes: Scenes, actions: Float) -> list[Proposal]:
     found = []
     for i in range(len(actions)):
         plan = Plan(plans.waypoints[i], plans.durations[i])
-        profile = plan_profile(task, scenes, plan)
+        profile = plan_profile(task, scenes.obstacles, plan)
         inside = bool(task.space.inside(profile.coordinates).all())
         proposal = Proposal(1, plan, None, None, profile, inside, float(cost[i] / straight[i]))
         if proposal.clear:
@@ -205,6 +265,8 @@ def evaluated(task: Task, scenes: Scenes, actions: Float) -> list[Proposal]:
 
 def describe_plan(plan: Proposal) -> str:
     """Return one sentence on a plan."""
+    if plan.reason:
+        return f"No free movement was found: {plan.reason}. The best one is shown in red."
     if not plan.reachable:
         return "This plan leaves the arm's reach."
     if plan.clearance <= 0.0:

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs import Plan, ReachVectorEnv, Scenes, Task
+from viapoint.envs import Plan, ReachVectorEnv, Task
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Observation
 from viapoint.envs.geometry.clearance import FAR, configuration_clearances
+from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.training.live.scene import LiveScene
 
 SAMPLES = 80
@@ -66,16 +67,16 @@ class Segment(NamedTuple):
     """True if a new movement begins with this segment."""
 
 
-def plan_profile(task: Task, scenes: Scenes, plan: Plan, samples: int = SAMPLES) -> Profile:
-    """Return the profile of a plan from rest in a batch of one scene, if obstacles keep their course."""
+def plan_profile(task: Task, obstacles: Obstacles, plan: Plan, samples: int = SAMPLES) -> Profile:
+    """Return the profile of a plan from rest among the obstacles of one scene, if they keep their course."""
     arm, space = task.arm, task.space
     time = np.linspace(0.0, float(plan.duration), samples)
     trajectory = plan.trajectory()
     coordinates = np.asarray(trajectory(time))
     joints = space.joints(coordinates)
     tool = arm.hand(joints)
-    obstacles = scenes.obstacles.take(np.zeros(samples, np.int64)).at(time)
-    each = configuration_clearances(arm.chain, arm.spheres, joints, obstacles, np.zeros(samples))
+    each_time = obstacles.take(np.zeros(samples, np.int64)).at(time)
+    each = configuration_clearances(arm.chain, arm.spheres, joints, each_time, np.zeros(samples))
     speed = norm(np.gradient(tool, time, axis=0))
     jerk = norm(np.asarray(trajectory(time, 3)))
     return Profile(time, coordinates, tool, speed, jerk, each[:, 0], each[:, 1])

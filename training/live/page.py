@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-import ipaddress
 import logging
 import socket
-import sys
 import time
 import warnings
 from pathlib import Path
@@ -16,9 +14,11 @@ from typing import Any, Self
 import torch
 import viser
 
+from viapoint.envs import Arm
 from viapoint.envs.registration import check_registered
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.config.checks import DEFAULT_ENV, SHIPPED_IDS
+from viapoint.training.config.configs import env_of_arm
 from viapoint.training.live.session import Session
 from viapoint.training.live.setting import Shared
 
@@ -35,15 +35,16 @@ class LivePage:
         agent: Agent, run folder, model folder, or id of an environment with a shipped agent. None for the agent that is
             shipped for `env` or, if there is none, the geometry search.
         env: Id of the environment; by default that of the agent.
-        host: Address to listen on.
         port: Port to listen on; 0 for a free one.
-        model_file: MJCF file that the arm was loaded from; its visible geoms, such as meshes, are drawn.
+        arm: Arm of the environment: the name of one, an MJCF or URDF file, or an arm. Without `env`, it moves among
+            obstacles.
+        model_file: MJCF file whose visible geoms, such as meshes, are drawn; by default the one that `arm` names.
         seed: Seed of the random scenes.
         **env_kwargs: Arguments of the environment; by default those of the agent.
 
     Raises:
         ValueError: The agent cannot be loaded, or an argument is not allowed.
-        OSError: The port is occupied, or the address is not one of this machine.
+        OSError: The port is occupied.
 
     Example:
         >>> from viapoint.training import LivePage
@@ -57,12 +58,17 @@ class LivePage:
         agent: Agent | str | Path | None = None,
         *,
         env: str | None = None,
-        host: str = LOOPBACK,
+        arm: Arm | str | Path | None = None,
         port: int = 8080,
         model_file: str | Path | None = None,
         seed: int | None = None,
         **env_kwargs: Any,
     ) -> None:
+        if arm is not None:
+            agent = load_agent(agent) if isinstance(agent, str | Path) else agent
+            named = env if agent is None else agent.env_id
+            env, argument = env_of_arm(str(arm) if isinstance(arm, Path) else arm, named)
+            env_kwargs = {**(env_kwargs or ({} if agent is None else agent.env_kwargs)), **argument}
         if agent is None and (env or DEFAULT_ENV) in SHIPPED_IDS and not env_kwargs:
             agent = env or DEFAULT_ENV
         loaded = load_agent(agent) if isinstance(agent, str | Path) else agent
@@ -76,7 +82,7 @@ class LivePage:
         self._sessions: dict[int, Session] = {}
         # A tab may be closed while its session still draws.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
-        self._server = _serve(host, port)
+        self._server = _serve(port)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         _light(self._server.scene)
         self._server.on_client_connect(self._connect)
@@ -85,9 +91,7 @@ class LivePage:
     @property
     def url(self) -> str:
         """Address of the page."""
-        host = self._server.get_host()
-        shown = LOOPBACK if host in ("0.0.0.0", "::") else host
-        return f"http://{f'[{shown}]' if ':' in shown else shown}:{self._server.get_port()}"
+        return f"http://{LOOPBACK}:{self._server.get_port()}"
 
     @property
     def sessions(self) -> tuple[Session, ...]:
@@ -127,43 +131,29 @@ class LivePage:
 def run(config: Any) -> None:
     """Serve the live page until Ctrl-C; see :class:`LivePage`."""
     torch.set_num_threads(1)  # decisions are small, and the page has threads of its own
-    with LivePage(config.agent, env=config.env, host=config.host, port=config.port, seed=config.seed) as page:
-        if not is_loopback(config.host):
-            print(
-                f"viapoint: warning: {config.host} lets other machines on the network use this page; "
-                f"without --host only this machine can",
-                file=sys.stderr,
-            )
+    given = {"env": config.env, "arm": config.arm, "port": config.port, "seed": config.seed}
+    with LivePage(config.agent, **given) as page:
         print(f"live page: {page.url} (Ctrl-C ends it)", flush=True)
         page.wait()
 
 
-def is_loopback(host: str) -> bool:
-    """Return True for an address that only this machine reaches."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
-def _serve(host: str, port: int) -> viser.ViserServer:
-    """Start the server on exactly this port."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
+def _serve(port: int) -> viser.ViserServer:
+    """Start the server on exactly this port of the loopback address, which only this machine reaches."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((host, port))
+            probe.bind((LOOPBACK, port))
         except OSError as error:
             raise OSError(
-                f"the page cannot listen on {host}:{port} ({error.strerror}); --host and --port choose another address"
+                f"the page cannot listen on port {port} ({error.strerror}); --port chooses another one"
             ) from None
         port = probe.getsockname()[1]
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     with contextlib.redirect_stdout(io.StringIO()):  # the library prints a box with the address
-        server = viser.ViserServer(host=host, port=port, verbose=False)
+        server = viser.ViserServer(host=LOOPBACK, port=port, verbose=False)
     if server.get_port() != port:
         server.stop()
-        raise OSError(f"the page cannot listen on {host}:{port}; --host and --port choose another address")
+        raise OSError(f"the page cannot listen on port {port}; --port chooses another one")
     # The page never asks for a public address, and a message that does gets none: no request leaves the machine.
     server.request_share_url = lambda *_, **__: None
     return server

@@ -77,7 +77,7 @@ class Panels:
         rows = [
             (
                 "you" if not each.rank else str(each.rank),
-                "fails" if each.reward is None else f"{each.reward:.2f}",
+                ("fails" if not each.clear else "-") if each.reward is None else f"{each.reward:.2f}",
                 "-" if each.predicted is None else f"{each.predicted:.2f}",
                 _millimetres(each.clearance) if each.reachable else "out of reach",
                 f"{each.duration:.2f}",
@@ -131,12 +131,13 @@ class Panels:
         head = _table(names, ("", "", "", "mm", "", "ms"), rows) if rows else ""
         self._methods.content = head + _note(note)
 
-    def show_decided(self, duration: float, n_via: int) -> None:
-        """Set the sliders to a decision."""
+    def show_decided(self, duration: float | None, n_via: int) -> None:
+        """Set the sliders to a decision; None leaves the duration as the user has set it."""
         self._quiet = True
         try:
             slider = self._duration
-            slider.value = float(np.clip(round(duration, 2), slider.min, slider.max))
+            if duration is not None:
+                slider.value = float(np.clip(round(duration, 2), slider.min, slider.max))
             self._vias.value = n_via
         finally:
             self._quiet = False
@@ -214,7 +215,9 @@ class Panels:
     def _build_controls(self, env_id: str, scene_kinds: Sequence[str]) -> None:
         gui, setting, act = self._gui, self._setting, self._act
         title = env_id.removeprefix("viapoint/")
-        subtitle = "no agent: the geometry search decides"
+        if setting.task.arm.file:
+            title += f", {setting.task.arm.name}"
+        subtitle = "no agent"
         if setting.agent is not None:
             subtitle = f"agent: {type(setting.agent).__name__}"
         gui.main_panel.dock_right()
@@ -250,10 +253,12 @@ class Panels:
         gui.add_html(_note(drag))
 
     def _build_decision_controls(self) -> None:
-        gui, act, action = self._gui, self._act, self._task.action
+        gui, act, setting, action = self._gui, self._act, self._setting, self._task.action
         low, high = action.duration_range if self._task.space.of_hand else JOINT_DURATIONS
         self._duration = gui.add_slider("Duration [s]", low, high, 0.01, (low * high) ** 0.5)
         self._duration.on_update(self._unless_quiet(lambda event: act("duration", event.target.value)))
+        method = gui.add_dropdown("Method", setting.methods, hint="Decides after each change of the scene")
+        method.on_update(lambda event: act("method", event.target.value))
         most = action.n_via if self._task.replanning else max(MOST_VIAS, action.n_via)
         self._vias = gui.add_slider("Via-points", 0, most, 1, action.n_via)
         self._vias.disabled = most == action.n_via

@@ -11,6 +11,7 @@ import numpy as np
 from viapoint.envs import Scenes, Shape, Task, scene_from_json, scene_to_json
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
+from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.scenes.options import FORMAT
 
 LARGEST_FILE = 1 << 20
@@ -79,6 +80,11 @@ class LiveScene(NamedTuple):
         """Return the options of `reset`; what does not change is left out."""
         changes = {name: getattr(self, name) for name in ("jumps", "turns") if getattr(self, name).any()}
         return {"start": self.start, "goal": self.goal, "obstacles": list(self.obstacles), **changes}
+
+    @property
+    def packed(self) -> Obstacles:
+        """Obstacles as one scene of packed arrays."""
+        return pack([self.obstacles])
 
     def with_obstacle(self, shape: Shape, row: int | None = None) -> LiveScene:
         """Return the scene with another obstacle in a row, or with one more."""

@@ -15,7 +15,16 @@ from PIL import Image
 from viapoint.envs import ReachVectorEnv, Scenes, Task
 from viapoint.envs.common.types import Float, Observation
 from viapoint.training.live.comparison import MethodResult, compare
-from viapoint.training.live.decisions import Decision, Proposal, describe_plan, plan_by_hand
+from viapoint.training.live.decisions import (
+    AGENT,
+    MOTION,
+    SECOND_LIMIT,
+    TIME_LIMIT,
+    Decision,
+    Proposal,
+    describe_plan,
+    plan_by_hand,
+)
 from viapoint.training.live.job_thread import TICK, Job, JobThread
 from viapoint.training.live.movements import (
     SAMPLES,
@@ -32,13 +41,17 @@ from viapoint.training.live.obstacle_editing import new_obstacle, resized, sizes
 from viapoint.training.live.panels import BAD, GOOD, RESET, Panels
 from viapoint.training.live.scene import LiveScene, to_python
 from viapoint.training.live.scene_view import SceneView
+from viapoint.training.live.setting import N_VIA
 
 if TYPE_CHECKING:
     import viser
 
     from viapoint.envs import Plan
     from viapoint.training.live.setting import Setting, Shared
+    from viapoint.training.planning.motion_plan import MotionPlan
 
+MOST_VIAS = 3
+"""Greatest number of via-points of the motion planner."""
 LATENCIES = 200
 """Changes whose latency is kept."""
 FADE_EVERY = 0.08
@@ -61,7 +74,9 @@ class Session:
     def __init__(self, client: viser.ClientHandle, shared: Shared, on_end: Callable[[], object]) -> None:
         self._on_end = on_end
         self._client, self._shared, self._setting = client, shared, shared.own
-        self._checks, self._n_via = 0, shared.own.task.action.n_via
+        self._method, self._checks = shared.own.methods[0], 0
+        self._n_via = self._usual_n_via
+        self._last: MotionPlan | None = None
         self._by_hand: tuple[Float, float] | None = None
         self._duration: float | None = None
         self._selected: int | None = None
@@ -138,6 +153,10 @@ class Session:
         """Go to the scene of a JSON file; an impossible one is refused on the page."""
         self._act("load", content)
 
+    def choose(self, method: str) -> None:
+        """Choose the method that decides, one of the setting's `methods`."""
+        self._act("method", method)
+
     def turn(self, quaternion: Float) -> None:
         """Turn the tool at the goal to another orientation."""
         self.post("drag turn", lambda: self._turn(quaternion))
@@ -147,6 +166,7 @@ class Session:
         jobs: dict[str, Callable[..., None]] = {
             "scene": self._draw_scene,
             "duration": self._set_duration,
+            "method": self._set_method,
             "vias": lambda n: self._redecide(_n_via=n, _by_hand=None),
             "checks": lambda n: self._redecide(_checks=n),
             "pick": self._pick,
@@ -164,6 +184,11 @@ class Session:
             "view": lambda: self._view.look_at_everything(),
         }
         self.post(control, lambda: jobs[control](*values))
+
+    @property
+    def _usual_n_via(self) -> int:
+        """Number of via-points that the method has by default."""
+        return N_VIA if self._method == MOTION else self._shared.own.task.action.n_via
 
     @property
     def _task(self) -> Task:
@@ -266,7 +291,7 @@ class Session:
     def _turn(self, quaternion: Float) -> None:
         """Turn the tool at the goal."""
         scene, setting = self._scene, self._setting
-        goal = setting.moved(scene.goal, setting.tool(scene.goal), self._scenes, quaternion)
+        goal = setting.moved(scene.goal, setting.tool(scene.goal), scene.packed, quaternion)
         self._by_hand = None
         self._set_scene(scene.at_rest()._replace(goal=goal), changed=True)
 
@@ -284,7 +309,7 @@ class Session:
 
     def _move_end(self, name: str, place: Float) -> None:
         scene, setting = self._scene, self._setting
-        moved = setting.moved(getattr(scene, name), place, self._scenes)
+        moved = setting.moved(getattr(scene, name), place, scene.packed)
         self._by_hand = None
         scene = scene._replace(start=moved) if name == "start" else scene.at_rest()._replace(goal=moved)
         self._set_scene(scene, changed=True)
@@ -356,9 +381,18 @@ class Session:
         """Decide and show the plan; proposals and plots follow when nothing else is to be done."""
         self._decision, self._proposals, self._picked = None, (), 0
         self._scenes = None
+        n_via = min(max(self._n_via, 1), MOST_VIAS)
+        if self._method == MOTION and self._by_hand is None:
+            self._plan(n_via, TIME_LIMIT)
+            return
         try:
             observation, _ = self._env.reset(options=self._scene.options())
         except ValueError:
+            if MOTION in self._setting.methods:  # it says what is wrong, and shows the best plan in red
+                self._plan(n_via, TIME_LIMIT)
+                if self._proposals and not self._proposals[0].clear:
+                    return
+                raise
             self._view.show_plan(None, np.zeros((0, 3)), clear=False)
             self._view.show_proposals([])
             self._panels.show_proposals((), 0, "", 0.0)
@@ -368,7 +402,11 @@ class Session:
         assert scenes is not None
         self._scenes, decisions = scenes, self._setting.decisions
         self._decision = decision = decisions.choose(
-            observation, scenes, n_via=self._n_via, checks=self._checks
+            observation,
+            scenes,
+            n_via=self._n_via,
+            checks=self._checks,
+            by_agent=self._method == AGENT,
         )
         chosen = decision.chosen
         if self._by_hand is not None:
@@ -376,19 +414,40 @@ class Session:
         elif self._duration is not None:
             vias = np.asarray(chosen.plan.waypoints[1:-1])
             chosen = decisions.evaluate(scenes, plan_by_hand(self._scene, vias, self._duration))
+        self._show_decision(chosen)
+        self.post("later proposals", lambda: self._add_proposals(observation, scenes, decision))
+
+    def _show_decision(self, chosen: Proposal, *, timed: bool = True) -> None:
+        """Show a new plan at once, and note the time since the change."""
         self._proposals = (chosen,)
         self._show_plan()
         self._client.flush()
         self.decisions += 1
-        self.latencies.append(time.perf_counter() - self._jobs.posted)
-        self.post("later proposals", lambda: self._add_proposals(observation, scenes, decision))
+        if timed:
+            self.latencies.append(time.perf_counter() - self._jobs.posted)
+
+    def _plan(self, n_via: int, time_limit: float) -> None:
+        """Show a plan of the motion planner; where it is not free, a second one follows in the next pause."""
+        decisions = self._setting.decisions
+        decision = decisions.plan(self._scene, n_via, self._duration, self._last, time_limit)
+        self._last, self._decision = decision.motion, decision
+        self._show_decision(decision.chosen, timed=time_limit == TIME_LIMIT)
+
+        def follow() -> None:
+            if decision is not self._decision or self._playing is not None:
+                return
+            if decision.chosen.reason and time_limit < SECOND_LIMIT:
+                self._plan(n_via, SECOND_LIMIT)
+            self._show_details()
+
+        self.post("later proposals", follow)
 
     def _show_plan(self) -> None:
         """Show the picked proposal, and say what it does."""
         plan = self.proposal
         assert plan is not None
         remarks, limit = [self._origin], self._shared.own.limit(self._scene)
-        if limit and self._shared.own.agent is not None:
+        if limit and self._method == AGENT:
             remarks.append(f"The agent was trained {limit}, so the geometry search decides.")
         remark = " ".join(filter(None, remarks))
         tool = self._setting.tool
@@ -397,7 +456,8 @@ class Session:
             self._view.show_plan(tool(plan.profile.coordinates), vias, clear=plan.clear)
             if self._proposals[1:] == ():
                 self._view.show_proposals([])
-            self._panels.show_decided(plan.duration, len(plan.plan.durations) - 1)
+            chosen = plan.duration if self._duration is None else None
+            self._panels.show_decided(chosen, len(plan.plan.durations) - 1)
             self._panels.tell(describe_plan(plan), GOOD if plan.clear else BAD, remark)
 
     def _add_proposals(self, observation: Observation, scenes: Scenes, decision: Decision) -> None:
@@ -460,7 +520,12 @@ class Session:
             checks, goal_of = self._checks, lambda: self._scene.goal
             decide: Decide = lambda seen: setting.decisions.action(seen, checks)  # noqa: E731
             return execute_replanning(self._env, decide, self._scene, plan.plan, goal_of)
-        if self._step_env is not None and plan.rank == 1 and setting is self._shared.own:
+        if (
+            self._step_env is not None
+            and self._method == AGENT
+            and plan.rank == 1
+            and setting is self._shared.own
+        ):
             return execute_stepwise(self._step_env, setting.act, self._scene)
         return execute_whole(self._env, self._scene, plan.plan)
 
@@ -512,8 +577,7 @@ class Session:
     def _compare(self) -> None:
         """Compare methods, one job for each, so that changes of the scene come between."""
         scene, results = self._scene, list[MethodResult]()
-        if self._scenes is None:
-            raise ValueError("methods are compared in possible scenes: move what stands in the way first")
+        self._env.reset(options=scene.options())  # raises where the scene is impossible
         methods = compare(self._setting, scene, self._shared.planners, self._checks)
 
         def step() -> None:
@@ -555,7 +619,11 @@ class Session:
         self._client.send_file_download(name, content, save_immediately=True)
 
     def _decide_anew(self) -> None:
-        self._redecide(_by_hand=None, _duration=None, _n_via=self._shared.own.task.action.n_via)
+        self._redecide(_by_hand=None, _duration=None, _n_via=self._usual_n_via)
+
+    def _set_method(self, name: str) -> None:
+        self._method, self._last = name, None
+        self._decide_anew()
 
     def _set_duration(self, duration: float) -> None:
         if self._by_hand is not None:

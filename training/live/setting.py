@@ -18,9 +18,9 @@ from viapoint.envs import ReachVectorEnv, Scenes, Task, inverse_kinematics
 from viapoint.envs.arms.kinematics import forward
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.clearance import configuration_clearances
-from viapoint.envs.geometry.obstacles import KINDS, check_simulated, quaternions_of
+from viapoint.envs.geometry.obstacles import KINDS, Obstacles, check_simulated, quaternions_of
 from viapoint.envs.scenes.options import draw_given
-from viapoint.training.live.decisions import DecisionMaker
+from viapoint.training.live.decisions import AGENT, MOTION, SEARCH, DecisionMaker
 from viapoint.training.live.drawing import ArmDrawing
 from viapoint.training.live.movements import DECISION_INTERVAL
 from viapoint.training.live.scene import LiveScene
@@ -29,6 +29,8 @@ from viapoint.training.planning.baselines import PLANNERS, PlannerMethod
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import load, shipped_set
 
+N_VIA = 2
+"""Number of via-points of the motion planner at first."""
 MOST_SHOWN = 24
 """Greatest number of obstacles of a scene."""
 SIMULATED = ("sphere", "capsule", "cylinder", "box", "half_space")
@@ -62,6 +64,9 @@ class Setting:
         self.height = self.sampler.room.height
         """Half height of obstacles in the plane, [m]."""
         self.decisions = DecisionMaker(task, agent if self.stepwise is None else None)
+        others = (AGENT, SEARCH) if agent is not None else (SEARCH,)
+        self.methods = others if task.replanning else (MOTION, *others)
+        """Names of the methods that can be chosen; the first one is the default."""
 
     def make_env(self) -> ReachVectorEnv:
         """Return a batch of one environment whose actions are whole movements or revisions of them."""
@@ -86,13 +91,13 @@ class Setting:
         level = np.full(coordinates.shape[:-1], arm.hand(arm.home)[2])
         return np.concatenate((coordinates, level[..., None]), axis=-1)
 
-    def moved(self, coordinates: Float, place: Float, scenes: Scenes | None, turn: Any = None) -> Float:
+    def moved(self, coordinates: Float, place: Float, obstacles: Obstacles | None, turn: Any = None) -> Float:
         """Return coordinates with the tool at another place, in joint space the nearest ones that are free.
 
         Args:
             coordinates: Present coordinates, shape (D,).
             place: New place of the tool, shape (3,), [m].
-            scenes: Batch of one scene whose obstacles are avoided; None for none.
+            obstacles: Obstacles of one scene, which are avoided; None for none.
             turn: New orientation of the tool, a quaternion; the present one by default.
 
         Raises:
@@ -104,9 +109,9 @@ class Setting:
         if turn is None and len(coordinates) >= ORIENTED:
             turn = self.orientation(coordinates)
         found = inverse_kinematics(arm, place, turn, seed=coordinates, n_seeds=NEAR_SEEDS)
-        if scenes is None:
+        if obstacles is None:
             return np.asarray(found[0])
-        rows = scenes.obstacles.take(np.zeros(len(found), np.int64))
+        rows = obstacles.take(np.zeros(len(found), np.int64))
         clearance = configuration_clearances(arm.chain, arm.spheres, found, rows, np.zeros(len(found)))
         free = clearance.min(axis=-1) > 0.0
         return np.asarray(found[int(free.argmax())])
@@ -149,7 +154,6 @@ class Shared:
         env_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
         self.env_id, self._env_kwargs, self._seed = env_id, dict(env_kwargs or {}), seed
-        self._model_file = model_file
         env: Any = gym.make_vec(env_id, num_envs=1, **self._env_kwargs)
         self.model = env.unwrapped.model
         self.own = Setting(env.unwrapped.task, agent)
@@ -157,7 +161,12 @@ class Shared:
         env.close()
         self._wide: Setting | None = None
         self._making = threading.Lock()
+        self._model_file = model_file
         self.drawing()  # a file that cannot be drawn is refused
+        if model_file is None and self.own.task.arm.file:
+            with contextlib.suppress(ValueError):  # MuJoCo alone does not find the meshes of every URDF
+                ArmDrawing(self.own.task.arm, self.model, self.own.task.arm.file)
+                self._model_file = self.own.task.arm.file
         self._decide_once()
 
     def _decide_once(self) -> None:
@@ -166,6 +175,8 @@ class Shared:
         observation, _ = env.reset(seed=0)
         assert env.scenes is not None
         self.own.decisions.choose(observation, env.scenes)
+        if MOTION in self.own.methods:
+            self.own.decisions.plan(LiveScene.of(env.scenes, self.own.task), N_VIA, None, None)
         env.close()
 
     def drawing(self) -> ArmDrawing:

@@ -1,5 +1,6 @@
 """Run folders: all files of one training.
 
+arm.xml                           copy of the arm, if it was loaded from a file
 config.json  versions.json        what was asked for, with which versions (the seed is in config.json)
 learning_curve.jsonl              one line for each evaluation on the validation scenes
 end.json                          why training ended: its budget was spent, or success stalled
@@ -22,6 +23,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from viapoint.envs.arms.stored import COPY, keep_arm, with_kept_arm
 from viapoint.training.agents.agent import best_model
 from viapoint.training.agents.model_io import save_model
 from viapoint.training.config.checks import check_folder
@@ -82,7 +84,10 @@ class Run:
             raise BadFileError(folder, "is no run folder: it holds no config.json")
         self.folder = folder
         try:
-            self.config: TrainConfig = TrainConfig.from_json(read_json(folder / "config.json"))
+            record = read_json(folder / "config.json")
+            if isinstance(record.get("env_kwargs"), dict):
+                record["env_kwargs"] = with_kept_arm(record["env_kwargs"], folder)
+            self.config: TrainConfig = TrainConfig.from_json(record)
         except (TypeError, ValueError) as error:
             if isinstance(error, BadFileError):
                 raise
@@ -114,6 +119,7 @@ class Run:
         with _lock(folder):
             check_free(folder)  # another process may have been faster
             write_json(folder / "versions.json", versions())
+            keep_arm(folder, config.task.arm)
             write_config(folder, config)
         return cls(folder)
 
@@ -263,7 +269,7 @@ def check_free(folder: Path) -> None:
     check_folder("run folder", folder)
     names = {path.name for path in folder.iterdir()} if folder.exists() else set()
     begun = {name for name in names if UNFINISHED.fullmatch(name)}
-    if names - begun - {"versions.json", "lock", "lock.pid"}:
+    if names - begun - {"versions.json", COPY, "lock", "lock.pid"}:
         raise BadFileError(folder, "is not empty and is no run folder")
     check_ours(folder / "versions.json")
 
