@@ -8,7 +8,9 @@ import pytest
 from viapoint.envs import Box, Capsule, Cylinder, Pose, Sphere, Task, arm_of, obstacles_to_json
 from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.arms.load import load_arm
+from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.plans import Plan
 from viapoint.training import plan_motion, plan_motions
 from viapoint.training.cli.main import main
 from viapoint.training.planning import plan_motion as module
@@ -16,7 +18,7 @@ from viapoint.training.planning import refine
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems, read_problems
 from viapoint.training.planning.export import read_motion, write_motion
 from viapoint.training.planning.motion_plan import UnsafePlanError, execute_plans
-from viapoint.training.planning.movements import movement_table
+from viapoint.training.planning.movements import OUTSIDE, movement_table
 
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 PANDA = arm_of("panda")
@@ -123,6 +125,46 @@ def test_movements_in_motion_begin_as_given_and_keep_the_limits() -> None:
     assert np.allclose(motion.velocity[0], velocity)
     assert np.allclose(motion.acceleration[0], acceleration)
     assert (np.abs(motion.velocity) <= PANDA.velocity_limit).all()
+
+
+def test_clearance_is_that_of_the_movement_in_motion() -> None:
+    velocity = np.array([-0.6, 0.5, 0.4, 0.3, 0.0, 0.0, 0.0])
+    plan = plan_motion(PANDA, PANDA.home, GOAL, [POST], velocity=velocity)
+    path = np.ascontiguousarray(plan.trajectory()(np.linspace(0.0, plan.duration, 500)))
+    scenes = pack([[POST]]).take(np.zeros(500, np.int64))
+    least = configuration_clearances(PANDA.chain, PANDA.spheres, path, scenes, np.zeros(500)).min()
+    assert plan.clearance == pytest.approx(least, abs=1e-3)
+
+
+def test_a_plan_that_leaves_the_joint_limits_has_no_success() -> None:
+    beyond = np.stack((PANDA.home, PANDA.joint_range[:, 1] + 0.1, GOAL))
+    plan = Plan.at_rest(beyond, np.array([2.0, 2.0]))
+    known = module.checked_motion(PANDA, "joints", plan, pack([[]]), "given")
+    assert (known.success, known.clearance) == (False, OUTSIDE)
+
+
+@pytest.mark.parametrize(
+    "kwargs", [{"arm": "planar", "whole_arm": True, "space": "joints"}, {"arm": "panda"}]
+)
+def test_objective_does_not_depend_on_the_direction_of_time(kwargs) -> None:
+    """What is skipped far from obstacles depends on what was seen before, and must not matter."""
+    task, starts, goals, obstacles = drawn(8, **kwargs)
+    setting, table = module._setting(task.arm, False), movement_table(0)
+    spheres = setting.spheres._replace(pairs=np.zeros((0, 2), np.int64))
+    aim, nothing = module.AIMS[0]._replace(stride=1, clearance=0.1), np.zeros((2, len(starts[0])))
+    found = []
+    for start, goal, scene in zip(starts, goals, obstacles, strict=True):
+        work = refine._work(setting, 3, len(start), scene, 0)
+        for one, other in ((start, goal), (goal, start)):
+            offsets = np.concatenate(((other - one)[None], nothing))
+            found.append(
+                refine._assemble(
+                    setting._replace(spheres=spheres), table, 0, np.ascontiguousarray(one), offsets, 1.0, scene, 0,
+                    aim, 360.0, np.empty((0, 0)), np.empty(0), work,
+                )[0]
+            )  # fmt: skip
+    assert np.ptp(found) > 1.0
+    np.testing.assert_allclose(found[::2], found[1::2], rtol=1e-9)
 
 
 def test_moving_obstacles_are_avoided_where_they_are_then() -> None:
