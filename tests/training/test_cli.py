@@ -1,6 +1,8 @@
 """The command, from the words to the files."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 
@@ -29,6 +31,13 @@ def test_every_command_has_help(words, capsys):
         run(*words, "--help")
     assert not end.value.code
     assert "Example: viapoint" in capsys.readouterr().out
+
+
+def test_output_that_nobody_reads_ends_the_command_without_a_word():
+    command = [sys.executable, "-c", "from viapoint.training.cli.entry import main; main()", "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
 
 
 @pytest.mark.parametrize(

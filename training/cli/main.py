@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import importlib
 import io
+import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any, Union
@@ -64,6 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         run_command(config)
     except KeyboardInterrupt:
         _leave("stopped", 130)
+    except BrokenPipeError:  # nobody reads the output any more, as in `viapoint --help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(141) from None
     except Exception as error:
         if debug:
             raise
