@@ -213,7 +213,7 @@ def planar_limits(chain: Chain, joint_range: Float) -> Float:
 
 @kernel
 def in_planar_reach(chain: Chain, limits: Float, x: float, y: float) -> bool:
-    """Return True where :func:`solve_planar` finds joints; without angles it takes a tenth of the time."""
+    """Return True where :func:`solve_planar` finds joints; without angles it takes a twentieth of the time."""
     upper, fore = chain.first_two.upper, chain.first_two.fore
     u, v = x - chain.origin[0, 0], y - chain.origin[0, 1]
     square = u * u + v * v

@@ -569,7 +569,7 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
     """Return a movement along a path of OMPL, with as many via-points as it needs; None if there is none."""
     patience = until - time.perf_counter()
     try:
-        import_ompl()  # the first time takes a second that does not count
+        import_ompl()  # the time of the first import does not count
     except ValueError:
         return None
     ends = np.ascontiguousarray(problem.space.joints(np.stack((problem.start, problem.goal))))
