@@ -120,6 +120,7 @@ LEAST: dict[str, float] = {
     "refinements": 0,
     "per_refinement": 1,
     "checks": 0,
+    "refine": 0,
 }
 """Least values of hyperparameters."""
 

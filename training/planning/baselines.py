@@ -164,37 +164,42 @@ class AgentMethod:
         model: Model with `predict`.
         checks: Number of proposals that are checked with computed geometry in each decision; None for the model's own
             number.
+        refine: Number of proposals that the planner refines in each decision; None for the model's own number.
     """
 
-    def __init__(self, name: str, model: Any, checks: int | None = None) -> None:
-        self.name, self._model, self._checks = name, model, checks
+    def __init__(self, name: str, model: Any, checks: int | None = None, refine: int | None = None) -> None:
+        self.name, self._model = name, model
+        given = {"checks": checks, "refine": refine}
+        self._settings = {name: number for name, number in given.items() if number is not None}
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return actions of the agent, see :class:`Method`; the scenes are unused."""
         policy = self._model.policy
-        own = getattr(policy, "checks", None)
-        if own is not None and self._checks is not None:
-            policy.checks = self._checks
+        own = {name: getattr(policy, name) for name in self._settings if hasattr(policy, name)}
+        for name in own:
+            setattr(policy, name, self._settings[name])
         try:
             actions, _ = self._model.predict(observation, deterministic=True)
         finally:
-            if own is not None:
-                policy.checks = own
+            for name, number in own.items():
+                setattr(policy, name, number)
         return np.asarray(actions, dtype=np.float64)
 
 
-def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
+def agent_method(name: str, model: Any, checks: int | None = None, refine: int | None = None) -> Method:
     """Return a trained agent as a method, for whole movements or for actions in every control step.
 
     Raises:
-        ValueError: The agent cannot check its proposals.
+        ValueError: The agent cannot check or refine its proposals.
     """
     if checks and not hasattr(model.policy, "checks"):
         raise ValueError(f"proposals are checked by ViaQ only; this agent is a {type(model).__name__}")
+    if refine and not getattr(model.policy, "can_refine", False):
+        raise ValueError("proposals are refined by ViaQ only, in tasks with one decision for a movement")
     env_id, env_kwargs = env_arguments(model.get_env())
     if registered_task(env_id, **env_kwargs).stepwise:
         return StepAgentMethod(name, model, env_id, env_kwargs)
-    return AgentMethod(name, model, checks)
+    return AgentMethod(name, model, checks, refine)
 
 
 def refined_search(simulation: SceneSimulation, checks: int) -> Method:
