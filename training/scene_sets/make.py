@@ -6,7 +6,8 @@
 
 Scenes are drawn one after the other, each with a generator of its own. The solution share of a scene is the share of
 random actions whose plan is clear. A scene is kept where its band of shares is still wanted, and where the search finds
-a movement that succeeds in physics.
+a movement that is clear by geometry, if all is decided at the beginning, and succeeds in physics. The spheres of an arm
+are a little larger than the arm, so that success in physics alone could be luck.
 """
 
 from __future__ import annotations
@@ -175,13 +176,17 @@ class Maker:
         return np.asarray((clearance >= CLEARANCE_MARGIN).mean(axis=-1))
 
     def _solved(self, drawn: FrozenScenes, wanted: Bool | None = None) -> Bool:
-        """Return True for scenes, of those that are wanted, in which a movement of the search succeeds."""
+        """Return True for scenes, of those that are wanted, in which a clear movement of the search succeeds."""
         solved = np.zeros(len(drawn.share), bool)
         rows = np.arange(len(solved)) if wanted is None else np.flatnonzero(wanted)
         if rows.size:
             scenes = drawn.scenes.take(rows)
             decided = self._search.decide(self._simulation.observe(scenes))
             solved[rows] = self._simulation.play(self._search, scenes, decided).success
+            if self.task.whole_movement:
+                problem = Problem.of_scenes(scenes, self.task)
+                clearance = plan_clearances(self.task, problem, decided[:, None], 0.0, 0.0, exact=True)
+                solved[rows] &= clearance[:, 0] >= 0.0
         return solved
 
 
