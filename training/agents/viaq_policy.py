@@ -72,7 +72,7 @@ class ViaQPolicy(BasePolicy):
         *,
         task: Mapping[str, Any],
         width: int = 32,
-        instants: int = 22,
+        instants: int = 32,
         candidates: int = 256,
         refinements: int = 2,
         per_refinement: int = 64,
