@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import sys
 import threading
@@ -11,9 +12,9 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from tqdm.auto import tqdm  # a bar of its own kind in a notebook
 
 from viapoint.training.evaluation.evaluator import MethodResult, evaluate_methods
+from viapoint.training.io.progress import progress_bar
 from viapoint.training.planning.baselines import agent_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import whole_task
@@ -76,32 +77,17 @@ class RunCallback(BaseCallback):
         self._next = {name: int(state["next"][name]) for name in self._next}
 
     @property
-    def stalled(self) -> bool:
-        """Flag: at the last validation the highest success had not risen for long enough to end the training."""
-        share = self.config.stop_when_stalled
-        if share is None or not self.curve:
-            return False
-        now = self.curve[-1]["decisions"]
-        return bool(now >= self.config.least_timesteps and now - self.best_record["decisions"] >= share * now)
-
-    @property
-    def best_record(self) -> dict[str, Any]:
-        """First record of the highest success in the learning curve."""
-        return max(self.curve, key=lambda record: record["success"]["rate"])  # the first of several
-
-    @property
     def seconds(self) -> float:
         """Wall time of training, with earlier parts of the run and without validation, [s]."""
         return self._seconds_before + time.monotonic() - self._began
 
     def __enter__(self) -> RunCallback:
-        self._bar = tqdm(
+        task = self.config.env.rpartition("/")[2]
+        self._bar = progress_bar(
             total=self.config.total_timesteps,
             unit=" decisions",
-            desc=f"{self.config.algo} on {self.config.env.rpartition('/')[2]}",
-            disable=not self.config.progress,
-            file=sys.stderr,
-            dynamic_ncols=True,
+            desc=f"{self.config.algo} on {task}",
+            disable=None if self.config.progress else True,
         )
         self._listens = threading.current_thread() is threading.main_thread()
         if self._listens:
@@ -136,10 +122,10 @@ class RunCallback(BaseCallback):
             self._save_checkpoint()
             self.run.save("final", self.model)
             raise TrainingStoppedError(
-                f"stopped after {self.num_timesteps} decisions; all is saved in {self.run.folder}, and training "
-                "goes on from there (viapoint train --resume, or viapoint demo again)"
+                f"stopped after {self.num_timesteps} decisions, and all is saved; go on with: "
+                f"{resume_command(self.run)}"
             )
-        if self.stalled:
+        if self.run.stalled:
             self._save_checkpoint()
             raise TrainingStalledError
 
@@ -182,6 +168,13 @@ class RunCallback(BaseCallback):
         record = self._record(result, seconds)
         self.curve.append(record)
         self.run.write_curve(self.curve)
+        if self.config.progress and self._bar.disable:
+            rate = 100.0 * record["success"]["rate"]
+            print(
+                f"{self.num_timesteps} of {self.config.total_timesteps} decisions: success {rate:.1f} % in validation",
+                file=sys.stderr,
+                flush=True,
+            )
         ranking = (record["success"]["rate"], -(record["jerk_ratio"] or 0.0))
         if ranking > self._best:
             self._best = ranking
@@ -227,6 +220,11 @@ class RunCallback(BaseCallback):
         if self.curve:
             shown["validation"] = f"{100.0 * self.curve[-1]['success']['rate']:.1f} %"
         self._bar.set_postfix(shown, refresh=False)
+
+
+def resume_command(run: Run) -> str:
+    """Return the command that goes on with a run."""
+    return shlex.join(["viapoint", "train", "--resume", "--out", str(run.folder)])
 
 
 def _timestep(env: Any) -> float:
