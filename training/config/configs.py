@@ -9,7 +9,7 @@ import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 import tyro
@@ -87,6 +87,8 @@ def env_of_arm(arm: Arm | str | None, env: str | None) -> tuple[str | None, dict
     return env or "viapoint/Obstacles-v0", {"arm": found if isinstance(arm, Arm) else found.file or arm}
 
 
+Format = Literal["table", "md", "csv", "json"]
+"""Form of a table."""
 BENCHMARK = "motionbenchmaker"
 """Name of the scene set that measures planners."""
 MOTION_FILES = (".csv", ".yaml", ".yml")
@@ -344,6 +346,8 @@ class EvaluateConfig(AgentConfig):
     """Folder of MotionBenchMaker's own files, in place of the problems that are shipped."""
     n_scenes: int | None = None
     """Number of scenes, evenly spread over the set; all if not given."""
+    format: Format = "table"
+    """Form in which the table is printed: for the terminal, Markdown, CSV or JSON."""
     json: Path | None = None
     """JSON file for all results, scene by scene."""
     env: Annotated[str | None, ENV] = None

@@ -205,7 +205,8 @@ class Run:
     @property
     def stalled(self) -> bool:
         """Flag: success had not risen for so long that training ended, see `stop_when_stalled`."""
-        share, best = self.config.stop_when_stalled, self.best_record
+        share = self.config.stop_when_stalled
+        best = None if share is None else self.best_record
         if share is None or best is None:
             return False
         now = self.curve[-1]["decisions"]

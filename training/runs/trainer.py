@@ -196,7 +196,7 @@ def _learn(model: BaseAlgorithm, run: Run, monitor: RunCallback, callback: Callb
     for reason in passed_over:
         print(f"passed over a damaged checkpoint: {reason}", file=sys.stderr)
     if restored is not None:
-        monitor.restore(restored)
+        monitor.restore(float(restored["seconds"]), model.num_timesteps)
     run.write_curve(monitor.curve)
     remaining = run.config.total_timesteps - model.num_timesteps
     if remaining > 0 and not run.stalled:
