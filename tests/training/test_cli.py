@@ -93,7 +93,7 @@ def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, 
     ):
         run("evaluate", trained, "--baselines", "straight", "--scenes", *words)
     kept = [json.loads(path.read_text()) for path in (trained / "evaluations").glob("validation-*.json")]
-    assert sorted(each["methods"]["straight line"]["scenes"] for each in kept) == [3, 4, 40]
+    assert sorted(each["methods"]["straight"]["scenes"] for each in kept) == [3, 4, 40]
 
 
 def test_an_agent_of_another_task_meets_scenes_of_that_task(tmp_path, capsys):

@@ -32,8 +32,8 @@ def test_an_interrupted_demo_goes_on_and_what_is_done_is_not_done_again(quick, c
     written = {name: (quick.out / name).stat().st_mtime_ns for name in demo.FILES}
     assert all(str(quick.out / name) in told for name in (*demo.FILES, "best"))
     methods = json.loads((quick.out / "table.json").read_text())["methods"]
-    assert {"agent", "agent, 8 checks", "untrained", "search, 512 checks"} <= set(methods)
-    assert methods["straight line"]["success"]["rate"] == 0.0
+    assert {"agent", "agent, 8 checks", "untrained", "search512"} <= set(methods)
+    assert methods["straight"]["success"]["rate"] == 0.0
 
     for name in ("evaluate_methods", "gallery", "record_video"):
         monkeypatch.setattr(demo, name, pytest.fail)

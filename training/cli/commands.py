@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,15 +18,15 @@ from viapoint.training.config.configs import (
 )
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate as measure
-from viapoint.training.evaluation.evaluator import evenly_spread
 from viapoint.training.io.files import read_json, write_json
+from viapoint.training.io.progress import scene_progress
 from viapoint.training.planning import benchmark_report
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.benchmark import benchmark_problems, read_problems
 from viapoint.training.planning.search import registered_task
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.scene_sets.scene_set import evenly_spread, scenes_for
 
 
 def train(config: TrainConfig) -> None:
@@ -45,7 +46,7 @@ def evaluate(config: EvaluateConfig) -> None:
     if config.arm is not None:
         env, argument = env_of_arm(config.arm, config.env if agent is None else agent.env_id)
         env_kwargs = {**({} if agent is None else agent.env_kwargs), **argument}
-    with report.progress_bar() as progress:
+    with scene_progress() as progress:
         result = measure(
             agent,
             env=env,
@@ -57,18 +58,18 @@ def evaluate(config: EvaluateConfig) -> None:
             progress=progress,
         )
     record = result.to_dict()
-    report.show(record)
+    print(report.formatted(record, config.format))
     if config.agent is not None and (Path(config.agent).expanduser() / "config.json").is_file():
         run = Run(config.agent)
         record["weights_sha256"] = read_json(run.best / "model.json").get("weights_sha256")
         partial = ".partial" if result.partial else ""
         name = f"{Path(config.scenes).stem}-{result.sha256[:8]}{partial}"  # the hash is that of the scenes
-        print(f"kept as {run.write_evaluation(name, record)}")
+        print(f"kept as {run.write_evaluation(name, record)}", file=sys.stderr)
     if config.json is not None:
         write_json(config.json, record)
-        print(f"results, scene by scene: {config.json}")
+        print(f"results, scene by scene: {config.json}", file=sys.stderr)
     if result.partial:
-        print("the results are partial")
+        print("the results are partial", file=sys.stderr)
         raise KeyboardInterrupt
 
 
@@ -79,12 +80,18 @@ def _measure_planners(config: EvaluateConfig) -> None:
     names = ("plan_motion",) if config.baselines == USUAL_BASELINES else config.baselines
     for name in names:
         benchmark_report.benchmark_planner(name)  # an unknown name is told before anything is measured
-    with report.progress_bar() as progress:
+    with scene_progress() as progress:
         lines = [benchmark_report.measure_planner(name, problems, progress=progress) for name in names]
-    print(f"{benchmark_report.markdown(pd.concat(lines))}\n\n{benchmark_report.NOTES}")
+    table = pd.concat(lines)
+    if config.format == "csv":
+        print(table.to_csv(index=False).rstrip())
+    elif config.format == "json":
+        print(table.to_json(orient="records", indent=1))
+    else:
+        print(f"{benchmark_report.markdown(table)}\n\n{benchmark_report.NOTES}")
     if config.json is not None:
-        write_json(config.json, pd.concat(lines).to_dict("records"))
-        print(f"results, problem by problem: {config.json}")
+        write_json(config.json, table.to_dict("records"))
+        print(f"results, problem by problem: {config.json}", file=sys.stderr)
 
 
 def play(config: PlayConfig) -> None:
@@ -95,8 +102,8 @@ def play(config: PlayConfig) -> None:
     env_id, argument = env_of_arm(config.arm, agent.env_id if agent is not None else None)
     assert env_id is not None
     env_kwargs = {**(agent.env_kwargs if agent is not None else {}), **argument}
-    scenes = scenes_for(config.scenes, registered_task(env_id, **env_kwargs), config.n_scenes).scenes
-    rows = evenly_spread(len(scenes.start), config.n_scenes)
+    task = registered_task(env_id, **env_kwargs)
+    scenes = scenes_for(config.scenes, task, config.n_scenes).spread(config.n_scenes).scenes
     env = gym.make(env_id, render_mode="rgb_array_list", **env_kwargs)
     if agent is None:
         method = make_method("search512", env_id, **env_kwargs)
@@ -104,6 +111,6 @@ def play(config: PlayConfig) -> None:
         name = f"agent, {config.checks} checks" if config.checks else "agent"
         method = agent_method(name, agent, config.checks)
     config.video.parent.mkdir(parents=True, exist_ok=True)
-    record_video(config.video, env, scenes.take(rows), method.decide, name=method.name)
+    record_video(config.video, env, scenes, method.decide, name=method.name)
     env.close()
-    print(f"{len(rows)} movements: {config.video}")
+    print(f"{len(scenes.start)} movements: {config.video}")

@@ -13,8 +13,9 @@ from viapoint.training.agents.agent import Agent, find_model, load_agent
 from viapoint.training.agents.model_io import untrained
 from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
-from viapoint.training.evaluation.evaluator import evaluate_methods, evenly_spread
+from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import check_ours, read_json
+from viapoint.training.io.progress import scene_progress
 from viapoint.training.planning.baselines import Method, agent_method, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plotting import plots
@@ -51,8 +52,7 @@ def run(config: DemoConfig) -> None:
         check_ours(folder / name)
     trained = _trained(config)
     agent = load_agent(trained.best)
-    frozen = scenes_for("test", registered_task(config.env), config.n_scenes)
-    frozen = frozen.take(evenly_spread(len(frozen.share), config.n_scenes))
+    frozen = scenes_for("test", registered_task(config.env), config.n_scenes).spread(config.n_scenes)
     record = _measured(config, agent, frozen)
     last = folder / "movements.mp4"  # written after all others
     if not last.exists() or last.stat().st_mtime < (folder / "table.json").stat().st_mtime:
@@ -60,7 +60,7 @@ def run(config: DemoConfig) -> None:
         plots.success_by_band(folder / "success_by_band.png", record)
         _draw_gallery(folder / "gallery.png", agent, frozen)
         _film(last, agent, frozen)
-    report.show(record)
+    print(report.text(record))
     for name, what in {**FILES, trained.best.name: "the trained agent"}.items():
         print(f"  {folder / name!s:<34} {what}")
     print(f"done in {time.monotonic() - began:.0f} s")
@@ -96,7 +96,7 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
         agent_method("untrained", untrained(agent), 0),
         *(make_method(name, config.env) for name in BASELINES),
     ]
-    with report.progress_bar() as progress:
+    with scene_progress() as progress:
         result = evaluate_methods(methods, frozen, config.env, progress=progress)
     record = {**result.to_dict(), **identity}
     report.write(record, config.out)
@@ -108,7 +108,7 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
 def _draw_gallery(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
     """Draw movements in scenes of all difficulties."""
     by_difficulty = np.argsort(-frozen.share, kind="stable")
-    chosen = frozen.take(by_difficulty[evenly_spread(len(by_difficulty), PICTURES)])
+    chosen = frozen.take(by_difficulty).spread(PICTURES)
     titles = [f"share {BANDS[band]}" for band in chosen.band]
     decide = agent_method("agent", agent, 0).decide
     task = registered_task(agent.env_id, **agent.env_kwargs)
@@ -118,6 +118,5 @@ def _draw_gallery(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
 
 def _film(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
-    scenes = frozen.scenes.take(evenly_spread(len(frozen.share), MOVEMENTS))
-    record_video(path, env, scenes, agent_method("agent", agent, 0).decide)
+    record_video(path, env, frozen.spread(MOVEMENTS).scenes, agent_method("agent", agent, 0).decide)
     env.close()

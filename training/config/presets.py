@@ -66,6 +66,7 @@ PRESETS: dict[str, Preset] = {
         "ViaQPolicy",  # its defaults are its settings
         eval_every=5_000,
         checkpoint_every=20_000,
+        learning_starts=4096,
         learning_rate={"kind": "linear", "start": 3e-3, "end": 3e-5, "end_fraction": 1.0},
     ),
     "sac": _preset(40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),

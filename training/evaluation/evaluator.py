@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext
@@ -14,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from viapoint.envs.common.types import Float, Int, Observation
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import NEVER, Scenes
@@ -33,7 +34,7 @@ from viapoint.training.planning.baselines import (
     make_method,
 )
 from viapoint.training.planning.search import registered_task
-from viapoint.training.rollouts.rollout import SceneSimulation, whole_task
+from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults, whole_task
 from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes, scenes_for
 
@@ -65,10 +66,10 @@ class MethodResult:
     """Scene family of each scene, '' for the training distribution, shape (n,)."""
     distance: Float
     """Distance from start to goal, shape (n,), [m]; NaN if the target jumps, as the shortest path is unknown."""
+    interrupted: bool
+    """Mark of an evaluation that Ctrl-C ended; decision times, and scenes if it is partial, are missing."""
     partial: bool
     """Mark of an evaluation that was interrupted before the last scene."""
-    interrupted: bool = False
-    """Mark of an evaluation that was interrupted, so that no further method follows."""
 
     @property
     def success(self) -> NDArray[np.bool_]:
@@ -77,7 +78,9 @@ class MethodResult:
 
     def summary(self) -> dict[str, Any]:
         """Return the metrics by name; those of successes are None without successes."""
-        success = self.success
+        success, outcomes = self.success, self.outcomes
+        times, paths = self.decision_times, outcomes["path_length"]
+        known = len(success) > 0 and np.isfinite(self.distance).all()
         return {
             "scenes": len(success),
             "partial": self.partial,
@@ -90,21 +93,15 @@ class MethodResult:
                 for name in dict.fromkeys(self.family.tolist())
                 if name != DRAWN
             },
-            "collision": _rate(np.asarray(self.outcomes["collision"], dtype=bool)),
-            "unreachable": _rate(~np.asarray(self.outcomes["reachable"], dtype=bool)),
-            "min_clearance": _quantile(self.outcomes["min_clearance"]),
-            "goal_error": _quantile(self.outcomes["goal_error"]),
-            "tracking_error": _quantile(self.outcomes["tracking_error"]),
-            "jerk_ratio": _quantile(self.outcomes["jerk_ratio"][success]),
-            "duration": _quantile(self.outcomes["duration"][success]),
-            "path_length": _quantile(self.outcomes["path_length"][success]),
-            "spl": success_weighted_path_length(success, self.distance, self.outcomes["path_length"])
-            if len(success) and np.isfinite(self.distance).all()
-            else None,
-            "decision_time": _quantile(self.decision_times),
-            "decision_time_98": _quantile(self.decision_times, 0.98)
-            if len(self.decision_times) > 1
-            else None,
+            "collision": _rate(np.asarray(outcomes["collision"], dtype=bool)),
+            "unreachable": _rate(~np.asarray(outcomes["reachable"], dtype=bool)),
+            **{name: _quantile(outcomes[name]) for name in ("min_clearance", "goal_error", "tracking_error")},
+            **{
+                name: _quantile(outcomes[name][success]) for name in ("jerk_ratio", "duration", "path_length")
+            },
+            "spl": success_weighted_path_length(success, self.distance, paths) if known else None,
+            "decision_time": _quantile(times),
+            "decision_time_98": None if len(times) < 2 else _quantile(times, 0.98),
         }
 
 
@@ -116,7 +113,7 @@ class EvaluationResult:
         >>> from viapoint.training import evaluate
         >>> result = evaluate(env="viapoint/PlanarReach-v0", baselines=["straight", "random"], n_scenes=20)
         >>> result.success_rate, [row["method"] for row in result.rows]
-        (1.0, ['straight line', 'random via-point'])
+        (1.0, ['straight', 'random'])
         >>> print(result.to_markdown().splitlines()[0])  # doctest: +ELLIPSIS
         # viapoint/PlanarReach-v0, scenes test (20, sha256 ...)
     """
@@ -217,11 +214,14 @@ def evaluate(
         True
         >>> low, high = result.success_interval
         >>> [row["method"] for row in result.rows]
-        ['agent', 'straight line']
+        ['agent', 'straight']
     """
     if n_scenes is not None:
         check_whole("n_scenes", n_scenes, 1)
-    for number in [checks] if checks is None or isinstance(checks, int) else checks:
+    if isinstance(baselines, str):
+        raise ValueError(f"baselines must be a list, such as [{baselines!r}], got {baselines!r}")
+    numbers = [checks] if checks is None or isinstance(checks, int) else list(checks)
+    for number in numbers:
         if number is not None:
             check_whole("checks", number, 0)
     if isinstance(agent, str | Path):
@@ -232,21 +232,19 @@ def evaluate(
         if isinstance(each, str) and not (each == "untrained" and isinstance(agent, BaseAlgorithm)):
             check_method(each, task)
     chosen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(str(scenes), task, n_scenes)
-    methods = [*_rows_of(agent, checks), *_baselines(baselines, agent, checks, env_id, kwargs)]
+    if n_scenes is not None and n_scenes > len(chosen.share):
+        print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
+    methods = _rows_of(agent, numbers)
+    for each in baselines:
+        methods += _baseline(each, agent, numbers, env_id, kwargs)
     return evaluate_methods(
         methods,
-        chosen.take(evenly_spread(len(chosen.share), n_scenes)),
+        chosen.spread(n_scenes),
         env_id,
         env_kwargs=kwargs,
         time_decisions=time_decisions,
         progress=progress,
     )
-
-
-def evenly_spread(number: int, count: int | None) -> Int:
-    """Return up to `count` rows of `number`, evenly spread from the first to the last; all if `count` is None."""
-    kept = number if count is None else min(number, count)
-    return np.linspace(0, number - 1, kept).round().astype(np.int64)
 
 
 def _environment_of(
@@ -269,37 +267,33 @@ def _environment_of(
 
 
 def _rows_of(
-    agent: BaseAlgorithm | Method | None, checks: int | Sequence[int] | None, name: str = "agent"
+    agent: BaseAlgorithm | Method | None, numbers: Sequence[int | None], name: str = "agent"
 ) -> list[Method]:
     """Return one method for each number of checks."""
     if agent is None:
         return []
     if not isinstance(agent, BaseAlgorithm):
         return [agent]
-    numbers = [checks] if checks is None or isinstance(checks, int) else checks
     return [agent_method(f"{name}, {each} checks" if each else name, agent, each) for each in numbers]
 
 
-def _baselines(
-    baselines: Sequence[str | Method],
+def _baseline(
+    baseline: str | Method,
     agent: BaseAlgorithm | Method | None,
-    checks: int | Sequence[int] | None,
+    numbers: Sequence[int | None],
     env_id: str,
     env_kwargs: Mapping[str, Any],
 ) -> list[Method]:
-    """Return the methods that the agent is compared with, in the order given."""
-    methods: list[Method] = []
-    for each in baselines:
-        if not isinstance(each, str):
-            methods.append(each)
-        elif each == "untrained" and isinstance(agent, BaseAlgorithm):
-            methods += _rows_of(untrained(agent), checks, each)
-        elif each == "unrevised" and isinstance(agent, BaseAlgorithm):
-            first = agent_method("agent", agent, None if checks is None else 0)
-            methods.append(OpenLoopBaseline(first, SceneSimulation(env_id, 250, **env_kwargs)))
-        else:
-            methods.append(make_method(each, env_id, **env_kwargs))
-    return methods
+    """Return the methods that a baseline stands for."""
+    if not isinstance(baseline, str):
+        return [baseline]
+    if isinstance(agent, BaseAlgorithm):
+        if baseline == "untrained":
+            return _rows_of(untrained(agent), numbers, baseline)
+        if baseline == "unrevised":
+            first = agent_method("agent", agent, None if numbers == [None] else 0)
+            return [OpenLoopBaseline(first, SceneSimulation(env_id, 250, **env_kwargs))]
+    return [make_method(baseline, env_id, **env_kwargs)]
 
 
 def evaluate_methods(
@@ -338,7 +332,7 @@ def _evaluate_one(
     progress: Progress | None,
 ) -> MethodResult:
     number = len(frozen.share)
-    pieces: list[Mapping[str, NDArray[Any]]] = []
+    pieces: list[SimulationResults] = []
     times: Float = np.zeros(0)
     seconds, interrupted = 0.0, False
     try:
@@ -348,27 +342,30 @@ def _evaluate_one(
             decided = method.decide(simulation.observe(scenes), scenes)
             seconds += time.perf_counter() - began
             outcome = simulation.play(method, scenes, decided)
-            action = np.asarray(decided, dtype=np.float64)
-            pieces.append({**outcome.info, "reward": outcome.reward, "": action})
+            outcome.info["action"] = np.asarray(decided, dtype=np.float64)
+            pieces.append(outcome)
             if progress is not None:
                 progress(method.name, min(first + batch, number), number)
         if time_decisions:
             times = _decision_times(method, frozen.scenes, simulation, seconds / number)
     except KeyboardInterrupt:
         interrupted = True
-    actions = [piece[""] for piece in pieces]  # kept with their outcomes, so that Ctrl-C parts none of them
-    done = sum(len(piece) for piece in actions)
-    names = [name for name in pieces[0] if name] if pieces else Outcome._fields
+    if pieces:
+        joined = SimulationResults.concatenate(pieces)
+        outcomes = {**joined.info, "reward": joined.reward}
+    else:
+        outcomes = {name: np.zeros(0) for name in (*Outcome._fields, "action")}
+    done = len(outcomes["is_success"])
     return MethodResult(
         name=method.name,
-        outcomes={name: np.concatenate([piece[name] for piece in pieces] or [np.zeros(0)]) for name in names},
-        actions=np.concatenate(actions) if actions else np.zeros((0, simulation.task.action.size)),
+        actions=outcomes.pop("action"),
+        outcomes=outcomes,
         decision_times=times,
         band=frozen.band[:done],
         family=frozen.family[:done],
         distance=_distances(frozen.scenes, simulation.task)[:done],
-        partial=interrupted and done < number,
         interrupted=interrupted,
+        partial=done < number,
     )
 
 

@@ -42,7 +42,7 @@ class Method(Protocol):
 class Straight:
     """Straight minimum-jerk movement, the zero action."""
 
-    name = "straight line"
+    name = "straight"
 
     def __init__(self, simulation: SceneSimulation) -> None:
         self._size = simulation.task.action.size
@@ -58,7 +58,7 @@ class RandomVias:
     def __init__(self, simulation: SceneSimulation, count: int) -> None:
         self._simulation, self._count = simulation, count
         self._generator = np.random.default_rng(0)
-        self.name = "random via-point" if count == 1 else f"best of {count} random, simulated"
+        self.name = "random" if count == 1 else f"random{count}"
 
     @functools.cached_property
     def _for_one_scene(self) -> SceneSimulation:
@@ -137,14 +137,14 @@ def ompl_method(simulation: SceneSimulation) -> PlannerMethod:
         ValueError: The library is not installed.
     """
     import_ompl()
-    return PlannerMethod(simulation, "motion planner (OMPL)", ompl_motion)
+    return PlannerMethod(simulation, "ompl", ompl_motion)
 
 
 class OpenLoopBaseline:
     """First decision of a method, which is never revised."""
 
     def __init__(self, method: Method, simulation: SceneSimulation) -> None:
-        self.name, self._method = f"{method.name}, no revision", method
+        self.name, self._method = "unrevised", method
         self._simulation = SceneSimulation(simulation.env_id, 250, **{**simulation.kwargs, "decide_at": ()})
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
@@ -205,8 +205,8 @@ def agent_method(name: str, model: Any, checks: int | None = None, refine: int |
 def refined_search(simulation: SceneSimulation, checks: int) -> Method:
     """Return a search that spends half of its checks on refinement, which solves more scenes."""
     rounds = 2 if checks < 512 else 4
-    half = checks // 2
-    return GeometrySearch(simulation.task, half, refinements=rounds, per_round=half // rounds)
+    each = checks // 2 // rounds
+    return GeometrySearch(simulation.task, checks - rounds * each, refinements=rounds, per_round=each)
 
 
 COUNTED: dict[str, Callable[[SceneSimulation, int], Method]] = {

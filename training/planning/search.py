@@ -83,6 +83,8 @@ class GeometrySearch:
         >>> plan = search.plan((-0.2, 0.3), (0.1, 0.4), [Cylinder(0.03, 0.04, position=(-0.05, 0.35, 0.0))])
         >>> plan.success, plan.waypoints.shape, plan.durations.shape
         (True, (3, 2), (2,))
+        >>> search.name, GeometrySearch("viapoint/PlanarObstacles-v0", 256, refinements=4).name
+        ('sobol64', 'search512')
     """
 
     def __init__(
@@ -106,9 +108,8 @@ class GeometrySearch:
 
     @property
     def name(self) -> str:
-        """Name in tables of results."""
-        kind = "search, {} checks" if self.refinements else "{} fixed plans"
-        return kind.format(self.total_checks)
+        """Name in tables of results and on the command line, such as search512, or sobol512 without refinement."""
+        return f"{'search' if self.refinements else 'sobol'}{self.total_checks}"
 
     def decide(self, observation: Mapping[str, Any], scenes: Any = None) -> Float:
         """Return the best action of each of B observations, shape (B, m).

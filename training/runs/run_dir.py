@@ -3,8 +3,7 @@
 arm.xml                           copy of the arm, if it was loaded from a file
 config.json  versions.json        what was asked for, with which versions (the seed is in config.json)
 learning_curve.jsonl              one line for each evaluation on the validation scenes
-end.json                          why training ended: its budget was spent, or success stalled
-checkpoints/<decisions>/          for an exact continuation; the last two are kept
+checkpoints/<decisions>.pt        for an exact continuation; the last two are kept
 best/  final/                     models: best on the validation scenes, last
 evaluations/<name>.json           what `viapoint evaluate` and `viapoint demo` measured
 tensorboard/                      logs
@@ -13,7 +12,6 @@ tensorboard/                      logs
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -39,12 +37,7 @@ from viapoint.training.io.files import (
     write_folder,
     write_json,
 )
-from viapoint.training.runs.checkpoints import (
-    is_checkpoint,
-    read_checkpoint,
-    remove_checkpoint,
-    write_checkpoint,
-)
+from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
 
 KEPT_CHECKPOINTS = 2
 PATIENCE = 10.0
@@ -99,7 +92,7 @@ class Run:
 
     def __repr__(self) -> str:
         config, curve = self.config, self.curve
-        stalled = " until it stalled" if self.stopped == "stalled" else ""
+        stalled = " until it stalled" if self.stalled else ""
         rate = f", success {100.0 * curve[-1]['success']['rate']:.1f} % on validation scenes" if curve else ""
         return (
             f"Run({str(self.folder)!r}: {config.algo} on {config.env}, seed {config.seed}, "
@@ -116,11 +109,12 @@ class Run:
         folder = config.folder
         check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        with _lock(folder):
-            check_free(folder)  # another process may have been faster
-            write_json(folder / "versions.json", versions())
-            keep_arm(folder, config.task.arm)
-            write_config(folder, config)
+        write_json(folder / "versions.json", versions())
+        keep_arm(folder, config.task.arm)
+        try:
+            write_config(folder, config, new=True)
+        except FileExistsError:  # another process was faster
+            check_free(folder)
         return cls(folder)
 
     @property
@@ -152,7 +146,7 @@ class Run:
     def decisions(self) -> int:
         """Number of decisions at the newest checkpoint; 0 without one."""
         checkpoints = self.checkpoints()
-        return int(checkpoints[-1].name) if checkpoints else 0
+        return int(checkpoints[-1].stem) if checkpoints else 0
 
     @property
     def best(self) -> Path:
@@ -174,14 +168,14 @@ class Run:
 
     def checkpoint(self, model: BaseAlgorithm, extra: Mapping[str, Any]) -> None:
         """Write a checkpoint and remove outdated ones."""
-        write_checkpoint(model, self._checkpoints / f"{model.num_timesteps:010d}", extra)
+        write_checkpoint(model, self._checkpoints / f"{model.num_timesteps:010d}.pt", extra)
         for outdated in self.checkpoints()[:-KEPT_CHECKPOINTS]:
-            remove_checkpoint(outdated)
+            outdated.unlink()
 
     def checkpoints(self) -> list[Path]:
-        """Folders of the checkpoints, oldest first."""
-        found = (path for path in self._checkpoints.glob("[0-9]*") if re.fullmatch(r"\d{10}", path.name))
-        return sorted(path for path in found if is_checkpoint(path))
+        """Files of the checkpoints, oldest first."""
+        found = self._checkpoints.glob("[0-9]*.pt")
+        return sorted(path for path in found if re.fullmatch(r"\d{10}", path.stem) and path.is_file())
 
     def restore(self, model: BaseAlgorithm) -> tuple[dict[str, Any] | None, list[str]]:
         """Set a model to the state of the newest intact checkpoint.
@@ -204,18 +198,25 @@ class Run:
         return None, []
 
     @property
-    def stopped(self) -> str | None:
-        """Reason why training ended: `budget` or `stalled`, see `stop_when_stalled`; None while it has not ended."""
-        path = self.folder / "end.json"
-        return str(read_json(path)["stopped"]) if path.is_file() else None
+    def best_record(self) -> dict[str, Any] | None:
+        """First record of the highest success in the learning curve; None without any."""
+        return max(self.curve, key=lambda record: record["success"]["rate"], default=None)
 
-    def write_end(self, record: Mapping[str, Any] | None) -> None:
-        """Write why and where training ended; None removes the file while training goes on."""
-        path = self.folder / "end.json"
-        if record is None:
-            path.unlink(missing_ok=True)
-        else:
-            write_json(path, record)
+    @property
+    def stalled(self) -> bool:
+        """Flag: success had not risen for so long that training ended, see `stop_when_stalled`."""
+        share = self.config.stop_when_stalled
+        best = None if share is None else self.best_record
+        if share is None or best is None:
+            return False
+        now = self.curve[-1]["decisions"]
+        return bool(now >= self.config.preset.n_timesteps and now - best["decisions"] >= share * now)
+
+    @property
+    def ended(self) -> bool:
+        """Flag: training has made all its decisions, or success stalled, and the last model is written."""
+        enough = self.stalled or self.decisions >= self.config.total_timesteps
+        return enough and (self.final / "model.json").is_file()
 
     def write_evaluation(self, name: str, record: Mapping[str, Any]) -> Path:
         """Write the result of an evaluation under a name."""
@@ -230,7 +231,11 @@ class Run:
         Raises:
             BadFileError: Another process trains in the folder.
         """
-        with _lock(self.folder):
+        try:
+            held = FileLock(self.folder / "lock").acquire(timeout=PATIENCE)
+        except Timeout:
+            raise BadFileError(self.folder, "is in use by another process") from None
+        with held:
             for folder in (self.folder, self._checkpoints, self.folder / "evaluations"):
                 tidy(folder)
             yield
@@ -238,23 +243,6 @@ class Run:
     @property
     def _checkpoints(self) -> Path:
         return self.folder / "checkpoints"
-
-
-@contextmanager
-def _lock(folder: Path) -> Iterator[None]:
-    """Lock a folder for this process; see :meth:`Run.locked`."""
-    lock, owner = FileLock(folder / "lock"), folder / "lock.pid"
-    try:
-        lock.acquire(timeout=PATIENCE)
-    except Timeout:
-        pid = owner.read_text() if owner.exists() else "unknown"
-        raise BadFileError(folder, f"is in use by the process with number {pid}") from None
-    try:
-        owner.write_text(str(os.getpid()))
-        yield
-    finally:
-        owner.unlink(missing_ok=True)
-        lock.release()
 
 
 def check_free(folder: Path) -> None:
@@ -269,14 +257,14 @@ def check_free(folder: Path) -> None:
     check_folder("run folder", folder)
     names = {path.name for path in folder.iterdir()} if folder.exists() else set()
     begun = {name for name in names if UNFINISHED.fullmatch(name)}
-    if names - begun - {"versions.json", COPY, "lock", "lock.pid"}:
+    if names - begun - {"versions.json", COPY}:
         raise BadFileError(folder, "is not empty and is no run folder")
     check_ours(folder / "versions.json")
 
 
-def write_config(folder: Path, config: TrainConfig) -> None:
+def write_config(folder: Path, config: TrainConfig, *, new: bool = False) -> None:
     """Write the configuration, which makes a folder a run, without the arguments of one call."""
-    write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False})
+    write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False}, new=new)
 
 
 def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = None) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Float, Int
 from viapoint.envs.geometry.obstacles import KINDS, MESH, no_obstacles
 from viapoint.envs.scenes.scene import Scenes, resting
 from viapoint.envs.task import Task
@@ -109,6 +109,16 @@ class FrozenScenes:
         return dataclasses.replace(
             self, scenes=self.scenes.take(rows), share=self.share[rows], family=self.family[rows]
         )
+
+    def spread(self, count: int | None) -> FrozenScenes:
+        """Return up to `count` scenes, evenly spread over the set; all if `count` is None."""
+        return self.take(evenly_spread(len(self.share), count))
+
+
+def evenly_spread(number: int, count: int | None) -> Int:
+    """Return up to `count` rows of `number`, evenly spread from the first to the last; all if `count` is None."""
+    kept = number if count is None else min(number, count)
+    return np.linspace(0, number - 1, kept).round().astype(np.int64)
 
 
 def together(parts: Sequence[FrozenScenes]) -> FrozenScenes:

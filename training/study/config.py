@@ -52,7 +52,7 @@ class Trial:
     scenes: tuple[str, ...] = ()
     """Names of the measured sets, or files of scenes."""
     n_scenes: int | None = None
-    """Number of scenes of each set, from the first on; None for all."""
+    """Number of scenes of each set, evenly spread over it; None for all."""
     row: str
     """Name of the row, which is also that of its folder."""
     seed: int = 0
