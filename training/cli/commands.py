@@ -54,6 +54,7 @@ def evaluate(config: EvaluateConfig) -> None:
             scenes=config.scenes,
             n_scenes=config.n_scenes,
             checks=config.checks,
+            refine=config.refine,
             baselines=config.baselines,
             progress=progress,
         )
@@ -108,8 +109,7 @@ def play(config: PlayConfig) -> None:
     if agent is None:
         method = make_method("search512", env_id, **env_kwargs)
     else:
-        name = f"agent, {config.checks} checks" if config.checks else "agent"
-        method = agent_method(name, agent, config.checks)
+        method = agent_method("agent", agent, config.checks)
     config.video.parent.mkdir(parents=True, exist_ok=True)
     record_video(config.video, env, scenes, method.decide, name=method.name)
     env.close()

@@ -92,7 +92,7 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
             return record
     methods: list[Method] = [
         agent_method("agent", agent, 0),
-        agent_method(f"agent, {config.checks} checks", agent, config.checks),
+        agent_method("agent", agent, config.checks),
         agent_method("untrained", untrained(agent), 0),
         *(make_method(name, config.env) for name in BASELINES),
     ]

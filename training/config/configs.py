@@ -339,6 +339,8 @@ class EvaluateConfig(AgentConfig):
     unrevised (the first plan alone)."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
+    refine: tuple[int, ...] = ()
+    """Numbers of proposals that the planner refines, one further row each."""
     scenes: str = "test"
     """Scene set: validation, test, hard, uniform, or a scene file; motionbenchmaker for the problems of that benchmark,
     on which planners are measured: straight, plan_motion, plan_motion+ompl, ompl, search512."""
@@ -382,8 +384,10 @@ class EvaluateConfig(AgentConfig):
         if not self.checks:
             raise ValueError("checks must name at least one number, such as 0")
         check_file("json", self.json)
-        if any(self.checks) and self.agent is None:
-            raise ValueError("checks concerns an agent, and none is given")
+        for number in self.refine:
+            check_whole("refine", number, 1)
+        if (any(self.checks) or self.refine) and self.agent is None:
+            raise ValueError("checks and refine concern an agent, and none is given")
 
 
 @dataclass(frozen=True, kw_only=True)

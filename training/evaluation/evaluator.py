@@ -181,6 +181,7 @@ def evaluate(
     scenes: str | Path | FrozenScenes = "test",
     n_scenes: int | None = None,
     checks: int | Sequence[int] | None = None,
+    refine: int | Sequence[int] = (),
     baselines: Sequence[str | Method] = (),
     time_decisions: bool = True,
     progress: Progress | None = None,
@@ -198,9 +199,10 @@ def evaluate(
         n_scenes: Number of scenes, evenly spread over the set; all if not given.
         checks: Number of proposals that the agent checks with exact geometry, or several numbers, one row each; the
             agent's own setting if not given.
+        refine: Number of proposals that the planner refines, or several numbers, one further row each.
         baselines: Names, or objects with `name` and `decide`. Names are `untrained` (the agent's network before
-            training), `straight`, `random`, `random16`, `random80`, `ompl`, `searchN` and `sobolN` (N checked plans)
-            and, in tasks with replanning, `unrevised` (the first plan alone).
+            training), `straight`, `random`, `random16`, `random80`, `plan_motion`, `ompl`, `searchN` and `sobolN` (N
+            checked plans) and, in tasks with replanning, `unrevised` (the first plan alone).
         time_decisions: Measure the wall time of single decisions.
         progress: Function of the method's name, the number of finished scenes and the number of all scenes.
 
@@ -220,10 +222,11 @@ def evaluate(
         check_whole("n_scenes", n_scenes, 1)
     if isinstance(baselines, str):
         raise ValueError(f"baselines must be a list, such as [{baselines!r}], got {baselines!r}")
-    numbers = [checks] if checks is None or isinstance(checks, int) else list(checks)
-    for number in numbers:
-        if number is not None:
-            check_whole("checks", number, 0)
+    settings: list[dict[str, int]] = []
+    for number in [checks] if checks is None or isinstance(checks, int) else checks:
+        settings.append({} if number is None else {"checks": check_whole("checks", number, 0)})
+    for number in [refine] if isinstance(refine, int) else refine:
+        settings.append({"checks": 0, "refine": check_whole("refine", number, 1)})
     if isinstance(agent, str | Path):
         agent = load_agent(agent)
     env_id, kwargs = _environment_of(agent, env, env_kwargs)
@@ -234,9 +237,9 @@ def evaluate(
     chosen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(str(scenes), task, n_scenes)
     if n_scenes is not None and n_scenes > len(chosen.share):
         print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
-    methods = _rows_of(agent, numbers)
+    methods = _rows_of(agent, settings)
     for each in baselines:
-        methods += _baseline(each, agent, numbers, env_id, kwargs)
+        methods += _baseline(each, agent, settings, env_id, kwargs)
     return evaluate_methods(
         methods,
         chosen.spread(n_scenes),
@@ -267,20 +270,20 @@ def _environment_of(
 
 
 def _rows_of(
-    agent: BaseAlgorithm | Method | None, numbers: Sequence[int | None], name: str = "agent"
+    agent: BaseAlgorithm | Method | None, settings: Sequence[Mapping[str, int]], name: str = "agent"
 ) -> list[Method]:
-    """Return one method for each number of checks."""
+    """Return one method for each number of checks, and of refined proposals."""
     if agent is None:
         return []
     if not isinstance(agent, BaseAlgorithm):
         return [agent]
-    return [agent_method(f"{name}, {each} checks" if each else name, agent, each) for each in numbers]
+    return [agent_method(name, agent, **each) for each in settings]
 
 
 def _baseline(
     baseline: str | Method,
     agent: BaseAlgorithm | Method | None,
-    numbers: Sequence[int | None],
+    settings: Sequence[Mapping[str, int]],
     env_id: str,
     env_kwargs: Mapping[str, Any],
 ) -> list[Method]:
@@ -289,9 +292,9 @@ def _baseline(
         return [baseline]
     if isinstance(agent, BaseAlgorithm):
         if baseline == "untrained":
-            return _rows_of(untrained(agent), numbers, baseline)
+            return _rows_of(untrained(agent), settings, baseline)
         if baseline == "unrevised":
-            first = agent_method("agent", agent, None if numbers == [None] else 0)
+            first = agent_method("agent", agent, checks=0 if settings[0] else None)
             return [OpenLoopBaseline(first, SceneSimulation(env_id, 250, **env_kwargs))]
     return [make_method(baseline, env_id, **env_kwargs)]
 

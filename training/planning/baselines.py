@@ -189,6 +189,8 @@ class AgentMethod:
 def agent_method(name: str, model: Any, checks: int | None = None, refine: int | None = None) -> Method:
     """Return a trained agent as a method, for whole movements or for actions in every control step.
 
+    Its name tells how many proposals are checked and refined, as :class:`AgentMethod` explains.
+
     Raises:
         ValueError: The agent cannot check or refine its proposals.
     """
@@ -196,6 +198,10 @@ def agent_method(name: str, model: Any, checks: int | None = None, refine: int |
         raise ValueError(f"proposals are checked by ViaQ only; this agent is a {type(model).__name__}")
     if refine and not getattr(model.policy, "can_refine", False):
         raise ValueError("proposals are refined by ViaQ only, in tasks with one decision for a movement")
+    if checks:
+        name += f", {checks} checks"
+    if refine:
+        name += f", {refine} refined"
     env_id, env_kwargs = env_arguments(model.get_env())
     if registered_task(env_id, **env_kwargs).stepwise:
         return StepAgentMethod(name, model, env_id, env_kwargs)

@@ -60,6 +60,8 @@ class Trial:
     """Fields of :class:`TrainConfig`; empty for a baseline."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one measurement each."""
+    refine: tuple[int, ...] = ()
+    """Numbers of proposals that the planner refines, one further measurement each."""
     untrained: bool = False
     """True to measure the network before training, too."""
     method: str = ""
@@ -309,17 +311,23 @@ def _agent(
     *,
     seeds: list[int],
     checks: list[int] | None = None,
+    refine: list[int] | None = None,
     untrained: bool = False,
     resources: dict[str, float] | None = None,
     **training: Any,
 ) -> list[Trial]:
     """Return a trial for each seed of an agent whose configuration is allowed in its environment."""
     numbers = tuple(check_whole("checks", number, 0) for number in checks or [0])
-    if any(numbers) and training.get("algo", "viaq") != "viaq":
-        raise ValueError(f"checks are those of viaq; {training['algo']} has no proposals to check")
+    refined = tuple(check_whole("refine", number, 1) for number in refine or [])
+    if (any(numbers) or refined) and training.get("algo", "viaq") != "viaq":
+        raise ValueError(
+            f"checks and refine are those of viaq; {training['algo']} has no proposals to check or refine"
+        )
+    if refined and registered_task(env["env_id"], **env["env_kwargs"]).replanning:
+        raise ValueError(f"refine is for tasks with one decision for a movement, {env['env_id']} has several")
     if not seeds or len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must hold at least one number and none twice, got {seeds}")
-    own: dict[str, Any] = {"training": training, "checks": numbers, "untrained": untrained}
+    own: dict[str, Any] = {"training": training, "checks": numbers, "refine": refined, "untrained": untrained}
     own["resources"] = {"cpu": 1, **(resources or {})}
     trials = [Trial(**env, row=row, seed=seed, **own) for seed in seeds]
     for trial in trials:

@@ -61,6 +61,8 @@ def run_trial(trial: Trial, out: Path) -> Record:
         for name, model in models.items():
             for checks in trial.checks:
                 methods[f"{name}/{checks}" if checks else name] = agent_method("agent", model, checks)
+            for refine in trial.refine:
+                methods[f"{name}/refine{refine}"] = agent_method("agent", model, 0, refine)
         env_kwargs, decisions = whole_task(config.env, config.env_kwargs), run.decisions
         record["curve"] = [[each["decisions"], each["success"]["rate"]] for each in run.curve]
         record["seconds"] = run.curve[-1]["seconds"] if run.curve else None
