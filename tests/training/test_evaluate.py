@@ -8,6 +8,7 @@ import pytest
 from viapoint.training.evaluation.evaluator import (
     SLOW_DECISION,
     MethodResult,
+    evaluate,
     evaluate_methods,
     single_decision_times,
 )
@@ -188,3 +189,9 @@ def test_comparisons_are_with_the_first(small_scenes, solutions):
     assert comparison["p_value"] == pytest.approx(2.0 * 0.5**solved)
     assert set(record["outcomes"]) == {"straight", "search"}
     assert len(record["outcomes"]["straight"]["action"]) == 40
+
+
+def test_fewer_scenes_than_asked_for_are_told(small_scenes, capsys):
+    result = evaluate(Given("a", ZEROS), env=ENV, scenes=small_scenes, n_scenes=50, time_decisions=False)
+    assert len(result.results[0].success) == 40
+    assert "40 scenes, not 50" in capsys.readouterr().err

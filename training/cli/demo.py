@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from viapoint.envs.rendering.renderer import GLUnavailableError
 from viapoint.training.agents.agent import Agent, find_model, load_agent
 from viapoint.training.agents.model_io import untrained
 from viapoint.training.config.configs import DemoConfig, TrainConfig
@@ -19,7 +21,7 @@ from viapoint.training.io.progress import scene_progress
 from viapoint.training.planning.baselines import Method, agent_method, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plotting import plots
-from viapoint.training.plotting.gallery import gallery, play
+from viapoint.training.plotting.gallery import gallery
 from viapoint.training.plotting.video import record_video
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
@@ -58,11 +60,14 @@ def run(config: DemoConfig) -> None:
     if not last.exists() or last.stat().st_mtime < (folder / "table.json").stat().st_mtime:
         plots.learning_curve(folder / "learning_curve.png", trained.curve)
         plots.success_by_band(folder / "success_by_band.png", record)
-        _draw_gallery(folder / "gallery.png", agent, frozen)
-        _film(last, agent, frozen)
+        try:
+            _show_movements(folder, agent, frozen)
+        except GLUnavailableError as error:
+            print(f"movements are not shown: {error}", file=sys.stderr)
     print(report.text(record))
     for name, what in {**FILES, trained.best.name: "the trained agent"}.items():
-        print(f"  {folder / name!s:<34} {what}")
+        if (folder / name).exists():
+            print(f"  {folder / name!s:<34} {what}")
     print(f"done in {time.monotonic() - began:.0f} s")
 
 
@@ -105,18 +110,15 @@ def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[st
     return record
 
 
-def _draw_gallery(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
-    """Draw movements in scenes of all difficulties."""
-    by_difficulty = np.argsort(-frozen.share, kind="stable")
-    chosen = frozen.take(by_difficulty).spread(PICTURES)
-    titles = [f"share {BANDS[band]}" for band in chosen.band]
+def _show_movements(folder: Path, agent: Agent, frozen: FrozenScenes) -> None:
+    """Draw and film movements in scenes of all difficulties."""
     decide = agent_method("agent", agent, 0).decide
-    task = registered_task(agent.env_id, **agent.env_kwargs)
-    episodes = play(agent.env_id, chosen.scenes, decide, **agent.env_kwargs)
-    gallery(path, task, episodes, titles, heading=f"The agent alone in {frozen.name} scenes, easy to hard")
-
-
-def _film(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
+    chosen = frozen.take(np.argsort(-frozen.share, kind="stable")).spread(PICTURES)
+    titles = [f"share {BANDS[band]}" for band in chosen.band]
+    heading = f"The agent alone in {frozen.name} scenes, easy to hard"
+    env = gym.make(agent.env_id, render_mode="rgb_array", **agent.env_kwargs)
+    gallery(folder / "gallery.png", env, chosen.scenes, decide, titles, heading=heading)
+    env.close()
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
-    record_video(path, env, frozen.spread(MOVEMENTS).scenes, agent_method("agent", agent, 0).decide)
+    record_video(folder / "movements.mp4", env, frozen.spread(MOVEMENTS).scenes, decide)
     env.close()

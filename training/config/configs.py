@@ -571,7 +571,7 @@ class StudyConfig(Config):
 
     The same command continues a study that was stopped, and does what was added to its file.
 
-    Example: echo '{environments: [viapoint/PlanarReach-v0], baselines: [straight]}' > reach.yaml; viapoint study reach.yaml
+    Example: echo '{environments: [viapoint/PlanarReach-v0], baselines: [straight]}' > a.yaml; viapoint study a.yaml
     """
 
     file: tyro.conf.Positional[Path]

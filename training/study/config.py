@@ -64,8 +64,6 @@ class Trial:
     """True to measure the network before training, too."""
     method: str = ""
     """Name of a baseline; empty for an agent."""
-    resources: Values = field(default_factory=lambda: {"cpu": 1})
-    """Resources of a node that the trial takes, such as {"cpu": 2, "GPU": 1}."""
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the trial."""
@@ -74,20 +72,14 @@ class Trial:
     def config(self, out: Path) -> TrainConfig:
         """Return the configuration of the training; `policy_kwargs` are merged with those of the preset."""
         given = dict(self.training)
-        given["env_kwargs"] = {**self.env_kwargs, **given.get("env_kwargs", {})}
-        hyperparameters = dict(given.pop("hyperparameters", {}))
+        env_kwargs = {**self.env_kwargs, **given.pop("env_kwargs", {})}
+        hyperparameters = dict(given.get("hyperparameters", {}))
         if "policy_kwargs" in hyperparameters:
-            task = registered_task(self.env_id, **given["env_kwargs"])
+            task = registered_task(self.env_id, **env_kwargs)
             usual = preset_of(task, given.get("algo", "viaq")).arguments().get("policy_kwargs", {})
             hyperparameters["policy_kwargs"] = {**usual, **hyperparameters["policy_kwargs"]}
-        return TrainConfig(
-            env=self.env_id,
-            seed=self.seed,
-            out=self.folder(out),
-            progress=False,
-            hyperparameters=hyperparameters,
-            **given,
-        )
+        given |= {"env_kwargs": env_kwargs, "hyperparameters": hyperparameters}
+        return TrainConfig(env=self.env_id, seed=self.seed, out=self.folder(out), progress=False, **given)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,15 +95,18 @@ class Search:
     first: tuple[Values, ...] = ()
     """Parameters of the first trials."""
 
-    def with_parameters(self, values: Values) -> Trial:
-        """Return the trial with these parameters, under a name that equal parameters share."""
+    def config(self, values: Values, folder: Path) -> TrainConfig:
+        """Return the configuration of a training with these parameters."""
         training = _with(self.trial.training, values)
-        return dataclasses.replace(self.trial, training=training, row=f"{self.trial.row}/{_hash(training)}")
+        return dataclasses.replace(
+            dataclasses.replace(self.trial, training=training).config(folder), out=folder
+        )
 
     @property
     def key(self) -> str:
         """Name that changes with the description of the search."""
-        return f"{self.trial.row}-{_hash(dataclasses.asdict(self))}"
+        plain = json.dumps(dataclasses.asdict(self), sort_keys=True)
+        return f"{self.trial.row}-{hashlib.sha256(plain.encode()).hexdigest()[:10]}"
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the search."""
@@ -121,11 +116,6 @@ class Search:
         """Return whether the best parameters of this very search are there."""
         path = self.folder(out) / "best.json"
         return path.is_file() and read_json(path).get("key") == self.key
-
-
-def _hash(values: Any) -> str:
-    """Return a short name for plain values, equal for equal ones."""
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:10]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -310,7 +300,6 @@ def _agent(
     seeds: list[int],
     checks: list[int] | None = None,
     untrained: bool = False,
-    resources: dict[str, float] | None = None,
     **training: Any,
 ) -> list[Trial]:
     """Return a trial for each seed of an agent whose configuration is allowed in its environment."""
@@ -320,7 +309,6 @@ def _agent(
     if not seeds or len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must hold at least one number and none twice, got {seeds}")
     own: dict[str, Any] = {"training": training, "checks": numbers, "untrained": untrained}
-    own["resources"] = {"cpu": 1, **(resources or {})}
     trials = [Trial(**env, row=row, seed=seed, **own) for seed in seeds]
     for trial in trials:
         config = trial.config(Path())

@@ -159,16 +159,14 @@ def _connected(address: str | None, workers: int | None) -> Iterator[None]:
 def _run_trials(trials: list[Trial], folder: Path, workers: int | None, told: Told) -> list[str]:
     """Run trials as tasks of Ray, and return a line for each that failed."""
     ray, _ = _import_libraries()
-    task = ray.remote(max_retries=RETRIES)(run_trial)
+    task = ray.remote(num_cpus=1, max_retries=RETRIES)(run_trial)
     waiting = list(reversed(trials))
     running: dict[Any, Trial] = {}
     failed = []
     while waiting or running:
         while waiting and len(running) < (workers or len(trials)):
             trial = waiting.pop()
-            others = dict(trial.resources)
-            placed = task.options(num_cpus=others.pop("cpu"), num_gpus=others.pop("GPU", 0), resources=others)
-            running[placed.remote(trial, folder)] = trial
+            running[task.remote(trial, folder)] = trial
         (done,), _ = ray.wait(list(running))
         label = running.pop(done).folder(Path()).as_posix()
         try:
@@ -213,13 +211,13 @@ def _search(search: Search, folder: Path, workers: int | None, told: Told) -> li
 
     def work(config: Values) -> None:
         try:
-            settings = search.with_parameters(config).config(folder)
+            settings = search.config(config, Path(tune.get_context().get_trial_dir()))
             run = train_or_resume(settings, ReportCallback(settings.folder, tune.report))
             tune.report({"success": run.curve[-1]["success"]["rate"], "decisions": run.decisions})
         except Exception as error:  # settings that cannot be trained do not end a search
             tune.report({"success": 0.0, "decisions": total, "error": _one_line(error)})
 
-    trainable = tune.with_resources(work, dict(search.trial.resources))
+    trainable = tune.with_resources(work, {"cpu": 1})
     path = folder / "tune" / f"search-{search.key}"
     if tune.Tuner.can_restore(path):
         tuner = tune.Tuner.restore(str(path), trainable, resume_unfinished=True, restart_errored=True)
@@ -277,8 +275,8 @@ def _write_search(search: Search, results: Any, folder: Path) -> str:
     table = table.sort_values(["decisions", "success"], ascending=False)
     write_bytes(search.folder(folder) / "trials.csv", table.to_csv(index=False).encode())
     best = table.to_dict("records")[0]
-    chosen = search.with_parameters({path: best[path] for path in search.parameters})
-    config = dataclasses.replace(chosen.config(folder), out=None)
+    chosen = search.config({path: best[path] for path in search.parameters}, folder)
+    config = dataclasses.replace(chosen, out=None)
     record = {"viapoint": "search", "key": search.key, "success": best["success"], "command": config.command}
     write_json(search.folder(folder) / "best.json", {**record, "training": config.as_json()})
     return f"best of {search.trial.row}, {100.0 * best['success']:.1f} %: {config.command}"
