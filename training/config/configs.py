@@ -9,7 +9,7 @@ import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 import tyro
@@ -283,28 +283,21 @@ class TrainConfig(Config):
 
     def as_json(self) -> dict[str, Any]:
         """Return the configuration as plain values; :meth:`from_json` is the inverse."""
-        values: dict[str, Any] = {}
-        for each in dataclasses.fields(self):
-            value = getattr(self, each.name)
-            if isinstance(value, Path):
-                value = str(value)
-            values[each.name] = list(value) if isinstance(value, tuple) else value
-        return values
+        values = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+        return {**values, "out": None if self.out is None else str(self.out)}
 
     @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> Self:
+    def from_json(cls, record: Mapping[str, Any]) -> TrainConfig:
         """Return the configuration that plain values describe.
 
         Raises:
             ValueError: A name is unknown or a value is not allowed.
         """
         names = [each.name for each in dataclasses.fields(cls)]
-        unknown = sorted(set(record) - set(names))
-        if unknown:
-            raise ValueError(f"a training has {', '.join(names)}, not {unknown[0]!r}")
-        return cls(
-            **{name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
-        )
+        for name in record:
+            if name not in names:
+                raise ValueError(unknown_name("fields of a training", name, names))
+        return cls(**record)
 
 
 @dataclass(frozen=True, kw_only=True)

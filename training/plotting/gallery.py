@@ -60,7 +60,7 @@ def gallery(
         axes.set_axis_off()
     for row, (axes, title) in enumerate(zip(grid.flat, titles, strict=False)):
         outcome, colour = describe_outcome(play(env, scenes.take([row]), decide))
-        axes.imshow(env.unwrapped.render())  # type: ignore[arg-type]
+        axes.imshow(env.unwrapped.render())
         axes.set_title(outcome, fontsize=8.5, color=colour, fontweight="bold", pad=3)
         axes.text(
             0.5,

@@ -142,9 +142,7 @@ class ViaVecEnv(VecEnv):
         except (TypeError, AttributeError):
             names, others = set(), []
         if len(others) != self.num_envs - 1 or any(each != names for each in others):
-            raise ValueError(
-                f"options must be a mapping, or a list of {self.num_envs} with the same names, got {given!r}"
-            )
+            raise ValueError(f"options must be a mapping, or a list of {self.num_envs} alike, got {given!r}")
         options = {name: [each[name] for each in given] for name in names}
         observation, _ = self.venv.reset(seed=seeds, options=options or None)
         self._reset_seeds()
