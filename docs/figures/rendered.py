@@ -62,7 +62,7 @@ def shown(env_id: str, number: int) -> Shown:
     shipped = env_id in SHIPPED_IDS
     method: Method = agent_method("agent", load_agent(env_id), 16) if shipped else GeometrySearch(task)
     plain = Straight(simulation)
-    scenes = scenes_for("validation", task, TRIED).scenes.take(slice(0, TRIED))
+    scenes = scenes_for("validation", task).scenes.take(slice(0, TRIED))
     observation = simulation.observe(scenes)
     found = simulation.play(method, scenes, method.decide(observation, scenes))
     passes = found.success & (found.info["min_clearance"] > CLEAREST)

@@ -103,7 +103,7 @@ def play(config: PlayConfig) -> None:
     assert env_id is not None
     env_kwargs = {**(agent.env_kwargs if agent is not None else {}), **argument}
     task = registered_task(env_id, **env_kwargs)
-    scenes = scenes_for(config.scenes, task, config.n_scenes).spread(config.n_scenes).scenes
+    scenes = scenes_for(config.scenes, task, config.n_scenes).scenes
     env = gym.make(env_id, render_mode="rgb_array_list", **env_kwargs)
     if agent is None:
         method = make_method("search512", env_id, **env_kwargs)

@@ -54,7 +54,7 @@ def run(config: DemoConfig) -> None:
         check_ours(folder / name)
     trained = _trained(config)
     agent = load_agent(trained.best)
-    frozen = scenes_for("test", registered_task(config.env), config.n_scenes).spread(config.n_scenes)
+    frozen = scenes_for("test", registered_task(config.env), config.n_scenes)
     record = _measured(config, agent, frozen)
     last = folder / "movements.mp4"  # written after all others
     if not last.exists() or last.stat().st_mtime < (folder / "table.json").stat().st_mtime:

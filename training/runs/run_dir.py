@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -177,25 +178,25 @@ class Run:
         found = self._checkpoints.glob("[0-9]*.pt")
         return sorted(path for path in found if re.fullmatch(r"\d{10}", path.stem) and path.is_file())
 
-    def restore(self, model: BaseAlgorithm) -> tuple[dict[str, Any] | None, list[str]]:
-        """Set a model to the state of the newest intact checkpoint.
+    def restore(self, model: BaseAlgorithm) -> dict[str, Any] | None:
+        """Set a model to the state of the newest intact checkpoint, and print why newer ones were skipped.
 
         Returns:
-            Content of `extra`, None without any checkpoint; and the reasons why newer checkpoints were
-            skipped.
+            Content of `extra`; None without any checkpoint.
 
         Raises:
             BadFileError: There are checkpoints, but none is whole; the message is about the newest.
         """
-        passed_over: list[BadFileError] = []
+        newest = None
         for path in reversed(self.checkpoints()):
             try:
-                return read_checkpoint(model, path), [str(error) for error in passed_over]
+                return read_checkpoint(model, path)
             except BadFileError as error:
-                passed_over.append(error)
-        if passed_over:
-            raise passed_over[0]
-        return None, []
+                print(f"passed over a damaged checkpoint: {error}", file=sys.stderr)
+                newest = newest or error
+        if newest is not None:
+            raise newest
+        return None
 
     @property
     def best_record(self) -> dict[str, Any] | None:

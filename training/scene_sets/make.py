@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import tyro
@@ -35,10 +36,11 @@ from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import (
     BANDS,
     DRAWN,
+    MOVING,
+    OWN,
     SETS,
     FrozenScenes,
     load,
-    rounded,
     shipped_path,
     together,
 )
@@ -183,6 +185,17 @@ class Maker:
             decided = self._search.decide(self._simulation.observe(scenes))
             solved[rows] = self._simulation.play(self._search, scenes, decided).success
         return solved
+
+
+def rounded(scenes: Scenes) -> Scenes:
+    """Return scenes whose numbers single precision represents."""
+    obstacles = scenes.obstacles._replace(**_single(scenes.obstacles, MOVING))
+    return scenes._replace(obstacles=obstacles, **_single(scenes, OWN))
+
+
+def _single(record: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Return fields of a record in numbers that single precision represents."""
+    return {name: getattr(record, name).astype(np.float32).astype(np.float64) for name in names}
 
 
 def _hardest(found: list[FrozenScenes], number: int) -> FrozenScenes:

@@ -147,7 +147,7 @@ def _sets(trial: Trial) -> dict[str, FrozenScenes]:
     task = registered_task(trial.env_id, **trial.env_kwargs)
     found = {}
     for name in trial.scenes:
-        found[Path(name).stem] = scenes_for(name, task, trial.n_scenes).spread(trial.n_scenes)
+        found[Path(name).stem] = scenes_for(name, task, trial.n_scenes)
     return found
 
 
