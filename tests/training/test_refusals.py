@@ -80,7 +80,6 @@ CONFIGURATIONS = [
     (LiveConfig, {"port": 70_000}),
     (LiveConfig, {"env": "nothing"}),
     (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}),
-    (DemoConfig, {"checks": 0}),
     (StudyConfig, {"file": "study.yaml", "workers": 0}),
 ]
 

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from viapoint.envs.rendering.renderer import GLUnavailableError
-from viapoint.training.agents.agent import Agent, find_model, load_agent
+from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.agents.model_io import untrained
 from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
@@ -27,6 +27,8 @@ from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, scenes_for
 
+CHECKS = 16
+"""Number of proposals that the agent checks with exact geometry in its second row of the table."""
 BASELINES = ("search16", "search512", "straight", "random")
 FILES = {
     "table.md": "the table",
@@ -55,11 +57,15 @@ def run(config: DemoConfig) -> None:
     trained = _trained(config)
     agent = load_agent(trained.best)
     frozen = scenes_for("test", registered_task(config.env), config.n_scenes)
-    record = _measured(config, agent, frozen)
-    last = folder / "movements.mp4"  # written after all others
-    if not last.exists() or last.stat().st_mtime < (folder / "table.json").stat().st_mtime:
+    weights = read_json(trained.best / "model.json")["weights_sha256"]
+    record = read_json(folder / "table.json") if (folder / "table.json").exists() else {}
+    if (record.get("sha256"), record.get("weights_sha256")) != (frozen.sha256, weights):
+        record = {**_measured(config, agent, frozen), "weights_sha256": weights}
+        report.write(record, folder)
         plots.learning_curve(folder / "learning_curve.png", trained.curve)
         plots.success_by_band(folder / "success_by_band.png", record)
+        (folder / "movements.mp4").unlink(missing_ok=True)
+    if not (folder / "movements.mp4").exists():
         try:
             _show_movements(folder, agent, frozen)
         except GLUnavailableError as error:
@@ -80,34 +86,22 @@ def _trained(config: DemoConfig) -> Run:
         print(f"{config.out} holds a training of {found.decisions} decisions: starting from it")
     else:
         print(f"training for {number} decisions; Ctrl-C saves, and the same command goes on")
-    return train_or_resume(TrainConfig(env=config.env, seed=config.seed, n_timesteps=number, out=config.out))
+    return train_or_resume(TrainConfig(env=config.env, n_timesteps=number, out=config.out))
 
 
 def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[str, Any]:
-    """Return the evaluation of the agent, from the folder if it holds one for these weights and scenes."""
-    path = config.out / "table.json"
-    identity = {
-        "sha256": frozen.sha256,
-        "weights_sha256": read_json(find_model(config.out) / "model.json")["weights_sha256"],
-        "checks": config.checks,
-    }
-    if path.exists():
-        record = read_json(path)
-        if not record.get("partial") and {name: record.get(name) for name in identity} == identity:
-            return record
+    """Return the evaluation of the agent and of methods without training."""
     methods: list[Method] = [
         agent_method("agent", agent, 0),
-        agent_method(f"agent, {config.checks} checks", agent, config.checks),
+        agent_method(f"agent, {CHECKS} checks", agent, CHECKS),
         agent_method("untrained", untrained(agent), 0),
         *(make_method(name, config.env) for name in BASELINES),
     ]
     with scene_progress() as progress:
         result = evaluate_methods(methods, frozen, config.env, progress=progress)
-    record = {**result.to_dict(), **identity}
-    report.write(record, config.out)
     if result.partial:
         raise KeyboardInterrupt
-    return record
+    return result.to_dict()
 
 
 def _show_movements(folder: Path, agent: Agent, frozen: FrozenScenes) -> None:

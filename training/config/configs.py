@@ -522,16 +522,12 @@ class DemoConfig(Config):
     """Folder for all files; existing results are kept."""
     env: Annotated[str, ENV] = DEFAULT_ENV
     """Id of the environment."""
-    seed: int = 0
-    """Seed of the training."""
     n_timesteps: int | None = None
     """Decisions in total; default: a quarter of those of the preset."""
     n_scenes: int | None = None
     """Number of test scenes, evenly spread over the set; all if not given."""
-    checks: int = 16
-    """Number of proposals that the agent checks with exact geometry in its second row of the table."""
 
-    least: ClassVar = {"seed": 0, "n_timesteps": 1, "n_scenes": 1, "checks": 1}
+    least: ClassVar = {"n_timesteps": 1, "n_scenes": 1}
 
     def _check(self) -> None:
         check_registered(self.env)
@@ -574,7 +570,7 @@ class StudyConfig(Config):
     address: str | None = None
     """Address HOST:PORT of a Ray cluster; default: a Ray of its own on this machine."""
     workers: int | None = None
-    """Number of trials at the same time; default: as many as the cores allow."""
+    """Number of trials at the same time on this machine; default: as many as the cores allow."""
 
     least: ClassVar = {"workers": 1}
 

@@ -82,14 +82,14 @@ class Run:
             if isinstance(record.get("env_kwargs"), dict):
                 record["env_kwargs"] = with_kept_arm(record["env_kwargs"], folder)
             self.config: TrainConfig = TrainConfig.from_json(record)
+        except BadFileError:
+            raise
         except (TypeError, ValueError) as error:
-            if isinstance(error, BadFileError):
-                raise
-            reason = f"is no configuration of a training by viapoint {versions()['viapoint']} ({error})"
-            writer = self.versions.get("viapoint")
-            raise BadFileError(
-                folder / "config.json", f"{reason}; it was written by viapoint {writer}" if writer else reason
-            ) from None
+            writer, mine = self.versions.get("viapoint", "of an unknown version"), versions()["viapoint"]
+            reason = (
+                f"was written by viapoint {writer}, and is no configuration of a training by {mine} ({error})"
+            )
+            raise BadFileError(folder / "config.json", reason) from None
 
     def __repr__(self) -> str:
         config, curve = self.config, self.curve

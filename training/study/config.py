@@ -83,11 +83,9 @@ class Trial:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
-    """Search for hyperparameters of one algorithm in one environment."""
+class Search(Trial):
+    """Search for hyperparameters of one algorithm in one environment; the fields of the trial are what all share."""
 
-    trial: Trial
-    """Training that all trials of the search share, with the name of the search."""
     parameters: Values
     """Range or list of values by the path of a field, such as `hyperparameters.learning_rate`."""
     trials: int = 20
@@ -95,22 +93,20 @@ class Search:
     first: tuple[Values, ...] = ()
     """Parameters of the first trials."""
 
-    def config(self, values: Values, folder: Path) -> TrainConfig:
+    def with_parameters(self, values: Values, folder: Path) -> TrainConfig:
         """Return the configuration of a training with these parameters."""
-        training = _with(self.trial.training, values)
-        return dataclasses.replace(
-            dataclasses.replace(self.trial, training=training).config(folder), out=folder
-        )
+        trial = dataclasses.replace(self, training=_with(self.training, values))
+        return dataclasses.replace(trial.config(folder), out=folder)
 
     @property
     def key(self) -> str:
         """Name that changes with the description of the search."""
         plain = json.dumps(dataclasses.asdict(self), sort_keys=True)
-        return f"{self.trial.row}-{hashlib.sha256(plain.encode()).hexdigest()[:10]}"
+        return f"{self.row}-{hashlib.sha256(plain.encode()).hexdigest()[:10]}"
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the search."""
-        return self.trial.folder(out).parent
+        return super().folder(out).parent
 
     def is_finished(self, out: Path) -> bool:
         """Return whether the best parameters of this very search are there."""
@@ -205,7 +201,7 @@ def _study(
     for name, fields in _entries(environments):
         fields = {"scenes": scenes, "n_scenes": n_scenes, **fields}
         known[name] = _made(f"environments.{name}", _environment, fields, name, folder)
-    found: list[Trial | Search] = []
+    found: list[Trial] = []
     rows: set[str] = set()
     for make, given in ((_agent, agents), (_baseline, baselines), (_search, searches)):
         for name, fields in _entries(given or {}):
@@ -219,13 +215,10 @@ def _study(
                 found += _made(name, make, {**shared, **fields}, known[env], name)
     if not found:
         raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
-    trials = [each for each in found if isinstance(each, Trial)]
-    return Study(
-        name=default,
-        out=Path(out or f"runs/{default}").expanduser(),
-        trials=tuple(sorted(trials, key=lambda trial: trial.seed)),
-        searches=tuple(each for each in found if isinstance(each, Search)),
-    )
+    searches = tuple(each for each in found if isinstance(each, Search))
+    trials = sorted((each for each in found if not isinstance(each, Search)), key=lambda trial: trial.seed)
+    place = Path(out or f"runs/{default}").expanduser()
+    return Study(name=default, out=place, trials=tuple(trials), searches=searches)
 
 
 def _entries(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -344,8 +337,8 @@ def _search(
     for path, given in parameters.items():
         for value in _ends(path, given):  # an impossible value is an error now, and not in the last trial
             _made("parameters", _agent, {"seeds": [0], **_with(training, {path: value})}, env, row)
-    number = check_whole("trials", trials, 1)
-    return [Search(trial=trial, parameters=parameters, trials=number, first=tuple(first or ()))]
+    own: dict[str, Any] = {"parameters": parameters, "trials": check_whole("trials", trials, 1)}
+    return [Search(**env, row=row, seed=trial.seed, training=training, first=tuple(first or ()), **own)]
 
 
 def _ends(path: str, given: Any) -> list[Any]:
