@@ -93,6 +93,8 @@ BENCHMARK = "motionbenchmaker"
 """Name of the scene set that measures planners."""
 MOTION_FILES = (".csv", ".yaml", ".yml")
 """Suffixes of files of movements."""
+UNNAMED = "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
+NOTHING_TO_CHECK = "checks concerns an agent, and none is given"
 USUAL_BASELINES = ("straight", "random", "search512")
 """Baselines of an evaluation."""
 
@@ -302,20 +304,31 @@ class TrainConfig(Config):
 
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig(Config):
-    """Configuration of a command for one agent."""
+    """Configuration of a command for an agent, an environment or an arm."""
 
     agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
     """Run folder, model folder, or id of an environment with a shipped agent."""
     pretrained: Annotated[str | None, PRETRAINED] = None
     """Id of an environment: its shipped agent, as if the id were given as AGENT."""
+    env: Annotated[str | None, ENV] = None
+    """Id of the environment; default: that of the agent."""
+    arm: Annotated[str | None, ARM] = None
+    """Arm, in an environment with obstacles if none is named, or in place of that of an agent."""
+
+    @property
+    def unnamed(self) -> bool:
+        """True if neither an agent nor an environment nor an arm is named."""
+        return self.agent is self.env is self.arm is None
 
     def _check(self) -> None:
+        if self.env is not None:
+            check_registered(self.env)
         if self.pretrained is None:
             return
         if self.agent not in (None, self.pretrained):
             raise ValueError(f"the agent is named twice: {self.agent} and pretrained={self.pretrained}")
         if self.pretrained not in SHIPPED_IDS:
-            raise ValueError(f"pretrained must be one of {', '.join(SHIPPED_IDS)}, got {self.pretrained!r}")
+            raise ValueError(unknown_name("pretrained", self.pretrained, SHIPPED_IDS))
         object.__setattr__(self, "agent", self.pretrained)
 
 
@@ -343,10 +356,6 @@ class EvaluateConfig(AgentConfig):
     """Form in which the table is printed: for the terminal, Markdown, CSV or JSON."""
     json: Path | None = None
     """JSON file for all results, scene by scene."""
-    env: Annotated[str | None, ENV] = None
-    """Id of the environment; default: that of the agent."""
-    arm: Annotated[str | None, ARM] = None
-    """Arm on which baselines are evaluated, or the one that replaces the arm of an agent."""
 
     least: ClassVar = {"n_scenes": 1}
 
@@ -359,35 +368,28 @@ class EvaluateConfig(AgentConfig):
         super()._check()
         if len(set(self.baselines)) < len(self.baselines):
             raise ValueError(f"baselines must differ, got {', '.join(self.baselines)}")
-        if self.env is not None:
-            check_registered(self.env)
-        if self.of_planners:
-            if not self.agent is self.env is self.arm is None:
-                raise ValueError(
-                    "motionbenchmaker measures planners: name neither an agent nor an environment"
-                )
-        elif self.agent is self.env is self.arm is None:
-            raise ValueError(
-                "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
-            )
-        for number in self.checks:
-            check_whole("checks", number, 0)
+        if self.of_planners and not self.unnamed:
+            raise ValueError("motionbenchmaker measures planners: name neither an agent nor an environment")
+        if self.unnamed and not self.of_planners:
+            raise ValueError(UNNAMED)
         if not self.checks:
             raise ValueError("checks must name at least one number, such as 0")
-        check_file("json", self.json)
+        for number in self.checks:
+            check_whole("checks", number, 0)
         if any(self.checks) and self.agent is None:
-            raise ValueError("checks concerns an agent, and none is given")
+            raise ValueError(NOTHING_TO_CHECK)
+        check_file("json", self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlayConfig(AgentConfig):
     """Record a video of an agent's movements.
 
+    Without an agent, the movements are those of search512.
+
     Example: viapoint play viapoint/PlanarObstacles-v0 --video movements.mp4 --scenes hard
     """
 
-    arm: Annotated[str | None, ARM] = None
-    """Arm that the geometry search moves where no agent is named, or the one that replaces the arm of an agent."""
     video: Path = Path("movements.mp4")
     """MP4 file to write."""
     scenes: str = "test"
@@ -401,10 +403,10 @@ class PlayConfig(AgentConfig):
 
     def _check(self) -> None:
         super()._check()
-        if self.agent is self.arm is None:
-            raise ValueError("name an agent: run folder, model folder or id; or an arm with --arm")
+        if self.unnamed:
+            raise ValueError(UNNAMED)
         if self.agent is None and self.checks:
-            raise ValueError("checks concerns an agent, and none is given")
+            raise ValueError(NOTHING_TO_CHECK)
         check_file("video", self.video, ".mp4")
 
 
@@ -478,21 +480,12 @@ class LiveConfig(AgentConfig):
     Example: viapoint live --arm panda
     """
 
-    env: Annotated[str | None, ENV] = None
-    """Id of the environment; an agent that is shipped for it can be chosen on the page."""
-    arm: Annotated[str | None, ARM] = None
-    """Arm of the page, in an environment with obstacles if none is named."""
     port: int = 8080
     """Port to listen on; 0 for a free one."""
     seed: int | None = None
     """Seed of the random scenes."""
 
     least: ClassVar = {"port": 0, "seed": 0}
-
-    def _check(self) -> None:
-        super()._check()
-        if self.env is not None:
-            check_registered(self.env)
 
 
 @dataclass(frozen=True, kw_only=True)
