@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import gymnasium as gym
 import pandas as pd
@@ -71,13 +71,18 @@ def evaluate(config: EvaluateConfig) -> None:
         record["weights_sha256"] = read_json(run.best / "model.json").get("weights_sha256")
         partial = ".partial" if result.partial else ""
         name = f"{Path(config.scenes).stem}-{result.sha256[:8]}{partial}"  # the hash is that of the scenes
-        print(f"kept as {run.write_evaluation(name, record)}", file=sys.stderr)
+        print(f"kept as {run.write_evaluation(name, record)}", file=_notes(config))
     if config.json is not None:
         write_json(config.json, record)
-        print(f"results, scene by scene: {config.json}", file=sys.stderr)
+        print(f"results, scene by scene: {config.json}", file=_notes(config))
     if result.partial:
-        print("the results are partial", file=sys.stderr)
+        print("the results are partial", file=_notes(config))
         raise KeyboardInterrupt
+
+
+def _notes(config: EvaluateConfig) -> TextIO:
+    """Return where to print what is not part of the table: elsewhere if a program reads it."""
+    return sys.stderr if config.format in ("csv", "json") else sys.stdout
 
 
 def _measure_planners(config: EvaluateConfig) -> None:
@@ -98,7 +103,7 @@ def _measure_planners(config: EvaluateConfig) -> None:
         print(f"{benchmark_report.markdown(table)}\n\n{benchmark_report.NOTES}")
     if config.json is not None:
         write_json(config.json, table.to_dict("records"))
-        print(f"results, problem by problem: {config.json}", file=sys.stderr)
+        print(f"results, problem by problem: {config.json}", file=_notes(config))
 
 
 def play(config: PlayConfig) -> None:
