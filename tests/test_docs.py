@@ -101,5 +101,5 @@ def test_commands_are_known(name):
 @pytest.mark.parametrize("name", cli.COMMANDS)
 def test_the_example_of_each_command_is_understood(name):
     config = cli.COMMANDS[name][0]
-    example = re.search(r"Example: viapoint (.+)", config.__doc__).group(1)
+    example = re.search(r"Example: (?:.*; )?viapoint (.+)", config.__doc__).group(1)
     assert type(cli.parse(shlex.split(example))) is config

@@ -138,7 +138,6 @@ CONTENTS = {
         b'{"format": ' + b"9" * 100_000 + b"}",
         b'{"format": 1e999}',
         b'{"format": NaN}',
-        b'{"format": 1, "format": 2}',
         b'{"format": 1}',
         b"[]",
         b"\xff\xfe\x00",

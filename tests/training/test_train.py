@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import resource
+import shlex
 import signal
 
 import numpy as np
@@ -150,8 +151,11 @@ def test_ctrl_c_saves_and_leaves_and_the_rest_follows(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(ViaVecEnv, "step_wait", interrupted)
-        with pytest.raises(TrainingStoppedError, match="--resume") as stop:
+        with pytest.raises(TrainingStoppedError, match="go on with") as stop:
             train(config(tmp_path / "stopped", checkpoint_every=10_000))
+    told = shlex.split(str(stop.value).partition("go on with: ")[2])
+    resume = cli.parse(told[1:])
+    assert (resume.folder, resume.resume) == (tmp_path / "stopped", True)
     assert stop.value.exit_code == 130
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     stopped = Run(tmp_path / "stopped")
@@ -189,7 +193,6 @@ def test_a_training_that_stalls_ends_there_and_says_so(algo, tmp_path, monkeypat
     # Success rises at 192 decisions; at 320, 128 of them are 40 %.
     assert [record["decisions"] for record in run.curve] == [0, 64, 128, 192, 256, 320]
     assert (run.stalled, run.ended, run.decisions) == (True, True, 320)
-    assert run.best_record["decisions"] == 192
     assert load_model(run.final).num_timesteps == 320
     assert heard.ended == 1
     again = train(TrainConfig(out=run.folder, resume=True, n_timesteps=1280, progress=False))
@@ -301,6 +304,22 @@ def test_other_versions_are_told(tmp_path, capsys):
     (run.folder / "config.json").write_text(json.dumps({"colour": "red"}))
     with pytest.raises(BadFileError, match=r"7\.2\.0"):
         Run(run.folder)
+
+
+def test_what_cannot_learn_is_told(tmp_path, capsys):
+    train(small(tmp_path / "a", n_timesteps=32))
+    assert "not updated once" in capsys.readouterr().err
+    train(small(tmp_path / "b", n_timesteps=64, env_kwargs={"threads": 1, "n_via": 0}))
+    told = capsys.readouterr().err
+    assert "n_via=0" in told
+    assert "updated" not in told
+
+
+def test_a_log_holds_a_line_for_each_validation_and_no_bar(tmp_path, capsys):
+    run = train(config(tmp_path / "run", n_timesteps=64, progress=True))
+    told = capsys.readouterr().err
+    assert "\r" not in told
+    assert len(told.strip().splitlines()) == len(run.curve) == 2
 
 
 def test_half_a_training_and_the_other_half_are_a_whole_one(tmp_path):

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any, TextIO
 
 import gymnasium as gym
 import pandas as pd
 
-from viapoint.training.agents.agent import load_agent
+from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.config.configs import (
     USUAL_BASELINES,
     EvaluateConfig,
@@ -36,16 +37,22 @@ def train(config: TrainConfig) -> None:
     print(training.train(config))
 
 
+def _named(config: EvaluateConfig | PlayConfig) -> tuple[Agent | None, str, dict[str, Any]]:
+    """Return the agent of a configuration, if any, and the id and the arguments of the environment."""
+    agent = None if config.agent is None else load_agent(config.agent)
+    if agent is not None and config.env not in (None, agent.env_id):
+        raise ValueError(f"env must be {agent.env_id}, on which the agent was trained, got {config.env!r}")
+    env_id, argument = env_of_arm(config.arm, config.env if agent is None else agent.env_id)
+    assert env_id is not None
+    return agent, env_id, {**({} if agent is None else agent.env_kwargs), **argument}
+
+
 def evaluate(config: EvaluateConfig) -> None:
     """Evaluate, print the table, and write the results."""
     if config.of_planners:
         _measure_planners(config)
         return
-    agent = None if config.agent is None else load_agent(config.agent)
-    env, env_kwargs = config.env, None
-    if config.arm is not None:
-        env, argument = env_of_arm(config.arm, config.env if agent is None else agent.env_id)
-        env_kwargs = {**({} if agent is None else agent.env_kwargs), **argument}
+    agent, env, env_kwargs = _named(config)
     with scene_progress() as progress:
         result = measure(
             agent,
@@ -65,13 +72,18 @@ def evaluate(config: EvaluateConfig) -> None:
         record["weights_sha256"] = read_json(run.best / "model.json").get("weights_sha256")
         partial = ".partial" if result.partial else ""
         name = f"{Path(config.scenes).stem}-{result.sha256[:8]}{partial}"  # the hash is that of the scenes
-        print(f"kept as {run.write_evaluation(name, record)}", file=sys.stderr)
+        print(f"kept as {run.write_evaluation(name, record)}", file=_notes(config))
     if config.json is not None:
         write_json(config.json, record)
-        print(f"results, scene by scene: {config.json}", file=sys.stderr)
+        print(f"results, scene by scene: {config.json}", file=_notes(config))
     if result.partial:
-        print("the results are partial", file=sys.stderr)
+        print("the results are partial", file=_notes(config))
         raise KeyboardInterrupt
+
+
+def _notes(config: EvaluateConfig) -> TextIO:
+    """Return where to print what is not part of the table: elsewhere if a program reads it."""
+    return sys.stderr if config.format in ("csv", "json") else sys.stdout
 
 
 def _measure_planners(config: EvaluateConfig) -> None:
@@ -92,19 +104,16 @@ def _measure_planners(config: EvaluateConfig) -> None:
         print(f"{benchmark_report.markdown(table)}\n\n{benchmark_report.NOTES}")
     if config.json is not None:
         write_json(config.json, table.to_dict("records"))
-        print(f"results, problem by problem: {config.json}", file=sys.stderr)
+        print(f"results, problem by problem: {config.json}", file=_notes(config))
 
 
 def play(config: PlayConfig) -> None:
     """Record a video of the movements of an agent, or of the geometry search."""
     from viapoint.training.plotting.video import record_video
 
-    agent = None if config.agent is None else load_agent(config.agent)
-    env_id, argument = env_of_arm(config.arm, agent.env_id if agent is not None else None)
-    assert env_id is not None
-    env_kwargs = {**(agent.env_kwargs if agent is not None else {}), **argument}
+    agent, env_id, env_kwargs = _named(config)
     task = registered_task(env_id, **env_kwargs)
-    scenes = scenes_for(config.scenes, task, config.n_scenes).spread(config.n_scenes).scenes
+    scenes = scenes_for(config.scenes, task, config.n_scenes).scenes
     env = gym.make(env_id, render_mode="rgb_array_list", **env_kwargs)
     if agent is None:
         method = make_method("search512", env_id, **env_kwargs)

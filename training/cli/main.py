@@ -46,6 +46,15 @@ COMMANDS: dict[str, tuple[type[Any], str]] = {
     "doctor": (DoctorConfig, "cli.doctor:run"),
 }
 """Configuration and function of each subcommand; the function is imported when it is called."""
+OVERVIEW = """usage: viapoint COMMAND [OPTIONS]
+
+Agents that reach around obstacles by placing via-points of minimum-jerk
+movements.
+
+{commands}
+
+viapoint COMMAND --help shows the options of a command and an example;
+--debug shows where an error came from."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -109,20 +118,8 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
 
 def _overview() -> str:
     """Return the help of the command without a subcommand."""
-    lines = [f"  {name:<10}{kind.__doc__.partition(chr(10))[0]}" for name, (kind, _) in COMMANDS.items()]
-    return "\n".join(
-        (
-            "usage: viapoint COMMAND [OPTIONS]",
-            "",
-            "Agents that reach around obstacles by placing via-points of minimum-jerk",
-            "movements.",
-            "",
-            *lines,
-            "",
-            "viapoint COMMAND --help shows the options of a command and an example;",
-            "--debug shows where an error came from.",
-        )
-    )
+    lines = [f"  {name:<10}{str(kind.__doc__).splitlines()[0]}" for name, (kind, _) in COMMANDS.items()]
+    return OVERVIEW.format(commands="\n".join(lines))
 
 
 def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:

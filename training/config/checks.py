@@ -37,7 +37,7 @@ ELSEWHERE = {
 }
 """Arguments that a training's environment does not take, and what to use instead."""
 GREATEST = {"seed": 2**32 - 1, "n_envs": 1 << 16, "n_timesteps": 10**9, "port": 65535}
-"""Greatest values: seeds of NumPy's legacy generator, environments that fit into memory, days of training, and ports."""
+"""Greatest values: seeds of NumPy's legacy generator, environments in memory, days of training, and ports."""
 
 
 def unknown_name(what: str, value: object, allowed: Collection[str]) -> str:

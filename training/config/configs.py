@@ -9,7 +9,7 @@ import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 import tyro
@@ -93,6 +93,8 @@ BENCHMARK = "motionbenchmaker"
 """Name of the scene set that measures planners."""
 MOTION_FILES = (".csv", ".yaml", ".yml")
 """Suffixes of files of movements."""
+UNNAMED = "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
+NOTHING_TO_CHECK = "checks concerns an agent, and none is given"
 USUAL_BASELINES = ("straight", "random", "search512")
 """Baselines of an evaluation."""
 
@@ -283,46 +285,50 @@ class TrainConfig(Config):
 
     def as_json(self) -> dict[str, Any]:
         """Return the configuration as plain values; :meth:`from_json` is the inverse."""
-        values: dict[str, Any] = {}
-        for each in dataclasses.fields(self):
-            value = getattr(self, each.name)
-            if isinstance(value, Path):
-                value = str(value)
-            values[each.name] = list(value) if isinstance(value, tuple) else value
-        return values
+        values = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+        return {**values, "out": None if self.out is None else str(self.out)}
 
     @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> Self:
+    def from_json(cls, record: Mapping[str, Any]) -> TrainConfig:
         """Return the configuration that plain values describe.
 
         Raises:
             ValueError: A name is unknown or a value is not allowed.
         """
         names = [each.name for each in dataclasses.fields(cls)]
-        unknown = sorted(set(record) - set(names))
-        if unknown:
-            raise ValueError(f"a training has {', '.join(names)}, not {unknown[0]!r}")
-        return cls(
-            **{name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
-        )
+        for name in record:
+            if name not in names:
+                raise ValueError(unknown_name("fields of a training", name, names))
+        return cls(**record)
 
 
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig(Config):
-    """Configuration of a command for one agent."""
+    """Configuration of a command for an agent, an environment or an arm."""
 
     agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
     """Run folder, model folder, or id of an environment with a shipped agent."""
     pretrained: Annotated[str | None, PRETRAINED] = None
     """Id of an environment: its shipped agent, as if the id were given as AGENT."""
+    env: Annotated[str | None, ENV] = None
+    """Id of the environment; default: that of the agent."""
+    arm: Annotated[str | None, ARM] = None
+    """Arm, in an environment with obstacles if none is named, or in place of that of an agent."""
+
+    @property
+    def unnamed(self) -> bool:
+        """True if neither an agent nor an environment nor an arm is named."""
+        return self.agent is self.env is self.arm is None
 
     def _check(self) -> None:
+        if self.env is not None:
+            check_registered(self.env)
         if self.pretrained is None:
             return
         if self.agent not in (None, self.pretrained):
             raise ValueError(f"the agent is named twice: {self.agent} and pretrained={self.pretrained}")
         if self.pretrained not in SHIPPED_IDS:
-            raise ValueError(f"pretrained must be one of {', '.join(SHIPPED_IDS)}, got {self.pretrained!r}")
+            raise ValueError(unknown_name("pretrained", self.pretrained, SHIPPED_IDS))
         object.__setattr__(self, "agent", self.pretrained)
 
 
@@ -352,10 +358,6 @@ class EvaluateConfig(AgentConfig):
     """Form in which the table is printed: for the terminal, Markdown, CSV or JSON."""
     json: Path | None = None
     """JSON file for all results, scene by scene."""
-    env: Annotated[str | None, ENV] = None
-    """Id of the environment; default: that of the agent."""
-    arm: Annotated[str | None, ARM] = None
-    """Arm on which baselines are evaluated, or the one that replaces the arm of an agent."""
 
     least: ClassVar = {"n_scenes": 1}
 
@@ -368,37 +370,30 @@ class EvaluateConfig(AgentConfig):
         super()._check()
         if len(set(self.baselines)) < len(self.baselines):
             raise ValueError(f"baselines must differ, got {', '.join(self.baselines)}")
-        if self.env is not None:
-            check_registered(self.env)
-        if self.of_planners:
-            if not self.agent is self.env is self.arm is None:
-                raise ValueError(
-                    "motionbenchmaker measures planners: name neither an agent nor an environment"
-                )
-        elif self.agent is self.env is self.arm is None:
-            raise ValueError(
-                "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
-            )
-        for number in self.checks:
-            check_whole("checks", number, 0)
+        if self.of_planners and not self.unnamed:
+            raise ValueError("motionbenchmaker measures planners: name neither an agent nor an environment")
+        if self.unnamed and not self.of_planners:
+            raise ValueError(UNNAMED)
         if not self.checks:
             raise ValueError("checks must name at least one number, such as 0")
-        check_file("json", self.json)
+        for number in self.checks:
+            check_whole("checks", number, 0)
         for number in self.refine:
             check_whole("refine", number, 1)
         if (any(self.checks) or self.refine) and self.agent is None:
-            raise ValueError("checks and refine concern an agent, and none is given")
+            raise ValueError(NOTHING_TO_CHECK)
+        check_file("json", self.json)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlayConfig(AgentConfig):
     """Record a video of an agent's movements.
 
+    Without an agent, the movements are those of search512.
+
     Example: viapoint play viapoint/PlanarObstacles-v0 --video movements.mp4 --scenes hard
     """
 
-    arm: Annotated[str | None, ARM] = None
-    """Arm that the geometry search moves where no agent is named, or the one that replaces the arm of an agent."""
     video: Path = Path("movements.mp4")
     """MP4 file to write."""
     scenes: str = "test"
@@ -412,10 +407,10 @@ class PlayConfig(AgentConfig):
 
     def _check(self) -> None:
         super()._check()
-        if self.agent is self.arm is None:
-            raise ValueError("name an agent: run folder, model folder or id; or an arm with --arm")
+        if self.unnamed:
+            raise ValueError(UNNAMED)
         if self.agent is None and self.checks:
-            raise ValueError("checks concerns an agent, and none is given")
+            raise ValueError(NOTHING_TO_CHECK)
         check_file("video", self.video, ".mp4")
 
 
@@ -489,21 +484,12 @@ class LiveConfig(AgentConfig):
     Example: viapoint live --arm panda
     """
 
-    env: Annotated[str | None, ENV] = None
-    """Id of the environment; an agent that is shipped for it can be chosen on the page."""
-    arm: Annotated[str | None, ARM] = None
-    """Arm of the page, in an environment with obstacles if none is named."""
     port: int = 8080
     """Port to listen on; 0 for a free one."""
     seed: int | None = None
     """Seed of the random scenes."""
 
     least: ClassVar = {"port": 0, "seed": 0}
-
-    def _check(self) -> None:
-        super()._check()
-        if self.env is not None:
-            check_registered(self.env)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -533,16 +519,12 @@ class DemoConfig(Config):
     """Folder for all files; existing results are kept."""
     env: Annotated[str, ENV] = DEFAULT_ENV
     """Id of the environment."""
-    seed: int = 0
-    """Seed of the training."""
     n_timesteps: int | None = None
     """Decisions in total; default: a quarter of those of the preset."""
     n_scenes: int | None = None
     """Number of test scenes, evenly spread over the set; all if not given."""
-    checks: int = 16
-    """Number of proposals that the agent checks with exact geometry in its second row of the table."""
 
-    least: ClassVar = {"seed": 0, "n_timesteps": 1, "n_scenes": 1, "checks": 1}
+    least: ClassVar = {"n_timesteps": 1, "n_scenes": 1}
 
     def _check(self) -> None:
         check_registered(self.env)
@@ -575,7 +557,7 @@ class StudyConfig(Config):
 
     The same command continues a study that was stopped, and does what was added to its file.
 
-    Example: echo '{environments: [viapoint/PlanarReach-v0], baselines: [straight]}' > reach.yaml; viapoint study reach.yaml
+    Example: echo '{environments: [viapoint/PlanarReach-v0], baselines: [straight]}' > a.yaml; viapoint study a.yaml
     """
 
     file: tyro.conf.Positional[Path]
@@ -585,7 +567,7 @@ class StudyConfig(Config):
     address: str | None = None
     """Address HOST:PORT of a Ray cluster; default: a Ray of its own on this machine."""
     workers: int | None = None
-    """Number of trials at the same time; default: as many as the cores allow."""
+    """Number of trials at the same time on this machine; default: as many as the cores allow."""
 
     least: ClassVar = {"workers": 1}
 

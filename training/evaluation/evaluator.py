@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ Progress = Callable[[str, int, int], None]
 """Function of the method's name, the number of finished scenes and the number of all scenes."""
 
 TIMED_DECISIONS = 200
-"""Greatest number of single decisions that are timed."""
+"""Number of single decisions after which no further scene is timed."""
 TIMING_BUDGET = 3.0
 """Wall time after which no further decision is timed, [s]."""
 SLOW_DECISION = 0.1
@@ -234,7 +234,8 @@ def evaluate(
     for each in baselines:
         if isinstance(each, str) and not (each == "untrained" and isinstance(agent, BaseAlgorithm)):
             check_method(each, task)
-    chosen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(str(scenes), task, n_scenes)
+    frozen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(scenes, task, n_scenes)
+    chosen = frozen.spread(n_scenes)
     if n_scenes is not None and n_scenes > len(chosen.share):
         print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
     methods = _rows_of(agent, settings)
@@ -242,7 +243,7 @@ def evaluate(
         methods += _baseline(each, agent, settings, env_id, kwargs)
     return evaluate_methods(
         methods,
-        chosen.spread(n_scenes),
+        chosen,
         env_id,
         env_kwargs=kwargs,
         time_decisions=time_decisions,
@@ -379,45 +380,32 @@ def _distances(scenes: Scenes, task: Task) -> Float:
 
 
 def _decision_times(method: Method, scenes: Scenes, simulation: SceneSimulation, in_batch: float) -> Float:
-    """Return the wall times of single decisions, [s]; for a slow method, the mean in a batch."""
-    times: list[float] = []
-    for seconds in single_decision_times(method, scenes, simulation, TIMED_DECISIONS + 1, TIMING_BUDGET):
-        times.append(seconds)
-        usual = float(np.median(times[1:] or [seconds / 20.0]))  # the first may warm up
-        if usual > SLOW_DECISION:
-            return np.array([in_batch])
-    return np.array(times[1:] or times)
-
-
-def single_decision_times(
-    method: Method, scenes: Scenes, simulation: SceneSimulation, most: int, budget: float
-) -> Iterator[float]:
-    """Yield the wall times of single decisions, [s], until there are `most` of them or the budget, [s], is spent.
+    """Return the wall times of single decisions, [s]; for a slow method, the mean in a batch.
 
     In tasks with replanning, they are all decisions of whole episodes: those in motion take longer than the first ones.
     """
-    seconds: list[float] = []
+    times: list[float] = []
 
     def decide(observation: Observation, scenes: Scenes) -> Float:
         before = time.perf_counter()
         decided = method.decide(observation, scenes)
-        seconds.append(time.perf_counter() - before)
+        times.append(time.perf_counter() - before)
         return decided
 
     began = time.perf_counter()
     replanning = simulation.task.replanning and not hasattr(method, "execute")
-    alone = SceneSimulation(simulation.env_id, 1, **simulation.kwargs) if replanning else None
-    with closing(alone) if alone else nullcontext():
-        for row in range(min(most, len(scenes.start))):
+    with closing(SceneSimulation(simulation.env_id, 1, **simulation.kwargs)) as alone:
+        for row in range(len(scenes.start)):
             one = scenes.take(slice(row, row + 1))
             decided = decide(simulation.observe(one), one)
-            if alone is not None:
+            if replanning:
                 alone.episodes(one, decided, decide)
-            yield from seconds
-            most -= len(seconds)
-            seconds.clear()
-            if most <= 0 or time.perf_counter() - began > budget:
+            usual = float(np.median(times[1:] or [times[0] / 20.0]))  # the first may warm up
+            if usual > SLOW_DECISION:
+                return np.array([in_batch])
+            if len(times) > TIMED_DECISIONS or time.perf_counter() - began > TIMING_BUDGET:
                 break
+    return np.array(times[1:] or times)
 
 
 @contextmanager

@@ -106,7 +106,7 @@ def formatted(record: Record, form: Format) -> str:
     """Return the metrics of an evaluation in a format: a table for terminals, Markdown, CSV or JSON."""
     if form == "csv":
         rows = [{"method": name, **summary} for name, summary in record["methods"].items()]
-        return pd.json_normalize(rows, sep=" ").to_csv(index=False).rstrip()
+        return str(pd.json_normalize(rows, sep=" ").to_csv(index=False)).rstrip()
     if form == "json":
         return json.dumps({name: value for name, value in record.items() if name != "outcomes"}, indent=1)
     return markdown(record).rstrip() if form == "md" else text(record)

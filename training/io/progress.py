@@ -19,9 +19,12 @@ def progress_bar(**settings: Any) -> Any:
 def scene_progress() -> Iterator[Callable[[str, int, int], None]]:
     """Show a bar over the scenes of each method; the context is a function of name, finished and all scenes."""
     with progress_bar(unit=" scenes", delay=0.01) as bar:
+        shown = ""
 
         def progress(name: str, done: int, total: int) -> None:
-            if bar.desc != f"{name}: ":
+            nonlocal shown
+            if name != shown:
+                shown = name
                 bar.reset(total)
                 bar.set_description(name)
             bar.update(done - bar.n)

@@ -120,7 +120,6 @@ class ViaVecEnv(VecEnv):
         self.env_id, self.env_kwargs = env_id, dict(kwargs)
         spaces = self.venv.single_observation_space, self.venv.single_action_space
         VecEnv.__init__(self, num_envs, *spaces)
-        self._batched_options: Mapping[str, Any] | None = None
         self._actions: NDArray[Any] | None = None
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, dtype=np.int64)
@@ -133,25 +132,19 @@ class ViaVecEnv(VecEnv):
         """Number of physics steps so far; 0 if the environment does not count them."""
         return int(getattr(self.venv.unwrapped, "physics_steps", 0))
 
-    def set_options(self, options: Sequence[Mapping[str, Any]] | Mapping[str, Any] | None = None) -> None:
-        """Set the options of the next reset.
-
-        Args:
-            options: Batched options as the environment accepts them, or a list of one mapping per copy.
-
-        Raises:
-            ValueError: There is not one mapping per copy, or their names differ.
-        """
-        if options is None or isinstance(options, Mapping):
-            self._batched_options = options
-        else:
-            self._batched_options = _batched(options, self.num_envs)
-
     def reset(self) -> Observation:
-        """Start a new episode in every copy."""
+        """Start a new episode in every copy, with the options of :meth:`set_options`, if any."""
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
-        options, self._batched_options = self._batched_options, None  # refused ones must not be met again
-        observation, _ = self.venv.reset(seed=seeds, options=options)
+        given: Any = self._options
+        self._reset_options()  # refused ones must not be met again
+        try:
+            names, *others = [set(each.keys()) for each in given]
+        except (TypeError, AttributeError):
+            names, others = set(), []
+        if len(others) != self.num_envs - 1 or any(each != names for each in others):
+            raise ValueError(f"options must be a mapping, or a list of {self.num_envs} alike, got {given!r}")
+        options = {name: [each[name] for each in given] for name in names}
+        observation, _ = self.venv.reset(seed=seeds, options=options or None)
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0.0, 0
         started: Observation = observation
@@ -246,15 +239,3 @@ class ViaVecEnv(VecEnv):
         if any(not -self.num_envs <= row < self.num_envs for row in rows):
             raise IndexError(f"indices must be of {self.num_envs} copies, got {indices!r}")
         return rows
-
-
-def _batched(options: Any, num_envs: int) -> dict[str, list[Any]]:
-    """Return the options of all copies in one mapping of lists."""
-    listed = isinstance(options, Sequence) and len(options) == num_envs
-    if not listed or not all(isinstance(each, Mapping) for each in options):
-        raise ValueError(
-            f"options must be a mapping, or a list of {num_envs}, one for each copy, got {options!r}"
-        )
-    if any(each.keys() != options[0].keys() for each in options):
-        raise ValueError(f"options must give the same names for every copy, got {options!r}")
-    return {name: [each[name] for each in options] for name in options[0]}

@@ -16,7 +16,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from viapoint.training.evaluation.evaluator import MethodResult, evaluate_methods
 from viapoint.training.io.progress import progress_bar
 from viapoint.training.planning.baselines import agent_method
-from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.rollouts.vec_env import LOGGED, ViaVecEnv
 from viapoint.training.runs.run_dir import Run
@@ -224,6 +223,4 @@ def _timestep(env: Any) -> float:
 
 def validation_scenes(run: Run) -> FrozenScenes:
     """Return the shipped validation scenes of a run's environment, or reproducibly sampled ones if none fit."""
-    config = run.config
-    task = registered_task(config.env, **config.env_kwargs)
-    return scenes_for("validation", task, config.eval_scenes).spread(config.eval_scenes)
+    return scenes_for("validation", run.config.task, run.config.eval_scenes)

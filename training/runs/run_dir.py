@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -81,14 +82,14 @@ class Run:
             if isinstance(record.get("env_kwargs"), dict):
                 record["env_kwargs"] = with_kept_arm(record["env_kwargs"], folder)
             self.config: TrainConfig = TrainConfig.from_json(record)
+        except BadFileError:
+            raise
         except (TypeError, ValueError) as error:
-            if isinstance(error, BadFileError):
-                raise
-            reason = f"is no configuration of a training by viapoint {versions()['viapoint']} ({error})"
-            writer = self.versions.get("viapoint")
-            raise BadFileError(
-                folder / "config.json", f"{reason}; it was written by viapoint {writer}" if writer else reason
-            ) from None
+            writer, mine = self.versions.get("viapoint", "of an unknown version"), versions()["viapoint"]
+            reason = (
+                f"was written by viapoint {writer}, and is no configuration of a training by {mine} ({error})"
+            )
+            raise BadFileError(folder / "config.json", reason) from None
 
     def __repr__(self) -> str:
         config, curve = self.config, self.curve
@@ -109,12 +110,11 @@ class Run:
         folder = config.folder
         check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "versions.json", versions())
-        keep_arm(folder, config.task.arm)
-        try:
-            write_config(folder, config, new=True)
-        except FileExistsError:  # another process was faster
-            check_free(folder)
+        with _locked(folder):
+            check_free(folder)  # another process may have been faster
+            write_json(folder / "versions.json", versions())
+            keep_arm(folder, config.task.arm)
+            write_config(folder, config)
         return cls(folder)
 
     @property
@@ -127,15 +127,9 @@ class Run:
 
     @property
     def curve(self) -> list[dict[str, Any]]:
-        """Learning curve: one record for each evaluation; an incomplete last line is left out."""
+        """Learning curve: one record for each evaluation."""
         path = self.folder / "learning_curve.jsonl"
-        records = []
-        for line in path.read_text().splitlines() if path.exists() else []:
-            try:
-                records.append(json.loads(line))
-            except ValueError:
-                break
-        return records
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
     def write_curve(self, records: list[dict[str, Any]]) -> None:
         """Replace the learning curve."""
@@ -177,39 +171,35 @@ class Run:
         found = self._checkpoints.glob("[0-9]*.pt")
         return sorted(path for path in found if re.fullmatch(r"\d{10}", path.stem) and path.is_file())
 
-    def restore(self, model: BaseAlgorithm) -> tuple[dict[str, Any] | None, list[str]]:
-        """Set a model to the state of the newest intact checkpoint.
+    def restore(self, model: BaseAlgorithm) -> dict[str, Any] | None:
+        """Set a model to the state of the newest intact checkpoint, and print why newer ones were skipped.
 
         Returns:
-            Content of `extra`, None without any checkpoint; and the reasons why newer checkpoints were
-            skipped.
+            Content of `extra`; None without any checkpoint.
 
         Raises:
             BadFileError: There are checkpoints, but none is whole; the message is about the newest.
         """
-        passed_over: list[BadFileError] = []
+        newest = None
         for path in reversed(self.checkpoints()):
             try:
-                return read_checkpoint(model, path), [str(error) for error in passed_over]
+                return read_checkpoint(model, path)
             except BadFileError as error:
-                passed_over.append(error)
-        if passed_over:
-            raise passed_over[0]
-        return None, []
-
-    @property
-    def best_record(self) -> dict[str, Any] | None:
-        """First record of the highest success in the learning curve; None without any."""
-        return max(self.curve, key=lambda record: record["success"]["rate"], default=None)
+                print(f"passed over a damaged checkpoint: {error}", file=sys.stderr)
+                newest = newest or error
+        if newest is not None:
+            raise newest
+        return None
 
     @property
     def stalled(self) -> bool:
         """Flag: success had not risen for so long that training ended, see `stop_when_stalled`."""
         share = self.config.stop_when_stalled
-        best = None if share is None else self.best_record
-        if share is None or best is None:
+        curve = [] if share is None else self.curve
+        if share is None or not curve:
             return False
-        now = self.curve[-1]["decisions"]
+        now = curve[-1]["decisions"]
+        best = max(curve, key=lambda record: record["success"]["rate"])  # the first of several
         return bool(now >= self.config.preset.n_timesteps and now - best["decisions"] >= share * now)
 
     @property
@@ -231,11 +221,7 @@ class Run:
         Raises:
             BadFileError: Another process trains in the folder.
         """
-        try:
-            held = FileLock(self.folder / "lock").acquire(timeout=PATIENCE)
-        except Timeout:
-            raise BadFileError(self.folder, "is in use by another process") from None
-        with held:
+        with _locked(self.folder):
             for folder in (self.folder, self._checkpoints, self.folder / "evaluations"):
                 tidy(folder)
             yield
@@ -243,6 +229,17 @@ class Run:
     @property
     def _checkpoints(self) -> Path:
         return self.folder / "checkpoints"
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock a folder for this process."""
+    try:
+        held = FileLock(folder / "lock").acquire(timeout=PATIENCE)
+    except Timeout:
+        raise BadFileError(folder, "is in use by another process") from None
+    with held:
+        yield
 
 
 def check_free(folder: Path) -> None:
@@ -257,14 +254,14 @@ def check_free(folder: Path) -> None:
     check_folder("run folder", folder)
     names = {path.name for path in folder.iterdir()} if folder.exists() else set()
     begun = {name for name in names if UNFINISHED.fullmatch(name)}
-    if names - begun - {"versions.json", COPY}:
+    if names - begun - {"versions.json", COPY, "lock"}:
         raise BadFileError(folder, "is not empty and is no run folder")
     check_ours(folder / "versions.json")
 
 
-def write_config(folder: Path, config: TrainConfig, *, new: bool = False) -> None:
+def write_config(folder: Path, config: TrainConfig) -> None:
     """Write the configuration, which makes a folder a run, without the arguments of one call."""
-    write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False}, new=new)
+    write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False})
 
 
 def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = None) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -95,7 +94,7 @@ def train_or_resume(config: TrainConfig, callback: Callbacks = None) -> Run:
     if not (config.folder / "config.json").is_file():
         return train(config, callback)
     run = Run(config.folder)
-    check_unchanged(run, resolved(config))
+    check_unchanged(run, resolved(dataclasses.replace(config, n_timesteps=run.config.total_timesteps)))
     if run.ended and run.config.total_timesteps == config.total_timesteps:
         return run
     again = TrainConfig(
@@ -142,11 +141,11 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
         try:
             model = build(config.algo, config.preset.policy, env, config.hyperparameters, seed=config.seed)
         except UNFIT as error:
-            usual, asked = config.preset.arguments(), config.hyperparameters
-            other = {name: value for name, value in asked.items() if usual.get(name) != value}
-            given = ", ".join(f"{name}={json.dumps(value, default=str)}" for name, value in other.items())
-            made = f"made with {given}" if given else f"made for {config.env}"
-            raise ValueError(f"{config.algo} cannot be {made}: {error}") from error
+            usual = config.preset.arguments()
+            others = {name: each for name, each in config.hyperparameters.items() if usual.get(name) != each}
+            raise ValueError(
+                f"{config.algo} cannot be made for {config.env} with {others}: {error}"
+            ) from error
         yield model
 
 
@@ -180,21 +179,16 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
         run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
         write_config(run.folder, run.config)
     run.config = dataclasses.replace(run.config, progress=config.progress)
-    began, now = run.versions, versions()
+    began = run.versions
     others = [
-        f"{name} {began[name]} (now {now[name]})" for name in now if began.get(name, now[name]) != now[name]
+        f"{name} {began[name]} (now {now})" for name, now in versions().items() if began.get(name, now) != now
     ]
     if others:
-        print(
-            f"the run began with {', '.join(others)}: it may end otherwise than it would have",
-            file=sys.stderr,
-        )
+        print(f"the run began with {', '.join(others)}: it may end otherwise", file=sys.stderr)
 
 
 def _learn(model: BaseAlgorithm, run: Run, monitor: RunCallback, callback: Callbacks) -> None:
-    restored, passed_over = run.restore(model)
-    for reason in passed_over:
-        print(f"passed over a damaged checkpoint: {reason}", file=sys.stderr)
+    restored = run.restore(model)
     if restored is not None:
         monitor.restore(float(restored["seconds"]), model.num_timesteps)
     run.write_curve(monitor.curve)

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import tyro
@@ -36,10 +37,11 @@ from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import (
     BANDS,
     DRAWN,
+    MOVING,
+    OWN,
     SETS,
     FrozenScenes,
     load,
-    rounded,
     shipped_path,
     together,
 )
@@ -188,6 +190,17 @@ class Maker:
                 clearance = plan_clearances(self.task, problem, decided[:, None], 0.0, 0.0, exact=True)
                 solved[rows] &= clearance[:, 0] >= 0.0
         return solved
+
+
+def rounded(scenes: Scenes) -> Scenes:
+    """Return scenes whose numbers single precision represents."""
+    obstacles = scenes.obstacles._replace(**_single(scenes.obstacles, MOVING))
+    return scenes._replace(obstacles=obstacles, **_single(scenes, OWN))
+
+
+def _single(record: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Return fields of a record in numbers that single precision represents."""
+    return {name: getattr(record, name).astype(np.float32).astype(np.float64) for name in names}
 
 
 def _hardest(found: list[FrozenScenes], number: int) -> FrozenScenes:
