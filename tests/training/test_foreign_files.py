@@ -143,7 +143,7 @@ def test_what_the_paper_wrote_can_be_written_again(tmp_path, monkeypatch):
     for name in paper.DRAWINGS:
         picture, _ = save_figure(Figure(), tmp_path, name)
         pictures.append((picture, "caption"))
-    monkeypatch.setattr(paper, "reproduce", lambda *_: paper.Reproduction(claims, pictures))
+    monkeypatch.setattr(paper, "reproduce", lambda *_: (claims, pictures))
     for _ in range(2):
         paper.run(PaperConfig(out=tmp_path))
 

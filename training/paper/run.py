@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib.style
 import pandas as pd
@@ -85,14 +85,11 @@ AROUND_LIGHTS = (obstacles.obstacle_claims, figures.around_lights, figures.isoch
 """Functions of them that take the movements around obstacles."""
 
 
-class Reproduction(NamedTuple):
-    """Claims, and pictures (PNG) with their captions."""
-
-    claims: list[Claim]
-    pictures: list[tuple[Path, str]]
+Pictures = list[tuple[Path, str]]
+"""Figures (PNG) and their captions."""
 
 
-def reproduce(out: Path, agent: Path | None) -> Reproduction:
+def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], Pictures]:
     """Compute every row, row 12 with an agent or a search, and draw every figure."""
     avoidance = obstacles.light_movements(agent)
     show_progress = partial(tqdm, file=sys.stderr, dynamic_ncols=True)
@@ -103,12 +100,12 @@ def reproduce(out: Path, agent: Path | None) -> Reproduction:
     claims: list[Claim] = []
     for _, compute in show_progress(ROWS.values(), desc="rows"):
         claims += result_of(compute)
-    pictures = []
+    pictures: Pictures = []
     for name, (caption, draw) in show_progress(DRAWINGS.items(), desc="figures"):
         with matplotlib.style.context(figures.STYLE):
             picture, _ = figures.save(result_of(draw), out, name)
         pictures.append((picture, caption))
-    return Reproduction(claims, pictures)
+    return claims, pictures
 
 
 TITLE = "Flash & Hogan 1985, reproduced with viapoint"
@@ -131,9 +128,8 @@ def summary_of(claims: list[Claim]) -> str:
     return f"{sum(claim.holds for claim in claims)} of {len(claims)} claims hold."
 
 
-def write(reproduction: Reproduction, out: Path) -> None:
+def write(claims: list[Claim], pictures: Pictures, out: Path) -> None:
     """Write the tables and the page to a folder."""
-    claims, pictures = reproduction
     summary = summary_of(claims)
     table = pd.DataFrame([cells(claim) for claim in claims], columns=HEADINGS)
     aligned = ["left"] * 4 + ["right"] * 5 + ["left"]
@@ -180,13 +176,13 @@ class ClaimsFailedError(Exception):
 
 def run(config: PaperConfig) -> None:
     """Compute the claims, draw and write them, and raise an error if a claim does not hold."""
-    pictures = [f"{name}{suffix}" for name in DRAWINGS for suffix in (".png", ".svg")]
-    for name in (*PAGES, *pictures):
+    files_of_figures = [f"{name}{suffix}" for name in DRAWINGS for suffix in (".png", ".svg")]
+    for name in (*PAGES, *files_of_figures):
         check_ours(config.out / name)
     with one_thread():
-        result = reproduce(config.out, config.agent)
-    write(result, config.out)
-    failed = [f"row {claim.row}, {claim.claim}" for claim in result.claims if not claim.holds]
-    print(f"{summary_of(result.claims)} The page: {config.out / PAGES[-1]}")
+        claims, pictures = reproduce(config.out, config.agent)
+    write(claims, pictures, config.out)
+    failed = [f"row {claim.row}, {claim.claim}" for claim in claims if not claim.holds]
+    print(f"{summary_of(claims)} The page: {config.out / PAGES[-1]}")
     if failed:
-        raise ClaimsFailedError(f"{len(failed)} of {len(result.claims)} claims fail: {'; '.join(failed)}")
+        raise ClaimsFailedError(f"{len(failed)} of {len(claims)} claims fail: {'; '.join(failed)}")

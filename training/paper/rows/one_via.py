@@ -191,11 +191,9 @@ def _threshold_claim(along: float, exact: str, expected: float, tolerance: float
 
 def valley_threshold(along: float) -> float:
     """Return the least d3 / (d1 + d2) for which the model's speed has a valley."""
-
-    def has_valley(height: float) -> bool:
-        return bool(speed_valleys(curved(*ENDS, along, -height)).time.size)
-
-    return first_place(has_valley, 0.2, 0.5, halvings=30)
+    return first_place(
+        lambda d3: speed_valleys(curved(*ENDS, along, -d3)).time.size > 0, 0.2, 0.5, halvings=30
+    )
 
 
 def first_place(holds: Callable[[float], bool], low: float, high: float, halvings: int) -> float:
