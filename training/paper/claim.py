@@ -78,7 +78,7 @@ class Claim:
     def as_json(self) -> dict[str, Any]:
         """Return plain values for JSON; open ends of a range are null."""
         record: dict[str, Any] = {
-            name: getattr(self, name) for name in ("row", "claim", "figure", "paper", "unit", "verdict")
+            name: getattr(self, name) for name in ("row", "claim", "figure", "paper", "unit")
         }
         for name, number in (("model", self.model), ("arm", self.arm)):
             value, expected = number or (None, None)
@@ -87,4 +87,4 @@ class Claim:
                 float(end) if np.isfinite(end) else None for end in expected
             ]
         record["deviation_mm"] = None if self.deviation is None else float(self.deviation)
-        return record
+        return {**record, "verdict": self.verdict}
