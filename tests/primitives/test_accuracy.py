@@ -4,7 +4,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from viapoint.primitives import minimum_jerk_coefficients, point_to_point, through
+from viapoint.primitives import minimum_jerk_coefficients, through
 
 mpmath.mp.dps = 80
 
@@ -109,13 +109,6 @@ def test_the_primers_coefficients_meet_all_six_conditions_at_any_duration(durati
     np.testing.assert_allclose(unit.sum(axis=-1), x1, atol=1e-12)
     np.testing.assert_allclose(unit @ np.arange(6), v1, atol=1e-12)
     np.testing.assert_allclose(unit @ (np.arange(6) * np.arange(-1, 5)), a1, atol=1e-11)
-
-
-def test_equation_2_of_the_paper():
-    start, goal, end = 0.2, 0.5, 1.7
-    tau = np.linspace(0, 1, 41)
-    straight = start + (start - goal) * (15 * tau**4 - 6 * tau**5 - 10 * tau**3)
-    np.testing.assert_allclose(point_to_point([start], [goal], end)(tau * end)[:, 0], straight, atol=1e-15)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
