@@ -386,13 +386,6 @@ def test_packages_are_looked_for_in_given_folders(crane, tmp_path):
     assert load_arm(path, packages=[tmp_path / "store"]).joint_names == ("lift", "turn", "tilt")
 
 
-def test_meshes_that_cannot_be_read_are_left_out_and_told(crane):
-    (crane / "meshes" / "wrist.dae").write_text("<COLLADA/>")
-    arm = load_arm(written(crane, "package://crane_description/meshes/wrist.dae"))
-    assert any("wrist.dae" in note for note in arm.notes)
-    assert "wrist" not in arm.group_names
-
-
 def test_files_that_are_no_robot_are_refused(tmp_path):
     for name, text, message in (
         ("a.urdf", "<robot", "not XML"),
@@ -517,7 +510,11 @@ def test_files_of_several_parts_in_degrees(tmp_path):
 def test_urdf_files_with_odd_parts_load(crane):
     trimesh.creation.box((0.1, 0.1, 0.1)).export(crane / "meshes" / "wrist.stl", file_type="stl_ascii")
     path = written(crane, "package://renamed_description/meshes/wrist.stl")
-    text = path.read_text().replace("</robot>", "<xacro:thing a:b='1'/></robot>")
+    (crane / "meshes" / "boom.dae").write_text("<COLLADA/>")
+    text = path.read_text().replace(
+        '<geometry><box size="0.4 0.06 0.06"/>', '<geometry><mesh filename="../meshes/boom.dae"/>'
+    )
+    text = text.replace("</robot>", "<xacro:thing a:b='1'/></robot>")
     text = text.replace(
         '<mass value="2"/>\n    <inertia ixx="0.1"', '<mass value="2"/>\n    <inertia ixx="-0.1"'
     )
@@ -529,5 +526,6 @@ def test_urdf_files_with_odd_parts_load(crane):
     path.write_text(text)
     arm = load_arm(path)
     assert "wrist" in arm.group_names
-    for told in ("inertia of boom", "its box has no size"):
+    assert "boom" not in arm.group_names
+    for told in ("inertia of boom", "its box has no size", "boom.dae"):
         assert any(told in note for note in arm.notes), told

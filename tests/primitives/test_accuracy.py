@@ -86,19 +86,6 @@ def test_derivatives_are_exact_to_rounding(vias, ratio, duration, offset, rng):
     np.testing.assert_allclose(float(trajectory.cost()), float(reference.cost()), rtol=1e-12)
 
 
-@pytest.mark.parametrize("duration", [1e-3, 1e3])
-def test_single_precision_stays_within_1e_5(duration, rng):
-    waypoints = rng.uniform(-1, 1, (20, 5, 2)).astype(np.float32)
-    durations = (rng.uniform(0.5, 1.0, (20, 4)) * duration).astype(np.float32)
-    single = through(waypoints, durations)
-    double = through(waypoints.astype(float), durations.astype(float))
-    assert single.coefficients.dtype == np.float32
-    for nu in range(3):
-        a, b = (trajectory.sample(100, nu)[0] for trajectory in (single, double))
-        assert np.abs(a - b).max() < 1e-5 * np.abs(b).max()
-    np.testing.assert_allclose(single.cost(), double.cost(), rtol=1e-5)
-
-
 @pytest.mark.parametrize("duration", [1e-5, 1e-3, 2.0, 1e3, 1e5])
 def test_the_primers_coefficients_meet_all_six_conditions_at_any_duration(duration, rng):
     x0, v0, a0, x1, v1, a1 = rng.normal(size=(6, 50))

@@ -112,13 +112,6 @@ def test_a_batch_gives_bit_for_bit_what_each_item_gives_alone(vias, rng):
             np.testing.assert_array_equal(coefficients, movements.coefficients[i])
 
 
-def test_single_precision_is_accurate(rng):
-    waypoints = rng.uniform(-1, 1, (300, 3, 2)).astype(np.float32)
-    single = passage_durations(waypoints, 1.0)
-    assert single.dtype == np.float32
-    np.testing.assert_allclose(single, passage_durations(waypoints.astype(float), 1.0), rtol=2e-7)
-
-
 @pytest.mark.parametrize("goal_velocity", [None, FREE])
 @pytest.mark.parametrize("goal_acceleration", [None, FREE])
 @pytest.mark.parametrize("pace", [0.3, 3.0, 10.0])
