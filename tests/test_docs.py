@@ -51,12 +51,6 @@ def test_links_lead_somewhere(name):
 
 
 @every_page
-def test_files_of_the_project_that_a_page_names_exist(name):
-    for file in re.findall(r"`((?:primitives|envs|training|tests|benchmarks)/[\w/]+\.\w+)`", text(name)):
-        assert name == "CHANGELOG.md" or "NAME" in file or (ROOT / file).exists(), file
-
-
-@every_page
 def test_examples_run(name):
     """Each page runs in a process of its own, as some examples register arms, tasks and families."""
     script = "\n".join(examples(name))

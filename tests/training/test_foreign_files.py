@@ -140,10 +140,10 @@ def test_what_the_paper_wrote_can_be_written_again(tmp_path, monkeypatch):
 
     claims = [paper.Claim(1, "one", model=(1.0, paper.straight.near(1.0, 0.1)))]
     pictures = []
-    for drawing in paper.DRAWINGS:
-        picture, _ = save_figure(Figure(), tmp_path, drawing.name)
+    for name in paper.DRAWINGS:
+        picture, _ = save_figure(Figure(), tmp_path, name)
         pictures.append((picture, "caption"))
-    monkeypatch.setattr(paper, "reproduce", lambda *_: paper.Reproduction(claims, pictures))
+    monkeypatch.setattr(paper, "reproduce", lambda *_: (claims, pictures))
     for _ in range(2):
         paper.run(PaperConfig(out=tmp_path))
 

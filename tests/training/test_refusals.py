@@ -30,7 +30,6 @@ from viapoint.training.config.words import from_words
 from viapoint.training.evaluation import statistics
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError
-from viapoint.training.paper.claim import Claim
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.plotting import plots
@@ -265,7 +264,6 @@ CALLS = [
     lambda: plots.learning_curve("none.png", []),
     lambda: statistics.wilson(5, 4),
     lambda: statistics.wilson(-1, 4),
-    lambda: Claim(1, "x"),
 ]  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from viapoint.training.live.decisions import AGENT, MOTION, SEARCH, DecisionMake
 from viapoint.training.live.drawing import ArmDrawing
 from viapoint.training.live.movements import DECISION_INTERVAL
 from viapoint.training.live.scene import LiveScene
-from viapoint.training.paper.movements import rows_of_lights
+from viapoint.training.paper.movements import TARGETS, rows_of_lights
 from viapoint.training.planning.baselines import PLANNERS, PlannerMethod
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import load, shipped_set
@@ -271,6 +271,7 @@ def _endless(scenes: Scenes, task: Task, name: str) -> Iterator[tuple[LiveScene,
 
 def _lights(half_height: float) -> Iterator[tuple[LiveScene, str]]:
     """Yield the obstacle paradigm of Flash & Hogan 1985, pair by pair, again and again."""
-    for row in itertools.cycle(rows_of_lights(half_height=half_height)):
-        scene = LiveScene(row.start, row.goal, (row.lights,), np.zeros((0, 3)), np.zeros((1, 4)))
-        yield scene, f"From {row.first} to {row.last} past a row of lights, Flash & Hogan 1985."
+    for first, last, lights in itertools.cycle(rows_of_lights(half_height=half_height)):
+        start, goal = TARGETS[first].copy(), TARGETS[last].copy()
+        scene = LiveScene(start, goal, (lights,), np.zeros((0, 3)), np.zeros((1, 4)))
+        yield scene, f"From {first} to {last} past a row of lights, Flash & Hogan 1985."
