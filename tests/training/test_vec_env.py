@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
@@ -116,3 +117,17 @@ def test_episodes_are_told_as_a_monitor_tells_them(env, recwarn):
     assert not [each for each in recwarn if "Monitor" in str(each.message)]
     assert lengths == [1] * 12
     assert len(set(rewards)) == 12
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("env_id", [ENV, STEP])
+def test_infos_hold_what_those_of_make_vec_env_hold(env_id):
+    both = make_vec_env(env_id, n_envs=2, seed=0), ViaVecEnv(env_id, 2, seed=0, threads=1)
+    action = np.zeros((2, *both[0].action_space.shape), np.float32)
+    for each in both:
+        each.reset()
+    ended = 0
+    while ended < 2:
+        (*_, done, theirs), (*_, mine) = (each.step(action) for each in both)
+        assert [info.keys() for info in mine] == [info.keys() for info in theirs]
+        ended += done.sum()

@@ -159,9 +159,9 @@ class ViaVecEnv(VecEnv):
 
         Returns:
             Observation, reward (N,), done (N,) and N info dictionaries. The dictionaries hold what the environment
-            reports of the decision. At the end of an episode they also hold `terminal_observation`,
-            `TimeLimit.truncated` and `episode` (return r, length l, wall time t [s] since the start, and those metrics
-            of :data:`LOGGED` that the environment reports).
+            reports of the decision and `TimeLimit.truncated`, as those of Stable-Baselines3's `make_vec_env`. At the
+            end of an episode they also hold `terminal_observation` and `episode` (return r, length l, wall time t [s]
+            since the start, and those metrics of :data:`LOGGED` that the environment reports).
         """
         observation, reward, terminated, truncated, info = self.venv.step(self._actions)
         done = terminated | truncated
@@ -174,13 +174,11 @@ class ViaVecEnv(VecEnv):
             for row in np.flatnonzero(done).tolist():
                 episode = {"r": float(self._returns[row]), "l": int(self._lengths[row]), "t": seconds}
                 episode |= {name: ended[row][name] for name in LOGGED if name in ended[row]}
-                infos[row] = {
-                    **ended[row],
-                    "terminal_observation": info["final_obs"][row],
-                    "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
-                    "episode": episode,
-                }
+                last = {"terminal_observation": info["final_obs"][row], "episode": episode}
+                infos[row] = {**ended[row], **last}
             self._returns[done], self._lengths[done] = 0.0, 0
+        for each, cut in zip(infos, (truncated & ~terminated).tolist(), strict=True):
+            each["TimeLimit.truncated"] = cut
         return observation, np.asarray(reward, dtype=np.float32), done, infos
 
     def _listed(self, info: Mapping[str, Any]) -> list[dict[str, Any]]:
