@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from viapoint.training.live.page import LivePage
     from viapoint.training.planning.export import read_motion, write_motion
     from viapoint.training.planning.motion_plan import MotionPlan, UnsafePlanError
-    from viapoint.training.planning.observe_candidates import ObserveCandidates, VectorObserveCandidates
     from viapoint.training.planning.plan_motion import plan_motion, plan_motions
     from viapoint.training.planning.search import GeometrySearch
     from viapoint.training.rollouts.vec_env import ViaVecEnv
@@ -42,13 +41,11 @@ __all__ = [
     "GeometrySearch",
     "LivePage",
     "MotionPlan",
-    "ObserveCandidates",
     "Run",
     "SceneExtractor",
     "Study",
     "TrainConfig",
     "UnsafePlanError",
-    "VectorObserveCandidates",
     "ViaQ",
     "ViaVecEnv",
     "evaluate",

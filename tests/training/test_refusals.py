@@ -11,7 +11,7 @@ import pytest
 from stable_baselines3.common.vec_env import VecNormalize
 
 from viapoint.envs import Sphere, Task, scene_from_json
-from viapoint.training import ObserveCandidates, evaluate, load_agent
+from viapoint.training import evaluate, load_agent
 from viapoint.training.agents.agent import SAC, find_model
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.viaq import ViaQ
@@ -60,9 +60,6 @@ CONFIGURATIONS = [
     *((TrainConfig, {"stop_when_stalled": share}) for share in (0.0, 1.0, -0.3, True, "0.3", math.nan)),
     (TrainConfig, STALLING),  # the preset has no more decisions than it must make
     (TrainConfig, {**STALLING, "n_timesteps": 10**5, "eval_every": 0}),
-    (TrainConfig, {"observe_candidates": 16}),
-    (TrainConfig, {"observe_candidates": 16, "algo": "sac", "env": STEP}),
-    (TrainConfig, {"observe_candidates": -1}),
     (EvaluateConfig, {}),
     (EvaluateConfig, {"baselines": ("ompl", "ompl"), "env": ENV}),
     (EvaluateConfig, {"env": ENV, "checks": (8,)}),
@@ -240,9 +237,6 @@ CALLS = [
     lambda: Task.from_dict({**agent().get_env().get_attr("task")[0].as_dict(), "arm": "octopus"}),
     *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, "Pendulum-v1")),
     lambda: ViaQ("ViaQPolicy", VecNormalize(ViaVecEnv(ENV, 2))),
-    *(lambda number=number: ObserveCandidates(gym.make(ENV), number) for number in (0, -1, 1.5, True, 4097)),
-    *(lambda env_id=env_id: ObserveCandidates(gym.make(env_id)) for env_id in (STEP, "CartPole-v1")),
-    lambda: ObserveCandidates(ObserveCandidates(gym.make(ENV))),
     *(lambda change=change: scene_file(**change) for change in (
         {"format": "other"}, {"start": [0.1]}, {"goal": [0.1, math.nan]}, {"jumps": [[1.0]]}, {"colour": 1},
         {"obstacles": 3}, {"obstacles": [3]}, {"obstacles": [[0.1, 0.2]]}, {"obstacles": [{"shape": "cube"}]},

@@ -18,9 +18,8 @@ from viapoint.training.agents.model_io import ALGORITHMS, load_model, save_model
 from viapoint.training.config.checks import SHIPPED, SHIPPED_IDS
 from viapoint.training.io.files import BadFileError, write_folder
 from viapoint.training.planning.motion_plan import MotionPlan
-from viapoint.training.planning.observe_candidates import with_candidates
 from viapoint.training.planning.plan_motion import checked_motion
-from viapoint.training.rollouts.vec_env import env_arguments, observed_candidates
+from viapoint.training.rollouts.vec_env import env_arguments
 
 
 class Agent(BaseAlgorithm):
@@ -53,17 +52,6 @@ class Agent(BaseAlgorithm):
     def env_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of that environment, without those that belong to its id."""
         return env_arguments(self.get_env())[1]
-
-    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> Any:
-        """Return actions and no state; see :meth:`stable_baselines3.common.base_class.BaseAlgorithm.predict`.
-
-        An agent that observes candidates computes their margins where the observation lacks them.
-        """
-        number = 0 if self.env is None else observed_candidates(self.env)
-        if number:
-            (task,) = self.env.get_attr("task", [0])  # type: ignore[union-attr]
-            observation = with_candidates(observation, task, number)
-        return super().predict(observation, *args, **kwargs)
 
     def plan(self, start: Any, goal: Any, obstacles: Any = ()) -> MotionPlan:
         """Return the plan of a movement from rest to rest among obstacles that stand still, without an environment.

@@ -38,7 +38,7 @@ from viapoint.envs.task import MOST_OBSTACLES
 from viapoint.training.agents.extractors import EXTRACTORS
 from viapoint.training.config.checks import check_arguments
 from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
-from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments, observed_candidates
+from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments
 
 ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     each.__name__: each for each in (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
@@ -197,7 +197,6 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
         known = ", ".join(kind.__name__ for kind in ALGORITHMS.values())
         raise ValueError(f"only agents of {known} can be saved, got {type(model).__name__}")
     (name,), (env_id, env_kwargs) = names, env_arguments(model.get_env())
-    number = observed_candidates(model.get_env())  # type: ignore[arg-type]
     policies = {kind: each for each, kind in ALGORITHMS[name].policy_aliases.items()}
     stored = sorted(name for name in argument_names(type(model)) if hasattr(model, name))
     return {
@@ -209,7 +208,6 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
             "id": env_id,
             "kwargs": _encode(env_kwargs),
             "task": model.get_env().get_attr("task", [0])[0].as_dict(),  # type: ignore[union-attr]
-            **({"candidates": number} if number else {}),
         },
         "num_timesteps": model.num_timesteps,
         "hyperparameters": {name: _encode(getattr(model, name)) for name in stored},
@@ -276,7 +274,7 @@ def own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
         for each in value if isinstance(value, list | tuple) else (value,):
             if isinstance(each, int | float) and each > most:
                 raise ValueError(f"{name} may be at most {most} in a file, got {each}")
-    return ViaVecEnv(env_id, 1, observe_candidates=record.get("candidates", 0), **kwargs)
+    return ViaVecEnv(env_id, 1, **kwargs)
 
 
 @contextmanager

@@ -27,7 +27,6 @@ SHIPPED_IDS = tuple(f"viapoint/{path.parent.name}" for path in sorted(SHIPPED.gl
 ELSEWHERE = {
     "num_envs": "--n-envs says how many environments are stepped together",
     "seed": "--seed is that of everything",
-    "observe_candidates": "--observe-candidates says how many candidates are observed",
     "env_id": "--env names the environment",
     "id": "--env names the environment",
     "render_mode": "viapoint play films",

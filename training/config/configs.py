@@ -94,7 +94,7 @@ BENCHMARK = "motionbenchmaker"
 MOTION_FILES = (".csv", ".yaml", ".yml")
 """Suffixes of files of movements."""
 UNNAMED = "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
-NOTHING_TO_CHECK = "checks concerns an agent, and none is given"
+NOTHING_TO_CHECK = "checks and refine concern an agent, and none is given"
 USUAL_BASELINES = ("straight", "random", "search512")
 """Baselines of an evaluation."""
 
@@ -138,7 +138,7 @@ class TrainConfig(Config):
         ('runs/PandaObstacles-v0-viaq-1', 40000)
     """
 
-    least: ClassVar = dict.fromkeys(("seed", "eval_every", "observe_candidates"), 0) | dict.fromkeys(
+    least: ClassVar = dict.fromkeys(("seed", "eval_every"), 0) | dict.fromkeys(
         ("n_timesteps", "n_envs", "eval_scenes", "checkpoint_every"), 1
     )
 
@@ -166,8 +166,6 @@ class TrainConfig(Config):
     """Validation scenes in each evaluation."""
     checkpoint_every: int | None = None
     """Decisions between checkpoints; default: the preset's."""
-    observe_candidates: int = 0
-    """Plans whose clearance is observed; not for viaq."""
     env_kwargs: NamedValues = field(default_factory=dict)
     """Arguments of the environment, values in YAML: n_via=2 timing=learned whole_arm=true n_obstacles=[1,8]."""
     hyperparameters: NamedValues = field(default_factory=dict)
@@ -187,16 +185,10 @@ class TrainConfig(Config):
             object.__setattr__(self, "env", env)
             object.__setattr__(self, "env_kwargs", {**self.env_kwargs, **argument})
             object.__setattr__(self, "arm", None)
-        stepwise = self.task.stepwise
-        if stepwise and self.algo not in STEP_PRESETS:
+        if self.task.stepwise and self.algo not in STEP_PRESETS:
             raise ValueError(
                 f"{self.algo} decides on whole movements; for {self.env} algo must be one of "
                 f"{', '.join(STEP_PRESETS)}"
-            )
-        if self.observe_candidates and (self.algo == "viaq" or stepwise):
-            raise ValueError(
-                "observe_candidates must be 0 for viaq, which checks candidates itself, and for actions in every "
-                f"control step, got {self.observe_candidates} for {self.algo} on {self.env}"
             )
         if not isinstance(self.hyperparameters, Mapping):
             raise ValueError(f"hyperparameters must be values by name, got {self.hyperparameters!r}")

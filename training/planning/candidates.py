@@ -13,11 +13,6 @@ if TYPE_CHECKING:
     from viapoint.envs.task import Task
 
 
-OBSERVED = "candidates"
-"""Part of an observation that holds the margins of candidates, see
-:class:`~viapoint.training.planning.observe_candidates.ObserveCandidates`."""
-
-
 def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:
     """Return candidate actions, shape (number, m), of which the first is the zero action.
 

@@ -16,8 +16,6 @@ from stable_baselines3.common.vec_env import VecEnv
 import viapoint.envs
 from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import RewardTerms
-from viapoint.training.planning.candidates import OBSERVED
-from viapoint.training.planning.observe_candidates import VectorObserveCandidates
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
@@ -29,13 +27,6 @@ LOGGED = ("collision", "reachable", "min_clearance", "jerk_ratio", "duration")
 """Metrics of an episode that `episode` in the infos holds too, as with `info_keywords` of SB3's `Monitor`."""
 TERMS = tuple(f"reward_{name}" for name in RewardTerms._fields)
 """Terms of a decision's reward, which the info dictionaries report."""
-
-
-def observed_candidates(env: VecEnv) -> int:
-    """Return the number of candidate plans whose margins are part of an environment's observations; 0 for none."""
-    space: Any = env.observation_space
-    parts = getattr(space, "spaces", {})
-    return int(parts[OBSERVED].shape[0]) if OBSERVED in parts else 0
 
 
 def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
@@ -76,13 +67,10 @@ class ViaVecEnv(VecEnv):
         env_id: Id of a registered environment.
         num_envs: Number of copies N.
         seed: Copy i is seeded with `seed + i` at the next reset; None seeds from the system.
-        observe_candidates: Number of candidate plans whose computed margins are part of the observation, see
-            :class:`~viapoint.training.planning.observe_candidates.ObserveCandidates`; 0 for none.
         **kwargs: Keyword arguments of the environment.
 
     Raises:
-        ValueError: There is no such environment, it does not start the next episode in the step that ends the last, or
-            it has no candidates to observe.
+        ValueError: There is no such environment, or it does not start the next episode in the step that ends the last.
 
     Example:
         >>> import numpy as np
@@ -102,8 +90,6 @@ class ViaVecEnv(VecEnv):
         env_id: str,
         num_envs: int,
         seed: int | None = None,
-        *,
-        observe_candidates: int = 0,
         **kwargs: Any,
     ) -> None:
         check_registered(env_id)
@@ -115,8 +101,6 @@ class ViaVecEnv(VecEnv):
             raise ValueError(
                 f"{env_id} must have autoreset mode SAME_STEP, not {self.venv.metadata.get('autoreset_mode')}"
             )
-        if observe_candidates:
-            self.venv = VectorObserveCandidates(self.venv, observe_candidates)
         self.env_id, self.env_kwargs = env_id, dict(kwargs)
         spaces = self.venv.single_observation_space, self.venv.single_action_space
         VecEnv.__init__(self, num_envs, *spaces)

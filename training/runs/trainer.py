@@ -132,9 +132,7 @@ def _warn(config: TrainConfig) -> None:
 def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
     """Build the untrained model of a resolved configuration with its own environments, and close them at the end."""
     try:
-        env = ViaVecEnv(
-            config.env, config.copies, observe_candidates=config.observe_candidates, **config.env_kwargs
-        )
+        env = ViaVecEnv(config.env, config.copies, **config.env_kwargs)
     except TypeError as error:
         raise ValueError(f"env_kwargs of {config.env}: {error}") from error
     with closing(env):
