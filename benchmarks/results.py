@@ -50,6 +50,7 @@ def rows_of(env_id: str, name: str, n_scenes: int | None) -> Iterator[dict[str, 
         checks=[0, 16],
         refine=[4] if refinable else [],
         baselines=BASELINES if refinable else REPLANNING_BASELINES,
+        time_decisions=name == "test",
     )
     for row in result.rows:
         success = row["success"]
