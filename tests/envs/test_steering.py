@@ -87,7 +87,8 @@ def test_the_zero_action_brings_to_rest_and_no_action_exceeds_the_bounds(space):
 
 
 def test_it_arrives_where_nothing_is_in_the_way():
-    steps = towards(*given(STEP), [GOAL])
+    env, observation = given(STEP)
+    steps = towards(env, observation, [GOAL])
     *_, terminated, truncated, info = steps[-1]
     assert terminated
     assert not truncated
@@ -95,6 +96,10 @@ def test_it_arrives_where_nothing_is_in_the_way():
     assert len(steps) * 0.04 == pytest.approx(info["duration"] + SETTLING, abs=0.041)
     assert info["path_length"] == pytest.approx(0.4, abs=0.02)
     assert info["tracking_error"] < 1e-3
+    rollout = env.last_rollout
+    assert rollout.planned.shape == (len(steps) * env.task.steering.physics_steps, 2)
+    assert np.abs(rollout.hand[:, :2] - rollout.planned).max() < 2e-3
+    np.testing.assert_allclose(rollout.hand[-1, :2], GOAL, atol=0.01)
 
 
 def test_the_way_round_succeeds_where_the_straight_line_crashes():
@@ -135,13 +140,3 @@ def test_a_reference_out_of_reach_ends_the_episode():
     assert not any(info[name] for name in ("reachable", "is_success", "collision"))
     assert env.physics_steps == before
     assert env.observation_space.contains(observation)
-
-
-def test_the_rollout_is_the_movement_so_far():
-    env, observation = given(STEP)
-    towards(env, observation, [GOAL])
-    rollout = env.last_rollout
-    assert rollout.planned.shape == (len(rollout.time), 2)
-    assert np.abs(rollout.hand[:, :2] - rollout.planned).max() < 2e-3
-    np.testing.assert_allclose(rollout.hand[-1, :2], GOAL, atol=0.01)
-    assert len(rollout.time) % env.task.steering.physics_steps == 0

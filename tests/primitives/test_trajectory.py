@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.integrate import quad
 from scipy.interpolate import make_interp_spline
 
-from viapoint.primitives import FREE, point_to_point, through
+from viapoint.primitives import through
 
 
 def random_movement(rng, vias, order=3, batch=(), dimension=2):
@@ -18,19 +18,6 @@ def random_movement(rng, vias, order=3, batch=(), dimension=2):
     names = ["start_velocity", "goal_velocity", "start_acceleration", "goal_acceleration"]
     ends = {name: rng.normal(size=(*batch, dimension)) for name in names[: 4 if order > 2 else 2]}
     return waypoints, durations, ends
-
-
-@pytest.mark.parametrize("order", [2, 3, 4])
-def test_all_but_the_highest_derivatives_are_continuous_at_via_points(order, rng):
-    waypoints, durations, ends = random_movement(rng, 3, order)
-    trajectory = through(waypoints, durations, order=order, **ends)
-    c, rates = trajectory.coefficients, trajectory.rates
-    for nu in range(2 * order - 1):
-        size = np.abs(trajectory(np.linspace(0, float(trajectory.duration), 50), nu)).max()
-        for s in range(3):
-            left = np.polynomial.Polynomial(c[:, s, 0]).deriv(nu)(1.0) * rates[s] ** nu
-            right = np.polynomial.Polynomial(c[:, s + 1, 0]).deriv(nu)(0.0) * rates[s + 1] ** nu
-            assert abs(left - right) < 1e-10 * size, nu
 
 
 def test_given_via_velocities_are_met_with_continuous_acceleration(rng):
@@ -203,13 +190,6 @@ def test_a_dropped_via_point_leaves_the_others():
     np.testing.assert_allclose(trajectory.cost(), plain.cost(), rtol=1e-13)
     moving = through(waypoints, [0.0, 0.4, 0.6, 0.0], goal_velocity=np.ones(2))
     np.testing.assert_allclose(moving([1.0], 1), [[1.0, 1.0]], atol=1e-12)
-
-
-def test_a_free_goal_velocity_and_acceleration_is_the_hitting_movement():
-    hit = point_to_point([0.0], [1.0], 1.0, goal_velocity=FREE, goal_acceleration=FREE)
-    np.testing.assert_allclose(hit.coefficients[:, 0, 0], np.array([0, 0, 0, 10, -5, 1]) / 6, atol=1e-15)
-    np.testing.assert_allclose(hit.cost(), 10.0, rtol=1e-14)
-    np.testing.assert_allclose(hit(1.0, 1), 2.5, rtol=1e-14)
 
 
 @hypothesis.settings(max_examples=40, deadline=None)
