@@ -23,9 +23,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.io.files import UNFINISHED, read_arrays, read_json
+from viapoint.training.io.files import UNFINISHED, read_arrays
+from viapoint.training.runs.checkpoints import read_state
 from viapoint.training.runs.run_dir import Run
 
 ENV = "viapoint/PlanarObstacles-v0"
@@ -92,15 +94,12 @@ def content(folder: Path) -> dict[str, Any]:
     """Return the results of a run without its times."""
     run = Run(folder)
     newest = run.checkpoints()[-1]
-    state = read_json(newest / "state.json")
-    for name in ("digest", "sha256"):
-        del state[name]
     arrays = {name: read_arrays(folder / name / "weights.safetensors") for name in ("best", "final")}
     return {
         "curve": without_times(run.curve),
-        "state": without_times(state),
         "checkpoint": newest.name,
-        "arrays": {**arrays, "tensors": read_arrays(newest / "tensors.safetensors")},
+        "state": repr(without_times(read_state(newest))),
+        "arrays": arrays,
     }
 
 
@@ -108,7 +107,9 @@ def without_times(value: Any) -> Any:
     """Return nested values without entries of real time."""
     if isinstance(value, dict):
         return {name: without_times(each) for name, each in value.items() if name not in CLOCK}
-    return [without_times(each) for each in value] if isinstance(value, list) else value
+    if isinstance(value, list | tuple):
+        return [without_times(each) for each in value]
+    return value.numpy().tobytes() if isinstance(value, torch.Tensor) else value
 
 
 def differences(one: dict[str, Any], other: dict[str, Any]) -> list[str]:

@@ -1,6 +1,7 @@
 """Measure the shipped agents and the methods without learning in the frozen sets, and write the tables of results.md.
 
-python benchmarks/results.py --out docs/results.csv
+python benchmarks/results.py                                  # all tasks; hours
+python benchmarks/results.py --env viapoint/PandaObstacles-v0 # others keep their numbers
 """
 
 from __future__ import annotations
@@ -19,7 +20,10 @@ from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.planning.search import registered_task
 from viapoint.training.scene_sets.scene_set import SETS, shipped_set
 
-BASELINES = ("untrained", "straight", "sobol512", "search512")
+BASELINES = ("untrained", "straight", "sobol64", "search512", "plan_motion")
+REPLANNING_BASELINES = BASELINES[:-1]
+"""Baselines of tasks in which plans are revised: :func:`plan_motion` is for obstacles that rest."""
+PAGE = Path("docs/results.md")
 FIELDS = ("env", "scenes", "method", "success", "low", "high", "count", "jerk_ratio", "milliseconds")
 
 
@@ -37,13 +41,15 @@ class Config:
 
 def rows_of(env_id: str, name: str, n_scenes: int | None) -> Iterator[dict[str, Any]]:
     """Yield the numbers of each method in one set."""
+    refinable = registered_task(env_id).whole_movement
     result = evaluate(
         load_agent(env_id),
         env=env_id,
         scenes=name,
         n_scenes=n_scenes,
-        checks=[0, 64],
-        baselines=list(BASELINES),
+        checks=[0, 16],
+        refine=[4] if refinable else [],
+        baselines=BASELINES if refinable else REPLANNING_BASELINES,
     )
     for row in result.rows:
         success = row["success"]
@@ -76,27 +82,45 @@ def table(rows: list[dict[str, Any]]) -> str:
         mine = {row["scenes"]: row for row in rows if row["method"] == method}
         cells = [f"{mine[name]['success']} ({mine[name]['low']}-{mine[name]['high']})" for name in sets]
         last = mine["test"]
-        lines.append(f"| {method} | {' | '.join(cells)} | {last['jerk_ratio']} | {last['milliseconds']} |")
+        lines.append(
+            f"| {method} | {' | '.join(cells)} | {last['jerk_ratio'] or '-'} | {last['milliseconds'] or '-'} |"
+        )
     return "\n".join(lines)
 
 
+def write_page(rows: list[dict[str, Any]]) -> None:
+    """Put the tables into the page: each follows the heading of its task, up to the next empty line after it."""
+    text = PAGE.read_text(encoding="utf-8")
+    for env_id in dict.fromkeys(row["env"] for row in rows):
+        heading = f"### {env_id.removeprefix('viapoint/').removesuffix('-v0')}\n\n"
+        before, _, after = text.partition(heading)
+        mine = [row for row in rows if row["env"] == env_id]
+        _, _, rest = after.partition("\n\n")  # after the old table
+        text = f"{before}{heading}{table(mine)}\n\n{rest}"
+    PAGE.write_text(text, encoding="utf-8")
+
+
 def main() -> None:
-    """Measure, print the tables, and write the file."""
+    """Measure, and write the file and the tables of the page after each task."""
     config = tyro.cli(Config)
     torch.set_num_threads(1)
-    every = []
+    every: list[dict[str, Any]] = []
+    if config.out.is_file():
+        with config.out.open(newline="", encoding="utf-8") as file:
+            every = list(csv.DictReader(file))
     for env_id in config.env:
         task = registered_task(env_id)
-        rows = []
+        rows = [row for row in every if row["env"] != env_id]
         for name in SETS:
             if name != "validation" and shipped_set(name, task) is not None:
                 rows += list(rows_of(env_id, name, config.n_scenes))
-        print(f"\n## {env_id.removeprefix('viapoint/').removesuffix('-v0')}\n\n{table(rows)}", flush=True)
-        every += rows
-    with config.out.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, FIELDS)
-        writer.writeheader()
-        writer.writerows(every)
+        every = sorted(rows, key=lambda row: SHIPPED_IDS.index(row["env"]))
+        with config.out.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, FIELDS)
+            writer.writeheader()
+            writer.writerows(every)
+        write_page(every)
+        print(f"{env_id} is measured", flush=True)
 
 
 if __name__ == "__main__":

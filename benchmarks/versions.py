@@ -34,7 +34,6 @@ TOOLS = [
     "build",
     "ruff",
     "mypy",
-    "coal",
 ]
 
 

@@ -86,7 +86,7 @@ def test_an_evaluation_has_one_row_for_each_method_and_number_of_checks():
     search = GeometrySearch(ENV, 8)
     result = evaluate(ENV, checks=(0, 4), baselines=["untrained", search], n_scenes=10)
     names = [row["method"] for row in result.rows]
-    assert names == ["agent", "agent, 4 checks", "untrained", "untrained, 4 checks", "8 fixed plans"]
+    assert names == ["agent", "agent, 4 checks", "untrained", "untrained, 4 checks", "sobol8"]
     low, high = result.success_interval
     assert low <= result.success_rate <= high
     assert result.to_dict()["methods"]["agent"]["success"]["rate"] == result.success_rate

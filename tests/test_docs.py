@@ -51,12 +51,6 @@ def test_links_lead_somewhere(name):
 
 
 @every_page
-def test_files_of_the_project_that_a_page_names_exist(name):
-    for file in re.findall(r"`((?:primitives|envs|training|tests|benchmarks)/[\w/]+\.\w+)`", text(name)):
-        assert name == "CHANGELOG.md" or "NAME" in file or (ROOT / file).exists(), file
-
-
-@every_page
 def test_examples_run(name):
     """Each page runs in a process of its own, as some examples register arms, tasks and families."""
     script = "\n".join(examples(name))
@@ -101,5 +95,5 @@ def test_commands_are_known(name):
 @pytest.mark.parametrize("name", cli.COMMANDS)
 def test_the_example_of_each_command_is_understood(name):
     config = cli.COMMANDS[name][0]
-    example = re.search(r"Example: viapoint (.+)", config.__doc__).group(1)
+    example = re.search(r"Example: (?:.*; )?viapoint (.+)", config.__doc__).group(1)
     assert type(cli.parse(shlex.split(example))) is config

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
+from top_view import View, draw_movement, planned_only
 
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
@@ -24,7 +25,7 @@ from viapoint.envs.task import Task
 from viapoint.training import load_agent
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import plan_clearances
-from viapoint.training.plotting.top_view import View, draw_movement, footprint, planned_only
+from viapoint.training.plotting.top_view import footprint
 from viapoint.training.scene_sets.scene_set import scenes_for
 
 ENV_ID, SCENE = "viapoint/PlanarObstacles-v0", 19

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from top_view import draw_movement, play
 
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.scenes.families_registry import scene_families
 from viapoint.training.planning.search import GeometrySearch
-from viapoint.training.plotting.gallery import play
-from viapoint.training.plotting.top_view import draw_movement
 from viapoint.training.scene_sets.scene_set import scenes_for
 
 FAMILIES = [name for name, family in scene_families(True).items() if family.hard]

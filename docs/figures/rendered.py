@@ -17,7 +17,7 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.training import GeometrySearch, load_agent
 from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.planning.baselines import Method, Straight, agent_method
-from viapoint.training.plotting.video import Camera
+from viapoint.training.plotting.video import play
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import scenes_for
 
@@ -62,7 +62,7 @@ def shown(env_id: str, number: int) -> Shown:
     shipped = env_id in SHIPPED_IDS
     method: Method = agent_method("agent", load_agent(env_id), 16) if shipped else GeometrySearch(task)
     plain = Straight(simulation)
-    scenes = scenes_for("validation", task, TRIED).scenes.take(slice(0, TRIED))
+    scenes = scenes_for("validation", task).scenes.take(slice(0, TRIED))
     observation = simulation.observe(scenes)
     found = simulation.play(method, scenes, method.decide(observation, scenes))
     passes = found.success & (found.info["min_clearance"] > CLEAREST)
@@ -77,16 +77,16 @@ def shown(env_id: str, number: int) -> Shown:
 
 def film(env: gym.Env[Any, Any], scene: Scenes, method: Method) -> list[Frame]:
     """Return the frames of an episode, which ends with the first contact."""
-    camera = Camera(env)
-    camera.play(scene, method.decide)
-    return list(camera.frames())
+    play(env, scene, method.decide)
+    frames: Any = env.unwrapped.render()
+    return list(frames)
 
 
 def still(path: Path, env_id: str) -> None:
     """Render one movement of a task."""
     some = shown(env_id, 1)
     env = gym.make(env_id, render_mode="rgb_array")
-    Camera(env).play(some.scenes, some.method.decide)
+    play(env, some.scenes, some.method.decide)
     frame: Any = env.unwrapped.render()
     env.close()
     Image.fromarray(frame).save(path, optimize=True)

@@ -218,7 +218,12 @@ def _load(
     pairs = _compared_pairs(parsed, exclude)
     low, high = ranges.T
     drawn = np.random.default_rng(0).uniform(low, high, (NEAR_LOOKED_AT, len(names)))
-    looked_at = np.array([[*_distances(parsed, each, pairs).values()] for each in drawn[:LOOKED_AT]])
+    looked_at = np.array(
+        [
+            [*_distances(parsed, _at(parsed.model, parsed.joints, each), pairs).values()]
+            for each in drawn[:LOOKED_AT]
+        ]
+    )
     near = [pair for pair, away in zip(pairs, looked_at.T, strict=True) if np.median(away) < NEAR]
     apart = _apart(parsed, near, drawn)
     meeting = set(near) - set(apart)
@@ -227,7 +232,7 @@ def _load(
     movable = [pair for pair in movable if _names(parsed, pair) not in exclude]
     home = _home(parsed, ranges, home, keyframe, movable, notes)
     zero = np.zeros(3) if origin is None else finite_array("origin", origin, (3,))
-    distances = _distances(parsed, home, _compared_pairs(parsed, exclude))
+    distances = _distances(parsed, _at(parsed.model, parsed.joints, home), _compared_pairs(parsed, exclude))
     near = [pair for pair, away in distances.items() if 0.0 < away < LEAST_GAP]
     exclude |= dict.fromkeys((_names(parsed, pair) for pair in _apart(parsed, near, drawn)), never)
     distances = {
@@ -481,7 +486,7 @@ def _home(
         return home
 
     def apart(home: Float) -> float:
-        return min(_distances(parsed, home, pairs).values(), default=1.0)
+        return min(_distances(parsed, _at(parsed.model, parsed.joints, home), pairs).values(), default=1.0)
 
     candidates = {"the file's keyframe": keyframe} if keyframe is not None else {}
     candidates["zeros"] = np.zeros(len(joints))
@@ -718,17 +723,18 @@ def _fitted(
 def _apart(parsed: Parsed, pairs: Iterable[tuple[int, int]], configurations: Float) -> list[tuple[int, int]]:
     """Return the pairs of bodies that are in contact in none of some configurations, shape (N, J)."""
     pairs = list(pairs)
+    data = mujoco.MjData(parsed.model)
     for joints in configurations:
-        away = _distances(parsed, joints, pairs)
+        _move(data, parsed.joints, joints)
+        away = _distances(parsed, data, pairs)
         pairs = [pair for pair in pairs if away[pair] > 0.0]
     return pairs
 
 
 def _distances(
-    parsed: Parsed, joints: Float, pairs: Sequence[tuple[int, int]]
+    parsed: Parsed, data: mujoco.MjData, pairs: Sequence[tuple[int, int]]
 ) -> dict[tuple[int, int], float]:
     """Return the distances of pairs of bodies, [m]; at most 0.1."""
-    data = _at(parsed.model, parsed.joints, joints)
     found = {}
     for first, second in pairs:
         geoms = itertools.product(parsed.geoms[first], parsed.geoms[second])
@@ -756,12 +762,17 @@ def _near_capsules(
     return found
 
 
-def _at(model: mujoco.MjModel, joints: tuple[str, ...], home: Float) -> mujoco.MjData:
-    """Return the places of all parts of a model at home."""
+def _at(model: mujoco.MjModel, joints: tuple[str, ...], positions: Float) -> mujoco.MjData:
+    """Return the places of all parts of a model at positions of its joints."""
     data = mujoco.MjData(model)
-    data.qpos[[int(model.joint(name).qposadr[0]) for name in joints]] = home
-    mujoco.mj_kinematics(model, data)
+    _move(data, joints, positions)
     return data
+
+
+def _move(data: mujoco.MjData, joints: tuple[str, ...], positions: Float) -> None:
+    """Compute the places of all parts of a model at positions of its joints."""
+    data.qpos[[int(data.model.joint(name).qposadr[0]) for name in joints]] = positions
+    mujoco.mj_kinematics(data.model, data)
 
 
 def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[Fit]]) -> str:

@@ -50,18 +50,12 @@ def test_built_in_arms_stick_out_by_five_millimetres_at_most_and_list_what_is_le
     assert frozenset(("link2", "gripper")) in compared
 
 
-NEEDLE = """
+LINKS = """
 <mujoco>
-  <option timestep="0.004" integrator="implicitfast"/>
   <worldbody>
-    <geom name="table" type="plane" size="1 1 1" contype="0" conaffinity="0"/>
-    <body name="a"><joint name="one" axis="0 0 1" range="-2 2"/>
-      <geom type="{kind}" {size} mass="1"/>
-      <body name="b" pos="0.3 0 0"><joint name="two" axis="0 0 1" range="-2 2"/>
-        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="1"/>
-        <body name="c" pos="0.3 0 0"><joint name="three" axis="0 0 1" range="-2.9 2.9"/>
-          <geom type="capsule" fromto="{gap} 0 0 {gap} 0.05 0" size="0.02" mass="1"/><site name="tip"/>
-        </body>
+    <body name="a"><joint name="one" axis="0 0 1" range="-2 2"/><geom type="{}" size="0.1 0.1 0.1" mass="1"/>
+      <body name="b" pos="1 0 0"><joint name="two" axis="0 0 1" range="-2 2"/><geom size="0.1" mass="1"/>
+        <site name="tip"/>
       </body>
     </body>
   </worldbody>
@@ -69,26 +63,16 @@ NEEDLE = """
 """
 
 
-def small(kind="capsule", size='fromto="0 0 0 0.2 0 0" size="0.02"', gap=0.1):
-    xml = NEEDLE.format(kind=kind, size=size, gap=gap)
-    limits = {"velocity_limit": (2.0,) * 3, "torque_limit": (50.0,) * 3}
+def small(geom="sphere"):
+    limits = {"velocity_limit": (2.0, 2.0), "torque_limit": (50.0, 50.0)}
     return arm_from_xml(
-        "small", xml, joints=("one", "two", "three"), tool="tip", home=(0.0, 0.0, 0.0), **limits
+        "small", LINKS.format(geom), joints=("one", "two"), tool="tip", home=(0.0, 0.0), **limits
     )
 
 
 def test_collision_geoms_of_other_shapes_are_refused():
     with pytest.raises(ValueError, match="capsules or spheres"):
-        small("box", 'size="0.1 0.1 0.1"')
-
-
-def test_pairs_that_are_near_at_home_are_compared_and_pairs_in_contact_are_left_out():
-    """The third link comes within a millimetre of the first at home, or touches it."""
-    near = small(size='fromto="0 0 0 0.2 0 0" size="0.02"', gap=-0.3589)
-    assert [(near.group_names[a], near.group_names[b]) for a, b in near.spheres.pairs] == [("a", "c")]
-    touching = small(gap=-0.37)
-    reasons = sorted(pair.reason for pair in touching.left_out)
-    assert reasons == ["consecutive links", "consecutive links", "in contact at home"]
+        small("box")
 
 
 def test_arms_are_found_by_their_names():

@@ -57,33 +57,19 @@ def test_clearance_is_that_of_the_nearest_sphere(name):
         assert found[i, 1] == pytest.approx(min(apart[compared].min(initial=FAR), FAR), abs=1e-9)
 
 
+@pytest.mark.parametrize("number", [0, 5])
 @pytest.mark.parametrize("name", ["planar", "panda"])
-def test_clearance_of_a_movement_is_that_of_its_nearest_configuration(name):
-    """Though most configurations are skipped."""
+def test_clearance_of_a_movement_is_that_of_its_nearest_configuration(name, number):
+    """Though most configurations of these winding movements are skipped."""
     rng, arm = np.random.default_rng(1), arm_of(name)
-    for _ in range(20):
-        obstacles = pack([some_shapes(rng, 5)])
-        ends = some_joints(rng, arm, 2)
-        path = ends[0] + np.linspace(0.0, 1.0, 400)[:, None] * (ends[1] - ends[0])
-        step = 0.004
-        found = movement_clearance(
-            arm.chain, arm.spheres, arm.reach, path, obstacles, 0, 0.0, step, memory(arm.chain, arm.spheres)
-        )
-        whole = obstacles.take(np.zeros(len(path), int))
-        each = configuration_clearances(arm.chain, arm.spheres, path, whole, step * np.arange(len(path)))
-        np.testing.assert_allclose(np.maximum(found, -FAR), np.maximum(each.min(axis=0), -FAR), atol=1e-12)
-
-
-def test_clearance_of_a_movement_from_itself_is_that_of_its_nearest_configuration():
-    """Winding movements, in which pairs of bodies come near one another for a short time."""
-    rng, arm = np.random.default_rng(1), arm_of("panda")
     share = np.linspace(0.0, 1.0, 400)[:, None]
-    nothing, placed = pack([[]]).with_rows(1), memory(arm.chain, arm.spheres)
-    for _ in range(100):
+    step, placed = 0.004, memory(arm.chain, arm.spheres)
+    for _ in range(50):
+        obstacles = pack([some_shapes(rng, number)]).with_rows(5)
         start, goal, bend = some_joints(rng, arm, 3)
         path = start + share * (goal - start) + 0.3 * np.sin(3.0 * np.pi * share) * (bend - start)
         path = np.clip(path, *arm.joint_range.T)
-        _, found = movement_clearance(arm.chain, arm.spheres, arm.reach, path, nothing, 0, 0.0, 0.004, placed)
-        scenes = nothing.take(np.zeros(400, int))
-        each = configuration_clearances(arm.chain, arm.spheres, path, scenes, np.zeros(400))
-        assert max(found, -FAR) == pytest.approx(max(each[:, 1].min(), -FAR), abs=1e-9)
+        found = movement_clearance(arm.chain, arm.spheres, arm.reach, path, obstacles, 0, 0.0, step, placed)
+        scenes = obstacles.take(np.zeros(len(path), int))
+        each = configuration_clearances(arm.chain, arm.spheres, path, scenes, step * np.arange(len(path)))
+        np.testing.assert_allclose(np.maximum(found, -FAR), np.maximum(each.min(axis=0), -FAR), atol=1e-9)

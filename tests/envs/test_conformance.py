@@ -40,7 +40,7 @@ def test_both_checkers_pass_without_a_warning(env_id):
 
 def test_info_is_complete_finite_and_scalar_and_its_terms_add_up_to_the_reward(env_id):
     env = gym.make(env_id)
-    for seed in range(8):
+    for seed in range(4 if TASKS[env_id].get("decide_at") != "steps" else 2):
         env.reset(seed=seed)
         for info in play(env, 1.0, seed):
             reward = info.pop("reward")
@@ -140,21 +140,6 @@ def test_scenes_are_those_of_the_twin(env_id):
     assert twin_of(twin_of(env_id)) == twin_of(env_id)
     mine, theirs = (gym.make_vec(each, num_envs=3).reset(seed=3)[0] for each in (env_id, twin_of(env_id)))
     same({name: mine[name] for name in theirs if name in mine}, {n: theirs[n] for n in theirs if n in mine})
-
-
-def test_any_id_with_the_same_entry_point_is_an_environment_like_these():
-    name = "tests/Own-v0"
-    gym.register(
-        name,
-        entry_point="viapoint.envs.env:ReachEnv",
-        vector_entry_point="viapoint.envs.vector_env:ReachVectorEnv",
-        kwargs={"n_obstacles": 2, "n_via": 2},
-    )
-    try:
-        gymnasium_check(gym.make(name).unwrapped, skip_render_check=True)
-        assert gym.make_vec(name, num_envs=2).unwrapped.task.n_via == 2
-    finally:
-        del gym.registry[name]
 
 
 @pytest.mark.parametrize("broken", [1e9, np.nan])

@@ -9,7 +9,6 @@ from viapoint.envs.arms.kinematics import link_poses
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles, unpack
 from viapoint.envs.geometry.shapes import Box, ConvexMesh, Sphere
-from viapoint.envs.scenes import families_registry
 from viapoint.envs.scenes.families_registry import (
     FAMILIES,
     check_families,
@@ -23,11 +22,6 @@ from viapoint.envs.task import Task
 
 ALL = KINDS[:5]
 NAMES = sorted(FAMILIES)
-
-
-@pytest.fixture
-def _own_families(monkeypatch):
-    monkeypatch.setattr(families_registry, "FAMILIES", dict(FAMILIES))
 
 
 def shapes_of(layout):
@@ -72,7 +66,6 @@ def test_layouts_are_valid_obstacles_of_allowed_kinds(plane, name, tall, spare):
 def test_families_never_trained_are_no_defaults():
     names = default_families(False, ALL, 32)
     assert set(names) == {"shelf", "table", "bin", "gate", "tunnel", "clutter"}
-    assert default_families(True, ("cylinder", "box"), 5) == ("clutter",)
     assert default_families(False, ("sphere",), 32) == ("clutter",)
     assert "shelf" not in default_families(False, ALL, 3)
 
@@ -118,7 +111,7 @@ def test_elbow_is_that_of_the_arm():
         np.testing.assert_allclose(furniture.elbow(*hand), (elbow - (0.1, 0.2)) @ turn, atol=1e-9)
 
 
-@pytest.mark.usefixtures("_own_families")
+@pytest.mark.usefixtures("registry")
 def test_own_family_of_shapes_and_places_is_drawn():
     def ball(rng, room):
         return [Sphere(0.1, position=(0.45, 0.0, 0.45))], [Place((0.6, 0.0, 0.4), half=(0.05, 0.1, 0.1))]
@@ -132,7 +125,7 @@ def test_own_family_of_shapes_and_places_is_drawn():
     assert (scenes.obstacles.kind == 0).all()
 
 
-@pytest.mark.usefixtures("_own_families")
+@pytest.mark.usefixtures("registry")
 @pytest.mark.parametrize(
     "build",
     [
@@ -149,32 +142,31 @@ def test_own_family_of_shapes_and_places_is_drawn():
 def test_wrong_results_of_own_families_name_the_family(build):
     register_scene_family("own", build)
     with pytest.raises(ValueError, match="'own'"):
-        FAMILIES_BUILD("own")(np.random.default_rng(0), room(False, 2, ("sphere",)))
+        scene_families(plane=False)["own"].build(np.random.default_rng(0), room(False, 2, ("sphere",)))
 
 
-def FAMILIES_BUILD(name):  # noqa: N802
-    return scene_families(plane=False)[name].build
+def nothing(rng, room):
+    """Build nothing."""
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error"),
+    ("name", "build", "values", "error"),
     [
-        ((3, lambda rng, room: None), TypeError),
-        (("x", lambda rng: None), TypeError),
-        (("x", None), TypeError),
-        (("", lambda rng, room: None), ValueError),
-        (("shelf", lambda rng, room: None), ValueError),
+        (3, nothing, {}, TypeError),
+        ("x", lambda rng: None, {}, TypeError),
+        ("x", None, {}, TypeError),
+        ("", nothing, {}, ValueError),
+        ("shelf", nothing, {}, ValueError),
+        *(
+            ("x", nothing, values, ValueError)
+            for values in ({"kinds": ("ball",)}, {"kinds": ("convex_mesh",)})
+        ),
+        ("x", nothing, {"n_obstacles": 0}, ValueError),
     ],
 )
-def test_registration_refuses(arguments, error):
+def test_registration_refuses(name, build, values, error):
     with pytest.raises(error):
-        register_scene_family(*arguments)
-
-
-@pytest.mark.parametrize("values", [{"kinds": ("ball",)}, {"kinds": ("convex_mesh",)}, {"n_obstacles": 0}])
-def test_registration_refuses_values(values):
-    with pytest.raises(ValueError, match=next(iter(values))):
-        register_scene_family("x", lambda rng, room: None, **values)
+        register_scene_family(name, build, **values)
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,8 @@
 """Videos of movements."""
 
 import gymnasium as gym
-import numpy as np
 import pytest
-from episodes import AROUND, moved
+from episodes import AROUND, JUMP, OBSTACLES, moved, play
 
 from viapoint.envs.record_video import RecordMovements
 
@@ -19,27 +18,15 @@ def test_gymnasium_records_two_frames_of_a_movement_and_a_warning_says_so(make, 
     assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == 2
 
 
-def test_whole_movements_are_recorded(make, tmp_path):
-    made = make(mode="rgb_array_list", side=64)
-    env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
-    moved(env, AROUND)
-    expected = 1 + round(env.unwrapped.last_rollout.time[-1] * env.metadata["render_fps"])
-    env.close()
-    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == expected
-
-
-def test_where_a_movement_is_several_steps_each_frame_of_it_is_recorded_once(make, tmp_path):
-    short = (0.4, 0.6)
-    made = make("viapoint.envs:viapoint/PlanarTargetJump-v0", "rgb_array_list", side=64, duration_range=short)
+@pytest.mark.parametrize("env_id", [OBSTACLES, JUMP])
+def test_each_frame_of_a_movement_of_one_or_several_steps_is_recorded_once(env_id, make, tmp_path):
+    made = make(f"viapoint.envs:{env_id}", "rgb_array_list", side=64, duration_range=(0.4, 0.6))
     env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
     env.reset(seed=0)
-    steps, over = 0, False
-    while not over:
-        *_, terminated, truncated, _ = env.step(np.full(env.action_space.shape, 0.3, np.float32))
-        steps, over = steps + 1, terminated or truncated
+    steps = len(play(env, 0.3))
     expected = 1 + round(env.unwrapped.last_rollout.time[-1] * env.metadata["render_fps"])
     env.close()
-    assert steps > 1
+    assert (steps > 1) == (env_id == JUMP)
     assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == pytest.approx(expected, abs=1)
 
 

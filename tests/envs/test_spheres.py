@@ -5,12 +5,11 @@ import itertools
 import mujoco
 import numpy as np
 import pytest
-from self_contact import check_contact_implies_overlap, least_pair_distance
+from self_contact import check_contact_implies_overlap
 
 from viapoint.envs.arms import capsule_fit
 from viapoint.envs.arms.capsule_fit import cover_geom, cover_points, polytope_around
 from viapoint.envs.arms.registry import arm_of
-from viapoint.envs.arms.spheres import bounding_ball
 from viapoint.envs.geometry.shapes import ConvexMesh
 
 GEOMS = """<mujoco>
@@ -28,22 +27,6 @@ GEOMS = """<mujoco>
 
 def test_contact_of_the_panda_with_itself_implies_that_spheres_overlap():
     check_contact_implies_overlap(arm_of("panda"))
-
-
-@pytest.mark.parametrize("name", ["planar", "panda"])
-def test_bounding_balls_contain_the_spheres_and_at_home_nothing_overlaps(name):
-    arm = arm_of(name)
-    for group, (first, last) in enumerate(itertools.pairwise(arm.spheres.first)):
-        away = np.linalg.norm(arm.spheres.centre[first:last] - arm.spheres.ball_centre[group], axis=1)
-        assert (away + arm.spheres.radius[first:last]).max() <= arm.spheres.ball_radius[group] + 1e-9
-    if len(arm.spheres.pairs):
-        assert least_pair_distance(arm, arm.home).min() > 0.0
-
-
-def test_bounding_balls_are_hardly_larger_than_needed():
-    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    _, radius = bounding_ball(corners, np.full(8, 0.5))
-    assert 3**0.5 + 0.5 <= radius <= 1.01 * (3**0.5 + 0.5)
 
 
 def points_in(model, geom, rng, number=3000):

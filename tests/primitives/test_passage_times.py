@@ -93,44 +93,47 @@ def test_equal_neighbours_are_merged():
 
 @pytest.mark.parametrize("vias", [1, 2, 4])
 def test_a_batch_gives_bit_for_bit_what_each_item_gives_alone(vias, rng):
-    waypoints = rng.normal(size=(30, vias + 2, 3))
+    waypoints = rng.normal(size=(12, vias + 2, 3))
+    waypoints[2] = waypoints[2, 0]
     waypoints[3, 1] = waypoints[3, 0]
     waypoints[4, -2] = waypoints[4, -1]
-    duration = rng.uniform(0.5, 2, 30)
-    velocity = rng.normal(size=(30, 3)) * (rng.uniform(size=(30, 1)) < 0.5)
+    waypoints[5, 1] = waypoints[5, 0] + [1e-30, 0.0, 0.0]
+    waypoints[6, -2] = waypoints[6, -1] + 1e-9
+    duration = rng.uniform(0.5, 2, 12)
+    velocity = rng.normal(size=(12, 3)) * (rng.uniform(size=(12, 1)) < 0.5)
     for ends in ({}, {"start_velocity": velocity}):
         batch = passage_durations(waypoints, duration, **ends)
-        for i in range(30):
+        movements = through(waypoints, batch, **ends)
+        for i in range(12):
             own = {name: value[i] for name, value in ends.items()}
-            np.testing.assert_array_equal(passage_durations(waypoints[i], duration[i], **own), batch[i])
-
-
-def test_single_precision_is_accurate(rng):
-    waypoints = rng.uniform(-1, 1, (300, 3, 2)).astype(np.float32)
-    single = passage_durations(waypoints, 1.0)
-    assert single.dtype == np.float32
-    np.testing.assert_allclose(single, passage_durations(waypoints.astype(float), 1.0), rtol=2e-7)
+            alone = passage_durations(waypoints[i], duration[i], **own)
+            np.testing.assert_array_equal(alone, batch[i])
+            coefficients = through(waypoints[i], alone, **own).coefficients
+            np.testing.assert_array_equal(coefficients, movements.coefficients[i])
 
 
 @pytest.mark.parametrize("goal_velocity", [None, FREE])
 @pytest.mark.parametrize("goal_acceleration", [None, FREE])
 @pytest.mark.parametrize("pace", [0.3, 3.0, 10.0])
-def test_one_via_point_with_moving_ends_is_passed_at_the_global_minimum(
+def test_one_via_point_anywhere_with_moving_ends_is_passed_at_the_global_minimum(
     goal_velocity, goal_acceleration, pace, rng
 ):
-    count = 150
-    waypoints, velocity, acceleration, given = (
+    count, early = 150, np.concatenate([np.linspace(0.005, 0.5, 50), np.logspace(-5, -1, 50)])
+    waypoints, (velocity, acceleration, given) = (
         rng.normal(size=(count, 3, 2)),
-        *pace * rng.normal(size=(3, count, 2)),
+        rng.normal(size=(3, count, 2)),
     )
+    near = 10.0 ** rng.uniform(-8, 0, (count, 1))
+    waypoints[:60, 1] = waypoints[:60, 0] + near[:60] * waypoints[:60, 1]
+    waypoints[60:120, 1] = waypoints[60:120, 2] + near[60:120] * waypoints[60:120, 1]
     ends = {
-        "start_velocity": velocity,
-        "start_acceleration": acceleration,
-        "goal_velocity": given if goal_velocity is None else FREE,
+        "start_velocity": pace * velocity,
+        "start_acceleration": pace * acceleration,
+        "goal_velocity": pace * given if goal_velocity is None else FREE,
         "goal_acceleration": goal_acceleration,
     }
     cost = through(waypoints, passage_durations(waypoints, 1.0, **ends), **ends).cost()
-    for t in np.linspace(0.005, 0.995, 100):
+    for t in (*early, *(1 - early)):
         anywhere = through(waypoints, np.tile([t, 1 - t], (count, 1)), **ends).cost()
         assert (cost <= anywhere * (1 + 1e-9)).all()
 
@@ -139,14 +142,6 @@ def test_of_three_minima_the_lowest_is_found():
     waypoints = np.array([[0.0, 0.0], [0.807, 0.752], [1.0, 0.0]])
     ends = {"start_velocity": np.array([8.83, 6.31]), "goal_velocity": np.array([1.49, -15.13])}
     np.testing.assert_allclose(passage_durations(waypoints, 1.0, **ends)[0], 0.1065, atol=5e-5)
-
-
-@pytest.mark.parametrize("vias", [2, 3, 5, 20])
-def test_the_movement_backwards_has_the_same_passage_times(vias, rng):
-    waypoints = rng.normal(size=(60, vias + 2, 2))
-    there = passage_durations(waypoints, 1.0)
-    back = passage_durations(waypoints[:, ::-1], 1.0)[:, ::-1]
-    assert (np.abs(there - back) / there.min(axis=-1, keepdims=True)).max() < 1e-9
 
 
 @pytest.mark.parametrize("distance", [1e-1, 1e-3, 1e-5, 1e-7, 1e-10, 1e-40, 1e-160, 1e-300])
@@ -173,27 +168,11 @@ def test_a_movement_and_its_reversal_pass_at_the_same_instant(distance, rest, rn
         np.testing.assert_allclose(toward, away, rtol=2e-9)
 
 
-@pytest.mark.parametrize("rest", ["at the start", "at the goal", "nowhere"])
-@pytest.mark.parametrize("where", [0, 1])
-def test_no_instant_is_better_for_a_via_point_near_an_end(where, rest, rng):
-    count, grid = 8, np.concatenate([np.logspace(-5, -0.5, 150), 1 - np.logspace(-5, -0.5, 150)])
-    ends = np.array([[0.0, 0.0], [1.0, 0.0]])
-    for distance in (1e-2, 1e-5, 1e-8):
-        via = ends[where] + distance * rng.normal(size=(count, 2))
-        waypoints = np.stack([np.tile(ends[0], (count, 1)), via, np.tile(ends[1], (count, 1))], axis=1)
-        state = {"start_velocity": rng.normal(size=(count, 2)), "goal_velocity": rng.normal(size=(count, 2))}
-        state.pop({"at the start": "start_velocity", "at the goal": "goal_velocity"}.get(rest, ""), None)
-        best = through(waypoints, passage_durations(waypoints, 1.0, **state), **state).cost()
-        moving = {name: value[:, None] for name, value in state.items()}
-        others = through(waypoints[:, None], np.stack([grid, 1 - grid], axis=-1), **moving).cost()
-        assert (best <= others.min(axis=1) * (1 + 1e-9)).all()
-
-
 LENGTHS = st.floats(-1e6, 1e6, allow_subnormal=False)
 """Coordinates, [m]; relative to the whole path, a subnormal distance is zero."""
 
 
-@hypothesis.settings(max_examples=150, deadline=None)
+@hypothesis.settings(max_examples=60, deadline=None)
 @hypothesis.given(
     st.integers(3, 5).flatmap(lambda n: hnp.arrays(float, (n, 2), elements=LENGTHS)),
     st.floats(1e-3, 1e3),

@@ -1,6 +1,7 @@
 """The command, from the words to the files."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -25,12 +26,23 @@ def failed(capsys, *words, code=2):
     return line
 
 
-@pytest.mark.parametrize("words", [[], *([name] for name in cli.COMMANDS)])
-def test_every_command_has_help(words, capsys):
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_every_command_has_help(command, capsys):
     with pytest.raises(SystemExit) as end:
-        run(*words, "--help")
+        run(command, "--help")
     assert not end.value.code
-    assert "Example: viapoint" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert f"viapoint {command}" in re.search("Example: (.+)", shown).group(1)
+
+
+def test_the_help_fits_a_screen(capsys):
+    with pytest.raises(SystemExit) as end:
+        run("--help")
+    lines = capsys.readouterr().out.splitlines()
+    assert not end.value.code
+    assert all(any(line.strip().startswith(command) for line in lines) for command in cli.COMMANDS)
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 80
 
 
 def test_output_that_nobody_reads_ends_the_command_without_a_word():
@@ -93,7 +105,7 @@ def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, 
     ):
         run("evaluate", trained, "--baselines", "straight", "--scenes", *words)
     kept = [json.loads(path.read_text()) for path in (trained / "evaluations").glob("validation-*.json")]
-    assert sorted(each["methods"]["straight line"]["scenes"] for each in kept) == [3, 4, 40]
+    assert sorted(each["methods"]["straight"]["scenes"] for each in kept) == [3, 4, 40]
 
 
 def test_an_agent_of_another_task_meets_scenes_of_that_task(tmp_path, capsys):

@@ -15,10 +15,9 @@ from viapoint.training.config.configs import (
     PlayConfig,
     StudyConfig,
     TrainConfig,
-    _from_words,
-    _to_words,
 )
 from viapoint.training.config.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
+from viapoint.training.config.words import from_words, to_words
 
 EXAMPLES = [
     TrainConfig(),
@@ -38,8 +37,9 @@ EXAMPLES = [
 
 
 @pytest.mark.parametrize("config", EXAMPLES, ids=lambda config: type(config).__name__)
-def test_configurations_survive_json_and_are_frozen(config):
-    assert type(config).from_json(json.loads(json.dumps(config.as_json()))) == config
+def test_configurations_are_frozen_and_that_of_a_training_survives_json(config):
+    if isinstance(config, TrainConfig):
+        assert TrainConfig.from_json(json.loads(json.dumps(config.as_json()))) == config
     with pytest.raises(dataclasses.FrozenInstanceError):
         config.env = "other"
 
@@ -60,14 +60,14 @@ def test_configurations_survive_json_and_are_frozen(config):
     ],
 )
 def test_words_are_values_in_yaml(text, value):
-    assert _from_words([f"x={text}"]) == {"x": value}
+    assert from_words([f"x={text}"]) == {"x": value}
 
 
 @pytest.mark.parametrize(
     "value", [2, 1e-7, True, None, [1, 8], {"a": [16]}, "learned", "2", "true", "", "a: b"]
 )
 def test_values_survive_the_way_to_words_and_back(value):
-    assert _from_words(_to_words({"x": value})) == {"x": value}
+    assert from_words(to_words({"x": value})) == {"x": value}
 
 
 def test_words_become_a_configuration():
@@ -85,6 +85,17 @@ def test_words_become_a_configuration():
     assert cli.parse(shlex.split(config.command)[1:]) == config
     config = cli.parse(shlex.split("evaluate runs/x --baselines planner --json a.json"))
     assert config == EvaluateConfig(agent="runs/x", baselines=("planner",), json=Path("a.json"))
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_a_short_training_begins_to_learn_in_proportion(algo):
+    usual = TrainConfig(algo=algo)
+    short = TrainConfig(algo=algo, n_timesteps=usual.total_timesteps // 8)
+    if "learning_starts" in usual.all_hyperparameters:
+        ratio = short.all_hyperparameters["learning_starts"] / usual.all_hyperparameters["learning_starts"]
+        assert ratio == pytest.approx(1 / 8)
+    given = TrainConfig(algo="sac", n_timesteps=64, hyperparameters={"learning_starts": 100})
+    assert given.all_hyperparameters["learning_starts"] == 100
 
 
 def test_every_algorithm_has_presets_that_fit():

@@ -13,7 +13,7 @@ from viapoint.training.runs.callback import RunCallback, TrainingStoppedError
 def quick(monkeypatch, shipped, tmp_path):
     monkeypatch.setattr(demo, "PICTURES", 2)
     monkeypatch.setattr(demo, "MOVEMENTS", 1)
-    return DemoConfig(out=tmp_path / "demo", n_timesteps=64, n_scenes=8, checks=8)
+    return DemoConfig(out=tmp_path / "demo", n_timesteps=64, n_scenes=8)
 
 
 def test_an_interrupted_demo_goes_on_and_what_is_done_is_not_done_again(quick, capsys, monkeypatch):
@@ -32,8 +32,8 @@ def test_an_interrupted_demo_goes_on_and_what_is_done_is_not_done_again(quick, c
     written = {name: (quick.out / name).stat().st_mtime_ns for name in demo.FILES}
     assert all(str(quick.out / name) in told for name in (*demo.FILES, "best"))
     methods = json.loads((quick.out / "table.json").read_text())["methods"]
-    assert {"agent", "agent, 8 checks", "untrained", "search, 512 checks"} <= set(methods)
-    assert methods["straight line"]["success"]["rate"] == 0.0
+    assert {"agent", "agent, 16 checks", "untrained", "search512"} <= set(methods)
+    assert methods["straight"]["success"]["rate"] == 0.0
 
     for name in ("evaluate_methods", "gallery", "record_video"):
         monkeypatch.setattr(demo, name, pytest.fail)

@@ -50,17 +50,12 @@ def test_a_crash_and_a_hang_end_no_report(monkeypatch):
     assert not doctor.in_a_process("it", "import time; time.sleep(60)", "").works
 
 
-def test_bounds_are_those_of_the_installed_package():
-    for version, least, enough in (
-        ("2.10", "2.9", True),
-        ("2.9", "2.10", False),
-        ("2.13.0+cpu", "2.13", True),
-        ("3.9", "4.0", False),
-    ):
-        assert doctor.at_least(version, least) is enough
-    lines = ["numpy>=99.1", "gymnasium[mujoco]>=0.1", "mypy>=99; extra == 'dev'", "no-such-package>=1"]
-    found = {each.name: each.works for each in doctor.packages(lines)}
-    assert found == {"Python": True, "numpy": False, "gymnasium": True, "no-such-package": False}
+def test_packages_of_training_are_told_from_those_that_are_always_needed():
+    extras = dict(doctor.requirements())
+    assert (extras["numpy"], extras["torch"]) == ("", "training")
+    assert "mypy" not in extras
+    assert doctor.installed("numpy")
+    assert not doctor.installed("no-such-package")
 
 
 def test_runs_need_a_folder_that_can_be_written(tmp_path):

@@ -8,12 +8,13 @@ import pytest
 from viapoint.training.evaluation.evaluator import (
     SLOW_DECISION,
     MethodResult,
+    evaluate,
     evaluate_methods,
-    single_decision_times,
 )
 from viapoint.training.planning.baselines import make_method
+from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets.scene_set import BANDS
+from viapoint.training.scene_sets.scene_set import BANDS, drawn
 
 ENV = "viapoint/PlanarObstacles-v0"
 
@@ -96,6 +97,7 @@ def fake(success, **changes):
         "family": np.full(n, ""),
         "distance": np.full(n, 0.4),
         "partial": False,
+        "interrupted": False,
     }
     return MethodResult(**{**values, **changes})
 
@@ -167,13 +169,9 @@ def test_decisions_are_timed_one_by_one_and_slow_ones_by_the_batch(small_scenes,
 
 def test_every_decision_of_an_episode_is_timed_where_plans_are_revised():
     env_id = "viapoint/PlanarMovingObstacles-v0"
-    simulation = SceneSimulation(env_id, 4, threads=1)
-    scenes = simulation.draw(4, seed=0)
-    method = make_method("straight", env_id, threads=1)
-    times = list(single_decision_times(method, scenes, simulation, 100, 60.0))
-    played = simulation.play(method, scenes, method.decide(simulation.observe(scenes), scenes))
-    simulation.close()
-    assert len(times) == played.info["decisions"].sum() > len(scenes.start)
+    frozen = drawn("test", registered_task(env_id), 4)
+    (result,) = evaluate_methods([make_method("straight", env_id)], frozen, env_id).results
+    assert len(result.decision_times) == result.outcomes["decisions"].sum() - 1 > 4
 
 
 def test_comparisons_are_with_the_first(small_scenes, solutions):
@@ -187,3 +185,9 @@ def test_comparisons_are_with_the_first(small_scenes, solutions):
     assert comparison["p_value"] == pytest.approx(2.0 * 0.5**solved)
     assert set(record["outcomes"]) == {"straight", "search"}
     assert len(record["outcomes"]["straight"]["action"]) == 40
+
+
+def test_fewer_scenes_than_asked_for_are_told(small_scenes, capsys):
+    result = evaluate(Given("a", ZEROS), env=ENV, scenes=small_scenes, n_scenes=50, time_decisions=False)
+    assert len(result.results[0].success) == 40
+    assert "40 scenes, not 50" in capsys.readouterr().err

@@ -140,10 +140,10 @@ def test_what_the_paper_wrote_can_be_written_again(tmp_path, monkeypatch):
 
     claims = [paper.Claim(1, "one", model=(1.0, paper.straight.near(1.0, 0.1)))]
     pictures = []
-    for drawing in paper.DRAWINGS:
-        picture, _ = save_figure(Figure(), tmp_path, drawing.name)
+    for name in paper.DRAWINGS:
+        picture, _ = save_figure(Figure(), tmp_path, name)
         pictures.append((picture, "caption"))
-    monkeypatch.setattr(paper, "reproduce", lambda *_: paper.Reproduction(claims, pictures))
+    monkeypatch.setattr(paper, "reproduce", lambda *_: (claims, pictures))
     for _ in range(2):
         paper.run(PaperConfig(out=tmp_path))
 
@@ -166,9 +166,8 @@ def test_a_training_leaves_foreign_files_in_its_folder_alone(tmp_path):
         "notes.txt",
         "checkpoints/2024-notes/a.txt",
         "checkpoints/12345/a.txt",
-        "checkpoints/0000000016/notes.txt",  # beside a checkpoint
-        "checkpoints/0000000001/a.txt",
-        "checkpoints/1700000000/a.txt",
+        "checkpoints/0000000016.txt",  # beside a checkpoint
+        "checkpoints/1700000000.pt/a.txt",
         "evaluations/notes.md",
         ".backup.part",
         ".cache/a.old",
@@ -177,7 +176,7 @@ def test_a_training_leaves_foreign_files_in_its_folder_alone(tmp_path):
     for name in foreign:
         put(folder, name)
     run = train(TrainConfig(out=folder, resume=True, n_timesteps=128, progress=False))
-    assert [int(path.name) for path in run.checkpoints()] == [112, 128]
+    assert [int(path.stem) for path in run.checkpoints()] == [112, 128]
     assert all((folder / name).read_bytes() == NOTES for name in foreign)
 
 

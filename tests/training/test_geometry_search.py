@@ -17,6 +17,7 @@ from viapoint.training.planning.search import (
     GeometrySearch,
     merits,
     plan_clearances,
+    refined_actions,
 )
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import scenes_for
@@ -226,3 +227,21 @@ def test_a_plan_may_have_no_obstacles_or_more_than_the_task():
     search = GeometrySearch(PLANE, 64)
     post = Cylinder(0.03, 0.1, position=(-0.05, 0.35, 0.0))
     assert np.abs(search.plan((-0.2, 0.3), (0.1, 0.4), [post]).waypoints[1] - (-0.05, 0.35)).max() > 0.03
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"n_via": 2, "timing": "learned"}])
+@pytest.mark.parametrize("env_id", [WHOLE_ARM, PANDA])
+def test_refined_actions_are_clear_more_often_and_keep_their_duration(env_id, kwargs):
+    env, _, problem = made(env_id, 24, **kwargs)
+    actions = random_actions(env.task, 24, 2)
+    refined = refined_actions(env.task, problem, actions)
+    at = env.task.n_via * env.task.action.dimension
+    np.testing.assert_array_equal(refined[..., at], actions[..., at])
+    assert np.abs(refined).max() <= 1.0
+
+    def clear(vectors):
+        return plan_clearances(env.task, problem, vectors, 0.0, 0.0, exact=True) >= 0.0
+
+    assert clear(refined).mean() > clear(actions).mean() + 0.3
+    # A problem alone is refined as it is among others.
+    np.testing.assert_array_equal(refined_actions(env.task, problem.take([5]), actions[5:6]), refined[5:6])

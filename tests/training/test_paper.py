@@ -14,7 +14,7 @@ from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.movements import Profile, construction, via_waypoints
 from viapoint.training.paper.rows import obstacles
 from viapoint.training.paper.rows.double_step import double_step, excess_cost
-from viapoint.training.paper.rows.one_via import count_roots, passage_polynomial, root_of
+from viapoint.training.paper.rows.one_via import passage_polynomial, roots_of
 from viapoint.training.paper.run import DRAWINGS, ROWS
 
 GUIDE = Path(__file__).parents[2] / "docs" / "flash-hogan.md"
@@ -37,11 +37,6 @@ def claims_of(folder):
     return json.loads((folder / "table.json").read_text())["claims"]
 
 
-def is_within(value, ends):
-    low, high = ends
-    return (low is None or value >= low) and (high is None or value <= high)
-
-
 def test_every_number_is_as_promised(made):
     claims = claims_of(made)
     assert {claim["row"] for claim in claims} == set(ROWS)
@@ -49,13 +44,15 @@ def test_every_number_is_as_promised(made):
         numbers = [name for name in ("model", "arm") if claim[name] is not None]
         assert numbers, claim["claim"]
         for name in numbers:
-            assert is_within(claim[name], claim[f"{name}_expected"]), claim
+            low, high = claim[f"{name}_expected"]
+            assert low is None or claim[name] >= low, claim
+            assert high is None or claim[name] <= high, claim
         assert claim["verdict"] == "holds"
     carried = [claim for claim in claims if claim["arm"] is not None]
     assert len(carried) > 0.7 * len(claims)
     assert max(claim["deviation_mm"] for claim in carried if "torque" not in claim["claim"]) < 1.0
-    for drawing in DRAWINGS:
-        assert (made / f"{drawing.name}.png").stat().st_size > 5_000
+    for name in DRAWINGS:
+        assert (made / f"{name}.png").stat().st_size > 5_000
 
 
 def test_the_guide_says_what_the_command_computes(made):
@@ -73,23 +70,17 @@ def test_the_guide_says_what_the_command_computes(made):
 
 
 @pytest.mark.parametrize(
-    ("model", "arm", "verdict"),
-    [
-        (1.0, 2.0, "holds"),
-        (1.2, 2.0, "FAILS"),
-        (1.0, 1.9, "FAILS"),
-        (np.nan, 2.0, "FAILS"),
-        (1.0, np.nan, "FAILS"),
-    ],
+    ("model", "arm", "holds"),
+    [(1.0, 2.0, True), (1.2, 2.0, False), (1.0, 1.9, False), (np.nan, 2.0, False), (1.0, np.nan, False)],
 )
-def test_a_claim_fails_where_a_number_is_not_as_promised(model, arm, verdict):
+def test_a_claim_holds_where_every_number_is_as_promised(model, arm, holds):
     claim = Claim(1, "x", model=(model, near(1.0, 0.1)), arm=(arm, at_least(2.0)))
-    assert claim.verdict == verdict
+    assert claim.holds == holds
 
 
 def test_a_failed_claim_ends_the_command_with_code_1(tmp_path, monkeypatch, capsys):
     claims = [Claim(1, "too much", model=(2.0, at_most(1.0)))]
-    monkeypatch.setattr(run, "reproduce", lambda *_: run.Reproduction(claims, []))
+    monkeypatch.setattr(run, "reproduce", lambda *_: (claims, []))
     with pytest.raises(SystemExit) as end:
         cli.main(["paper", "--out", str(tmp_path)])
     assert end.value.code == 1
@@ -97,24 +88,9 @@ def test_a_failed_claim_ends_the_command_with_code_1(tmp_path, monkeypatch, caps
     assert json.loads((tmp_path / "table.json").read_text())["holds"] is False
 
 
-def test_sturm_counts_known_roots():
-    def product(*roots):
-        result = [Fraction(1)]
-        for root in roots:
-            result = [
-                a - root * b for a, b in zip([Fraction(0), *result], [*result, Fraction(0)], strict=True)
-            ]
-        return result
-
-    tenth = Fraction(1, 10)
-    assert count_roots(product(3 * tenth, 7 * tenth, Fraction(2))) == 2
-    assert count_roots(product(3 * tenth, 3 * tenth, -tenth)) == 1  # a double root is one root
-    assert count_roots(product(-tenth, Fraction(2))) == 0
-
-
 def test_the_passage_polynomial_knows_the_symmetric_movement():
-    polynomial = passage_polynomial((Fraction(1, 2), Fraction(1, 3)), (Fraction(1), Fraction(0)))
-    assert root_of(polynomial) == pytest.approx(0.5, abs=1e-15)
+    (root,) = roots_of(passage_polynomial((Fraction(1, 2), Fraction(1, 3)), (Fraction(1), Fraction(0))))
+    assert root == pytest.approx(0.5, abs=1e-15)
 
 
 def test_the_construction_is_undone():
@@ -127,7 +103,7 @@ def test_a_profile_finds_peaks_and_valley():
     time = np.linspace(0.0, 1.0, 501)
     speed = 1.0 - np.cos(4 * np.pi * time) * 0.8 - 0.1 * time
     velocity = np.stack((speed, np.zeros_like(speed)), axis=-1)
-    profile = Profile.of(time, np.zeros((501, 2)), velocity, np.zeros((501, 2)))
+    profile = Profile(time, np.zeros((501, 2)), velocity, np.zeros((501, 2)))
     assert profile.valley == pytest.approx(0.5, abs=2e-3)
     assert profile.peaks[:, 0] == pytest.approx([0.25, 0.75], abs=2e-3)
     assert 0.0 < profile.valley_depth < 0.2
@@ -135,28 +111,15 @@ def test_a_profile_finds_peaks_and_valley():
 
 
 @pytest.mark.parametrize("moment", [0.04, 0.2, 0.55])
-@pytest.mark.parametrize("remaining", [0.7, 1.1])
-def test_a_sum_of_two_movements_costs_more_than_the_plan_by_the_closed_form(moment, remaining):
-    movement = double_step(moment, remaining=remaining)
+@pytest.mark.parametrize("late", [0.0, 0.1, 0.5])
+def test_a_sum_of_two_movements_costs_more_than_the_plan_where_it_arrives_later(moment, late):
+    movement = double_step(moment, remaining=0.7 - moment + late)
     more = movement.cost("superposed") - movement.cost("planned")
-    assert more > 0.0
-    assert more == pytest.approx(
-        excess_cost(0.4, moment, 0.7, remaining), rel=1e-9
-    )  # T1 and T4 are 40 cm apart
-
-
-def test_sum_and_plan_are_the_same_where_the_arrival_stays():
-    time = np.linspace(0.0, 0.7, 301)
-    for moment in (0.1, 0.35, 0.6):
-        movement = double_step(moment, remaining=0.7 - moment)
-        for nu in range(4):
-            apart = movement.superposed(time, nu) - movement.planned(time, nu)
-            assert abs(apart).max() < 1e-10 * abs(movement.first(time, nu)).max() / (0.7 - moment) ** 3
-
-
-@pytest.mark.parametrize("way", ["superposed", "planned"])
-def test_a_movement_whose_target_jumps_arrives_at_rest(way):
-    movement = double_step(0.2)
-    ends = [getattr(movement, way)(np.array([0.0, 0.9]), nu) for nu in range(3)]
-    np.testing.assert_allclose(ends[0], [(-0.32, 0.42), (-0.02, 0.57)], atol=1e-12)
-    np.testing.assert_allclose(ends[1:], 0.0, atol=1e-10)
+    assert more == pytest.approx(excess_cost(movement), rel=1e-9, abs=1e-9 * movement.cost("planned"))
+    assert (more > 1e-3) == (late > 0.0)
+    time = np.array([0.0, moment, movement.arrival + 0.1])
+    for nu in range(3):
+        states = movement.superposed(time, nu), movement.planned(time, nu)
+        np.testing.assert_allclose(*states, atol=1e-9)
+        rest = [(-0.32, 0.42), (-0.02, 0.57)] if nu == 0 else 0.0
+        np.testing.assert_allclose(states[0][[0, 2]], rest, atol=1e-9)

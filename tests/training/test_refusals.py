@@ -25,12 +25,11 @@ from viapoint.training.config.configs import (
     PlayConfig,
     StudyConfig,
     TrainConfig,
-    _from_words,
 )
+from viapoint.training.config.words import from_words
 from viapoint.training.evaluation import statistics
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError
-from viapoint.training.paper.claim import Claim
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.plotting import plots
@@ -61,7 +60,6 @@ CONFIGURATIONS = [
     *((TrainConfig, {"stop_when_stalled": share}) for share in (0.0, 1.0, -0.3, True, "0.3", math.nan)),
     (TrainConfig, STALLING),  # the preset has no more decisions than it must make
     (TrainConfig, {**STALLING, "n_timesteps": 10**5, "eval_every": 0}),
-    (TrainConfig, {"min_timesteps": 5}),
     (TrainConfig, {"observe_candidates": 16}),
     (TrainConfig, {"observe_candidates": 16, "algo": "sac", "env": STEP}),
     (TrainConfig, {"observe_candidates": -1}),
@@ -81,7 +79,6 @@ CONFIGURATIONS = [
     (LiveConfig, {"port": 70_000}),
     (LiveConfig, {"env": "nothing"}),
     (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}),
-    (DemoConfig, {"checks": 0}),
     (StudyConfig, {"file": "study.yaml", "workers": 0}),
 ]
 
@@ -97,7 +94,7 @@ def test_configurations(kind, values):
 )
 def test_words(words):
     with pytest.raises(ValueError):
-        _from_words(words)
+        from_words(words)
 
 
 @pytest.mark.parametrize(
@@ -215,6 +212,7 @@ CALLS = [
     lambda: evaluate(env=ENV, baselines=["untrained"]),
     lambda: evaluate("nowhere"),
     lambda: evaluate(ENV, checks=-1),
+    lambda: evaluate(ENV, baselines="straight"),
     lambda: evaluate(ENV, checks=[0, 1.5]),
     lambda: evaluate(ENV, n_scenes=0),
     lambda: evaluate(ENV, scenes="nowhere.npz"),
@@ -266,7 +264,6 @@ CALLS = [
     lambda: plots.learning_curve("none.png", []),
     lambda: statistics.wilson(5, 4),
     lambda: statistics.wilson(-1, 4),
-    lambda: Claim(1, "x"),
 ]  # fmt: skip
 
 
@@ -279,11 +276,11 @@ def test_calls(call, tmp_path, monkeypatch):
 
 
 COPIES = [
-    (lambda env: env.set_options([{"start": 0.0}, *[{}] * 5]), ValueError),
-    (lambda env: env.set_options([*[{}] * 5, {"goal": 0.0}]), ValueError),
-    (lambda env: env.set_options([{}] * 5), ValueError),
-    (lambda env: env.set_options([5] * 6), ValueError),
-    (lambda env: env.set_options(5), ValueError),
+    (lambda env: (env.set_options([{"start": 0.0}, *[{}] * 5]), env.reset()), ValueError),
+    (lambda env: (env.set_options([*[{}] * 5, {"goal": 0.0}]), env.reset()), ValueError),
+    (lambda env: (env.set_options([{}] * 5), env.reset()), ValueError),
+    (lambda env: (env.set_options([5] * 6), env.reset()), ValueError),
+    (lambda env: (env.set_options(5), env.reset()), ValueError),
     (lambda env: env.get_attr("num_envs", 6), IndexError),
     (lambda env: env.env_method("__str__", indices=[0, -7]), IndexError),
     (lambda env: env.env_is_wrapped(gym.Wrapper, indices=[9]), IndexError),
@@ -326,7 +323,17 @@ def test_folders_that_are_no_runs(tmp_path):
 COMMANDS = [
     ("", "train"),
     ("fly", "fly"),
+    ("trian", "did you mean 'train'"),
     ("train --env viapoint/PlanarObstacle-v0", "Did you mean: `PlanarObstacles`"),
+    ("train --n-timesteps -5", "--n-timesteps must be a whole number, from 1"),
+    ("train --n-timesteps 1e5", "--n-timesteps: must be a whole number, got '1e5'"),
+    (f"train --n-timesteps 1{'0' * 21}", "to 1000000000"),
+    ("train --env-kwargs n_vias=2 --out full", "did you mean 'n_via'"),
+    ("train --env-kwargs n_obstacles=999", "n_obstacles"),
+    ("train --out /proc/x/y", "/proc/x/y cannot be written"),
+    ("paper --out /proc/p", "--out /proc/p cannot be written"),
+    (f"evaluate --env {ENV} --json /proc/x", "--json /proc/x cannot be written"),
+    ("study --workers 0 a.yaml", "--workers must be a whole number, 1 or more"),
     ("train --env-kwargs n_via", "n_via"),
     ("train --env-kwargs num_envs=4", "--n-envs"),
     ("train --env-kwargs n_vi=2 --out new", "n_vi"),

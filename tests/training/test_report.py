@@ -4,9 +4,9 @@ import io
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
-from rich.console import Console
 
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate_methods
@@ -34,20 +34,37 @@ def record(small_scenes):
 
 
 def test_the_document_holds_every_method_and_metric(record, tmp_path):
-    document, data = report.write(record, tmp_path / "new")
+    report.write(record, tmp_path / "new")
+    document, data = (tmp_path / "new" / f"table.{suffix}" for suffix in ("md", "json"))
     lines = [line for line in document.read_text().splitlines() if line.startswith("|")]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert {len(line) for line in cells} == {len(cells[0])}
-    assert [line[0] for line in cells[2:]] == ["still [bold]", "search, 32 checks"]
-    summary = record["methods"]["search, 32 checks"]
+    assert [line[0] for line in cells[2:]] == ["still [bold]", "search32"]
+    summary = record["methods"]["search32"]
     search = dict(zip(cells[0], cells[3], strict=True))
     assert search["success"] == f"{100 * summary['success']['rate']:.1f} %"
     assert search["clearance [mm]"] == f"{1e3 * summary['min_clearance']:.1f}"
     assert json.loads(data.read_text()) == record
     assert record["sha256"][:12] in document.read_text()
-    console = Console(width=100, record=True, file=io.StringIO())
-    report.show(record, console)
-    assert "[bold]" in console.export_text()
+
+
+@pytest.mark.parametrize("number", [1, 5, 12])
+def test_the_table_fits_a_terminal_of_80_columns(record, number):
+    (summary, *_) = record["methods"].values()
+    names = [f"untrained, {16 * i} checks" for i in range(number)]
+    shown = report.text({**record, "methods": dict.fromkeys(names, summary)})
+    assert max(map(len, shown.splitlines())) <= 80
+    assert shown.count("untrained") == number
+
+
+def test_every_format_holds_the_same_numbers(record):
+    rate = record["methods"]["search32"]["success"]["rate"]
+    csv = pd.read_csv(io.StringIO(report.formatted(record, "csv"))).set_index("method")
+    assert csv["success rate"]["search32"] == rate
+    parsed = json.loads(report.formatted(record, "json"))
+    assert parsed["methods"]["search32"]["success"]["rate"] == rate
+    for form in ("md", "table"):
+        assert f"{100 * rate:.1f} %" in report.formatted(record, form)
 
 
 def test_pictures_are_drawn(record, tmp_path):

@@ -5,10 +5,12 @@ import errno
 import json
 import os
 import resource
+import shlex
 import signal
 
 import numpy as np
 import pytest
+import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from viapoint.training.agents.model_io import load_model
@@ -20,6 +22,7 @@ from viapoint.training.io.files import BadFileError, read_arrays
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs import callback
 from viapoint.training.runs.callback import TrainingStoppedError
+from viapoint.training.runs.checkpoints import read_state
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import TrainingFailedError, train
 
@@ -64,9 +67,21 @@ def same_result(one, other):
         assert set(first) == set(second)
         for part in first:
             np.testing.assert_array_equal(first[part], second[part], err_msg=f"{name} {part}")
-    first, second = (json.loads((run.checkpoints()[-1] / "state.json").read_text()) for run in (one, other))
-    for name in ("counters", "random", "env"):
-        assert first[name] == second[name], name
+    same_state(*(read_state(run.checkpoints()[-1]) for run in (one, other)))
+
+
+def same_state(one, other, name=""):
+    """All but the times at which episodes ended."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one.keys() - {"t", "seconds"}:
+            same_state(one[key], other[key], f"{name}/{key}")
+    elif isinstance(one, list | tuple):
+        assert len(one) == len(other)
+        for each, theirs in zip(one, other, strict=True):
+            same_state(each, theirs, name)
+    else:
+        assert torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other, name
 
 
 def kill_after(monkeypatch, steps):
@@ -136,8 +151,11 @@ def test_ctrl_c_saves_and_leaves_and_the_rest_follows(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(ViaVecEnv, "step_wait", interrupted)
-        with pytest.raises(TrainingStoppedError, match="--resume") as stop:
+        with pytest.raises(TrainingStoppedError, match="go on with") as stop:
             train(config(tmp_path / "stopped", checkpoint_every=10_000))
+    told = shlex.split(str(stop.value).partition("go on with: ")[2])
+    resume = cli.parse(told[1:])
+    assert (resume.folder, resume.resume) == (tmp_path / "stopped", True)
     assert stop.value.exit_code == 130
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     stopped = Run(tmp_path / "stopped")
@@ -146,12 +164,14 @@ def test_ctrl_c_saves_and_leaves_and_the_rest_follows(tmp_path, monkeypatch):
     same_result(whole, train(TrainConfig(out=stopped.folder, resume=True, progress=False)))
 
 
-STALLING = {"stop_when_stalled": 0.4, "min_timesteps": 128, "n_timesteps": 640}
+STALLING = {"stop_when_stalled": 0.4, "n_timesteps": 640}
 """Training that stalls unless success rises."""
 
 
 def with_success(monkeypatch, rates):
-    """Let validations at 0, 64, 128, ... decisions find these rates of success."""
+    """Let validations at 0, 64, 128, ... decisions find these rates of success; presets are of 128 decisions."""
+    for algo, preset in PRESETS.items():
+        monkeypatch.setitem(PRESETS, algo, dataclasses.replace(preset, n_timesteps=128))
     evaluate = callback.evaluate_methods
 
     def measured(methods, *args, **kwargs):
@@ -172,15 +192,12 @@ def test_a_training_that_stalls_ends_there_and_says_so(algo, tmp_path, monkeypat
     run = train(config(tmp_path / "run", algo, **STALLING), heard)
     # Success rises at 192 decisions; at 320, 128 of them are 40 %.
     assert [record["decisions"] for record in run.curve] == [0, 64, 128, 192, 256, 320]
-    assert (run.stopped, run.decisions) == ("stalled", 320)
-    assert json.loads((run.folder / "end.json").read_text()) == {
-        "stopped": "stalled", "decisions": 320, "best_decisions": 192
-    }  # fmt: skip
+    assert (run.stalled, run.ended, run.decisions) == (True, True, 320)
     assert load_model(run.final).num_timesteps == 320
     assert heard.ended == 1
     again = train(TrainConfig(out=run.folder, resume=True, n_timesteps=1280, progress=False))
     same_result(run, again)
-    assert (again.stopped, again.decisions) == ("stalled", 320)
+    assert (again.stalled, again.decisions) == (True, 320)
 
 
 class Heard(BaseCallback):
@@ -203,9 +220,9 @@ def test_a_stalling_run_is_the_same_with_and_without_interruption(tmp_path, monk
         with pytest.raises(SystemError):
             train(config(tmp_path / "killed", **STALLING))
     killed = Run(tmp_path / "killed")
-    assert (killed.stopped, killed.decisions) == (None, 256)
+    assert (killed.stalled, killed.ended, killed.decisions) == (False, False, 256)
     same_result(whole, train(TrainConfig(out=killed.folder, resume=True, progress=False)))
-    assert (killed.stopped, killed.decisions) == ("stalled", 320)
+    assert (killed.stalled, killed.decisions) == (True, 320)
 
 
 def test_learning_happens(tmp_path):
@@ -259,7 +276,7 @@ def full_disk():
 
 
 def test_a_full_disk_stops_training_and_keeps_what_was_there(full_disk, tmp_path):
-    with pytest.raises(TrainingFailedError, match=r"tensors\.safetensors.*--resume") as error:
+    with pytest.raises(TrainingFailedError, match=r"\.pt.*--resume") as error:
         train(small(tmp_path / "run"))
     assert error.value.__cause__.errno in (errno.EFBIG, errno.ENOSPC)
     run = Run(tmp_path / "run")
@@ -289,9 +306,29 @@ def test_other_versions_are_told(tmp_path, capsys):
         Run(run.folder)
 
 
+def test_what_cannot_learn_is_told(tmp_path, capsys):
+    train(small(tmp_path / "a", n_timesteps=32))
+    assert "not updated once" in capsys.readouterr().err
+    train(small(tmp_path / "b", n_timesteps=64, env_kwargs={"threads": 1, "n_via": 0}))
+    told = capsys.readouterr().err
+    assert "n_via=0" in told
+    assert "updated" not in told
+
+
+def test_a_log_holds_a_line_for_each_validation_and_no_bar(tmp_path, capsys):
+    run = train(config(tmp_path / "run", n_timesteps=64, progress=True))
+    told = capsys.readouterr().err
+    assert "\r" not in told
+    assert len(told.strip().splitlines()) == len(run.curve) == 2
+
+
 def test_half_a_training_and_the_other_half_are_a_whole_one(tmp_path):
     """With a constant learning rate even where the first half was meant to be all."""
     whole = train(small(tmp_path / "whole", n_timesteps=128))
     train(small(tmp_path / "halves", n_timesteps=64))
     halves = train(TrainConfig(out=tmp_path / "halves", resume=True, n_timesteps=128, progress=False))
-    same_arrays(*(run.checkpoints()[-1] / "tensors.safetensors" for run in (whole, halves)))
+    one, other = (read_state(run.checkpoints()[-1]) for run in (whole, halves))
+    for state in (one, other):  # what was meant to be all differs
+        del state["arrays"]["counters"]["_total_timesteps"]
+        del state["arrays"]["counters"]["_current_progress_remaining"]
+    same_state(one, other)

@@ -162,3 +162,18 @@ def test_the_outcome_is_known_only_where_the_terms_sum_to_the_reward():
     np.testing.assert_allclose(told, (1.0, 0.0, 0.1, 0.0, -0.5))
     assert np.isnan(outcome_of(info, 0.7)).all()
     assert np.isnan(outcome_of({}, 0.6)).all()
+
+
+def test_refinement_solves_more_than_as_many_checks(made):
+    env = made(number=64)
+    model, observation = model_on(env), env.reset()
+    solved = []
+    for settings in ({"checks": 4}, {"refine": 4}):
+        chosen = agent_method("agent", model, **{"checks": 0, **settings}).decide(observation, None)
+        solved.append(env.step(chosen)[1].mean())
+        observation = env.reset()
+    assert solved[1] > solved[0] + 0.3
+    with pytest.raises(ValueError, match="refine"):
+        agent_method("agent", model_on(made(REPLANNING)), refine=4)
+    with pytest.raises(ValueError, match="refine"):
+        model_on(made(REPLANNING), policy_kwargs={**FEW, "refine": 4})

@@ -1,4 +1,4 @@
-"""Policy of viaq: candidate plans, a critic that ranks them, and exact geometric checks of the best ones."""
+"""Policy of viaq: candidate plans, a critic that ranks them, and exact checks or refinement of the best ones."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.candidates import candidate_actions, normal_steps
 from viapoint.training.planning.movements import FINE_INSTANTS, INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
-from viapoint.training.planning.search import INFEASIBLE, VERIFIED, best_of, merits
+from viapoint.training.planning.search import INFEASIBLE, VERIFIED, best_of, merits, refined_actions
 
 Observation = Mapping[str, NDArray[Any]]
 Numbers = NDArray[np.floating[Any]]
@@ -60,6 +60,8 @@ class ViaQPolicy(BasePolicy):
         refinements: Rounds of candidates around the best ones.
         per_refinement: Candidates of each round.
         checks: Greatest number of plans that exact geometry checks, the best candidates first; 0 for none.
+        refine: Number of best candidates that the planner refines by the gradient of clearance, of which the best one
+            is taken after an exact check; 0 for none. Only for tasks whose actions are whole movements.
     """
 
     def __init__(
@@ -70,11 +72,12 @@ class ViaQPolicy(BasePolicy):
         *,
         task: Mapping[str, Any],
         width: int = 32,
-        instants: int = 22,
+        instants: int = 32,
         candidates: int = 256,
         refinements: int = 2,
         per_refinement: int = 64,
         checks: int = 0,
+        refine: int = 0,
         optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
@@ -86,6 +89,7 @@ class ViaQPolicy(BasePolicy):
             "refinements": refinements,
             "per_refinement": per_refinement,
             "checks": checks,
+            "refine": refine,
         }
         check_arguments(ViaQPolicy, own)
         super().__init__(
@@ -98,7 +102,9 @@ class ViaQPolicy(BasePolicy):
         self.task = Task.from_dict(task)
         self.replanning = self.task.replanning
         self.candidates, self.refinements, self.per_refinement = candidates, refinements, per_refinement
-        self.checks = checks
+        self.checks, self.refine = checks, refine
+        if refine and not self.can_refine:
+            raise ValueError(f"refine must be 0 where plans are revised or have no via-points, got {refine}")
         self.width, self.instants = width, instants
         self.critic = self.make_critic()
         self.critic_target = self.make_critic() if self.replanning else None
@@ -126,7 +132,13 @@ class ViaQPolicy(BasePolicy):
             "refinements": self.refinements,
             "per_refinement": self.per_refinement,
             "checks": self.checks,
+            "refine": self.refine,
         }
+
+    @property
+    def can_refine(self) -> bool:
+        """True for tasks whose movements begin at rest and have via-points, which can be refined."""
+        return not self.replanning and self.task.n_via > 0
 
     @property
     def shown_instants(self) -> Int:
@@ -193,17 +205,20 @@ class ViaQPolicy(BasePolicy):
     def _chosen(self, problem: Problem) -> Numbers:
         """Return the chosen actions of B problems, shape (B, m)."""
         actions, values = self.propose(problem)
-        every = np.arange(len(actions))
-        if not self.checks:
+        if not self.checks and not self.refine:
             return self._best_within_reach(problem, actions, values.copy())
-        count = min(self.checks, values.shape[1])
-        local = max(count - PROPOSALS, 0)
+        count = min(max(self.checks, self.refine), values.shape[1])
+        local = max(count - PROPOSALS, 0) if self.checks else 0
         promising = self._promising(values, count - local)
         checked = np.take_along_axis(actions, promising[..., None], axis=1)
+        if self.refine:  # Sobol points differ more from each other than the candidates of later rounds
+            top = np.argsort(-values[:, : self.candidates], axis=1, kind="stable")[:, : self.refine]
+            seeds = np.take_along_axis(actions, top[..., None], axis=1)
+            checked = np.concatenate((checked, refined_actions(self.task, problem, seeds)), axis=1)
         worth = merits(self.task, problem, checked)
         unsolved = np.flatnonzero(worth.max(axis=1) < 0.5 * INFEASIBLE)
         best = best_of(self.task, problem, checked, worth)
-        some = every if self.replanning else unsolved
+        some = np.arange(len(actions)) if self.replanning else unsolved
         if local and len(some):
             best[some] = self._improved(problem.take(some), checked[some], worth[some], local)
         return best

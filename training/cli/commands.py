@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from typing import Any, TextIO
 
 import gymnasium as gym
 import pandas as pd
 
-from viapoint.training.agents.agent import load_agent
+from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.config.configs import (
     USUAL_BASELINES,
     EvaluateConfig,
@@ -17,15 +19,15 @@ from viapoint.training.config.configs import (
 )
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate as measure
-from viapoint.training.evaluation.evaluator import evenly_spread
 from viapoint.training.io.files import read_json, write_json
+from viapoint.training.io.progress import scene_progress
 from viapoint.training.planning import benchmark_report
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.benchmark import benchmark_problems, read_problems
 from viapoint.training.planning.search import registered_task
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.scene_sets.scene_set import evenly_spread, scenes_for
 
 
 def train(config: TrainConfig) -> None:
@@ -35,17 +37,23 @@ def train(config: TrainConfig) -> None:
     print(training.train(config))
 
 
+def _named(config: EvaluateConfig | PlayConfig) -> tuple[Agent | None, str, dict[str, Any]]:
+    """Return the agent of a configuration, if any, and the id and the arguments of the environment."""
+    agent = None if config.agent is None else load_agent(config.agent)
+    if agent is not None and config.env not in (None, agent.env_id):
+        raise ValueError(f"env must be {agent.env_id}, on which the agent was trained, got {config.env!r}")
+    env_id, argument = env_of_arm(config.arm, config.env if agent is None else agent.env_id)
+    assert env_id is not None
+    return agent, env_id, {**({} if agent is None else agent.env_kwargs), **argument}
+
+
 def evaluate(config: EvaluateConfig) -> None:
     """Evaluate, print the table, and write the results."""
     if config.of_planners:
         _measure_planners(config)
         return
-    agent = None if config.agent is None else load_agent(config.agent)
-    env, env_kwargs = config.env, None
-    if config.arm is not None:
-        env, argument = env_of_arm(config.arm, config.env if agent is None else agent.env_id)
-        env_kwargs = {**({} if agent is None else agent.env_kwargs), **argument}
-    with report.progress_bar() as progress:
+    agent, env, env_kwargs = _named(config)
+    with scene_progress() as progress:
         result = measure(
             agent,
             env=env,
@@ -53,23 +61,29 @@ def evaluate(config: EvaluateConfig) -> None:
             scenes=config.scenes,
             n_scenes=config.n_scenes,
             checks=config.checks,
+            refine=config.refine,
             baselines=config.baselines,
             progress=progress,
         )
     record = result.to_dict()
-    report.show(record)
+    print(report.formatted(record, config.format))
     if config.agent is not None and (Path(config.agent).expanduser() / "config.json").is_file():
         run = Run(config.agent)
         record["weights_sha256"] = read_json(run.best / "model.json").get("weights_sha256")
         partial = ".partial" if result.partial else ""
         name = f"{Path(config.scenes).stem}-{result.sha256[:8]}{partial}"  # the hash is that of the scenes
-        print(f"kept as {run.write_evaluation(name, record)}")
+        print(f"kept as {run.write_evaluation(name, record)}", file=_notes(config))
     if config.json is not None:
         write_json(config.json, record)
-        print(f"results, scene by scene: {config.json}")
+        print(f"results, scene by scene: {config.json}", file=_notes(config))
     if result.partial:
-        print("the results are partial")
+        print("the results are partial", file=_notes(config))
         raise KeyboardInterrupt
+
+
+def _notes(config: EvaluateConfig) -> TextIO:
+    """Return where to print what is not part of the table: elsewhere if a program reads it."""
+    return sys.stderr if config.format in ("csv", "json") else sys.stdout
 
 
 def _measure_planners(config: EvaluateConfig) -> None:
@@ -79,31 +93,33 @@ def _measure_planners(config: EvaluateConfig) -> None:
     names = ("plan_motion",) if config.baselines == USUAL_BASELINES else config.baselines
     for name in names:
         benchmark_report.benchmark_planner(name)  # an unknown name is told before anything is measured
-    with report.progress_bar() as progress:
+    with scene_progress() as progress:
         lines = [benchmark_report.measure_planner(name, problems, progress=progress) for name in names]
-    print(f"{benchmark_report.markdown(pd.concat(lines))}\n\n{benchmark_report.NOTES}")
+    table = pd.concat(lines)
+    if config.format == "csv":
+        print(table.to_csv(index=False).rstrip())
+    elif config.format == "json":
+        print(table.to_json(orient="records", indent=1))
+    else:
+        print(f"{benchmark_report.markdown(table)}\n\n{benchmark_report.NOTES}")
     if config.json is not None:
-        write_json(config.json, pd.concat(lines).to_dict("records"))
-        print(f"results, problem by problem: {config.json}")
+        write_json(config.json, table.to_dict("records"))
+        print(f"results, problem by problem: {config.json}", file=_notes(config))
 
 
 def play(config: PlayConfig) -> None:
     """Record a video of the movements of an agent, or of the geometry search."""
     from viapoint.training.plotting.video import record_video
 
-    agent = None if config.agent is None else load_agent(config.agent)
-    env_id, argument = env_of_arm(config.arm, agent.env_id if agent is not None else None)
-    assert env_id is not None
-    env_kwargs = {**(agent.env_kwargs if agent is not None else {}), **argument}
-    scenes = scenes_for(config.scenes, registered_task(env_id, **env_kwargs), config.n_scenes).scenes
-    rows = evenly_spread(len(scenes.start), config.n_scenes)
+    agent, env_id, env_kwargs = _named(config)
+    task = registered_task(env_id, **env_kwargs)
+    scenes = scenes_for(config.scenes, task, config.n_scenes).scenes
     env = gym.make(env_id, render_mode="rgb_array_list", **env_kwargs)
     if agent is None:
         method = make_method("search512", env_id, **env_kwargs)
     else:
-        name = f"agent, {config.checks} checks" if config.checks else "agent"
-        method = agent_method(name, agent, config.checks)
+        method = agent_method("agent", agent, config.checks)
     config.video.parent.mkdir(parents=True, exist_ok=True)
-    record_video(config.video, env, scenes.take(rows), method.decide, name=method.name)
+    record_video(config.video, env, scenes, method.decide, name=method.name)
     env.close()
-    print(f"{len(rows)} movements: {config.video}")
+    print(f"{len(scenes.start)} movements: {config.video}")

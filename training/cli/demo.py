@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -9,21 +10,25 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from viapoint.training.agents.agent import Agent, find_model, load_agent
+from viapoint.envs.rendering.renderer import GLUnavailableError
+from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.agents.model_io import untrained
 from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
-from viapoint.training.evaluation.evaluator import evaluate_methods, evenly_spread
+from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import check_ours, read_json
+from viapoint.training.io.progress import scene_progress
 from viapoint.training.planning.baselines import Method, agent_method, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plotting import plots
-from viapoint.training.plotting.gallery import gallery, play
+from viapoint.training.plotting.gallery import gallery
 from viapoint.training.plotting.video import record_video
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, scenes_for
 
+CHECKS = 16
+"""Number of proposals that the agent checks with exact geometry in its second row of the table."""
 BASELINES = ("search16", "search512", "straight", "random")
 FILES = {
     "table.md": "the table",
@@ -52,17 +57,23 @@ def run(config: DemoConfig) -> None:
     trained = _trained(config)
     agent = load_agent(trained.best)
     frozen = scenes_for("test", registered_task(config.env), config.n_scenes)
-    frozen = frozen.take(evenly_spread(len(frozen.share), config.n_scenes))
-    record = _measured(config, agent, frozen)
-    last = folder / "movements.mp4"  # written after all others
-    if not last.exists() or last.stat().st_mtime < (folder / "table.json").stat().st_mtime:
+    weights = read_json(trained.best / "model.json")["weights_sha256"]
+    record = read_json(folder / "table.json") if (folder / "table.json").exists() else {}
+    if (record.get("sha256"), record.get("weights_sha256")) != (frozen.sha256, weights):
+        record = {**_measured(config, agent, frozen), "weights_sha256": weights}
+        report.write(record, folder)
         plots.learning_curve(folder / "learning_curve.png", trained.curve)
         plots.success_by_band(folder / "success_by_band.png", record)
-        _draw_gallery(folder / "gallery.png", agent, frozen)
-        _film(last, agent, frozen)
-    report.show(record)
+        (folder / "movements.mp4").unlink(missing_ok=True)
+    if not (folder / "movements.mp4").exists():
+        try:
+            _show_movements(folder, agent, frozen)
+        except GLUnavailableError as error:
+            print(f"movements are not shown: {error}", file=sys.stderr)
+    print(report.text(record))
     for name, what in {**FILES, trained.best.name: "the trained agent"}.items():
-        print(f"  {folder / name!s:<34} {what}")
+        if (folder / name).exists():
+            print(f"  {folder / name!s:<34} {what}")
     print(f"done in {time.monotonic() - began:.0f} s")
 
 
@@ -75,49 +86,33 @@ def _trained(config: DemoConfig) -> Run:
         print(f"{config.out} holds a training of {found.decisions} decisions: starting from it")
     else:
         print(f"training for {number} decisions; Ctrl-C saves, and the same command goes on")
-    return train_or_resume(TrainConfig(env=config.env, seed=config.seed, n_timesteps=number, out=config.out))
+    return train_or_resume(TrainConfig(env=config.env, n_timesteps=number, out=config.out))
 
 
 def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[str, Any]:
-    """Return the evaluation of the agent, from the folder if it holds one for these weights and scenes."""
-    path = config.out / "table.json"
-    identity = {
-        "sha256": frozen.sha256,
-        "weights_sha256": read_json(find_model(config.out) / "model.json")["weights_sha256"],
-        "checks": config.checks,
-    }
-    if path.exists():
-        record = read_json(path)
-        if not record.get("partial") and {name: record.get(name) for name in identity} == identity:
-            return record
+    """Return the evaluation of the agent and of methods without training."""
     methods: list[Method] = [
         agent_method("agent", agent, 0),
-        agent_method(f"agent, {config.checks} checks", agent, config.checks),
+        agent_method("agent", agent, CHECKS),
         agent_method("untrained", untrained(agent), 0),
         *(make_method(name, config.env) for name in BASELINES),
     ]
-    with report.progress_bar() as progress:
+    with scene_progress() as progress:
         result = evaluate_methods(methods, frozen, config.env, progress=progress)
-    record = {**result.to_dict(), **identity}
-    report.write(record, config.out)
     if result.partial:
         raise KeyboardInterrupt
-    return record
+    return result.to_dict()
 
 
-def _draw_gallery(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
-    """Draw movements in scenes of all difficulties."""
-    by_difficulty = np.argsort(-frozen.share, kind="stable")
-    chosen = frozen.take(by_difficulty[evenly_spread(len(by_difficulty), PICTURES)])
-    titles = [f"share {BANDS[band]}" for band in chosen.band]
+def _show_movements(folder: Path, agent: Agent, frozen: FrozenScenes) -> None:
+    """Draw and film movements in scenes of all difficulties."""
     decide = agent_method("agent", agent, 0).decide
-    task = registered_task(agent.env_id, **agent.env_kwargs)
-    episodes = play(agent.env_id, chosen.scenes, decide, **agent.env_kwargs)
-    gallery(path, task, episodes, titles, heading=f"The agent alone in {frozen.name} scenes, easy to hard")
-
-
-def _film(path: Path, agent: Agent, frozen: FrozenScenes) -> None:
+    chosen = frozen.take(np.argsort(-frozen.share, kind="stable")).spread(PICTURES)
+    titles = [f"share {BANDS[band]}" for band in chosen.band]
+    heading = f"The agent alone in {frozen.name} scenes, easy to hard"
+    env = gym.make(agent.env_id, render_mode="rgb_array", **agent.env_kwargs)
+    gallery(folder / "gallery.png", env, chosen.scenes, decide, titles, heading=heading)
+    env.close()
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
-    scenes = frozen.scenes.take(evenly_spread(len(frozen.share), MOVEMENTS))
-    record_video(path, env, scenes, agent_method("agent", agent, 0).decide)
+    record_video(folder / "movements.mp4", env, frozen.spread(MOVEMENTS).scenes, decide)
     env.close()

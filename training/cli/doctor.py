@@ -13,21 +13,19 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 PATIENCE = 120.0
 """Time limit of a check in a separate process, [s]."""
-INSTALL_TRAINING = "pip install 'viapoint[training]'"
+INSTALL, INSTALL_TRAINING = "pip install viapoint", "pip install 'viapoint[training]'"
 EXTRAS = {"mjviser": "live", "optuna": "study", "ray": "study", "viser": "live"}
 """Extras of packages that a command imports when it needs them."""
 MODULES = {"pyyaml": "yaml"}
 """Modules of packages with other names."""
 BROWSERS = ("chromium", "google-chrome", "chromium-browser", "microsoft-edge", "firefox")
 """Programs that show the live page."""
-REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(\[[^]]*\])?(>=(?P<least>[0-9.]+))?")
-
 STEP = """
 import gymnasium as gym, viapoint.envs
 env = gym.make_vec("viapoint/PlanarObstacles-v0", num_envs=3, threads=2)
@@ -90,28 +88,33 @@ def explain_import_error(error: ImportError, subject: str = "the command") -> st
 
 def examine(folder: Path) -> Iterator[Finding]:
     """Run all checks; `folder` is the folder for runs."""
-    yield from packages(importlib.metadata.requires("viapoint") or [])
+    yield Finding("Python", sys.version_info >= (3, 11), platform.python_version(), "install 3.11 or newer")
+    for name, extra in requirements():
+        version = installed(name)
+        yield Finding(name, bool(version), version or "not installed", INSTALL_TRAINING if extra else INSTALL)
     yield in_a_process("MuJoCo engine", STEP, "pip install --force-reinstall 'mujoco>=4'")
-    without = "without it films are drawn from above; on Debian and Ubuntu: apt-get install libegl1 libgl1"
+    without = "without it nothing is rendered; on Debian and Ubuntu: apt-get install libegl1 libgl1"
     yield in_a_process("OpenGL", FRAME, without, needed=False)
     if not missing_packages():
         # Some versions of triton crash if they are imported after a frame was rendered.
         yield in_a_process("agents", FRAME + LEARN, INSTALL_TRAINING)
-    place = next(filter(None, map(shutil.which, BROWSERS)), "")
+    browser = next(filter(None, map(shutil.which, BROWSERS)), "")
     remedy = (
         "on Debian and Ubuntu: apt-get install chromium; or open the page from elsewhere by an SSH tunnel"
     )
-    yield Finding("browser", bool(place), place or "none for `viapoint live`", remedy, needed=False)
+    yield Finding("browser", bool(browser), browser or "none for `viapoint live`", remedy, needed=False)
     yield disk(folder)
 
 
-def requirements(lines: Sequence[str]) -> Iterator[tuple[str, str, str]]:
-    """Yield name, oldest version and extra ('' if always needed) of the packages that metadata state."""
-    for line in lines:
-        found = REQUIREMENT.match(line)
-        extra = re.search(r"extra == ['\"](\w+)['\"]", line)
-        if found is not None and found["name"] != "viapoint":
-            yield found["name"], found["least"] or "0", extra[1] if extra else ""
+def requirements() -> list[tuple[str, str]]:
+    """Return name and extra ('' if always needed) of the packages that the package and training need."""
+    try:
+        lines = importlib.metadata.requires("viapoint") or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
+    found = [(re.split(r"[^\w.-]", line)[0], re.search(r"extra == ['\"](\w+)", line)) for line in lines]
+    named = [(name, extra[1] if extra else "") for name, extra in found]
+    return [(name, extra) for name, extra in named if extra in ("", "training")]
 
 
 def installed(name: str) -> str:
@@ -126,30 +129,7 @@ def installed(name: str) -> str:
 
 def missing_packages() -> list[str]:
     """Return the packages of the extra `training` that are not installed."""
-    try:
-        lines = importlib.metadata.requires("viapoint") or []
-    except importlib.metadata.PackageNotFoundError:
-        return []
-    return [name for name, _, extra in requirements(lines) if extra == "training" and not installed(name)]
-
-
-def packages(lines: Sequence[str]) -> Iterator[Finding]:
-    """Compare versions of Python and of packages with the bounds that the installed package states."""
-    wanted = [("Python", "3.11", "")]
-    wanted += [each for each in requirements(lines) if each[2] in ("", "training")]
-    for name, least, extra in wanted:
-        version = platform.python_version() if name == "Python" else installed(name)
-        remedy = INSTALL_TRAINING if extra else f"install {name} {least} or newer"
-        found = f"{version or 'not installed'}, {least} or newer wanted"
-        works = bool(version) and at_least(version, least)
-        yield Finding(name, works, found, remedy)
-
-
-def at_least(version: str, least: str) -> bool:
-    """Return whether a version is the least one or newer."""
-    mine = [int(part) for part in re.findall(r"\d+", version.partition("+")[0])]
-    wanted = [int(part) for part in least.split(".")]
-    return mine[: len(wanted)] >= wanted
+    return [name for name, extra in requirements() if extra and not installed(name)]
 
 
 def in_a_process(name: str, script: str, remedy: str, *, needed: bool = True) -> Finding:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import importlib
 import io
 import os
+import re
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any, Union
+from typing import Any
 
 import tyro
 
-from viapoint.envs.registration import ENV_IDS
 from viapoint.training.cli.doctor import explain_import_error
+from viapoint.training.config.checks import unknown_name
 from viapoint.training.config.configs import (
     DemoConfig,
     DoctorConfig,
@@ -27,6 +27,7 @@ from viapoint.training.config.configs import (
     StudyConfig,
     TrainConfig,
 )
+from viapoint.training.config.words import REGISTRY
 
 
 class UsageError(ValueError):
@@ -45,12 +46,15 @@ COMMANDS: dict[str, tuple[type[Any], str]] = {
     "doctor": (DoctorConfig, "cli.doctor:run"),
 }
 """Configuration and function of each subcommand; the function is imported when it is called."""
+OVERVIEW = """usage: viapoint COMMAND [OPTIONS]
 
-DESCRIPTION = (
-    "Agents that reach around obstacles by placing via-points of minimum-jerk movements. "
-    "`viapoint COMMAND --help` shows a command's options and an example; --debug shows where an error came from. "
-    f"Environments: {', '.join(ENV_IDS)}."
-)
+Agents that reach around obstacles by placing via-points of minimum-jerk
+movements.
+
+{commands}
+
+viapoint COMMAND --help shows the options of a command and an example;
+--debug shows where an error came from."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -92,20 +96,30 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
         SystemExit: Help was asked for; code 0.
         UsageError: A word is not understood or not allowed.
     """
-    kinds = []
-    for name, (kind, _) in COMMANDS.items():
-        default = {"default": usual} if isinstance(usual, kind) else {}
-        kinds.append(Annotated[kind, tyro.conf.subcommand(name=name, **default)])
-    union: Any = functools.reduce(lambda some, one: Union[some, one], kinds)  # noqa: UP007 - built at run time
+    if words and words[0] in ("-h", "--help"):
+        print(_overview())
+        raise SystemExit(0)
+    if not words:
+        raise UsageError(f"name a command: {', '.join(COMMANDS)} (viapoint --help)")
+    command, *options = words
+    if command not in COMMANDS:
+        raise UsageError(unknown_name("command", command, COMMANDS))
+    kind, _ = COMMANDS[command]
+    default = {} if usual is None else {"default": usual}
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            config = (tyro.conf.OmitArgPrefixes,)
-            return tyro.cli(union, prog="viapoint", description=DESCRIPTION, args=words, config=config)
+            return tyro.cli(kind, prog=f"viapoint {command}", args=options, registry=REGISTRY, **default)
     except SystemExit as end:
         if not end.code:
             raise
-        raise UsageError(_without_frame(complaint.getvalue())) from None
+        raise UsageError(_complaint(complaint.getvalue(), command, kind)) from None
+
+
+def _overview() -> str:
+    """Return the help of the command without a subcommand."""
+    lines = [f"  {name:<10}{str(kind.__doc__).splitlines()[0]}" for name, (kind, _) in COMMANDS.items()]
+    return OVERVIEW.format(commands="\n".join(lines))
 
 
 def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
@@ -117,8 +131,8 @@ def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
     check_unchanged(run, parse(words, usual), usual)
 
 
-def _without_frame(text: str) -> str:
-    """Return the words in tyro's boxes without frame, title and rules.
+def _complaint(text: str, command: str, kind: type[Any]) -> str:
+    """Return the words in tyro's boxes in one line, and fields by their flags.
 
     Where the output knows only ASCII, there is no frame, and a rule follows the title.
     """
@@ -126,7 +140,13 @@ def _without_frame(text: str) -> str:
     if "╭" not in text:
         rule = next((i for i, line in enumerate(lines) if line and not line.strip("-")), -1)
         lines = lines[rule + 1 :]
-    return " ".join(line for line in lines if line.strip("-")) or text
+    said = " ".join(line for line in lines if line.strip("-")) or text
+    said = re.sub(
+        rf"^Error parsing ({kind.__name__}: )?|( Argument helptext: .*)? For full helptext, .*", "", said
+    )
+    for each in dataclasses.fields(kind):
+        said = re.sub(rf"^{each.name}\b", f"--{each.name.replace('_', '-')}", said)
+    return f"{said} (viapoint {command} --help)"
 
 
 def _one_line(error: Exception) -> str:

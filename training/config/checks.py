@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import os
+import tempfile
 import typing
 from collections.abc import Callable, Collection, Mapping
 from importlib.resources import files
@@ -15,7 +16,6 @@ import numpy as np
 from typeguard import TypeCheckError, check_type
 
 from viapoint.envs.common.validation import is_number, whole_number
-from viapoint.envs.registration import check_registered
 from viapoint.training.io.files import check_ours
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
@@ -36,8 +36,8 @@ ELSEWHERE = {
     "wrappers": "the environments are trained on as they are",
 }
 """Arguments that a training's environment does not take, and what to use instead."""
-GREATEST = {"seed": 2**32 - 1, "n_envs": 1 << 16, "num_envs": 1 << 16, "port": 65535}
-"""Greatest values: seeds of NumPy's legacy generator, environments that fit into memory, and ports."""
+GREATEST = {"seed": 2**32 - 1, "n_envs": 1 << 16, "n_timesteps": 10**9, "port": 65535}
+"""Greatest values: seeds of NumPy's legacy generator, environments in memory, days of training, and ports."""
 
 
 def unknown_name(what: str, value: object, allowed: Collection[str]) -> str:
@@ -45,13 +45,6 @@ def unknown_name(what: str, value: object, allowed: Collection[str]) -> str:
     close = difflib.get_close_matches(str(value), list(allowed), n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ""
     return f"{what} must be one of {', '.join(allowed)}, got {value!r}{hint}"
-
-
-def check_env(env: str) -> None:
-    """Check that an id is registered."""
-    if not isinstance(env, str):
-        raise ValueError(f"env must be the id of an environment, got {env!r}")
-    check_registered(env)
 
 
 def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:
@@ -89,8 +82,11 @@ def _check_place(name: str, path: Path, folder: Path) -> None:
     there = next(each for each in (folder.absolute(), *folder.absolute().parents) if os.path.exists(each))
     if not os.path.isdir(there):
         raise ValueError(f"{name} {path} cannot be written: {there} is no folder")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ValueError(f"{name} {path} cannot be written: nothing may be written in {there}")
+    try:
+        with tempfile.TemporaryFile(dir=there):  # permissions alone do not tell, in /proc for example
+            pass
+    except OSError:
+        raise ValueError(f"{name} {path} cannot be written: nothing may be written in {there}") from None
 
 
 POSITIVE = frozenset({"learning_rate", "temperature", "clip_range", "max_grad_norm"})
@@ -120,6 +116,7 @@ LEAST: dict[str, float] = {
     "refinements": 0,
     "per_refinement": 1,
     "checks": 0,
+    "refine": 0,
 }
 """Least values of hyperparameters."""
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
+import inspect
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 import tyro
@@ -17,59 +17,36 @@ import tyro
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.registry import ARM_FILES, arm_names, arm_of
 from viapoint.envs.common.validation import is_number
-from viapoint.envs.registration import ENV_IDS
+from viapoint.envs.registration import ENV_IDS, check_registered
 from viapoint.envs.task import Task
 from viapoint.training.config.checks import (
     DEFAULT_ENV,
     SHIPPED_IDS,
-    check_env,
     check_env_kwargs,
     check_file,
     check_folder,
     check_whole,
+    unknown_name,
 )
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of
-from viapoint.training.io.files import parse_yaml
+from viapoint.training.config.words import NamedValues, to_words
 from viapoint.training.planning.search import registered_task
 
-ENV = tyro.conf.arg(metavar="ID", help=f"Id of a registered environment, such as {', '.join(ENV_IDS)}.")
+
+def _listed(ids: Iterable[str]) -> str:
+    """Return ids in few words for a help."""
+    names = ", ".join(env_id.removeprefix("viapoint/").removesuffix("-v0") for env_id in ids)
+    return f"viapoint/NAME-v0, where NAME is one of {names}"
+
+
+ENV = tyro.conf.arg(metavar="ID", help=f"Id of a registered environment, such as {_listed(ENV_IDS)}.")
 AGENT = tyro.conf.arg(
-    metavar="AGENT",
-    help=f"Run folder, model folder, or id of an environment with a shipped agent: {', '.join(SHIPPED_IDS)}.",
+    metavar="AGENT", help="Run folder, model folder, or id of an environment with a shipped agent."
 )
-PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent, one of {', '.join(SHIPPED_IDS)}.")
+PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent: {_listed(SHIPPED_IDS)}.")
 ARM = tyro.conf.arg(metavar="ARM", help="Arm: panda, planar, or an MJCF or URDF file.")
 ARM_ENVS = {"planar": DEFAULT_ENV, "panda": "viapoint/PandaObstacles-v0"}
 """Environments of the built-in arms; that of other arms is viapoint/Obstacles-v0."""
-EnvId = Annotated[str, ENV]
-"""Id of an environment; the help of a command lists them."""
-
-if TYPE_CHECKING:
-    AnyPath = str | Path
-else:
-    AnyPath = Path  # the command line makes paths of words
-
-
-def _from_words(words: list[str]) -> dict[str, Any]:
-    """Return NAME=VALUE words as a dictionary; values are YAML, so that lists and settings by name have a form."""
-    values: dict[str, Any] = {}
-    for word in words:
-        name, equals, text = word.partition("=")
-        if not equals or not name:
-            raise ValueError(f"must be NAME=VALUE, got {word!r}")
-        if name in values:
-            raise ValueError(f"{name} is there twice")
-        values[name] = parse_yaml(text)
-    return values
-
-
-def _to_words(values: Mapping[str, Any]) -> list[str]:
-    """Return a dictionary as NAME=VALUE words; :func:`_from_words` is the inverse."""
-    words = []
-    for name, value in values.items():
-        plain = isinstance(value, str) and parse_yaml(value) == value
-        words.append(f"{name}={value if plain else json.dumps(value)}")
-    return words
 
 
 def _plain(name: str, value: Any) -> Any:
@@ -110,24 +87,14 @@ def env_of_arm(arm: Arm | str | None, env: str | None) -> tuple[str | None, dict
     return env or "viapoint/Obstacles-v0", {"arm": found if isinstance(arm, Arm) else found.file or arm}
 
 
-# tyro reads a dictionary of one type of values only.
-NamedValues = Annotated[
-    dict[str, Any],
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs="*",
-        metavar="NAME=VALUE",
-        instance_from_str=_from_words,
-        is_instance=lambda value: isinstance(value, dict),
-        str_from_instance=_to_words,
-    ),
-]
-"""Dictionary that the command line writes as NAME=VALUE NAME=VALUE ..."""
-
-
+Format = Literal["table", "md", "csv", "json"]
+"""Form of a table."""
 BENCHMARK = "motionbenchmaker"
 """Name of the scene set that measures planners."""
 MOTION_FILES = (".csv", ".yaml", ".yml")
 """Suffixes of files of movements."""
+UNNAMED = "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
+NOTHING_TO_CHECK = "checks concerns an agent, and none is given"
 USUAL_BASELINES = ("straight", "random", "search512")
 """Baselines of an evaluation."""
 
@@ -154,37 +121,12 @@ class Config:
     def _check(self) -> None:
         """Check what is not a whole number."""
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the configuration as plain values; :meth:`from_json` is the inverse."""
-        values: dict[str, Any] = {}
-        for each in dataclasses.fields(self):
-            value = getattr(self, each.name)
-            if isinstance(value, Path):
-                value = str(value)
-            values[each.name] = list(value) if isinstance(value, tuple) else value
-        return values
-
-    @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> Self:
-        """Return the configuration that plain values describe.
-
-        Raises:
-            ValueError: A name is unknown or a value is not allowed.
-        """
-        names = [each.name for each in dataclasses.fields(cls)]
-        unknown = sorted(set(record) - set(names))
-        if unknown:
-            raise ValueError(f"{cls.__name__} knows {', '.join(names)}, not {unknown[0]!r}")
-        return cls(
-            **{name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig(Config):
     """Train an agent.
 
-    Example: viapoint train --env viapoint/PlanarObstacles-v0 --algo viaq --seed 0 --out runs/first
+    Example: viapoint train --env viapoint/PlanarObstacles-v0 --n-timesteps 10000 --out runs/first
 
     Raises:
         ValueError: A value is not allowed; the message lists the allowed values.
@@ -197,10 +139,10 @@ class TrainConfig(Config):
     """
 
     least: ClassVar = dict.fromkeys(("seed", "eval_every", "observe_candidates"), 0) | dict.fromkeys(
-        ("n_timesteps", "min_timesteps", "n_envs", "eval_scenes", "checkpoint_every"), 1
+        ("n_timesteps", "n_envs", "eval_scenes", "checkpoint_every"), 1
     )
 
-    env: EnvId = DEFAULT_ENV
+    env: Annotated[str, ENV] = DEFAULT_ENV
     """Id of the environment."""
     arm: Annotated[str | None, ARM] = None
     """Arm, which becomes one of the arguments of the environment; the usual environment is then one for any arm."""
@@ -212,11 +154,9 @@ class TrainConfig(Config):
     """Decisions; default: the preset's."""
     stop_when_stalled: float | None = None
     """Stop if success stalls for this share of decisions."""
-    min_timesteps: int | None = None
-    """Decisions before it may stop; default: the preset's."""
     n_envs: int | None = None
     """Environments stepped together; default: the preset's."""
-    out: AnyPath | None = None
+    out: Path | str | None = None
     """Run folder; default: runs/<environment>-<algorithm>-<seed>."""
     resume: bool = False
     """Continue the run from its last checkpoint; --n-timesteps may extend it, others must be as they were."""
@@ -236,7 +176,9 @@ class TrainConfig(Config):
     """Show a progress bar."""
 
     def _check(self) -> None:
-        check_env(self.env)
+        if not isinstance(self.env, str):
+            raise ValueError(f"env must be the id of an environment, got {self.env!r}")
+        check_registered(self.env)
         if self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
         check_env_kwargs(self.env_kwargs)
@@ -260,16 +202,14 @@ class TrainConfig(Config):
             raise ValueError(f"hyperparameters must be values by name, got {self.hyperparameters!r}")
         share = self.stop_when_stalled
         if share is None:
-            if self.min_timesteps is not None:
-                raise ValueError("min_timesteps needs stop_when_stalled, such as 0.3")
             return
         if not is_number(share) or not 0.0 < share < 1.0:
             raise ValueError(f"stop_when_stalled must be a number over 0 and below 1, got {share!r}")
         if not self.evaluation_interval:
             raise ValueError("stop_when_stalled needs validations: eval_every must be 1 or more, got 0")
-        if self.least_timesteps >= self.total_timesteps:
+        if self.total_timesteps <= self.preset.n_timesteps:
             raise ValueError(
-                f"n_timesteps must be over min_timesteps ({self.least_timesteps}) with stop_when_stalled, "
+                f"n_timesteps must be over {self.preset.n_timesteps}, before which a training does not stall, "
                 f"got {self.total_timesteps}"
             )
 
@@ -283,6 +223,10 @@ class TrainConfig(Config):
         try:
             return registered_task(self.env, **self.env_kwargs)
         except TypeError as error:
+            known = inspect.signature(Task.of).parameters
+            for name in self.env_kwargs:
+                if name not in (*known, "threads"):
+                    raise ValueError(unknown_name("env_kwargs", name, known)) from error
             raise ValueError(f"env_kwargs of {self.env}: {error}") from error
 
     @property
@@ -291,14 +235,18 @@ class TrainConfig(Config):
         return preset_of(self.task, self.algo)
 
     @property
+    def all_hyperparameters(self) -> dict[str, Any]:
+        """Hyperparameters with those of the preset; a short training begins to learn sooner in proportion."""
+        usual = self.preset.arguments()
+        if "learning_starts" in usual:
+            share = min(1.0, self.total_timesteps / self.preset.n_timesteps)
+            usual["learning_starts"] = round(share * usual["learning_starts"])
+        return {**usual, **self.hyperparameters}
+
+    @property
     def total_timesteps(self) -> int:
         """Decisions in total."""
         return self.n_timesteps or self.preset.n_timesteps
-
-    @property
-    def least_timesteps(self) -> int:
-        """Decisions before which a stalled training goes on."""
-        return self.min_timesteps or self.preset.n_timesteps
 
     @property
     def copies(self) -> int:
@@ -326,7 +274,7 @@ class TrainConfig(Config):
         for name in ("env_kwargs", "hyperparameters"):
             values = getattr(self, name)
             if values:
-                words += [f"--{name.replace('_', '-')}", *_to_words(values)]
+                words += [f"--{name.replace('_', '-')}", *to_words(values)]
         return shlex.join(words)
 
     @property
@@ -335,23 +283,52 @@ class TrainConfig(Config):
         usual = Path("runs") / f"{self.env.rpartition('/')[2]}-{self.algo}-{self.seed}"
         return Path(self.out) if self.out else usual
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the configuration as plain values; :meth:`from_json` is the inverse."""
+        values = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+        return {**values, "out": None if self.out is None else str(self.out)}
+
+    @classmethod
+    def from_json(cls, record: Mapping[str, Any]) -> TrainConfig:
+        """Return the configuration that plain values describe.
+
+        Raises:
+            ValueError: A name is unknown or a value is not allowed.
+        """
+        names = [each.name for each in dataclasses.fields(cls)]
+        for name in record:
+            if name not in names:
+                raise ValueError(unknown_name("fields of a training", name, names))
+        return cls(**record)
+
 
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig(Config):
-    """Configuration of a command for one agent."""
+    """Configuration of a command for an agent, an environment or an arm."""
 
     agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
     """Run folder, model folder, or id of an environment with a shipped agent."""
     pretrained: Annotated[str | None, PRETRAINED] = None
     """Id of an environment: its shipped agent, as if the id were given as AGENT."""
+    env: Annotated[str | None, ENV] = None
+    """Id of the environment; default: that of the agent."""
+    arm: Annotated[str | None, ARM] = None
+    """Arm, in an environment with obstacles if none is named, or in place of that of an agent."""
+
+    @property
+    def unnamed(self) -> bool:
+        """True if neither an agent nor an environment nor an arm is named."""
+        return self.agent is self.env is self.arm is None
 
     def _check(self) -> None:
+        if self.env is not None:
+            check_registered(self.env)
         if self.pretrained is None:
             return
         if self.agent not in (None, self.pretrained):
             raise ValueError(f"the agent is named twice: {self.agent} and pretrained={self.pretrained}")
         if self.pretrained not in SHIPPED_IDS:
-            raise ValueError(f"pretrained must be one of {', '.join(SHIPPED_IDS)}, got {self.pretrained!r}")
+            raise ValueError(unknown_name("pretrained", self.pretrained, SHIPPED_IDS))
         object.__setattr__(self, "agent", self.pretrained)
 
 
@@ -359,7 +336,7 @@ class AgentConfig(Config):
 class EvaluateConfig(AgentConfig):
     """Evaluate an agent and baselines on the same scenes.
 
-    Example: viapoint evaluate runs/first --baselines straight search512 --scenes test
+    Example: viapoint evaluate viapoint/PlanarObstacles-v0 --baselines straight search512 --n-scenes 100
     """
 
     baselines: tuple[str, ...] = USUAL_BASELINES
@@ -368,6 +345,8 @@ class EvaluateConfig(AgentConfig):
     unrevised (the first plan alone)."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
+    refine: tuple[int, ...] = ()
+    """Numbers of proposals that the planner refines, one further row each."""
     scenes: str = "test"
     """Scene set: validation, test, hard, uniform, or a scene file; motionbenchmaker for the problems of that benchmark,
     on which planners are measured: straight, plan_motion, plan_motion+ompl, ompl, search512."""
@@ -375,12 +354,10 @@ class EvaluateConfig(AgentConfig):
     """Folder of MotionBenchMaker's own files, in place of the problems that are shipped."""
     n_scenes: int | None = None
     """Number of scenes, evenly spread over the set; all if not given."""
+    format: Format = "table"
+    """Form in which the table is printed: for the terminal, Markdown, CSV or JSON."""
     json: Path | None = None
     """JSON file for all results, scene by scene."""
-    env: Annotated[str | None, ENV] = None
-    """Id of the environment; default: that of the agent."""
-    arm: Annotated[str | None, ARM] = None
-    """Arm on which baselines are evaluated, or the one that replaces the arm of an agent."""
 
     least: ClassVar = {"n_scenes": 1}
 
@@ -393,35 +370,30 @@ class EvaluateConfig(AgentConfig):
         super()._check()
         if len(set(self.baselines)) < len(self.baselines):
             raise ValueError(f"baselines must differ, got {', '.join(self.baselines)}")
-        if self.env is not None:
-            check_env(self.env)
-        if self.of_planners:
-            if not self.agent is self.env is self.arm is None:
-                raise ValueError(
-                    "motionbenchmaker measures planners: name neither an agent nor an environment"
-                )
-        elif self.agent is self.env is self.arm is None:
-            raise ValueError(
-                "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
-            )
-        for number in self.checks:
-            check_whole("checks", number, 0)
+        if self.of_planners and not self.unnamed:
+            raise ValueError("motionbenchmaker measures planners: name neither an agent nor an environment")
+        if self.unnamed and not self.of_planners:
+            raise ValueError(UNNAMED)
         if not self.checks:
             raise ValueError("checks must name at least one number, such as 0")
+        for number in self.checks:
+            check_whole("checks", number, 0)
+        for number in self.refine:
+            check_whole("refine", number, 1)
+        if (any(self.checks) or self.refine) and self.agent is None:
+            raise ValueError(NOTHING_TO_CHECK)
         check_file("json", self.json)
-        if any(self.checks) and self.agent is None:
-            raise ValueError("checks concerns an agent, and none is given")
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlayConfig(AgentConfig):
     """Record a video of an agent's movements.
 
-    Example: viapoint play runs/first --video movements.mp4 --scenes hard
+    Without an agent, the movements are those of search512.
+
+    Example: viapoint play viapoint/PlanarObstacles-v0 --video movements.mp4 --scenes hard
     """
 
-    arm: Annotated[str | None, ARM] = None
-    """Arm that the geometry search moves where no agent is named, or the one that replaces the arm of an agent."""
     video: Path = Path("movements.mp4")
     """MP4 file to write."""
     scenes: str = "test"
@@ -435,18 +407,18 @@ class PlayConfig(AgentConfig):
 
     def _check(self) -> None:
         super()._check()
-        if self.agent is self.arm is None:
-            raise ValueError("name an agent: run folder, model folder or id; or an arm with --arm")
+        if self.unnamed:
+            raise ValueError(UNNAMED)
         if self.agent is None and self.checks:
-            raise ValueError("checks concerns an agent, and none is given")
+            raise ValueError(NOTHING_TO_CHECK)
         check_file("video", self.video, ".mp4")
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanConfig(Config):
-    """Plan a smooth movement of an arm around known obstacles, and write it for a controller.
+    """Plan a smooth movement of an arm around known obstacles.
 
-    Example: viapoint plan --arm panda --position 0.5 0.3 0.4 --scene scene.json --out plan.csv --video plan.mp4
+    Example: viapoint plan --arm panda --position 0.5 0.3 0.4 --out plan.csv
     """
 
     arm: str = "panda"
@@ -507,15 +479,11 @@ class PlanConfig(Config):
 
 @dataclass(frozen=True, kw_only=True)
 class LiveConfig(AgentConfig):
-    """Serve a page in the browser on which goal and obstacles are dragged and the movement is planned anew.
+    """Serve a page in the browser on which goal and obstacles are dragged.
 
     Example: viapoint live --arm panda
     """
 
-    env: Annotated[str | None, ENV] = None
-    """Id of the environment; an agent that is shipped for it can be chosen on the page."""
-    arm: Annotated[str | None, ARM] = None
-    """Arm of the page, in an environment with obstacles if none is named."""
     port: int = 8080
     """Port to listen on; 0 for a free one."""
     seed: int | None = None
@@ -523,15 +491,10 @@ class LiveConfig(AgentConfig):
 
     least: ClassVar = {"port": 0, "seed": 0}
 
-    def _check(self) -> None:
-        super()._check()
-        if self.env is not None:
-            check_env(self.env)
-
 
 @dataclass(frozen=True, kw_only=True)
 class PaperConfig(Config):
-    """Reproduce the claims and figures of Flash & Hogan 1985 with the model and on the simulated arm.
+    """Reproduce the claims and figures of Flash & Hogan 1985.
 
     Example: viapoint paper --out paper
     """
@@ -547,28 +510,24 @@ class PaperConfig(Config):
 
 @dataclass(frozen=True, kw_only=True)
 class DemoConfig(Config):
-    """Train an agent, evaluate it, and write table, figures and a video to one folder.
+    """Train an agent, evaluate it, draw and film it.
 
     Example: viapoint demo --out runs/demo
     """
 
     out: Path = Path("runs/demo")
     """Folder for all files; existing results are kept."""
-    env: EnvId = DEFAULT_ENV
+    env: Annotated[str, ENV] = DEFAULT_ENV
     """Id of the environment."""
-    seed: int = 0
-    """Seed of the training."""
     n_timesteps: int | None = None
     """Decisions in total; default: a quarter of those of the preset."""
     n_scenes: int | None = None
     """Number of test scenes, evenly spread over the set; all if not given."""
-    checks: int = 16
-    """Number of proposals that the agent checks with exact geometry in its second row of the table."""
 
-    least: ClassVar = {"seed": 0, "n_timesteps": 1, "n_scenes": 1, "checks": 1}
+    least: ClassVar = {"n_timesteps": 1, "n_scenes": 1}
 
     def _check(self) -> None:
-        check_env(self.env)
+        check_registered(self.env)
         if not registered_task(self.env).whole_movement:
             raise ValueError(
                 f"env must have whole movements as actions, {DEFAULT_ENV} for one, got {self.env!r}"
@@ -583,7 +542,7 @@ class DemoConfig(Config):
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorConfig(Config):
-    """Check what works on this machine, and print what to install where something does not.
+    """Check what works on this machine, and name what to install.
 
     Example: viapoint doctor
     """
@@ -594,11 +553,11 @@ class DoctorConfig(Config):
 
 @dataclass(frozen=True, kw_only=True)
 class StudyConfig(Config):
-    """Run a study: trainings, baselines and searches for hyperparameters that a YAML file describes.
+    """Run the trainings, baselines and searches of a YAML file.
 
     The same command continues a study that was stopped, and does what was added to its file.
 
-    Example: viapoint study study.yaml --workers 2
+    Example: echo '{environments: [viapoint/PlanarReach-v0], baselines: [straight]}' > a.yaml; viapoint study a.yaml
     """
 
     file: tyro.conf.Positional[Path]
@@ -608,7 +567,7 @@ class StudyConfig(Config):
     address: str | None = None
     """Address HOST:PORT of a Ray cluster; default: a Ray of its own on this machine."""
     workers: int | None = None
-    """Number of trials at the same time; default: as many as the cores allow."""
+    """Number of trials at the same time on this machine; default: as many as the cores allow."""
 
     least: ClassVar = {"workers": 1}
 

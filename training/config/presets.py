@@ -66,6 +66,7 @@ PRESETS: dict[str, Preset] = {
         "ViaQPolicy",  # its defaults are its settings
         eval_every=5_000,
         checkpoint_every=20_000,
+        learning_starts=4096,
         learning_rate={"kind": "linear", "start": 3e-3, "end": 3e-5, "end_fraction": 1.0},
     ),
     "sac": _preset(40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
@@ -109,18 +110,24 @@ REACH_PRESETS: dict[str, Preset] = {"viaq": dataclasses.replace(PRESETS["viaq"],
 REPLANNING_PRESETS: dict[str, Preset] = {
     "viaq": dataclasses.replace(
         PRESETS["viaq"],
+        n_timesteps=24_000,
         hyperparameters={**PRESETS["viaq"].hyperparameters, "gradient_steps": 6, "next_candidates": 4},
     )
 }
 """Presets of replanning tasks."""
+JOINT_DECISIONS = 16_000
+"""Greatest default number of decisions of viaq in joint space, where one costs several times as much."""
 
 
 def preset_of(task: Task, algo: Algorithm) -> Preset:
     """Return the default settings of an algorithm for a task."""
     if task.stepwise:
         return STEP_PRESETS[algo]
+    preset = PRESETS[algo]
     if task.replanning:
-        return REPLANNING_PRESETS.get(algo, PRESETS[algo])
-    if not task.n_obstacles[1]:
-        return REACH_PRESETS.get(algo, PRESETS[algo])
-    return PRESETS[algo]
+        preset = REPLANNING_PRESETS.get(algo, preset)
+    elif not task.n_obstacles[1]:
+        preset = REACH_PRESETS.get(algo, preset)
+    if algo == "viaq" and not task.space.of_hand:
+        preset = dataclasses.replace(preset, n_timesteps=min(preset.n_timesteps, JOINT_DECISIONS))
+    return preset

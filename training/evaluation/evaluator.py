@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from viapoint.envs.common.types import Float, Int, Observation
+from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import NEVER, Scenes
@@ -33,7 +34,7 @@ from viapoint.training.planning.baselines import (
     make_method,
 )
 from viapoint.training.planning.search import registered_task
-from viapoint.training.rollouts.rollout import SceneSimulation, whole_task
+from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults, whole_task
 from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes, scenes_for
 
@@ -41,7 +42,7 @@ Progress = Callable[[str, int, int], None]
 """Function of the method's name, the number of finished scenes and the number of all scenes."""
 
 TIMED_DECISIONS = 200
-"""Greatest number of single decisions that are timed."""
+"""Number of single decisions after which no further scene is timed."""
 TIMING_BUDGET = 3.0
 """Wall time after which no further decision is timed, [s]."""
 SLOW_DECISION = 0.1
@@ -65,10 +66,10 @@ class MethodResult:
     """Scene family of each scene, '' for the training distribution, shape (n,)."""
     distance: Float
     """Distance from start to goal, shape (n,), [m]; NaN if the target jumps, as the shortest path is unknown."""
+    interrupted: bool
+    """Mark of an evaluation that Ctrl-C ended; decision times, and scenes if it is partial, are missing."""
     partial: bool
     """Mark of an evaluation that was interrupted before the last scene."""
-    interrupted: bool = False
-    """Mark of an evaluation that was interrupted, so that no further method follows."""
 
     @property
     def success(self) -> NDArray[np.bool_]:
@@ -77,7 +78,9 @@ class MethodResult:
 
     def summary(self) -> dict[str, Any]:
         """Return the metrics by name; those of successes are None without successes."""
-        success = self.success
+        success, outcomes = self.success, self.outcomes
+        times, paths = self.decision_times, outcomes["path_length"]
+        known = len(success) > 0 and np.isfinite(self.distance).all()
         return {
             "scenes": len(success),
             "partial": self.partial,
@@ -90,21 +93,15 @@ class MethodResult:
                 for name in dict.fromkeys(self.family.tolist())
                 if name != DRAWN
             },
-            "collision": _rate(np.asarray(self.outcomes["collision"], dtype=bool)),
-            "unreachable": _rate(~np.asarray(self.outcomes["reachable"], dtype=bool)),
-            "min_clearance": _quantile(self.outcomes["min_clearance"]),
-            "goal_error": _quantile(self.outcomes["goal_error"]),
-            "tracking_error": _quantile(self.outcomes["tracking_error"]),
-            "jerk_ratio": _quantile(self.outcomes["jerk_ratio"][success]),
-            "duration": _quantile(self.outcomes["duration"][success]),
-            "path_length": _quantile(self.outcomes["path_length"][success]),
-            "spl": success_weighted_path_length(success, self.distance, self.outcomes["path_length"])
-            if len(success) and np.isfinite(self.distance).all()
-            else None,
-            "decision_time": _quantile(self.decision_times),
-            "decision_time_98": _quantile(self.decision_times, 0.98)
-            if len(self.decision_times) > 1
-            else None,
+            "collision": _rate(np.asarray(outcomes["collision"], dtype=bool)),
+            "unreachable": _rate(~np.asarray(outcomes["reachable"], dtype=bool)),
+            **{name: _quantile(outcomes[name]) for name in ("min_clearance", "goal_error", "tracking_error")},
+            **{
+                name: _quantile(outcomes[name][success]) for name in ("jerk_ratio", "duration", "path_length")
+            },
+            "spl": success_weighted_path_length(success, self.distance, paths) if known else None,
+            "decision_time": _quantile(times),
+            "decision_time_98": None if len(times) < 2 else _quantile(times, 0.98),
         }
 
 
@@ -116,7 +113,7 @@ class EvaluationResult:
         >>> from viapoint.training import evaluate
         >>> result = evaluate(env="viapoint/PlanarReach-v0", baselines=["straight", "random"], n_scenes=20)
         >>> result.success_rate, [row["method"] for row in result.rows]
-        (1.0, ['straight line', 'random via-point'])
+        (1.0, ['straight', 'random'])
         >>> print(result.to_markdown().splitlines()[0])  # doctest: +ELLIPSIS
         # viapoint/PlanarReach-v0, scenes test (20, sha256 ...)
     """
@@ -184,6 +181,7 @@ def evaluate(
     scenes: str | Path | FrozenScenes = "test",
     n_scenes: int | None = None,
     checks: int | Sequence[int] | None = None,
+    refine: int | Sequence[int] = (),
     baselines: Sequence[str | Method] = (),
     time_decisions: bool = True,
     progress: Progress | None = None,
@@ -201,9 +199,10 @@ def evaluate(
         n_scenes: Number of scenes, evenly spread over the set; all if not given.
         checks: Number of proposals that the agent checks with exact geometry, or several numbers, one row each; the
             agent's own setting if not given.
+        refine: Number of proposals that the planner refines, or several numbers, one further row each.
         baselines: Names, or objects with `name` and `decide`. Names are `untrained` (the agent's network before
-            training), `straight`, `random`, `random16`, `random80`, `ompl`, `searchN` and `sobolN` (N checked plans)
-            and, in tasks with replanning, `unrevised` (the first plan alone).
+            training), `straight`, `random`, `random16`, `random80`, `plan_motion`, `ompl`, `searchN` and `sobolN` (N
+            checked plans) and, in tasks with replanning, `unrevised` (the first plan alone).
         time_decisions: Measure the wall time of single decisions.
         progress: Function of the method's name, the number of finished scenes and the number of all scenes.
 
@@ -217,13 +216,17 @@ def evaluate(
         True
         >>> low, high = result.success_interval
         >>> [row["method"] for row in result.rows]
-        ['agent', 'straight line']
+        ['agent', 'straight']
     """
     if n_scenes is not None:
         check_whole("n_scenes", n_scenes, 1)
+    if isinstance(baselines, str):
+        raise ValueError(f"baselines must be a list, such as [{baselines!r}], got {baselines!r}")
+    settings: list[dict[str, int]] = []
     for number in [checks] if checks is None or isinstance(checks, int) else checks:
-        if number is not None:
-            check_whole("checks", number, 0)
+        settings.append({} if number is None else {"checks": check_whole("checks", number, 0)})
+    for number in [refine] if isinstance(refine, int) else refine:
+        settings.append({"checks": 0, "refine": check_whole("refine", number, 1)})
     if isinstance(agent, str | Path):
         agent = load_agent(agent)
     env_id, kwargs = _environment_of(agent, env, env_kwargs)
@@ -231,22 +234,21 @@ def evaluate(
     for each in baselines:
         if isinstance(each, str) and not (each == "untrained" and isinstance(agent, BaseAlgorithm)):
             check_method(each, task)
-    chosen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(str(scenes), task, n_scenes)
-    methods = [*_rows_of(agent, checks), *_baselines(baselines, agent, checks, env_id, kwargs)]
+    frozen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(scenes, task, n_scenes)
+    chosen = frozen.spread(n_scenes)
+    if n_scenes is not None and n_scenes > len(chosen.share):
+        print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
+    methods = _rows_of(agent, settings)
+    for each in baselines:
+        methods += _baseline(each, agent, settings, env_id, kwargs)
     return evaluate_methods(
         methods,
-        chosen.take(evenly_spread(len(chosen.share), n_scenes)),
+        chosen,
         env_id,
         env_kwargs=kwargs,
         time_decisions=time_decisions,
         progress=progress,
     )
-
-
-def evenly_spread(number: int, count: int | None) -> Int:
-    """Return up to `count` rows of `number`, evenly spread from the first to the last; all if `count` is None."""
-    kept = number if count is None else min(number, count)
-    return np.linspace(0, number - 1, kept).round().astype(np.int64)
 
 
 def _environment_of(
@@ -269,37 +271,33 @@ def _environment_of(
 
 
 def _rows_of(
-    agent: BaseAlgorithm | Method | None, checks: int | Sequence[int] | None, name: str = "agent"
+    agent: BaseAlgorithm | Method | None, settings: Sequence[Mapping[str, int]], name: str = "agent"
 ) -> list[Method]:
-    """Return one method for each number of checks."""
+    """Return one method for each number of checks, and of refined proposals."""
     if agent is None:
         return []
     if not isinstance(agent, BaseAlgorithm):
         return [agent]
-    numbers = [checks] if checks is None or isinstance(checks, int) else checks
-    return [agent_method(f"{name}, {each} checks" if each else name, agent, each) for each in numbers]
+    return [agent_method(name, agent, **each) for each in settings]
 
 
-def _baselines(
-    baselines: Sequence[str | Method],
+def _baseline(
+    baseline: str | Method,
     agent: BaseAlgorithm | Method | None,
-    checks: int | Sequence[int] | None,
+    settings: Sequence[Mapping[str, int]],
     env_id: str,
     env_kwargs: Mapping[str, Any],
 ) -> list[Method]:
-    """Return the methods that the agent is compared with, in the order given."""
-    methods: list[Method] = []
-    for each in baselines:
-        if not isinstance(each, str):
-            methods.append(each)
-        elif each == "untrained" and isinstance(agent, BaseAlgorithm):
-            methods += _rows_of(untrained(agent), checks, each)
-        elif each == "unrevised" and isinstance(agent, BaseAlgorithm):
-            first = agent_method("agent", agent, None if checks is None else 0)
-            methods.append(OpenLoopBaseline(first, SceneSimulation(env_id, 250, **env_kwargs)))
-        else:
-            methods.append(make_method(each, env_id, **env_kwargs))
-    return methods
+    """Return the methods that a baseline stands for."""
+    if not isinstance(baseline, str):
+        return [baseline]
+    if isinstance(agent, BaseAlgorithm):
+        if baseline == "untrained":
+            return _rows_of(untrained(agent), settings, baseline)
+        if baseline == "unrevised":
+            first = agent_method("agent", agent, checks=0 if settings[0] else None)
+            return [OpenLoopBaseline(first, SceneSimulation(env_id, 250, **env_kwargs))]
+    return [make_method(baseline, env_id, **env_kwargs)]
 
 
 def evaluate_methods(
@@ -338,7 +336,7 @@ def _evaluate_one(
     progress: Progress | None,
 ) -> MethodResult:
     number = len(frozen.share)
-    pieces: list[Mapping[str, NDArray[Any]]] = []
+    pieces: list[SimulationResults] = []
     times: Float = np.zeros(0)
     seconds, interrupted = 0.0, False
     try:
@@ -348,27 +346,30 @@ def _evaluate_one(
             decided = method.decide(simulation.observe(scenes), scenes)
             seconds += time.perf_counter() - began
             outcome = simulation.play(method, scenes, decided)
-            action = np.asarray(decided, dtype=np.float64)
-            pieces.append({**outcome.info, "reward": outcome.reward, "": action})
+            outcome.info["action"] = np.asarray(decided, dtype=np.float64)
+            pieces.append(outcome)
             if progress is not None:
                 progress(method.name, min(first + batch, number), number)
         if time_decisions:
             times = _decision_times(method, frozen.scenes, simulation, seconds / number)
     except KeyboardInterrupt:
         interrupted = True
-    actions = [piece[""] for piece in pieces]  # kept with their outcomes, so that Ctrl-C parts none of them
-    done = sum(len(piece) for piece in actions)
-    names = [name for name in pieces[0] if name] if pieces else Outcome._fields
+    if pieces:
+        joined = SimulationResults.concatenate(pieces)
+        outcomes = {**joined.info, "reward": joined.reward}
+    else:
+        outcomes = {name: np.zeros(0) for name in (*Outcome._fields, "action")}
+    done = len(outcomes["is_success"])
     return MethodResult(
         name=method.name,
-        outcomes={name: np.concatenate([piece[name] for piece in pieces] or [np.zeros(0)]) for name in names},
-        actions=np.concatenate(actions) if actions else np.zeros((0, simulation.task.action.size)),
+        actions=outcomes.pop("action"),
+        outcomes=outcomes,
         decision_times=times,
         band=frozen.band[:done],
         family=frozen.family[:done],
         distance=_distances(frozen.scenes, simulation.task)[:done],
-        partial=interrupted and done < number,
         interrupted=interrupted,
+        partial=done < number,
     )
 
 
@@ -379,45 +380,32 @@ def _distances(scenes: Scenes, task: Task) -> Float:
 
 
 def _decision_times(method: Method, scenes: Scenes, simulation: SceneSimulation, in_batch: float) -> Float:
-    """Return the wall times of single decisions, [s]; for a slow method, the mean in a batch."""
-    times: list[float] = []
-    for seconds in single_decision_times(method, scenes, simulation, TIMED_DECISIONS + 1, TIMING_BUDGET):
-        times.append(seconds)
-        usual = float(np.median(times[1:] or [seconds / 20.0]))  # the first may warm up
-        if usual > SLOW_DECISION:
-            return np.array([in_batch])
-    return np.array(times[1:] or times)
-
-
-def single_decision_times(
-    method: Method, scenes: Scenes, simulation: SceneSimulation, most: int, budget: float
-) -> Iterator[float]:
-    """Yield the wall times of single decisions, [s], until there are `most` of them or the budget, [s], is spent.
+    """Return the wall times of single decisions, [s]; for a slow method, the mean in a batch.
 
     In tasks with replanning, they are all decisions of whole episodes: those in motion take longer than the first ones.
     """
-    seconds: list[float] = []
+    times: list[float] = []
 
     def decide(observation: Observation, scenes: Scenes) -> Float:
         before = time.perf_counter()
         decided = method.decide(observation, scenes)
-        seconds.append(time.perf_counter() - before)
+        times.append(time.perf_counter() - before)
         return decided
 
     began = time.perf_counter()
     replanning = simulation.task.replanning and not hasattr(method, "execute")
-    alone = SceneSimulation(simulation.env_id, 1, **simulation.kwargs) if replanning else None
-    with closing(alone) if alone else nullcontext():
-        for row in range(min(most, len(scenes.start))):
+    with closing(SceneSimulation(simulation.env_id, 1, **simulation.kwargs)) as alone:
+        for row in range(len(scenes.start)):
             one = scenes.take(slice(row, row + 1))
             decided = decide(simulation.observe(one), one)
-            if alone is not None:
+            if replanning:
                 alone.episodes(one, decided, decide)
-            yield from seconds
-            most -= len(seconds)
-            seconds.clear()
-            if most <= 0 or time.perf_counter() - began > budget:
+            usual = float(np.median(times[1:] or [times[0] / 20.0]))  # the first may warm up
+            if usual > SLOW_DECISION:
+                return np.array([in_batch])
+            if len(times) > TIMED_DECISIONS or time.perf_counter() - began > TIMING_BUDGET:
                 break
+    return np.array(times[1:] or times)
 
 
 @contextmanager

@@ -1,19 +1,16 @@
-"""Progress of evaluations, and their tables for terminals, documents and programs."""
+"""Tables of evaluations for terminals, documents and programs."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+import json
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-from tqdm.auto import tqdm
 
+from viapoint.training.config.configs import Format
 from viapoint.training.io.files import MARK, write_bytes, write_json
 from viapoint.training.scene_sets.scene_set import BANDS
 
@@ -38,8 +35,8 @@ NOTES = (
     "by straight distance over path length. Decision: median wall time of single decisions, and their 98th "
     "percentile; where that is missing, the mean in a batch."
 )
-HEADINGS, COLUMN = 21, 11
-"""Width of the column of headings, and least width of a method's column, [characters]."""
+HEADINGS, COLUMN = 18, 14
+"""Width of the column of headings, and of that of a method with the space before it, [characters]."""
 
 
 def table(record: Record) -> pd.DataFrame:
@@ -87,39 +84,35 @@ def markdown(record: Record) -> str:
     return f"# {title(record)}\n\n{cells.to_markdown(colalign=align, disable_numparse=True)}\n\n{NOTES}\n"
 
 
-def show(record: Record, console: Console | None = None) -> None:
-    """Print the table with one column for each method, split into several tables if it is too wide."""
-    console = console or Console()
+def text(record: Record) -> str:
+    """Return the table with one column for each method, in several parts if it is wider than the terminal."""
     cells = table(record).T
-    fitting = max((console.width - HEADINGS) // COLUMN, 1)
+    fitting = max((shutil.get_terminal_size().columns - HEADINGS) // COLUMN, 1)
+    parts = [title(record)]
     for first in range(0, cells.shape[1], fitting):
         part = cells.iloc[:, first : first + fitting]
-        shown = Table(title=title(record) if not first else None, title_justify="left")
-        shown.add_column("", no_wrap=True)
-        for name in part.columns:
-            shown.add_column(escape(name), justify="right", overflow="fold")
-        for heading, line in part.iterrows():
-            shown.add_row(escape(str(heading)), *line)
-        console.print(shown)
+        names = [
+            name if len(name) <= COLUMN - 4 else name.replace(", ", ",\n").replace(" (", "\n(")
+            for name in part
+        ]
+        align = ["left", *["right"] * len(names)]
+        parts.append(
+            part.to_markdown(headers=["", *names], tablefmt="simple", colalign=align, disable_numparse=True)
+        )
+    return "\n\n".join(parts)
 
 
-@contextmanager
-def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """Show a progress bar over the scenes of each method, from the first finished ones on."""
-    with tqdm(unit=" scenes", file=sys.stderr, dynamic_ncols=True, delay=0.01) as bar:
-
-        def progress(name: str, done: int, total: int) -> None:
-            if bar.desc != f"{name}: ":
-                bar.reset(total)
-                bar.set_description(name)
-            bar.update(done - bar.n)
-
-        yield progress
+def formatted(record: Record, form: Format) -> str:
+    """Return the metrics of an evaluation in a format: a table for terminals, Markdown, CSV or JSON."""
+    if form == "csv":
+        rows = [{"method": name, **summary} for name, summary in record["methods"].items()]
+        return str(pd.json_normalize(rows, sep=" ").to_csv(index=False)).rstrip()
+    if form == "json":
+        return json.dumps({name: value for name, value in record.items() if name != "outcomes"}, indent=1)
+    return markdown(record).rstrip() if form == "md" else text(record)
 
 
-def write(record: Record, folder: Path) -> tuple[Path, Path]:
+def write(record: Record, folder: Path) -> None:
     """Write the table as Markdown, and with the outcomes of every scene as JSON."""
-    document, data = folder / "table.md", folder / "table.json"
-    write_bytes(document, f"{markdown(record)}\n<!-- {MARK.decode()} -->\n".encode())
-    write_json(data, dict(record))
-    return document, data
+    write_bytes(folder / "table.md", f"{markdown(record)}\n<!-- {MARK.decode()} -->\n".encode())
+    write_json(folder / "table.json", dict(record))

@@ -97,14 +97,12 @@ def write_bytes(path: Path, content: bytes) -> None:
         raise
 
 
-def write_folder(path: Path, fill: Callable[[Path], None], *, marked: bool = True) -> None:
+def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
     """Create a folder, or replace one that this package wrote, atomically; `fill` writes its content.
 
     Args:
-        path: Folder to write.
+        path: Folder to write; one with further files, or whose JSON lacks the mark of this package, is not replaced.
         fill: Function that writes the content to a temporary folder.
-        marked: Replace only folders whose JSON has the mark of this package; False where the name of the folder
-            suffices. Folders with further files are never replaced.
 
     Raises:
         BadFileError: There is something else, which stays as it is.
@@ -116,7 +114,7 @@ def write_folder(path: Path, fill: Callable[[Path], None], *, marked: bool = Tru
         fill(temporary)
         _sync_folder(temporary)
         if path.exists():
-            _check_replaceable(path, {each.name for each in temporary.iterdir()}, marked)
+            _check_replaceable(path, {each.name for each in temporary.iterdir()})
             outdated = path.with_name(f".{path.name}.{uuid.uuid4().hex}.old")
             path.rename(outdated)
             temporary.rename(path)
@@ -129,22 +127,22 @@ def write_folder(path: Path, fill: Callable[[Path], None], *, marked: bool = Tru
         raise
 
 
-def _check_replaceable(path: Path, names: set[str], marked: bool) -> None:
+def _check_replaceable(path: Path, names: set[str]) -> None:
     """Check that a folder is empty, or holds nothing but an earlier version of files with these names."""
     if not path.is_dir():
         raise BadFileError(path, "exists and is no folder; name another one")
-    there = {each.name for each in path.iterdir()}
-    for name in sorted(there - names):
+    there = sorted(path.iterdir())
+    for each in there:
+        if each.name not in names or not each.is_file():
+            raise BadFileError(
+                path, f"holds {each.name}, which is not part of what is written; name a new folder"
+            )
+        if each.suffix == ".json":
+            check_ours(each)
+    if there and not any(each.suffix == ".json" for each in there):
         raise BadFileError(
-            path, f"holds {name}, which is not part of what is written; name a new or empty folder"
+            path, f"holds {there[0].name}, not written by viapoint; name a new or empty folder"
         )
-    for name in sorted(there):
-        if not (path / name).is_file():
-            raise BadFileError(path / name, "exists and is no file; name a new or empty folder")
-        if marked and name.endswith(".json"):
-            check_ours(path / name)
-    if marked and there and not any(name.endswith(".json") for name in there):
-        raise BadFileError(path, f"holds {min(there)}, not written by viapoint; name a new or empty folder")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -160,12 +158,7 @@ def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
     """
     content = read_bytes(path, largest)
     try:
-        value = json.loads(
-            content,
-            parse_constant=refuse_constant,
-            parse_float=_finite,
-            object_pairs_hook=_without_repetition,
-        )
+        value = json.loads(content, parse_constant=refuse_constant, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise BadFileError(path, f"cannot be read as JSON ({error})") from None
     if not isinstance(value, dict):
@@ -266,15 +259,6 @@ def _finite(digits: str) -> float:
     if not math.isfinite(number):
         raise ValueError(f"{digits[:40]} is too large a number")
     return number
-
-
-def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return pairs as a dictionary; repeated names raise ValueError, as readers differ in which one they take."""
-    result = dict(pairs)
-    if len(result) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"{next(name for name in names if names.count(name) > 1)!r} is there twice")
-    return result
 
 
 def _sync_folder(folder: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -46,11 +45,7 @@ Number: TypeAlias = tuple[Any, Range]
 
 @dataclass(frozen=True)
 class Claim:
-    """Statement with its number on the model and, where it can be simulated, on the arm.
-
-    Raises:
-        ValueError: There is no number.
-    """
+    """Statement with its number on the model and, where it can be simulated, on the arm."""
 
     row: int
     """Number of its subject."""
@@ -69,15 +64,16 @@ class Claim:
     unit: str = ""
     """Unit of the numbers."""
 
-    def __post_init__(self) -> None:
-        if self.model is None and self.arm is None:
-            raise ValueError(f"claim without a number: {self.claim}")
+    @property
+    def holds(self) -> bool:
+        """True if every number is in its expected range."""
+        numbers = [number for number in (self.model, self.arm) if number is not None]
+        return all(expected.contains(value) for value, expected in numbers)
 
     @property
     def verdict(self) -> str:
-        """Verdict in one word: every number is in its expected range, or not."""
-        numbers = [number for number in (self.model, self.arm) if number is not None]
-        return "holds" if all(expected.contains(value) for value, expected in numbers) else "FAILS"
+        """Verdict in one word."""
+        return "holds" if self.holds else "FAILS"
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values for JSON; open ends of a range are null."""
@@ -92,15 +88,3 @@ class Claim:
             ]
         record["deviation_mm"] = None if self.deviation is None else float(self.deviation)
         return {**record, "verdict": self.verdict}
-
-
-class Reproduction(NamedTuple):
-    """Claims, and pictures (PNG) with their captions."""
-
-    claims: list[Claim]
-    pictures: list[tuple[Path, str]]
-
-    @property
-    def failed(self) -> list[Claim]:
-        """Claims that do not hold."""
-        return [claim for claim in self.claims if claim.verdict != "holds"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,25 +12,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from viapoint import primitives
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import unpack
-from viapoint.primitives import Trajectory, point_to_point
 from viapoint.training.io.files import MARK
 from viapoint.training.paper import movements
-from viapoint.training.paper.movements import (
-    EDGE,
-    TARGETS,
-    Profile,
-    curved,
-    simulate,
-    straight,
-)
+from viapoint.training.paper.movements import TARGETS, Profile, curved, passage_share, simulate, straight
 from viapoint.training.paper.rows import alternatives, double_step, one_via
-from viapoint.training.paper.rows.double_step import DoubleStep
-from viapoint.training.paper.rows.obstacles import ObstacleMovements
+from viapoint.training.paper.rows.obstacles import ObstacleMovements, features
 from viapoint.training.paper.rows.one_via import ENDS
-from viapoint.training.paper.rows.straight import DURATION, diagonal_ends
+from viapoint.training.paper.rows.straight import DIAGONALS, DURATION, diagonals
 from viapoint.training.plotting.top_view import footprint
 
 WIDTH = 8.5
@@ -47,10 +40,15 @@ NAMES = ("model", "simulated arm")
 JOINTS = (("shoulder $S$", SECOND), ("elbow $E$", THIRD))
 
 
-def sheet(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, Any]:
-    """Return a figure of one column and `height` centimetres, and its axes, shape (rows, columns)."""
+def sheet(
+    rows: int, columns: int, height: float, titles: Sequence[str] = "ABCDEFGH", **options: Any
+) -> tuple[Figure, Any]:
+    """Return a figure of one column and `height` centimetres, and its titled axes, shape (rows, columns)."""
     figure = Figure(figsize=(WIDTH / 2.54, height / 2.54))
-    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    for ax, title in zip(axes.flat, titles, strict=False):
+        ax.set_title(title)
+    return figure, axes
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
@@ -83,10 +81,9 @@ def path(ax: Axes, position: Any, **style: Any) -> None:
     ax.plot(*(100.0 * position.T), **style)
 
 
-def paths(ax: Axes, movement: Trajectory, hand: Float) -> None:
-    """Draw the plane with the hand path of a plan and that of the simulated arm, shape (T, 2), [m]."""
-    plane(ax)
-    path(ax, movement.sample(201, 0)[0], **MODEL)
+def paths(ax: Axes, planned: Float, hand: Float) -> None:
+    """Draw the hand path of a plan and that of the simulated arm, shape (T, 2), [m]."""
+    path(ax, planned, **MODEL)
     path(ax, hand, **ARM)
 
 
@@ -100,55 +97,29 @@ def zero(ax: Axes) -> None:
     ax.axhline(0.0, color="0.8", linewidth=0.6, zorder=0)
 
 
-def profiles(axes: Any, model: Profile, arm: Profile, end: float, names: Any = NAMES) -> None:
-    """Draw speed on the first and curvature on the second of two axes, the curvature without its unbounded ends."""
-    for profile, style, name in zip((model, arm), (MODEL, ARM), names, strict=True):
-        axes[0].plot(end * profile.time, profile.speed, label=name, **style)
-        curvature(axes[1], profile, end, **style)
-
-
-def curvature(ax: Axes, profile: Profile, end: float = 1.0, **style: Any) -> None:
-    """Draw the curvature of a movement without its unbounded ends."""
-    inner = (profile.time > EDGE) & (profile.time < 1.0 - EDGE)
-    ax.plot(end * profile.time[inner], profile.curvature[inner], **style)
-
-
-def titles(axes: Any, texts: Any = "ABCDEFGH", **options: Any) -> None:
-    """Add panel letters or titles, upper left."""
-    for ax, text in zip(np.ravel(axes), texts, strict=False):
-        ax.set_title(text, **options)
-
-
-def speed(velocity: Any) -> Any:
-    """Return the speed of velocities, shape (..., D)."""
-    return np.linalg.norm(velocity, axis=-1)
-
-
 def model() -> Figure:
     """Draw Fig. 1: a straight and a curved movement of the model."""
-    figure, axes = sheet(3, 2, 10.5)
+    figure, axes = sheet(3, 2, 10.5, ("A", "", "B"))
     first, second = straight("T2", "T5", 1.0), curved(*ENDS, *one_via.EXAMPLE)
-    via = second(float(second.knots[1]))
     for ax, movement in ((axes[0], first), (axes[1], second)):
         (profile,) = movements.model_profiles(movement)
         plane(ax[0])
         path(ax[0], profile.position, zorder=2.1, **MODEL)
         ax[1].plot(profile.time, profile.speed / profile.speed.max(), **MODEL)
         ax[1].set(ylabel="$T/V_M$", ylim=(0, 1.08))
+    via = second(float(second.knots[1]))
     _construction(axes[1, 0], *(100.0 * each for each in (second(0.0), via, second(1.0))))
     dot(axes[1, 0], via)
-    curvature(axes[2, 0], profile, **MODEL)
+    axes[2, 0].plot(profile.time, profile.curvature, **MODEL)
     axes[2, 0].axvline(profile.valley, color="0.6", linewidth=0.7, linestyle=":")
     axes[2, 0].set(ylabel="$C$ [1/m]", ylim=(0, 1.15 * profile.bend[1]))
-    velocity = second.sample(201, 1)[0]
-    for i, (name, colour) in enumerate((("$V_x$", SECOND), ("$V_y$", THIRD))):
-        axes[2, 1].plot(np.linspace(0, 1, 201), velocity[:, i], color=colour, label=name, linewidth=1.6)
+    for values, name, colour in zip(profile.velocity.T, ("$V_x$", "$V_y$"), (SECOND, THIRD), strict=True):
+        axes[2, 1].plot(profile.time, values, color=colour, label=name, linewidth=1.6)
     axes[2, 1].set(ylabel="velocity [m/s]", ylim=(-0.7, 1.5))
     zero(axes[2, 1])
     axes[2, 1].legend(loc="upper right", handlelength=1.2)
     for ax in (axes[0, 1], axes[1, 1], axes[2, 0], axes[2, 1]):
         ax.set(xlabel="$t/t_f$", xlim=(0, 1), xticks=[0, 0.5, 1], xticklabels=["0", "0.5", "1"])
-    titles(axes[:2, 0])
     return figure
 
 
@@ -166,116 +137,122 @@ def _construction(ax: Axes, start: Float, via: Float, goal: Float) -> None:
 
 def straight_movements() -> Figure:
     """Draw Fig. 3: two straight movements on the model and on the simulated arm."""
-    figure, axes = sheet(4, 2, 12.5)
+    figure, axes = sheet(4, 2, 12.5, ("A   $T_3$ to $T_6$", "B   $T_1$ to $T_4$"))
     time = np.linspace(0.0, DURATION, 401)
-    for ax, ends in zip(axes.T, (("T3", "T6"), ("T1", "T4")), strict=True):
-        movement = straight(*ends, DURATION)
-        motion = simulate(movement)
-        paths(ax[0], movement, motion.hand[0])
-        _, velocity, acceleration = movement.sample(401)
-        ax[1].plot(time, speed(velocity), label="model", **MODEL)
-        ax[1].plot(motion.time, speed(motion.velocity()[0]), label="simulated arm", **ARM)
+    movement = diagonals()
+    motion = simulate(movement)
+    planned, reached = movement(time, 2), motion.derivative(motion.velocity())
+    for row, ax in enumerate(axes.T):
+        plane(ax[0])
+        paths(ax[0], motion.planned[row], motion.hand[row])
+        ax[1].plot(time, primitives.speed(movement, time)[row], label="model", **MODEL)
+        ax[1].plot(motion.time, motion.speed()[row], label="simulated arm", **ARM)
         ax[1].set(xlim=(0, 0.9), ylim=(0, 1.5))
         for each, axis in ((ax[2], 1), (ax[3], 0)):
-            each.plot(time, acceleration[:, axis], **MODEL)
-            each.plot(motion.time, motion.acceleration()[0, :, axis], **ARM)
+            each.plot(time, planned[row, :, axis], **MODEL)
+            each.plot(motion.time, reached[row, :, axis], **ARM)
             each.set(xlim=(0, 0.9), ylim=(-4.2, 4.2))
             zero(each)
         ax[3].set_xlabel("$t$ [s]")
     for ax, text in zip(axes[1:, 0], ("$T$ [m/s]", r"$\ddot{y}$ [m/s²]", r"$\ddot{x}$ [m/s²]"), strict=True):
         ax.set_ylabel(text)
-    titles(axes[0], ("A   $T_3$ to $T_6$", "B   $T_1$ to $T_4$"))
     axes[1, 1].legend(loc="upper right")
     return figure
 
 
 def joints() -> Figure:
     """Draw Fig. 4: joint angles, velocities and torques of two movements."""
-    figure, axes = sheet(3, 2, 10.0, sharex=True, sharey="row")
+    titles = ("A   $T_3$ to $T_6$", "B   $T_2$ to $T_5$")
+    figure, axes = sheet(3, 2, 10.0, titles, sharex=True, sharey="row")
+    movement = diagonals()
+    motion = simulate(movement)
     time = np.linspace(0.0, DURATION, 401)
-    units = (np.degrees(1.0), np.degrees(1.0), 1.0)
-    for column, ends in zip(axes.T, (("T3", "T6"), ("T2", "T5")), strict=True):
-        movement = straight(*ends, DURATION)
-        motion = simulate(movement)
-        angles, rates, _ = movements.joint_motion(movement)
-        planned = (angles, rates, movements.required_torque(movement))
-        reached = (motion.joints[0], motion.joint_rates()[0], motion.torque[0])
-        within = np.flatnonzero(motion.time[:-1] <= DURATION)
-        for ax, unit, plan, arm in zip(column, units, planned, reached, strict=True):
+    angles, rates, _ = map(np.degrees, movements.joint_motion(movement))
+    reached = np.degrees(motion.joints)
+    quantities = (
+        (r"$\theta$ [deg]", angles, reached),
+        (r"$\dot{\theta}$ [deg/s]", rates, motion.derivative(reached)),
+        ("torque [N m]", movements.required_torque(movement), motion.torque),
+    )
+    within = np.flatnonzero(motion.time[:-1] <= DURATION)
+    for pair_of_axes, (text, model, arm) in zip(axes, quantities, strict=True):
+        pair_of_axes[0].set_ylabel(text)
+        for ax, row in zip(pair_of_axes, (0, 2), strict=True):
             for joint, (name, colour) in enumerate(JOINTS):
-                ax.plot(time, unit * plan[:, joint], color=colour, linewidth=2.0, label=name)
-                ax.plot(motion.time[within], unit * arm[within, joint], **ARM)
+                ax.plot(time, model[row, :, joint], color=colour, linewidth=2.0, label=name)
+                ax.plot(motion.time[within], arm[row, within, joint], **ARM)
             zero(ax)
-        column[2].set(xlabel="$t$ [s]", xlim=(0, DURATION))
-    axes[0, 0].set_ylabel(r"$\theta$ [deg]")
-    axes[1, 0].set_ylabel(r"$\dot{\theta}$ [deg/s]")
-    axes[2, 0].set_ylabel("torque [N m]")
-    titles(axes[0], ("A   $T_3$ to $T_6$", "B   $T_2$ to $T_5$"))
+    for ax in axes[2]:
+        ax.set(xlabel="$t$ [s]", xlim=(0, DURATION))
     axes[0, 0].legend(loc="upper left", handlelength=1.2)
     axes[0, 0].set_ylim(-10, 215)
     return figure
 
 
-ROWS = ("$T$ [m/s]", "$C$ [1/m]", "$V_x$ [m/s]", "$V_y$ [m/s]")
+def _two_movements(rows: int, height: float, titles: Sequence[str]) -> tuple[Figure, Any]:
+    """Return a sheet for the paths of two movements and for `profiles`, with one scale in each row of these."""
+    figure, axes = sheet(rows, 2, height, titles)
+    for row, text in zip(axes[1:], ("$T$ [m/s]", "$C$ [1/m]", "$V_x$ [m/s]", "$V_y$ [m/s]"), strict=False):
+        row[1].sharey(row[0])
+        row[0].set_ylabel(text)
+    return figure, axes
+
+
+def profiles(axes: Any, model: Profile, arm: Profile, end: float, names: Any = NAMES) -> None:
+    """Draw speed, curvature and velocities on as many axes as there are."""
+    for profile, style, name in zip((model, arm), (MODEL, ARM), names, strict=True):
+        quantities = (profile.speed, profile.curvature, *profile.velocity.T)
+        for ax, values in zip(axes, quantities, strict=False):
+            ax.plot(end * profile.time, values, label=name, **style)
+
+
+def _finish(axes: Any, duration: float) -> None:
+    """Begin the scales at zero, with room for the legend above the speed."""
+    for ax in axes.flat:
+        ax.set_xlim(0, duration)
+    axes[0, 0].set_ylim(0, 1.6 * axes[0, 0].get_ylim()[1])
+    axes[1, 0].set_ylim(0, 1.05 * axes[1, 0].get_ylim()[1])
+    axes[0, 1].legend(loc="upper right")
 
 
 def pair(first: Any, second: Any, texts: Any) -> Figure:
     """Draw two movements side by side, on the model and on the simulated arm; they are arguments of `curved`."""
+    figure, axes = _two_movements(5, 14.0, [f"A   {texts[0]}", f"B   {texts[1]}"])
     plans = [curved(*first), curved(*second)]
-    figure, axes = sheet(5, 2, 14.0)
     for ax, movement in zip(axes.T, plans, strict=True):
         motion = simulate(movement)
         passage = float(movement.knots[1])
-        paths(ax[0], movement, motion.hand[0])
+        plane(ax[0])
+        paths(ax[0], motion.planned[0], motion.hand[0])
         dot(ax[0], movement(passage))
-        end = float(movement.duration)
         (model,), (arm,) = movements.model_profiles(movement), movements.arm_profiles(motion)
-        profiles(ax[1:], model, arm, end)
-        planned, reached = movement.sample(len(model.time), 1)[0], motion.velocity()[0]
-        for each, x, y in zip(ax[3:], planned.T, reached.T, strict=True):
-            each.plot(end * model.time, x, **MODEL)
-            each.plot(motion.time, y, **ARM)
-            zero(each)
+        profiles(ax[1:], model, arm, float(movement.duration))
         for each in ax[1:]:
             each.axvline(passage, color=THIRD, linewidth=0.7, linestyle=":")
+        for each in ax[3:]:
+            zero(each)
         ax[4].set_xlabel("$t$ [s]")
-    _same_scales(axes[1:], max(float(each.duration) for each in plans))
-    titles(axes[0], [f"{letter}   {text}" for letter, text in zip("AB", texts, strict=True)], pad=6.0)
-    axes[1, 1].legend(loc="upper right")
+    _finish(axes[1:], max(float(each.duration) for each in plans))
     return figure
-
-
-def _same_scales(axes: Any, duration: float) -> None:
-    """Set one scale for each row, with room for the legend above the speed and labels on the left only."""
-    for row, text in zip(axes, ROWS[: len(axes)], strict=True):
-        limits = np.array([each.get_ylim() for each in row])
-        low, high = float(limits[:, 0].min()), float(limits[:, 1].max())
-        if text in ROWS[:2]:
-            low, high = 0.0, high * (1.6 if text == ROWS[0] else 1.05)
-        for each in row:
-            each.set(xlim=(0, duration), ylim=(low, high))
-        row[0].set_ylabel(text)
 
 
 def around_lights(avoidance: ObstacleMovements) -> Figure:
     """Draw Fig. 8: two movements around rows of lights, and the model through their points of greatest curvature."""
-    figure, axes = sheet(3, 2, 10.5)
+    figure, axes = _two_movements(3, 10.5, "AB")
     depth = np.array([each.valley_depth for each in avoidance.profiles])
     for ax, row in zip(axes.T, np.argsort(depth)[[0, len(depth) // 2]].tolist(), strict=True):
         profile, (start, *_, goal) = avoidance.profiles[row], avoidance.plan.waypoints[row]
         via = profile.place(profile.bend[0])
-        duration = float(avoidance.motion.duration[row])
-        movement = movements.minimum_jerk_through(np.stack((start, via, goal)), duration)
-        paths(ax[0], movement, profile.position)
+        duration = avoidance.motion.duration[row]
+        (model,) = movements.model_profiles(movements.minimum_jerk_through((start, via, goal), duration))
+        plane(ax[0])
+        paths(ax[0], model.position, profile.position)
         (lights,) = unpack(avoidance.scenes.obstacles, row)
         ax[0].fill(*(100.0 * footprint(lights)[0].T), color=PALETTE.obstacle)
         dot(ax[0], via)
-        (model,) = movements.model_profiles(movement)
         profiles(ax[1:], model, profile, 1.0, ("model through $\\bullet$", avoidance.name))
         ax[2].set_xlabel("$t/t_f$")
-    _same_scales(axes[1:], 1.0)
-    titles(axes[0])
-    axes[1, 1].legend(loc="upper right")
+    _finish(axes[1:], 1.0)
     return figure
 
 
@@ -284,8 +261,7 @@ def valleys() -> Figure:
     figure, axes = sheet(1, 2, 4.6)
     region, late = axes[0]
     alongs, heights = np.linspace(0.05, 0.95, 37), np.linspace(0.4, 1.0, 25)
-    has_valley = [functools.partial(one_via.model_has_valley, along) for along in alongs]
-    region.plot(alongs, [one_via.valley_threshold(each) for each in has_valley], **MODEL)
+    region.plot(alongs, [one_via.valley_threshold(along) for along in alongs], **MODEL)
     region.plot(0.5, 9.0 / 32.0, "o", color=THIRD, markersize=3.6)
     label = functools.partial(region.annotate, ha="center", fontsize=6.5)
     label("9/32", (0.5, 9 / 32), xytext=(0, -8), textcoords="offset points")
@@ -297,7 +273,6 @@ def valleys() -> Figure:
         late.plot(heights, [100 * (p.bend[0] - p.valley) for p in family], color=colour, label=f"{along}")
     late.set(xlabel="$d_3/(d_1+d_2)$", ylabel="curvature peak\nminus valley [% of $t_f$]", xlim=(0.4, 1.0))
     late.legend(title="$d_1/(d_1+d_2)$")
-    titles(axes)
     return figure
 
 
@@ -316,26 +291,24 @@ def isochrony(avoidance: ObstacleMovements) -> Figure:
     figure, axes = sheet(2, 2, 8.4)
     (over_place, place_residual), (over_height, height_residual) = axes
     shares, lengths = one_via.SHARES, one_via.LENGTHS
-
-    def model_shares(along: Any, height: Any) -> Float:
-        return movements.passage_share(curved(*ENDS, along, height))
-
     alongs, heights = np.linspace(0.001, 0.999, 400), np.linspace(0.02, 1.0, 200)
     for height, width in ((0.1, 0.6), (-one_via.HEIGHT, 2.2), (1.0, 1.1)):
-        share = model_shares(alongs, height)
+        share = passage_share(curved(*ENDS, alongs, height))
         over_place.plot(alongs, share, color=PALETTE.plan, linewidth=width, label=f"{height:g}")
-    found = avoidance.features
+    found = features(avoidance.profiles, avoidance.plan)
     over_place.plot(found.along, found.bend, **FAINT)
     place_residual.plot(found.along, found.residual, label=avoidance.name, **FAINT)
     arm, _ = one_via.arm_shares(shares, one_via.HEIGHT)
     over_place.plot(shares, arm, **DOTS)
-    residual = arm - model_shares(shares, one_via.HEIGHT)
+    residual = arm - passage_share(curved(*ENDS, shares, one_via.HEIGHT))
     place_residual.plot(shares, residual, label="arm, via-points", **DOTS)
     for along, colour in ((0.5, SECOND), (one_via.TYPICAL, PALETTE.plan), (0.2, THIRD)):
-        over_height.plot(heights, model_shares(along, heights), color=colour, label=f"{along:g}")
+        over_height.plot(
+            heights, passage_share(curved(*ENDS, along, heights)), color=colour, label=f"{along:g}"
+        )
         arm, _ = one_via.arm_shares(along, -lengths)
         over_height.plot(lengths, arm, **DOTS)
-        height_residual.plot(lengths, arm - model_shares(along, -lengths), **DOTS)
+        height_residual.plot(lengths, arm - passage_share(curved(*ENDS, along, -lengths)), **DOTS)
     for row, text, (mean, deviation) in zip(
         axes, ("$d_1/(d_1+d_2)$", "$d_3/(d_1+d_2)$"), SUBJECTS, strict=True
     ):
@@ -350,7 +323,6 @@ def isochrony(avoidance: ObstacleMovements) -> Figure:
     over_place.legend(title="$d_3/(d_1+d_2)$", loc="upper left", **small)
     over_height.legend(title="$d_1/(d_1+d_2)$", loc="lower right", **small)
     place_residual.legend(loc="upper center", handletextpad=0.2)
-    titles(axes)
     return figure
 
 
@@ -369,16 +341,13 @@ def orders_and_spaces() -> Figure:
     axes[0, 1].set(ylabel=r"$\ddot{x}\;t_f^2/A$", xlabel="$t/t_f$", xlim=(0, 1), ylim=(-9, 19))
     zero(axes[0, 1])
     axes[0, 1].legend(title="least", loc="upper right", handlelength=1.2)
-    ends = diagonal_ends()
     for ax, motion in (
-        (axes[1, 0], simulate(point_to_point(ends[:, 0], ends[:, 1], DURATION))),
-        (axes[1, 1], alternatives.joint_space(ends)),
+        (axes[1, 0], simulate(diagonals())),
+        (axes[1, 1], alternatives.joint_space(DIAGONALS)),
     ):
         plane(ax)
         for planned, hand in zip(motion.planned, motion.hand, strict=True):
-            path(ax, planned, **MODEL)
-            path(ax, hand, **ARM)
-    titles(axes)
+            paths(ax, planned, hand)
     return figure
 
 
@@ -408,7 +377,6 @@ def limits() -> Figure:
     plane(both, names=("T3", "T6"))
     both.annotate("at the\nlimit", (-16.0, 38.0), ha="right", fontsize=6.0)
     both.annotate(f"in {alternatives.HURRY} of\nthe time", (-4.0, 46.0), fontsize=6.0)
-    titles(axes)
     return figure
 
 
@@ -434,12 +402,14 @@ def paths_and_speeds() -> Figure:
         path(left, movement.superposed(time), **SUM)
         dot(left, movement.first(moment))
         left.annotate(f"{1e3 * moment:.0f} ms", (-33.5, 52.5), color=THIRD, fontweight="bold")
-        right.plot(time, speed(movement.planned(time, 1)), label="plan revised", **MODEL)
-        right.plot(motion.time, speed(motion.velocity()[1]), label="simulated arm", **ARM)
-        right.plot(time, speed(movement.superposed(time, 1)), label="sum", **SUM)
+        right.plot(time, np.hypot(*movement.planned(time, 1).T), label="plan revised", **MODEL)
+        right.plot(motion.time, motion.speed()[1], label="simulated arm", **ARM)
+        right.plot(time, np.hypot(*movement.superposed(time, 1).T), label="sum", **SUM)
         for begins, each in ((0.0, movement.first), (moment, movement.second)):
             own = np.linspace(0.0, float(each.duration), 201)
-            right.plot(begins + own, speed(each(own, 1)), label=None if begins else "its parts", **PART)
+            right.plot(
+                begins + own, primitives.speed(each, own), label=None if begins else "its parts", **PART
+            )
         right.axvline(moment, **NOW)
         left.set(xlim=(-36.0, 13.0), ylim=(36.0, 63.0), yticks=[40, 50, 60], xlabel="")
         right.set(xlim=(0.0, 1.05), xticks=[0.0, 0.5, 1.0], ylim=(0.0, 1.2), yticks=[0.0, 0.5, 1.0])
@@ -448,7 +418,6 @@ def paths_and_speeds() -> Figure:
     axes[-1, 1].set_xlabel("$t$ [s]")
     lines, names = axes[0, 1].get_legend_handles_labels()
     figure.legend(lines, names, loc="outside upper center", ncols=4, handlelength=1.8, columnspacing=1.4)
-    titles(axes)
     return figure
 
 
@@ -456,7 +425,16 @@ def comparison() -> Figure:
     """Draw the cost of the sum and its distance from the plan against the moment of revision."""
     figure, axes = sheet(2, 2, 8.4)
     (jerk, cost), (distance, peaks) = axes
-    _jerk(jerk, double_step.double_step(0.2))
+    movement = double_step.double_step(0.2)
+    time = np.linspace(0.0, movement.arrival, 1_801)
+    jerk.plot(time, movement.planned(time, 3)[:, 0], **MODEL, label="plan revised")
+    jerk.plot(time, movement.superposed(time, 3)[:, 0], **SUM, label="sum")
+    jerk.axvline(movement.moment, **NOW)
+    zero(jerk)
+    jerk.set(
+        xlabel="$t$ [s]", ylabel="jerk along $x$ [m/s$^3$]", xlim=(0.0, movement.arrival), ylim=(-80.0, 125.0)
+    )
+    jerk.legend(loc="upper right", handlelength=1.4)
     usual = double_step.STEP_DURATION
     moments = np.linspace(0.005, usual - 0.02, 60)
     for remaining, width in ((usual, 2.2), (0.85, 1.3), (1.0, 0.7)):
@@ -477,17 +455,4 @@ def comparison() -> Figure:
     peaks.legend(loc="lower right", handlelength=1.2)
     for ax in (cost, distance, peaks):
         ax.set(xlabel="revised at [s]", xlim=(0.0, usual))
-    titles(axes)
     return figure
-
-
-def _jerk(ax: Axes, movement: DoubleStep) -> None:
-    """Draw the jerk along the first movement, which has all of the difference."""
-    time = np.linspace(0.0, movement.arrival, 1_801)
-    zero(ax)
-    ax.plot(time, movement.planned(time, 3)[:, 0], **MODEL, label="plan revised")
-    ax.plot(time, movement.superposed(time, 3)[:, 0], **SUM, label="sum")
-    ax.axvline(movement.moment, **NOW)
-    ax.set(xlabel="$t$ [s]", ylabel="jerk along $x$ [m/s$^3$]", ylim=(-80.0, 125.0))
-    ax.set_xlim(0.0, movement.arrival)
-    ax.legend(loc="upper right", handlelength=1.4)

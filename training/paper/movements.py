@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
+from mujoco.batch import Batch
 from numpy.typing import ArrayLike
+from scipy.signal import find_peaks
 
-from viapoint.envs import Box, arm_of
+from viapoint.envs import Box, Task
 from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.obstacles import no_obstacles
-from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import Motion
-from viapoint.envs.simulator import Simulator
-from viapoint.envs.spaces import HandPlane
 from viapoint.primitives import Trajectory, passage_durations, point_to_point, through
 
 TARGETS = {
@@ -31,9 +29,9 @@ TARGETS = {
 The figure gives no coordinates. Its movements T1-T4, T2-T5 and T3-T6 (Figs. 1, 3 and 4) are the three diagonals of a
 hexagon here, 40, 36 and 36 cm long, in front of the right shoulder and within the reach of the arm.
 """
-ADULT = arm_of("planar")
+ADULT = Task.of().arm
 """Arm of an adult."""
-PLANE = HandPlane(ADULT)
+PLANE = Task.of().space
 """Plane of its hand."""
 
 
@@ -93,53 +91,49 @@ LEAST_APART = 0.3
 """Least distance of the targets of a movement, [m]."""
 
 
-class RowOfLights(NamedTuple):
-    """Movement between two targets, and the row of lights across its middle."""
-
-    first: str
-    last: str
-    """Names of the targets."""
-    start: Float
-    """Shape (2,), [m]."""
-    goal: Float
-    """Shape (2,), [m]."""
-    lights: Box
-
-
 def rows_of_lights(
-    length: float = 0.25, radius: float = 0.008, half_height: float = 0.04
-) -> list[RowOfLights]:
-    """Return the obstacle paradigm of Flash & Hogan 1985, one for each two targets that are far apart.
+    length: float = 0.25,
+    radius: float = 0.008,
+    shift: tuple[float, float] = (0.0, 0.0),
+    half_height: float = 0.04,
+) -> list[tuple[str, str, Box]]:
+    """Return the obstacle paradigm of Flash & Hogan 1985: pairs of targets, and a row of lights across the way.
 
     Args:
         length: Length of the row, [m]; the paper's rows were up to 25 cm long.
         radius: Half width of the row, [m].
-        half_height: Half height of the obstacle that stands for it, [m].
+        shift: Offset of the row's middle from that of the line between the targets, along and across it, [m].
+        half_height: Half height of the obstacle that stands for the row, [m].
+
+    Returns:
+        Names of start and goal, and the row, for each two targets that are far apart.
 
     Example:
         >>> from viapoint.training.paper.movements import rows_of_lights
         >>> rows = rows_of_lights()
-        >>> len(rows), rows[0].first, rows[0].last
-        (14, 'T1', 'T3')
+        >>> len(rows), rows[0][:2]
+        (14, ('T1', 'T3'))
     """
     found = []
-    for first, start in TARGETS.items():
-        for last, goal in TARGETS.items():
-            line = goal - start
-            if np.hypot(*line) < LEAST_APART:
-                continue
-            across = 0.5 * (np.arctan2(line[1], line[0]) + 0.5 * np.pi)
-            lights = Box(
-                size=(0.5 * length, radius, half_height),
-                position=(*(0.5 * (start + goal)), 0.0),
-                quaternion=(np.cos(across), 0.0, 0.0, np.sin(across)),
-            )
-            found.append(RowOfLights(first, last, start.copy(), goal.copy(), lights))
+    for (first, start), (last, goal) in itertools.permutations(TARGETS.items(), 2):
+        line = goal - start
+        distance = np.hypot(*line)
+        if distance < LEAST_APART:
+            continue
+        along = line / distance
+        middle = 0.5 * (start + goal) + (shift[0] * along + shift[1] * left_of(along))
+        turn = 0.5 * (np.arctan2(line[1], line[0]) + 0.5 * np.pi)
+        lights = Box(
+            size=(0.5 * length, radius, half_height),
+            position=(*middle, 0.0),
+            quaternion=(np.cos(turn), 0.0, 0.0, np.sin(turn)),
+        )
+        found.append((first, last, lights))
     return found
 
 
-TIMESTEP = 0.002
-"""Time step of the physics in the arm's model file, [s]."""
+SETTLING = 0.1
+"""Time after the end of a movement that is simulated, too, [s]."""
 
 
 class SimulatedMovements(NamedTuple):
@@ -168,26 +162,27 @@ class SimulatedMovements(NamedTuple):
         """Greatest deviation of all movements, [mm]."""
         return float(self.deviation.max())
 
+    def derivative(self, values: Float) -> Float:
+        """Return the derivative of values, shape (N, T, ...), with respect to time by central differences."""
+        return np.asarray(np.gradient(values, self.time, axis=1))
+
     def velocity(self) -> Float:
-        """Return the velocity of the hand by central differences, shape (N, T, 2), [m/s]."""
-        return np.asarray(np.gradient(self.hand, self.time, axis=1))
+        """Return the velocity of the hand, shape (N, T, 2), [m/s]."""
+        return self.derivative(self.hand)
 
-    def acceleration(self) -> Float:
-        """Return the acceleration of the hand by central differences, shape (N, T, 2), [m/s^2]."""
-        return np.asarray(np.gradient(self.velocity(), self.time, axis=1))
+    def speed(self) -> Float:
+        """Return the speed of the hand, shape (N, T), [m/s]."""
+        return np.asarray(np.linalg.norm(self.velocity(), axis=-1))
 
-    def joint_rates(self) -> Float:
-        """Return the velocities of the joints by central differences, shape (N, T, 2), [rad/s]."""
-        return np.asarray(np.gradient(self.joints, self.time, axis=1))
+    def at(self, fractions: Float) -> Float:
+        """Return the hand positions at F fractions of the durations, shape (N, F, 2), [m]."""
+        rows = zip(self.duration, self.hand, strict=True)
+        return np.stack([along_path(fractions * duration, self.time, hand) for duration, hand in rows])
 
-    def peak_speed(self) -> Float:
-        """Return the greatest speed of each movement, shape (N,), [m/s]."""
-        return np.asarray(np.linalg.norm(self.velocity(), axis=-1).max(axis=-1))
 
-    def at(self, row: int, fractions: Float) -> Float:
-        """Return the hand position of one movement at fractions of its duration, shape (len(fractions), 2), [m]."""
-        time = np.asarray(fractions) * self.duration[row]
-        return np.stack([np.interp(time, self.time, self.hand[row, :, i]) for i in (0, 1)], axis=-1)
+def along_path(time: Any, times: Float, positions: Float) -> Float:
+    """Return positions, shape (T, 2) at increasing times, interpolated at some times, shape (..., 2)."""
+    return np.stack([np.interp(time, times, axis) for axis in positions.T], axis=-1)
 
 
 def simulate(movement: Trajectory) -> SimulatedMovements:
@@ -200,25 +195,25 @@ def simulate(movement: Trajectory) -> SimulatedMovements:
 
 def instants(duration: float) -> Float:
     """Return the instants of the physics steps of a movement and of its settling, from 0 on, [s]."""
-    return np.asarray(TIMESTEP * np.arange(int(np.ceil((duration + SETTLING) / TIMESTEP)) + 1))
+    return np.asarray(ADULT.timestep * np.arange(int(np.ceil((duration + SETTLING) / ADULT.timestep)) + 1))
 
 
 def track(duration: Float, position: Float, velocity: Float, acceleration: Float) -> SimulatedMovements:
     """Make the arm follow references, shape (N, T, 2) at every physics step, from rest at the first."""
     number, count = position.shape[:2]
-    simulator = Simulator(ADULT, n_obstacles=0, num_envs=number)
     planned = PLANE.joint_motion(Motion(position, velocity, acceleration))
     start = planned.position[:, 0]
-    simulator.place(np.arange(number), start, no_obstacles(number))
+    batch = Batch(ADULT.compile(n_obstacles=0), number, 1)
+    batch.bind("qpos")[:] = start
     controls = ADULT.controls(*planned)[:, :-1]
-    ran = simulator.batch.rollout(count - 1, controls, record=("qpos", "qvel", "actuator_force"))
+    ran = batch.rollout(count - 1, controls, record=("qpos", "qvel", "actuator_force"))
     joints = np.concatenate((start[:, None], ran["qpos"]), axis=1)
     # The integrator applies the servo's damping at the end of a step; the recorded force is that at its beginning.
     # A force at its limit does not depend on the rates.
     force = ran["actuator_force"]
     damped = force - ADULT.damping * np.diff(ran["qvel"], axis=1, prepend=0.0)
     torque = np.where(np.abs(force) < ADULT.torque_limit, damped, force)
-    time = np.asarray(TIMESTEP * np.arange(count))
+    time = np.asarray(ADULT.timestep * np.arange(count))
     return SimulatedMovements(time, duration, position, PLANE.coordinates(joints), joints, torque)
 
 
@@ -241,94 +236,87 @@ SAMPLES = 2001
 
 
 class Profile(NamedTuple):
-    """Speed and curvature of one movement at T instants."""
+    """States of the hand in one movement at T instants."""
 
     time: Float
     """Instants as fractions of the duration, shape (T,)."""
-    speed: Float
-    """[m/s]"""
-    curvature: Float
-    """Unsigned, [1/m]."""
     position: Float
     """Shape (T, 2), [m]."""
+    velocity: Float
+    """Shape (T, 2), [m/s]."""
+    acceleration: Float
+    """Shape (T, 2), [m/s^2]."""
 
-    @classmethod
-    def of(cls, time: Float, position: Float, velocity: Float, acceleration: Float) -> Profile:
-        """Return the profile of hand position, velocity and acceleration, shape (T, 2), at fractions of the duration.
+    @property
+    def speed(self) -> Float:
+        """Speed, shape (T,), [m/s]."""
+        return np.asarray(np.linalg.norm(self.velocity, axis=-1))
 
-        kappa = |x' y'' - y' x''| / |v|^3
-        """
-        speed = np.linalg.norm(velocity, axis=-1)
-        turn = velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]
-        safe = np.maximum(speed, 1e-9)
-        return cls(time, speed, np.abs(turn) / (safe * safe * safe), position)
+    @property
+    def curvature(self) -> Float:
+        """Unsigned curvature |x' y'' - y' x''| / |v|^3, shape (T,), [1/m]; NaN near the ends, where it has no bound."""
+        turn = np.abs(np.linalg.det(np.stack((self.velocity, self.acceleration), axis=-2)))
+        return np.where(self.inner, turn / np.maximum(self.speed, 1e-9) ** 3, np.nan)
+
+    @property
+    def inner(self) -> Any:
+        """True for instants away from both ends, shape (T,)."""
+        return (self.time > EDGE) & (self.time < 1.0 - EDGE)
+
+    def local_maxima(self, values: Float) -> Float:
+        """Return time and height of local maxima away from the ends, the highest first, shape (n, 2)."""
+        index, _ = find_peaks(values)
+        index = index[self.inner[index]]
+        shift, height = vertex(values[index - 1], values[index], values[index + 1])
+        found = np.stack((self.time[index] + shift * self.time[1], height), axis=-1)
+        return found[np.argsort(-height, kind="stable")]
 
     @property
     def valley(self) -> float:
         """Time of the least speed between two peaks, as a fraction of the duration; NaN without a valley."""
-        places = _peaks(self.time, -self.speed)
-        return places[0][0] if places else np.nan
+        valleys = self.local_maxima(-self.speed)
+        return float(valleys[0, 0]) if len(valleys) else np.nan
 
     @property
     def valley_depth(self) -> float:
         """Speed in the valley relative to the mean of the two highest peaks; 1 without a valley."""
-        valleys, peaks = _peaks(self.time, -self.speed), self.peaks
-        return -valleys[0][1] / float(np.mean(peaks[:2, 1])) if valleys and len(peaks) > 1 else 1.0
+        valleys, peaks = self.local_maxima(-self.speed), self.peaks
+        return float(-valleys[0, 1] / peaks[:2, 1].mean()) if len(valleys) and len(peaks) > 1 else 1.0
 
     @property
     def peaks(self) -> Float:
         """Time and height of the local maxima of the speed, the highest first, shape (n, 2)."""
-        return np.array(_peaks(self.time, self.speed)).reshape(-1, 2)
+        return self.local_maxima(self.speed)
 
     @property
     def bend(self) -> tuple[float, float]:
         """Time and height [1/m] of the greatest local maximum of the curvature; NaN without one."""
-        places = _peaks(self.time, self.curvature)
-        return places[0] if places else (np.nan, np.nan)
+        bends = self.local_maxima(self.curvature)
+        return tuple(bends[0].tolist()) if len(bends) else (np.nan, np.nan)
 
     def place(self, time: float) -> Float:
         """Return the hand position at a fraction of the duration, shape (2,), [m]."""
-        return np.array([np.interp(time, self.time, self.position[:, i]) for i in (0, 1)])
+        return along_path(time, self.time, self.position)
 
 
 def model_profiles(movement: Trajectory) -> list[Profile]:
     """Return the profiles of movements of the model, of batch shape () or (N,)."""
     time = np.linspace(0.0, 1.0, SAMPLES)
     parts = [part.reshape(-1, SAMPLES, 2) for part in movement.sample(SAMPLES)]
-    return [Profile.of(time, *row) for row in zip(*parts, strict=True)]
+    return [Profile(time, *row) for row in zip(*parts, strict=True)]
 
 
 def arm_profiles(motion: SimulatedMovements) -> list[Profile]:
     """Return the profiles of movements of the simulated arm."""
+    states = (motion.hand, motion.velocity(), motion.derivative(motion.velocity()))
     profiles = []
-    for duration, *row in zip(
-        motion.duration, motion.hand, motion.velocity(), motion.acceleration(), strict=True
-    ):
+    for duration, *state in zip(motion.duration, *states, strict=True):
         within = motion.time <= duration + 1e-9
-        profiles.append(Profile.of(motion.time[within] / duration, *(part[within] for part in row)))
+        profiles.append(Profile(motion.time[within] / duration, *(part[within] for part in state)))
     return profiles
 
 
-def first_place(holds: Callable[[Any], bool], low: Any, high: Any, halvings: int) -> Any:
-    """Return where in an interval a condition begins to hold, by bisection; it holds at `high`, not at `low`."""
-    for _ in range(halvings):
-        middle = (low + high) / 2
-        low, high = (low, middle) if holds(middle) else (middle, high)
-    return (low + high) / 2
-
-
-def vertex(before: float, here: float, after: float) -> tuple[float, float]:
+def vertex(before: Any, here: Any, after: Any) -> tuple[Any, Any]:
     """Return the vertex of the parabola through three equidistant samples: offset from the middle one, and height."""
     shift = 0.5 * (before - after) / (before - 2.0 * here + after)
     return shift, here - 0.25 * (before - after) * shift
-
-
-def _peaks(time: Float, value: Float) -> list[tuple[float, float]]:
-    """Return time and height of local maxima away from the ends, the highest first, by parabolas through samples."""
-    inner = (time > EDGE) & (time < 1.0 - EDGE)
-    index = np.flatnonzero(inner[1:-1] & (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:])) + 1
-    found = []
-    for i in index:
-        shift, height = vertex(*value[i - 1 : i + 2])
-        found.append((float(time[i] + shift * (time[i + 1] - time[i])), float(height)))
-    return sorted(found, key=lambda each: -each[1])

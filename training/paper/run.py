@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import matplotlib.style
 import pandas as pd
@@ -20,7 +20,7 @@ from viapoint.training.config.configs import PaperConfig
 from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import MARK, check_ours, versions, write_bytes, write_json
 from viapoint.training.paper import figures
-from viapoint.training.paper.claim import Claim, Number, Reproduction
+from viapoint.training.paper.claim import Claim, Number
 from viapoint.training.paper.rows import alternatives, double_step, obstacles, one_via, straight
 from viapoint.training.paper.rows.one_via import ENDS, FAST, SLOW, THREE_POINTS
 
@@ -39,82 +39,73 @@ ROWS: dict[int, tuple[str, Callable[..., list[Claim]]]] = {
     12: ("Obstacle avoidance", obstacles.obstacle_claims),
     13: ("A target that jumps on the way (Flash & Henis 1991)", double_step.double_step_claims),
 }
-"""Titles and functions of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991.
-
-That of row 12 takes the movements around obstacles.
-"""
+"""Titles and functions of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991."""
 
 
-class Drawing(NamedTuple):
-    """Figure with its file name and caption."""
-
-    name: str
-    caption: str
-    draw: Callable[..., Figure]
-    around_lights: bool = False
-    """True if `draw` takes the movements around obstacles."""
-
-
-DRAWINGS = (
-    Drawing("fig01_model", "The model (Fig. 1). A: straight movement, speed T relative to its peak V_M. B: through a "
-            "via-point; path with d1, d2, d3, speed, curvature C (valley of the speed dotted) and velocities.",
-            figures.model),
-    Drawing("fig03_straight", "Straight movements (Fig. 3): path, speed and accelerations. Wide: model; dashed: "
-            "simulated arm, here and in the following figures.", figures.straight_movements),
-    Drawing("fig04_joints", "Joint angles, joint velocities and torques of two straight movements (Fig. 4): what is "
-            "the same for the hand is not for the joints.", figures.joints),
-    Drawing("fig05_height", "A larger d3 gives a deeper valley and a higher curvature peak (Fig. 5); d1 = d2; lengths "
-            "relative to d1 + d2. Dotted: passage of the via-point.",
-            partial(figures.pair, (*ENDS, 0.5, -0.52), (*ENDS, 0.5, -0.35), ("$d_3$ = 0.52", "$d_3$ = 0.35"))),
-    Drawing("fig06_place", "The longer side has the higher speed peak (Fig. 6).",
-            partial(figures.pair, (*ENDS, 0.3, -0.45), (*ENDS, 0.7, -0.45), ("$d_1$ = 0.3", "$d_1$ = 0.7"))),
-    Drawing("fig07_turned", "The same in other directions (Fig. 7).",
-            partial(figures.pair, ("T2", "T5", 0.35, 0.5), ("T3", "T6", 0.65, -0.5),
-                    ("$T_2$ to $T_5$", "$T_3$ to $T_6$"))),
-    Drawing("fig08_obstacles", "Around a row of lights (Fig. 8): the movement with the deepest valley (A) and a "
-            "median one (B), each with the model through its point of greatest curvature.",
-            figures.around_lights, around_lights=True),
-    Drawing("fig10_isochrony", "Passage times (Fig. 10). A: against d1, for three d3; C: against d3, for three d1. "
-            "B, D: difference from the model. Grey squares: movements around rows of lights.",
-            figures.isochrony, around_lights=True),
-    Drawing("fig11_scaling", "The same three points in 1.1 s and 0.85 s (Fig. 11).",
-            partial(figures.pair, (*ENDS, *THREE_POINTS, SLOW), (*ENDS, *THREE_POINTS, FAST),
-                    (f"{SLOW} s", f"{FAST} s"))),
-    Drawing("valleys", "Where there is a speed valley at all (A), and how much later the curvature has its peak (B).",
-            figures.valleys),
-    Drawing("alternatives", "Least acceleration, jerk and snap (A, B); least jerk of the hand (C) and of the joints "
-            "(D).", figures.orders_and_spaces),
-    Drawing("limits", "A repetitive movement beside a sinusoid (A); T3 to T6 at the torque limit and faster (B), with "
-            "the torques of both (C, D; limits dotted).", figures.limits),
-    Drawing("double_step", "The target jumps from T4 to T5 and the movement is revised (orange) 50, 100, 200 or 300 ms "
-            "after its start: by a second movement that is added, or by one new plan with the same arrival.",
-            figures.paths_and_speeds),
-    Drawing("double_step_jerk", "Sum and plan compared. A: jerk, revised at 200 ms. B, C: jerk cost relative to the "
-            "plan's and greatest distance from it, for three durations of the second movement. D: peak speeds.",
-            figures.comparison),
-)  # fmt: skip
-"""Figures in the order of the paper."""
+DRAWINGS: dict[str, tuple[str, Callable[..., Figure]]] = {
+    "fig01_model": ("The model (Fig. 1). A: straight movement, speed T relative to its peak V_M. B: through a "
+        "via-point; path with d1, d2, d3, speed, curvature C (valley of the speed dotted) and velocities.",
+        figures.model),
+    "fig03_straight": ("Straight movements (Fig. 3): path, speed and accelerations. Wide: model; dashed: "
+        "simulated arm, here and in the following figures.", figures.straight_movements),
+    "fig04_joints": ("Joint angles, joint velocities and torques of two straight movements (Fig. 4): what is "
+        "the same for the hand is not for the joints.", figures.joints),
+    "fig05_height": ("A larger d3 gives a deeper valley and a higher curvature peak (Fig. 5); d1 = d2; lengths "
+        "relative to d1 + d2. Dotted: passage of the via-point.",
+        partial(figures.pair, (*ENDS, 0.5, -0.52), (*ENDS, 0.5, -0.35), ("$d_3$ = 0.52", "$d_3$ = 0.35"))),
+    "fig06_place": ("The longer side has the higher speed peak (Fig. 6).",
+        partial(figures.pair, (*ENDS, 0.3, -0.45), (*ENDS, 0.7, -0.45), ("$d_1$ = 0.3", "$d_1$ = 0.7"))),
+    "fig07_turned": ("The same in other directions (Fig. 7).",
+        partial(figures.pair, ("T2", "T5", 0.35, 0.5), ("T3", "T6", 0.65, -0.5),
+            ("$T_2$ to $T_5$", "$T_3$ to $T_6$"))),
+    "fig08_obstacles": ("Around a row of lights (Fig. 8): the movement with the deepest valley (A) and a "
+        "median one (B), each with the model through its point of greatest curvature.",
+        figures.around_lights),
+    "fig10_isochrony": ("Passage times (Fig. 10). A: against d1, for three d3; C: against d3, for three d1. "
+        "B, D: difference from the model. Grey squares: movements around rows of lights.",
+        figures.isochrony),
+    "fig11_scaling": ("The same three points in 1.1 s and 0.85 s (Fig. 11).",
+        partial(figures.pair, (*ENDS, *THREE_POINTS, SLOW), (*ENDS, *THREE_POINTS, FAST),
+            (f"{SLOW} s", f"{FAST} s"))),
+    "valleys": ("Where there is a speed valley at all (A), and how much later the curvature has its peak (B).",
+        figures.valleys),
+    "alternatives": ("Least acceleration, jerk and snap (A, B); least jerk of the hand (C) and of the joints "
+        "(D).", figures.orders_and_spaces),
+    "limits": ("A repetitive movement beside a sinusoid (A); T3 to T6 at the torque limit and faster (B), with "
+        "the torques of both (C, D; limits dotted).", figures.limits),
+    "double_step": ("The target jumps from T4 to T5 and the movement is revised (orange) 50, 100, 200 or 300 ms "
+        "after its start: by a second movement that is added, or by one new plan with the same arrival.",
+        figures.paths_and_speeds),
+    "double_step_jerk": ("Sum and plan compared. A: jerk, revised at 200 ms. B, C: jerk cost relative to the "
+        "plan's and greatest distance from it, for three durations of the second movement. D: peak speeds.",
+        figures.comparison),
+}  # fmt: skip
+"""Captions and functions of the figures by their file names, in the order of the paper."""
+AROUND_LIGHTS = (obstacles.obstacle_claims, figures.around_lights, figures.isochrony)
+"""Functions of them that take the movements around obstacles."""
 
 
-STEPS = len(ROWS) + 1 + len(DRAWINGS)
+Pictures = list[tuple[Path, str]]
+"""Figures (PNG) and their captions."""
 
 
-def reproduce(out: Path, agent: Path | None, report_step: Callable[[str], None]) -> Reproduction:
-    """Compute every row, row 12 with an agent or a search, and draw every figure; each step is reported."""
-    report_step("movements around lights")
+def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], Pictures]:
+    """Compute every row, row 12 with an agent or a search, and draw every figure."""
     avoidance = obstacles.light_movements(agent)
+    show_progress = partial(tqdm, file=sys.stderr, dynamic_ncols=True)
+
+    def result_of(function: Callable[..., Any]) -> Any:
+        return function(avoidance) if function in AROUND_LIGHTS else function()
+
     claims: list[Claim] = []
-    for row, (_, compute) in ROWS.items():
-        report_step(f"row {row}")
-        claims += compute(avoidance) if compute is obstacles.obstacle_claims else compute()
-    pictures = []
-    for drawing in DRAWINGS:
-        report_step(drawing.name)
+    for _, compute in show_progress(ROWS.values(), desc="rows"):
+        claims += result_of(compute)
+    pictures: Pictures = []
+    for name, (caption, draw) in show_progress(DRAWINGS.items(), desc="figures"):
         with matplotlib.style.context(figures.STYLE):
-            figure = drawing.draw(avoidance) if drawing.around_lights else drawing.draw()
-            picture, _ = figures.save(figure, out, drawing.name)
-        pictures.append((picture, drawing.caption))
-    return Reproduction(claims, pictures)
+            picture, _ = figures.save(result_of(draw), out, name)
+        pictures.append((picture, caption))
+    return claims, pictures
 
 
 TITLE = "Flash & Hogan 1985, reproduced with viapoint"
@@ -132,15 +123,23 @@ NOTE = (
 )
 
 
-def write(reproduction: Reproduction, out: Path) -> list[Path]:
+def summary_of(claims: list[Claim]) -> str:
+    """Return a sentence with the number of claims that hold."""
+    return f"{sum(claim.holds for claim in claims)} of {len(claims)} claims hold."
+
+
+def write(claims: list[Claim], pictures: Pictures, out: Path) -> None:
     """Write the tables and the page to a folder."""
-    claims, pictures = reproduction
     summary = summary_of(claims)
     table = pd.DataFrame([cells(claim) for claim in claims], columns=HEADINGS)
     aligned = ["left"] * 4 + ["right"] * 5 + ["left"]
     text = table.replace("|", r"\|").to_markdown(index=False, disable_numparse=True, colalign=aligned)
     markdown = f"# {TITLE}\n\n{summary} {NOTE}\n\n{text}\n\n<!-- {MARK.decode()} -->\n"
-    record = {"viapoint": versions()["viapoint"], "title": TITLE, "holds": not reproduction.failed}
+    record = {
+        "viapoint": versions()["viapoint"],
+        "title": TITLE,
+        "holds": all(claim.holds for claim in claims),
+    }
     page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = page.from_string(
         (files("viapoint.training") / "paper/templates/page.html.j2").read_text("utf-8")
@@ -149,11 +148,9 @@ def write(reproduction: Reproduction, out: Path) -> list[Path]:
         title=TITLE, note=NOTE, summary=summary, headings=HEADINGS[1:], claims=claims, cells=cells, rows=ROWS,
         figures=[(base64.b64encode(path.read_bytes()).decode(), caption) for path, caption in pictures],
     )  # fmt: skip
-    paths = [out / name for name in PAGES]
-    write_bytes(paths[0], markdown.encode())
-    write_json(paths[1], {**record, "claims": [claim.as_json() for claim in claims]})
-    write_bytes(paths[2], html.encode())
-    return paths
+    write_bytes(out / "table.md", markdown.encode())
+    write_json(out / "table.json", {**record, "claims": [claim.as_json() for claim in claims]})
+    write_bytes(out / "index.html", html.encode())
 
 
 def cells(claim: Claim) -> list[str]:
@@ -171,11 +168,6 @@ def _number_and_range(number: Number | None, unit: str) -> tuple[str, str]:
     return f"{text} {unit}".rstrip(), str(expected)
 
 
-def summary_of(claims: list[Claim]) -> str:
-    """Return a sentence with the number of claims that hold."""
-    return f"{sum(claim.verdict == 'holds' for claim in claims)} of {len(claims)} claims hold."
-
-
 class ClaimsFailedError(Exception):
     """Error after a run in which some claims do not hold; all results are written."""
 
@@ -184,20 +176,13 @@ class ClaimsFailedError(Exception):
 
 def run(config: PaperConfig) -> None:
     """Compute the claims, draw and write them, and raise an error if a claim does not hold."""
-    if config.agent is not None:
-        obstacles.check_agent(config.agent)
-    pictures = [f"{drawing.name}{suffix}" for drawing in DRAWINGS for suffix in (".png", ".svg")]
-    for name in (*PAGES, *pictures):
+    files_of_figures = [f"{name}{suffix}" for name in DRAWINGS for suffix in (".png", ".svg")]
+    for name in (*PAGES, *files_of_figures):
         check_ours(config.out / name)
-    with tqdm(total=STEPS, file=sys.stderr, dynamic_ncols=True, unit=" steps") as bar, one_thread():
-
-        def report_step(name: str) -> None:
-            bar.set_description(name)
-            bar.update()
-
-        result = reproduce(config.out, config.agent, report_step)
-    pages = write(result, config.out)
-    print(f"{summary_of(result.claims)} The page: {pages[-1]}")
-    if result.failed:
-        names = "; ".join(f"row {claim.row}, {claim.claim}" for claim in result.failed)
-        raise ClaimsFailedError(f"{len(result.failed)} of {len(result.claims)} claims fail: {names}")
+    with one_thread():
+        claims, pictures = reproduce(config.out, config.agent)
+    write(claims, pictures, config.out)
+    failed = [f"row {claim.row}, {claim.claim}" for claim in claims if not claim.holds]
+    print(f"{summary_of(claims)} The page: {config.out / PAGES[-1]}")
+    if failed:
+        raise ClaimsFailedError(f"{len(failed)} of {len(claims)} claims fail: {'; '.join(failed)}")

@@ -42,7 +42,7 @@ class Method(Protocol):
 class Straight:
     """Straight minimum-jerk movement, the zero action."""
 
-    name = "straight line"
+    name = "straight"
 
     def __init__(self, simulation: SceneSimulation) -> None:
         self._size = simulation.task.action.size
@@ -58,7 +58,7 @@ class RandomVias:
     def __init__(self, simulation: SceneSimulation, count: int) -> None:
         self._simulation, self._count = simulation, count
         self._generator = np.random.default_rng(0)
-        self.name = "random via-point" if count == 1 else f"best of {count} random, simulated"
+        self.name = "random" if count == 1 else f"random{count}"
 
     @functools.cached_property
     def _for_one_scene(self) -> SceneSimulation:
@@ -137,14 +137,14 @@ def ompl_method(simulation: SceneSimulation) -> PlannerMethod:
         ValueError: The library is not installed.
     """
     import_ompl()
-    return PlannerMethod(simulation, "motion planner (OMPL)", ompl_motion)
+    return PlannerMethod(simulation, "ompl", ompl_motion)
 
 
 class OpenLoopBaseline:
     """First decision of a method, which is never revised."""
 
     def __init__(self, method: Method, simulation: SceneSimulation) -> None:
-        self.name, self._method = f"{method.name}, no revision", method
+        self.name, self._method = "unrevised", method
         self._simulation = SceneSimulation(simulation.env_id, 250, **{**simulation.kwargs, "decide_at": ()})
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
@@ -164,44 +164,55 @@ class AgentMethod:
         model: Model with `predict`.
         checks: Number of proposals that are checked with computed geometry in each decision; None for the model's own
             number.
+        refine: Number of proposals that the planner refines in each decision; None for the model's own number.
     """
 
-    def __init__(self, name: str, model: Any, checks: int | None = None) -> None:
-        self.name, self._model, self._checks = name, model, checks
+    def __init__(self, name: str, model: Any, checks: int | None = None, refine: int | None = None) -> None:
+        self.name, self._model = name, model
+        given = {"checks": checks, "refine": refine}
+        self._settings = {name: number for name, number in given.items() if number is not None}
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return actions of the agent, see :class:`Method`; the scenes are unused."""
         policy = self._model.policy
-        own = getattr(policy, "checks", None)
-        if own is not None and self._checks is not None:
-            policy.checks = self._checks
+        own = {name: getattr(policy, name) for name in self._settings if hasattr(policy, name)}
+        for name in own:
+            setattr(policy, name, self._settings[name])
         try:
             actions, _ = self._model.predict(observation, deterministic=True)
         finally:
-            if own is not None:
-                policy.checks = own
+            for name, number in own.items():
+                setattr(policy, name, number)
         return np.asarray(actions, dtype=np.float64)
 
 
-def agent_method(name: str, model: Any, checks: int | None = None) -> Method:
+def agent_method(name: str, model: Any, checks: int | None = None, refine: int | None = None) -> Method:
     """Return a trained agent as a method, for whole movements or for actions in every control step.
 
+    Its name tells how many proposals are checked and refined, as :class:`AgentMethod` explains.
+
     Raises:
-        ValueError: The agent cannot check its proposals.
+        ValueError: The agent cannot check or refine its proposals.
     """
     if checks and not hasattr(model.policy, "checks"):
         raise ValueError(f"proposals are checked by ViaQ only; this agent is a {type(model).__name__}")
+    if refine and not getattr(model.policy, "can_refine", False):
+        raise ValueError("proposals are refined by ViaQ only, in tasks with one decision for a movement")
+    if checks:
+        name += f", {checks} checks"
+    if refine:
+        name += f", {refine} refined"
     env_id, env_kwargs = env_arguments(model.get_env())
     if registered_task(env_id, **env_kwargs).stepwise:
         return StepAgentMethod(name, model, env_id, env_kwargs)
-    return AgentMethod(name, model, checks)
+    return AgentMethod(name, model, checks, refine)
 
 
 def refined_search(simulation: SceneSimulation, checks: int) -> Method:
     """Return a search that spends half of its checks on refinement, which solves more scenes."""
     rounds = 2 if checks < 512 else 4
-    half = checks // 2
-    return GeometrySearch(simulation.task, half, refinements=rounds, per_round=half // rounds)
+    each = checks // 2 // rounds
+    return GeometrySearch(simulation.task, checks - rounds * each, refinements=rounds, per_round=each)
 
 
 COUNTED: dict[str, Callable[[SceneSimulation, int], Method]] = {

@@ -103,6 +103,12 @@ def movement_table(n_via: int) -> MovementTable:
     return table_with(np.array([np.diff((0.0, *times, 1.0)) for times in sets]))
 
 
+@functools.cache
+def fine_table(n_via: int) -> MovementTable:
+    """Return the same table at many instants, for the last check of a movement."""
+    return table_with(movement_table(n_via).durations, FINE_INSTANTS)
+
+
 def table_with(durations: Float, number_of_instants: int = INSTANTS) -> MovementTable:
     """Return the table of movements whose segments take some durations in unit time, shape (M, K + 1)."""
     durations = np.ascontiguousarray(durations, dtype=np.float64)

@@ -34,31 +34,22 @@ from viapoint.training.planning.movements import (
     OUTSIDE,
     MovementTable,
     Setting,
+    fine_table,
     movement_table,
     table_with,
 )
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl, path_around, points_on
 from viapoint.training.planning.refine import (
+    AIMS,
+    SMOOTH,
     STRAIGHT_COST,
-    Aim,
     Found,
     exact_clearance,
     is_free,
     refine_seeds,
+    unit_of_jerk,
 )
 
-AIMS = (
-    Aim(clearance=0.04, jerk=0.1, iterations=20, gain=1.0, stride=2),
-    Aim(clearance=0.02, jerk=1.0, iterations=20, gain=0.02, stride=2),
-    Aim(clearance=0.02, jerk=0.3, iterations=20, gain=0.01, stride=2),
-    Aim(clearance=0.015, jerk=1.5, iterations=20, gain=0.01, stride=2),
-)
-"""Aims of the refinements. The first one, of a seed, has little weight of jerk, and ends as soon as the movement is
-free; the others polish free movements."""
-SMOOTH = 1.5
-"""Relative jerk cost with which a movement is polished no more."""
-SHORT = {"joints": 2.0, "hand": 0.2}
-"""Way of a straight movement whose jerk cost is the unit for shorter ones, too, [rad] and [m]."""
 ROUGH, MORE = 4.0, 4
 """Relative jerk cost above which more seeds are tried after a free movement, and how many of them."""
 SPREADS = 0.8, 1.0
@@ -342,12 +333,6 @@ def _setting(arm: Arm, of_hand: bool) -> Setting:
     return Setting(arm.chain, arm.spheres, ranges, of_hand, arm.reach, hand_alone=False)
 
 
-@functools.cache
-def _fine_table(n_via: int) -> MovementTable:
-    """Return the table of movements at many instants."""
-    return table_with(movement_table(n_via).durations, FINE_INSTANTS)
-
-
 @functools.lru_cache(maxsize=64)
 def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     """Make tables, and load or compile the machine code, so that no time limit is spent on them."""
@@ -359,7 +344,7 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     _is_free(problem, straight, 0.0)
     _result(problem, straight, _fault(problem)[0])
     nothing = np.zeros((0, n_via, len(start)))
-    _refined(problem, 0.0, movement_table(n_via), _fine_table(n_via), nothing, 1.0, smooth=SMOOTH, enough=1)
+    _refined(problem, 0.0, movement_table(n_via), fine_table(n_via), nothing, 1.0, smooth=SMOOTH, enough=1)
 
 
 def _goals(problem: _Problem, goal: Any) -> Float:
@@ -481,7 +466,7 @@ def _plan(
 def _straight(problem: _Problem) -> _Movement:
     """Return the straight movement, without via-points."""
     nothing = np.zeros((0, len(problem.start)))
-    movement = _Movement(nothing, _fine_table(0), 0, problem.duration or 1.0, "straight")
+    movement = _Movement(nothing, fine_table(0), 0, problem.duration or 1.0, "straight")
     if problem.duration is None and problem.moves:
         still = np.zeros_like(problem.start)
         resting = problem._replace(velocity=still, acceleration=still)
@@ -504,9 +489,9 @@ def _search(
     """Refine seeds until enough movements are free; return the one with the least jerk, and the number of seeds."""
     share = np.arange(1, n_via + 1)[:, None] / (n_via + 1)
     straight = share * (problem.goal - problem.start)
-    unit = _unit(problem)
+    unit = unit_of_jerk(problem.goal - problem.start, problem.space.of_hand)
     near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
-    table, fine = movement_table(n_via), _fine_table(n_via)
+    table, fine = movement_table(n_via), fine_table(n_via)
     best, least = None, np.inf
     tried = free = 0
     total = len(given) + 1 + number
@@ -553,16 +538,11 @@ def _refined(
     """Refine seeds, shape (S, K, D); see :func:`~viapoint.training.planning.refine.refine_seeds`."""
     n_via = seeds.shape[1]
     fixed = problem.offsets(np.zeros((n_via, len(problem.start))), duration)[n_via:]
+    unit = unit_of_jerk(problem.goal - problem.start, problem.space.of_hand)
     return refine_seeds(
         problem.setting, table, fine, problem.start, fixed, seeds, duration, problem.obstacles, 0, kept, AIMS,
-        _unit(problem), smooth, enough,
+        unit, smooth, enough,
     )  # fmt: skip
-
-
-def _unit(problem: _Problem) -> float:
-    """Return the unit of jerk costs in unit time: the cost of the straight movement, if it is not too short."""
-    way = float(np.linalg.norm(problem.goal - problem.start))
-    return STRAIGHT_COST * max(way, SHORT[problem.space.name]) ** 2
 
 
 def _along_path(problem: _Problem, kept: float, duration: float, until: float) -> _Movement | None:

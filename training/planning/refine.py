@@ -60,6 +60,9 @@ LONGEST_STEP = 0.6, 0.15
 """Longest step of a coordinate in joint space, [rad], and in hand space, [m]."""
 STRAIGHT_COST = 360.0
 """Jerk cost of a straight minimum-jerk movement of the way 1 in unit time."""
+SHORT = 2.0, 0.2
+"""Way of a straight movement whose jerk cost is the unit for shorter ones, too, in joint space, [rad], and in hand
+space, [m]."""
 SINGULAR = 1e-3
 """Least determinant of the arm's Jacobian in the plane that is believed, [m^2]."""
 
@@ -77,6 +80,18 @@ class Aim(NamedTuple):
     """Relative gain of the objective below which a free movement is good enough."""
     stride: int
     """Step between the instants that are looked at."""
+
+
+AIMS = (
+    Aim(clearance=0.04, jerk=0.1, iterations=20, gain=1.0, stride=2),
+    Aim(clearance=0.02, jerk=1.0, iterations=20, gain=0.02, stride=2),
+    Aim(clearance=0.02, jerk=0.3, iterations=20, gain=0.01, stride=2),
+    Aim(clearance=0.015, jerk=1.5, iterations=20, gain=0.01, stride=2),
+)
+"""Aims of the refinements. The first one, of a seed, has little weight of jerk, and ends as soon as the movement is
+free; the others polish free movements."""
+SMOOTH = 1.5
+"""Relative jerk cost with which a movement is polished no more."""
 
 
 class Found(NamedTuple):
@@ -407,6 +422,11 @@ def _refine(
             if damping > MOST_DAMPING:
                 break
     return int(times)
+
+
+def unit_of_jerk(way: Float, of_hand: bool) -> float:
+    """Return the unit of jerk costs in unit time: the cost of a straight movement, if it is not too short."""
+    return STRAIGHT_COST * max(float(np.linalg.norm(way)), SHORT[of_hand]) ** 2
 
 
 @compiled

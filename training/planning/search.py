@@ -13,13 +13,21 @@ from viapoint.envs.common.types import Bool, Float, Single
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
+from viapoint.envs.plans import Plan
 from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.task import Task
 from viapoint.training.planning.candidates import candidate_actions, sobol_actions
 from viapoint.training.planning.motion_plan import MotionPlan
-from viapoint.training.planning.movements import MovementTable, Setting, least_clearance, memory_of
+from viapoint.training.planning.movements import (
+    MovementTable,
+    Setting,
+    fine_table,
+    least_clearance,
+    memory_of,
+    movement_table,
+)
 from viapoint.training.planning.plan_motion import checked_motion
 from viapoint.training.planning.problem import (
     Moves,
@@ -29,6 +37,7 @@ from viapoint.training.planning.problem import (
     setting_of,
     worth_of,
 )
+from viapoint.training.planning.refine import AIMS, SMOOTH, refine_seeds, unit_of_jerk
 
 CLEARANCE_MARGIN = 0.001
 """Least planned clearance of a movement that the search prefers, [m]; 1 to 8 mm make no difference."""
@@ -74,6 +83,8 @@ class GeometrySearch:
         >>> plan = search.plan((-0.2, 0.3), (0.1, 0.4), [Cylinder(0.03, 0.04, position=(-0.05, 0.35, 0.0))])
         >>> plan.success, plan.waypoints.shape, plan.durations.shape
         (True, (3, 2), (2,))
+        >>> search.name, GeometrySearch("viapoint/PlanarObstacles-v0", 256, refinements=4).name
+        ('sobol64', 'search512')
     """
 
     def __init__(
@@ -97,9 +108,8 @@ class GeometrySearch:
 
     @property
     def name(self) -> str:
-        """Name in tables of results."""
-        kind = "search, {} checks" if self.refinements else "{} fixed plans"
-        return kind.format(self.total_checks)
+        """Name in tables of results and on the command line, such as search512, or sobol512 without refinement."""
+        return f"{'search' if self.refinements else 'sobol'}{self.total_checks}"
 
     def decide(self, observation: Mapping[str, Any], scenes: Any = None) -> Float:
         """Return the best action of each of B observations, shape (B, m).
@@ -220,6 +230,37 @@ def merits(
     horizons = np.array(HORIZONS if replanning else HORIZONS[:1])
     gain = task.weights.clearance / CLEARANCE_UNIT
     return _merits(setting, moves.table, problem.start, moves, worth, problem.obstacles, horizons, gain)
+
+
+def refined_actions(task: Task, problem: Problem, actions: Numbers) -> Numbers:
+    """Return actions of shape (B, H, m) after a refinement of their via-points by the gradient of clearance and jerk.
+
+    Durations relative to the shortest movement stay as they are, and what lies outside the action space is clipped.
+
+    Args:
+        task: Task whose movements begin at rest.
+        problem: B problems.
+        actions: Actions.
+    """
+    table, fine = movement_table(task.n_via), fine_table(task.n_via)
+    setting = setting_of(task, problem.obstacles, exact=True)
+    moves = moves_of(task, problem, actions)
+    found = np.array(actions)
+    number, at = task.n_via, task.n_via * task.action.dimension
+    for b in range(len(found)):
+        start, line = problem.start[b], problem.goal[b] - problem.start[b]
+        seeds, fixed = moves.offsets[b, :, :number].copy(), moves.offsets[b, 0, number:].copy()
+        _, better = refine_seeds(
+            setting, table, fine, start, fixed, seeds, moves.duration[b, 0], problem.obstacles, b, CLEARANCE_MARGIN,
+            AIMS, unit_of_jerk(line, setting.of_hand), SMOOTH, len(seeds),
+        )  # fmt: skip
+        waypoints = np.zeros((len(seeds), number + 2, len(start)))
+        waypoints[:, 1:-1] = better.vias
+        waypoints[:, -1] = line
+        refined = task.action.encode(Plan(start + waypoints, table.durations[better.times]))
+        refined[:, at] = actions[b, :, at]
+        found[b] = np.clip(refined, -1.0, 1.0)
+    return found
 
 
 def plan_clearances(

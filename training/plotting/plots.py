@@ -14,38 +14,29 @@ from viapoint.training.scene_sets.scene_set import BANDS
 
 BLUE = "#1f5fa8"
 DOTS_PER_INCH = 130
-AXES = (
-    ("decisions", "decisions", 1.0),
-    ("simulated_seconds", "simulated minutes", 1 / 60),
-    ("seconds", "minutes of training", 1 / 60),
-)
-"""Axes of the learning curve: key of the record, label, scale; keys that a record lacks are left out."""
 
 
 def learning_curve(path: Path, curve: Sequence[Mapping[str, Any]]) -> Path:
-    """Draw success on the validation scenes against decisions, simulated and training time, with its Wilson band.
+    """Draw success on the validation scenes against decisions, with its Wilson band and the time of training.
 
     Raises:
         ValueError: There is no record.
     """
     if not curve:
         raise ValueError("there is no learning curve to draw: the run was never evaluated")
-    shown = [axis for axis in AXES if all(axis[0] in record for record in curve)]
     rate, low, high = (
         100.0 * np.array([record["success"][part] for record in curve]) for part in ("rate", "low", "high")
     )
-    figure = Figure(figsize=(11.0, 3.6), layout="constrained")
-    axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-    for ax, (key, label, scale) in zip(axes, shown, strict=True):
-        x = scale * np.array([record[key] for record in curve])
-        ax.plot(x, rate, marker="o", markersize=3.5, label="agent", color=BLUE)
-        ax.fill_between(x, low, high, alpha=0.2, linewidth=0.0, color=BLUE)
-        ax.set_xlabel(label)
-        ax.set_xlim(left=0.0)
-        ax.set_ylim(0.0, 102.0)
-        style_axes(ax)
-    axes[0].set_ylabel("success on validation scenes [%]\nband: 95 % Wilson interval")
-    axes[-1].legend(frameon=False, loc="lower right")
+    decisions = np.array([record["decisions"] for record in curve])
+    figure = Figure(figsize=(6.0, 3.6), layout="constrained")
+    ax = figure.subplots()
+    ax.plot(decisions, rate, marker="o", markersize=3.5, color=BLUE)
+    ax.fill_between(decisions, low, high, alpha=0.2, linewidth=0.0, color=BLUE)
+    ax.set_xlabel(f"decisions ({curve[-1]['seconds'] / 60.0:.1f} minutes of training)")
+    ax.set_ylabel("success on validation scenes [%]\nband: 95 % Wilson interval")
+    ax.set_xlim(left=0.0)
+    ax.set_ylim(0.0, 102.0)
+    style_axes(ax)
     return _save(figure, path)
 
 

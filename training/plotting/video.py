@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import uuid
 from collections.abc import Iterable, Iterator
@@ -12,20 +11,16 @@ from typing import Any
 import gymnasium as gym
 import imageio_ffmpeg
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont
 
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Frame
-from viapoint.envs.episodes import Recorded
-from viapoint.envs.rendering.renderer import EpisodeRenderer, GLUnavailableError, frame_steps
+from viapoint.envs.rendering.renderer import EpisodeRenderer
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.config.checks import check_file
 from viapoint.training.io.files import MARK
 from viapoint.training.planning.motion_plan import MotionPlan, executed
-from viapoint.training.plotting.top_view import draw_movement, view_of
 from viapoint.training.rollouts.rollout import Decide
 
 CAPTION = 48
@@ -39,15 +34,11 @@ PLAN_SIZE, PLAN_FPS = (640, 480), 50
 PAUSE = 0.8
 """Time for which each result stays, [s]."""
 
-log = logging.getLogger(__name__)
-
 
 def record_video(
     path: str | Path, env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, *, name: str = "agent"
 ) -> int:
     """Record one episode in each scene as an MP4, and return the number of frames.
-
-    Without an OpenGL library the movements are drawn from above, and one warning names the package to install.
 
     Args:
         path: MP4 file; its folder must exist.
@@ -59,6 +50,7 @@ def record_video(
     Raises:
         ValueError: The path has another suffix or is a file of something else, the environment has another render
             mode, or there is no scene.
+        GLUnavailableError: There is no OpenGL library.
     """
     path = Path(path).expanduser()
     check_file("path", path, ".mp4")
@@ -66,10 +58,10 @@ def record_video(
         raise ValueError(f"env must be made with render_mode='rgb_array_list', got {env.render_mode!r}")
     if not len(scenes.start):
         raise ValueError("scenes must hold at least one scene")
-    camera = Camera(env)
+    fps = float(env.metadata["render_fps"])
     part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part.mp4")
     try:
-        count = _write_mp4(part, _scenes(camera, scenes, decide, name), camera.fps * SPEED)
+        count = _write_mp4(part, _scenes(env, scenes, decide, name, fps), fps * SPEED)
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
@@ -101,15 +93,16 @@ def record_plan(path: str | Path, plan: MotionPlan) -> int:
         film.close()
 
 
-def _scenes(camera: Camera, scenes: Scenes, decide: Decide, name: str) -> Iterator[Frame]:
+def _scenes(env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, name: str, fps: float) -> Iterator[Frame]:
     """Yield the frames of a movement in each scene and of a pause after it."""
     number = len(scenes.start)
     for i in range(number):
-        scene = scenes.take([i])
-        info = camera.play(scene, decide)
+        info = play(env, scenes.take([i]), decide)
         left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
-        hold = round(PAUSE * SPEED * camera.fps)
-        yield from _with_captions(camera.frames(), left, *describe_outcome(info), hold=hold)
+        frames: Any = env.unwrapped.render()
+        yield from _with_captions(
+            iter(frames), left, *describe_outcome(info), hold=round(PAUSE * SPEED * fps)
+        )
 
 
 def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
@@ -144,48 +137,15 @@ def describe_outcome(info: dict[str, Any]) -> tuple[str, Colour]:
     return f"missed by {1e3 * info['goal_error']:.0f} mm", PALETTE.contact
 
 
-class Camera:
-    """Source of the frames of an environment's episodes, rendered with OpenGL if available."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self._env: Any = env.unwrapped
-        self.fps = float(env.metadata["render_fps"])
-        self.rendered = True
-        """False once OpenGL has failed."""
-
-    def play(self, scene: Scenes, decide: Decide) -> dict[str, Any]:
-        """Simulate an episode, and return the info of its last decision."""
-        batch = self._env.batch
-        observation = batch.begin(scene)
-        while True:
-            decision = batch.execute_actions(decide(observation, scene))
-            observation = decision.observation
-            if decision.terminated[0] or decision.truncated[0]:
-                return {name: value[0] for name, value in decision.info.items()}
-
-    def frames(self) -> Iterator[Frame]:
-        """Yield the frames of the last episode, each of shape (height, width, 3)."""
-        if self.rendered:
-            try:
-                yield from self._env.render()
-                return
-            except GLUnavailableError as error:
-                self.rendered = False
-                log.warning("the video shows a drawn view from above: %s", error)
-        yield from self._drawn()
-
-    def _drawn(self) -> Iterator[Frame]:
-        batch, task = self._env.batch, self._env.task
-        recorded = Recorded(batch.scenes, batch.last_plans[0], batch.last_rollout[0])
-        figure = Figure(figsize=(4.8, 4.8), dpi=100)
-        canvas: Any = FigureCanvasAgg(figure)
-        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        view = view_of(task, recorded)
-        for step in frame_steps(recorded.rollout.time, round(self.fps)):
-            axes.clear()
-            draw_movement(axes, task, recorded, step=int(step), view=view)
-            canvas.draw()
-            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+def play(env: gym.Env[Any, Any], scene: Scenes, decide: Decide) -> dict[str, Any]:
+    """Simulate an episode of an environment in one scene, and return the info of its last decision."""
+    batch: Any = env.unwrapped.batch  # type: ignore[attr-defined]
+    observation = batch.begin(scene)
+    while True:
+        decision = batch.execute_actions(decide(observation, scene))
+        observation = decision.observation
+        if decision.terminated[0] or decision.truncated[0]:
+            return {name: value[0] for name, value in decision.info.items()}
 
 
 def _with_captions(

@@ -25,8 +25,8 @@ Observation = dict[str, NDArray[np.float32]] | NDArray[Any]
 
 ELAPSED = "elapsed"
 """Name of the duration of a decision in infos, [s]."""
-REPORTED = ("is_success", "collision", "min_clearance", "jerk_ratio", "duration", "reachable")
-"""Metrics of an episode that the info dictionaries report."""
+LOGGED = ("collision", "reachable", "min_clearance", "jerk_ratio", "duration")
+"""Metrics of an episode that `episode` in the infos holds too, as with `info_keywords` of SB3's `Monitor`."""
 TERMS = tuple(f"reward_{name}" for name in RewardTerms._fields)
 """Terms of a decision's reward, which the info dictionaries report."""
 
@@ -120,9 +120,6 @@ class ViaVecEnv(VecEnv):
         self.env_id, self.env_kwargs = env_id, dict(kwargs)
         spaces = self.venv.single_observation_space, self.venv.single_action_space
         VecEnv.__init__(self, num_envs, *spaces)
-        self.last_outcome: dict[str, NDArray[Any]] = {}
-        """Outcomes of the episodes that ended in the last step, one entry of each array per episode."""
-        self._batched_options: Mapping[str, Any] | None = None
         self._actions: NDArray[Any] | None = None
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, dtype=np.int64)
@@ -135,25 +132,19 @@ class ViaVecEnv(VecEnv):
         """Number of physics steps so far; 0 if the environment does not count them."""
         return int(getattr(self.venv.unwrapped, "physics_steps", 0))
 
-    def set_options(self, options: Sequence[Mapping[str, Any]] | Mapping[str, Any] | None = None) -> None:
-        """Set the options of the next reset.
-
-        Args:
-            options: Batched options as the environment accepts them, or a list of one mapping per copy.
-
-        Raises:
-            ValueError: There is not one mapping per copy, or their names differ.
-        """
-        if options is None or isinstance(options, Mapping):
-            self._batched_options = options
-        else:
-            self._batched_options = _batched(options, self.num_envs)
-
     def reset(self) -> Observation:
-        """Start a new episode in every copy."""
+        """Start a new episode in every copy, with the options of :meth:`set_options`, if any."""
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
-        options, self._batched_options = self._batched_options, None  # refused ones must not be met again
-        observation, _ = self.venv.reset(seed=seeds, options=options)
+        given: Any = self._options
+        self._reset_options()  # refused ones must not be met again
+        try:
+            names, *others = [set(each.keys()) for each in given]
+        except (TypeError, AttributeError):
+            names, others = set(), []
+        if len(others) != self.num_envs - 1 or any(each != names for each in others):
+            raise ValueError(f"options must be a mapping, or a list of {self.num_envs} alike, got {given!r}")
+        options = {name: [each[name] for each in given] for name in names}
+        observation, _ = self.venv.reset(seed=seeds, options=options or None)
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0.0, 0
         started: Observation = observation
@@ -167,55 +158,38 @@ class ViaVecEnv(VecEnv):
         """Step all copies; if an episode ended, the observation is the first one of the next episode.
 
         Returns:
-            Observation, reward (N,), done (N,) and N info dictionaries. The dictionaries hold `elapsed` [s], the
-            duration of the decision, if the environment reports it. At the end of an episode they also hold
-            `terminal_observation`, `TimeLimit.truncated`, `episode` (return r, length l, wall time t [s] since the
-            start) and those metrics of :data:`REPORTED` that the environment reports.
+            Observation, reward (N,), done (N,) and N info dictionaries. The dictionaries hold what the environment
+            reports of the decision. At the end of an episode they also hold `terminal_observation`,
+            `TimeLimit.truncated` and `episode` (return r, length l, wall time t [s] since the start, and those metrics
+            of :data:`LOGGED` that the environment reports).
         """
         observation, reward, terminated, truncated, info = self.venv.step(self._actions)
         done = terminated | truncated
         self._returns += reward
         self._lengths += 1
-        infos = self._began_infos(info, done)
-        self.last_outcome = {}
-        rows = np.flatnonzero(done)
-        if rows.size:
-            self._close_episodes(rows, infos, info, truncated & ~terminated)
+        infos = self._listed(info)
+        if done.any():
+            ended = self._listed(info.get("final_info", {}))
+            seconds = round(time.monotonic() - self._began, 6)
+            for row in np.flatnonzero(done).tolist():
+                episode = {"r": float(self._returns[row]), "l": int(self._lengths[row]), "t": seconds}
+                episode |= {name: ended[row][name] for name in LOGGED if name in ended[row]}
+                infos[row] = {
+                    **ended[row],
+                    "terminal_observation": info["final_obs"][row],
+                    "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
+                    "episode": episode,
+                }
+            self._returns[done], self._lengths[done] = 0.0, 0
         return observation, np.asarray(reward, dtype=np.float32), done, infos
 
-    def _began_infos(self, info: Mapping[str, Any], done: NDArray[np.bool_]) -> list[dict[str, Any]]:
-        """Return one info per copy, with the duration of its decision and the terms of its reward, if reported."""
-        final = info.get("final_info", {})
-        columns = {}
-        for name in (ELAPSED, *TERMS):
-            told = [part[name] for part in (info, final) if name in part]
-            if told:
-                columns[name] = np.where(done, told[-1], told[0]).tolist()
-        if not columns:
+    def _listed(self, info: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """Return the info of a vector environment as one dictionary for each copy, with plain numbers."""
+        names = [name for name in info if not name.startswith(("_", "final_"))]
+        if not names:
             return [{} for _ in range(self.num_envs)]
-        names = tuple(columns)
-        return [dict(zip(names, values, strict=True)) for values in zip(*columns.values(), strict=True)]
-
-    def _close_episodes(
-        self,
-        rows: NDArray[np.int64],
-        infos: list[dict[str, Any]],
-        info: Mapping[str, Any],
-        cut: NDArray[np.bool_],
-    ) -> None:
-        final = info.get("final_info", {})
-        names = [name for name in REPORTED if name in final]
-        self.last_outcome = {name: np.asarray(final[name])[rows] for name in names}
-        columns = [self.last_outcome[name].tolist() for name in names]
-        seconds = round(time.monotonic() - self._began, 6)
-        statistics = zip(self._returns[rows].tolist(), self._lengths[rows].tolist(), strict=True)
-        values = zip(*columns, strict=True) if names else iter([()] * len(rows))
-        for row, (r, length), value in zip(rows.tolist(), statistics, values, strict=True):
-            infos[row].update(zip(names, value, strict=True))
-            infos[row]["terminal_observation"] = info["final_obs"][row]
-            infos[row]["TimeLimit.truncated"] = bool(cut[row])
-            infos[row]["episode"] = {"r": r, "l": length, "t": seconds}
-        self._returns[rows], self._lengths[rows] = 0.0, 0
+        columns = (info[name].tolist() for name in names)
+        return [dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)]
 
     def state(self) -> dict[str, Any]:
         """Return random generators, running episodes and counters as values and arrays for :meth:`restore`."""
@@ -265,15 +239,3 @@ class ViaVecEnv(VecEnv):
         if any(not -self.num_envs <= row < self.num_envs for row in rows):
             raise IndexError(f"indices must be of {self.num_envs} copies, got {indices!r}")
         return rows
-
-
-def _batched(options: Any, num_envs: int) -> dict[str, list[Any]]:
-    """Return the options of all copies in one mapping of lists."""
-    listed = isinstance(options, Sequence) and len(options) == num_envs
-    if not listed or not all(isinstance(each, Mapping) for each in options):
-        raise ValueError(
-            f"options must be a mapping, or a list of {num_envs}, one for each copy, got {options!r}"
-        )
-    if any(each.keys() != options[0].keys() for each in options):
-        raise ValueError(f"options must give the same names for every copy, got {options!r}")
-    return {name: [each[name] for each in options] for name in options[0]}

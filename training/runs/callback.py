@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import sys
 import threading
@@ -11,20 +12,17 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from tqdm.auto import tqdm  # a bar of its own kind in a notebook
 
 from viapoint.training.evaluation.evaluator import MethodResult, evaluate_methods
+from viapoint.training.io.progress import progress_bar
 from viapoint.training.planning.baselines import agent_method
-from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import whole_task
-from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.rollouts.vec_env import LOGGED, ViaVecEnv
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets.scene_set import FrozenScenes, scenes_for
 
 LOG_EVERY = 1_000
 """Decisions between two entries of the log."""
-RECENT = 20
-"""Steps of all environments over which outcomes are averaged for log and progress bar."""
 RATES = ("collision", "reachable")
 """Metrics of an episode that are true or false; Stable-Baselines3 logs the success itself."""
 VALIDATED = ("success", "collision", "min_clearance", "goal_error", "jerk_ratio", "duration")
@@ -55,39 +53,16 @@ class RunCallback(BaseCallback):
         self.run, self.config = run, run.config
         self.curve: list[dict[str, Any]] = []
         """Learning curve: one record for each evaluation so far."""
-        self._best = (-1.0, 0.0)
         self._seconds_before, self._began = 0.0, time.monotonic()
-        checkpoint, evaluation = self.config.checkpoint_interval, self.config.evaluation_interval
-        self._every = {"log": LOG_EVERY, "checkpoint": checkpoint, "evaluation": evaluation}
-        self._next = {**self._every, "evaluation": 0}
-        self._validation = validation_scenes(run) if evaluation else None
-        self._recent: list[dict[str, float]] = []
+        self._before = 0
+        """Decisions when it was last decided what is due."""
+        self._validation = validation_scenes(run) if self.config.evaluation_interval else None
         self._stop = False
 
-    def state(self) -> dict[str, Any]:
-        """Return the state as plain values for :meth:`restore`."""
-        best, following = list(self._best), dict(self._next)
-        return {"curve": self.curve, "best": best, "seconds": self.seconds, "next": following}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a state that :meth:`state` returned."""
-        self.curve, self._seconds_before = list(state["curve"]), float(state["seconds"])
-        self._best = (float(state["best"][0]), float(state["best"][1]))
-        self._next = {name: int(state["next"][name]) for name in self._next}
-
-    @property
-    def stalled(self) -> bool:
-        """Flag: at the last validation the highest success had not risen for long enough to end the training."""
-        share = self.config.stop_when_stalled
-        if share is None or not self.curve:
-            return False
-        now = self.curve[-1]["decisions"]
-        return bool(now >= self.config.least_timesteps and now - self.best_record["decisions"] >= share * now)
-
-    @property
-    def best_record(self) -> dict[str, Any]:
-        """First record of the highest success in the learning curve."""
-        return max(self.curve, key=lambda record: record["success"]["rate"])  # the first of several
+    def restore(self, seconds: float, decisions: int) -> None:
+        """Continue a training that took a time [s] for a number of decisions."""
+        self.curve = [record for record in self.run.curve if record["decisions"] <= decisions]
+        self._seconds_before, self._before = seconds, decisions
 
     @property
     def seconds(self) -> float:
@@ -95,13 +70,12 @@ class RunCallback(BaseCallback):
         return self._seconds_before + time.monotonic() - self._began
 
     def __enter__(self) -> RunCallback:
-        self._bar = tqdm(
+        task = self.config.env.rpartition("/")[2]
+        self._bar = progress_bar(
             total=self.config.total_timesteps,
             unit=" decisions",
-            desc=f"{self.config.algo} on {self.config.env.rpartition('/')[2]}",
-            disable=not self.config.progress,
-            file=sys.stderr,
-            dynamic_ncols=True,
+            desc=f"{self.config.algo} on {task}",
+            disable=None if self.config.progress else True,
         )
         self._listens = threading.current_thread() is threading.main_thread()
         if self._listens:
@@ -123,10 +97,6 @@ class RunCallback(BaseCallback):
         self._show_progress()
 
     def _on_step(self) -> bool:
-        env = self.training_env
-        if isinstance(env, ViaVecEnv) and env.last_outcome:
-            self._recent.append({name: float(np.mean(env.last_outcome[name])) for name in env.last_outcome})
-            del self._recent[:-RECENT]
         self._show_progress()
         return True
 
@@ -136,10 +106,10 @@ class RunCallback(BaseCallback):
             self._save_checkpoint()
             self.run.save("final", self.model)
             raise TrainingStoppedError(
-                f"stopped after {self.num_timesteps} decisions; all is saved in {self.run.folder}, and training "
-                "goes on from there (viapoint train --resume, or viapoint demo again)"
+                f"stopped after {self.num_timesteps} decisions, and all is saved; go on with: "
+                f"{resume_command(self.run)}"
             )
-        if self.stalled:
+        if self.run.stalled:
             self._save_checkpoint()
             raise TrainingStalledError
 
@@ -147,32 +117,34 @@ class RunCallback(BaseCallback):
         self._run_due_actions(final=True)
 
     def _run_due_actions(self, *, final: bool) -> None:
-        validates = self._validation is not None and (self._is_due("evaluation") or final)
-        if self._validation is not None and validates:
-            self._validate(self._validation)
-        if self._is_due("log") or validates or final:
+        config = self.config
+        validates = self._validation is not None and (
+            final or not self.curve or self._is_due(config.evaluation_interval)
+        )
+        if validates:
+            self._validate()
+        if validates or final or self._is_due(LOG_EVERY):
             self._log()
-        if self._is_due("checkpoint") or final:
+        saves = final or self._is_due(config.checkpoint_interval)
+        self._before = self.num_timesteps
+        if saves:
             self._save_checkpoint()
 
-    def _is_due(self, what: str) -> bool:
-        """Return whether an action is due, and schedule the next one if so."""
-        if self.num_timesteps < self._next[what]:
-            return False
-        self._next[what] = (self.num_timesteps // self._every[what] + 1) * self._every[what]
-        return True
+    def _is_due(self, interval: int) -> bool:
+        """Return whether decisions have passed a multiple of an interval."""
+        return self.num_timesteps // interval > self._before // interval
 
     def _save_checkpoint(self) -> None:
-        self.run.checkpoint(self.model, self.state())
+        self.run.checkpoint(self.model, {"seconds": self.seconds})
 
-    def _validate(self, frozen: FrozenScenes) -> None:
+    def _validate(self) -> None:
         """Evaluate the policy, extend the learning curve, and save the model if it is the best so far."""
-        if self.curve and self.curve[-1]["decisions"] == self.num_timesteps:
+        if self._validation is None or (self.curve and self.curve[-1]["decisions"] == self.num_timesteps):
             return
         seconds, began = self.seconds, time.monotonic()
         result = evaluate_methods(
             [agent_method("agent", self.model)],
-            frozen,
+            self._validation,
             self.config.env,
             env_kwargs=whole_task(self.config.env, self.config.env_kwargs),
             time_decisions=False,
@@ -182,9 +154,14 @@ class RunCallback(BaseCallback):
         record = self._record(result, seconds)
         self.curve.append(record)
         self.run.write_curve(self.curve)
-        ranking = (record["success"]["rate"], -(record["jerk_ratio"] or 0.0))
-        if ranking > self._best:
-            self._best = ranking
+        if self.config.progress and self._bar.disable:
+            rate = 100.0 * record["success"]["rate"]
+            print(
+                f"{self.num_timesteps} of {self.config.total_timesteps} decisions: success {rate:.1f} % in validation",
+                file=sys.stderr,
+                flush=True,
+            )
+        if record is max(self.curve, key=_ranking):
             self.run.save("best", self.model)
         self._show_progress()
         self._began += time.monotonic() - began
@@ -208,25 +185,35 @@ class RunCallback(BaseCallback):
         return record
 
     def _log(self) -> None:
-        for name in {name for each in self._recent for name in each} - {"is_success"}:
-            tag = f"rollout/{name}_rate" if name in RATES else f"rollout/{name}"
-            self.logger.record(tag, self._average(name))
+        episodes = list(self.model.ep_info_buffer or ())
+        for name in LOGGED:
+            values = [episode[name] for episode in episodes if name in episode]
+            if values:
+                tag = f"rollout/{name}_rate" if name in RATES else f"rollout/{name}"
+                self.logger.record(tag, float(np.mean(values)))
         env = self.training_env
         if isinstance(env, ViaVecEnv) and env.physics_steps:
             self.logger.record("time/simulated_seconds", env.physics_steps * _timestep(env))
         self.model.dump_logs()
 
-    def _average(self, name: str) -> float:
-        return float(np.mean([each[name] for each in self._recent if name in each]))
-
     def _show_progress(self) -> None:
         self._bar.update(min(self.num_timesteps, self.config.total_timesteps) - self._bar.n)
         shown = {}
-        if self._recent:
-            shown["success"] = f"{100.0 * self._average('is_success'):.0f} %"
+        if self.model.ep_success_buffer:
+            shown["success"] = f"{100.0 * np.mean(self.model.ep_success_buffer):.0f} %"
         if self.curve:
             shown["validation"] = f"{100.0 * self.curve[-1]['success']['rate']:.1f} %"
         self._bar.set_postfix(shown, refresh=False)
+
+
+def _ranking(record: dict[str, Any]) -> tuple[float, float]:
+    """Return what makes a validation better than another one: success, then less jerk."""
+    return record["success"]["rate"], -(record["jerk_ratio"] or 0.0)
+
+
+def resume_command(run: Run) -> str:
+    """Return the command that goes on with a run."""
+    return shlex.join(["viapoint", "train", "--resume", "--out", str(run.folder)])
 
 
 def _timestep(env: Any) -> float:
@@ -236,6 +223,4 @@ def _timestep(env: Any) -> float:
 
 def validation_scenes(run: Run) -> FrozenScenes:
     """Return the shipped validation scenes of a run's environment, or reproducibly sampled ones if none fit."""
-    config = run.config
-    frozen = scenes_for("validation", registered_task(config.env, **config.env_kwargs), config.eval_scenes)
-    return frozen.take(slice(0, config.eval_scenes))
+    return scenes_for("validation", run.config.task, run.config.eval_scenes)

@@ -3,8 +3,7 @@
 arm.xml                           copy of the arm, if it was loaded from a file
 config.json  versions.json        what was asked for, with which versions (the seed is in config.json)
 learning_curve.jsonl              one line for each evaluation on the validation scenes
-end.json                          why training ended: its budget was spent, or success stalled
-checkpoints/<decisions>/          for an exact continuation; the last two are kept
+checkpoints/<decisions>.pt        for an exact continuation; the last two are kept
 best/  final/                     models: best on the validation scenes, last
 evaluations/<name>.json           what `viapoint evaluate` and `viapoint demo` measured
 tensorboard/                      logs
@@ -13,8 +12,8 @@ tensorboard/                      logs
 from __future__ import annotations
 
 import json
-import os
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -39,12 +38,7 @@ from viapoint.training.io.files import (
     write_folder,
     write_json,
 )
-from viapoint.training.runs.checkpoints import (
-    is_checkpoint,
-    read_checkpoint,
-    remove_checkpoint,
-    write_checkpoint,
-)
+from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
 
 KEPT_CHECKPOINTS = 2
 PATIENCE = 10.0
@@ -88,18 +82,18 @@ class Run:
             if isinstance(record.get("env_kwargs"), dict):
                 record["env_kwargs"] = with_kept_arm(record["env_kwargs"], folder)
             self.config: TrainConfig = TrainConfig.from_json(record)
+        except BadFileError:
+            raise
         except (TypeError, ValueError) as error:
-            if isinstance(error, BadFileError):
-                raise
-            reason = f"is no configuration of a training by viapoint {versions()['viapoint']} ({error})"
-            writer = self.versions.get("viapoint")
-            raise BadFileError(
-                folder / "config.json", f"{reason}; it was written by viapoint {writer}" if writer else reason
-            ) from None
+            writer, mine = self.versions.get("viapoint", "of an unknown version"), versions()["viapoint"]
+            reason = (
+                f"was written by viapoint {writer}, and is no configuration of a training by {mine} ({error})"
+            )
+            raise BadFileError(folder / "config.json", reason) from None
 
     def __repr__(self) -> str:
         config, curve = self.config, self.curve
-        stalled = " until it stalled" if self.stopped == "stalled" else ""
+        stalled = " until it stalled" if self.stalled else ""
         rate = f", success {100.0 * curve[-1]['success']['rate']:.1f} % on validation scenes" if curve else ""
         return (
             f"Run({str(self.folder)!r}: {config.algo} on {config.env}, seed {config.seed}, "
@@ -116,7 +110,7 @@ class Run:
         folder = config.folder
         check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        with _lock(folder):
+        with _locked(folder):
             check_free(folder)  # another process may have been faster
             write_json(folder / "versions.json", versions())
             keep_arm(folder, config.task.arm)
@@ -133,15 +127,9 @@ class Run:
 
     @property
     def curve(self) -> list[dict[str, Any]]:
-        """Learning curve: one record for each evaluation; an incomplete last line is left out."""
+        """Learning curve: one record for each evaluation."""
         path = self.folder / "learning_curve.jsonl"
-        records = []
-        for line in path.read_text().splitlines() if path.exists() else []:
-            try:
-                records.append(json.loads(line))
-            except ValueError:
-                break
-        return records
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
     def write_curve(self, records: list[dict[str, Any]]) -> None:
         """Replace the learning curve."""
@@ -152,7 +140,7 @@ class Run:
     def decisions(self) -> int:
         """Number of decisions at the newest checkpoint; 0 without one."""
         checkpoints = self.checkpoints()
-        return int(checkpoints[-1].name) if checkpoints else 0
+        return int(checkpoints[-1].stem) if checkpoints else 0
 
     @property
     def best(self) -> Path:
@@ -174,48 +162,51 @@ class Run:
 
     def checkpoint(self, model: BaseAlgorithm, extra: Mapping[str, Any]) -> None:
         """Write a checkpoint and remove outdated ones."""
-        write_checkpoint(model, self._checkpoints / f"{model.num_timesteps:010d}", extra)
+        write_checkpoint(model, self._checkpoints / f"{model.num_timesteps:010d}.pt", extra)
         for outdated in self.checkpoints()[:-KEPT_CHECKPOINTS]:
-            remove_checkpoint(outdated)
+            outdated.unlink()
 
     def checkpoints(self) -> list[Path]:
-        """Folders of the checkpoints, oldest first."""
-        found = (path for path in self._checkpoints.glob("[0-9]*") if re.fullmatch(r"\d{10}", path.name))
-        return sorted(path for path in found if is_checkpoint(path))
+        """Files of the checkpoints, oldest first."""
+        found = self._checkpoints.glob("[0-9]*.pt")
+        return sorted(path for path in found if re.fullmatch(r"\d{10}", path.stem) and path.is_file())
 
-    def restore(self, model: BaseAlgorithm) -> tuple[dict[str, Any] | None, list[str]]:
-        """Set a model to the state of the newest intact checkpoint.
+    def restore(self, model: BaseAlgorithm) -> dict[str, Any] | None:
+        """Set a model to the state of the newest intact checkpoint, and print why newer ones were skipped.
 
         Returns:
-            Content of `extra`, None without any checkpoint; and the reasons why newer checkpoints were
-            skipped.
+            Content of `extra`; None without any checkpoint.
 
         Raises:
             BadFileError: There are checkpoints, but none is whole; the message is about the newest.
         """
-        passed_over: list[BadFileError] = []
+        newest = None
         for path in reversed(self.checkpoints()):
             try:
-                return read_checkpoint(model, path), [str(error) for error in passed_over]
+                return read_checkpoint(model, path)
             except BadFileError as error:
-                passed_over.append(error)
-        if passed_over:
-            raise passed_over[0]
-        return None, []
+                print(f"passed over a damaged checkpoint: {error}", file=sys.stderr)
+                newest = newest or error
+        if newest is not None:
+            raise newest
+        return None
 
     @property
-    def stopped(self) -> str | None:
-        """Reason why training ended: `budget` or `stalled`, see `stop_when_stalled`; None while it has not ended."""
-        path = self.folder / "end.json"
-        return str(read_json(path)["stopped"]) if path.is_file() else None
+    def stalled(self) -> bool:
+        """Flag: success had not risen for so long that training ended, see `stop_when_stalled`."""
+        share = self.config.stop_when_stalled
+        curve = [] if share is None else self.curve
+        if share is None or not curve:
+            return False
+        now = curve[-1]["decisions"]
+        best = max(curve, key=lambda record: record["success"]["rate"])  # the first of several
+        return bool(now >= self.config.preset.n_timesteps and now - best["decisions"] >= share * now)
 
-    def write_end(self, record: Mapping[str, Any] | None) -> None:
-        """Write why and where training ended; None removes the file while training goes on."""
-        path = self.folder / "end.json"
-        if record is None:
-            path.unlink(missing_ok=True)
-        else:
-            write_json(path, record)
+    @property
+    def ended(self) -> bool:
+        """Flag: training has made all its decisions, or success stalled, and the last model is written."""
+        enough = self.stalled or self.decisions >= self.config.total_timesteps
+        return enough and (self.final / "model.json").is_file()
 
     def write_evaluation(self, name: str, record: Mapping[str, Any]) -> Path:
         """Write the result of an evaluation under a name."""
@@ -230,7 +221,7 @@ class Run:
         Raises:
             BadFileError: Another process trains in the folder.
         """
-        with _lock(self.folder):
+        with _locked(self.folder):
             for folder in (self.folder, self._checkpoints, self.folder / "evaluations"):
                 tidy(folder)
             yield
@@ -241,20 +232,14 @@ class Run:
 
 
 @contextmanager
-def _lock(folder: Path) -> Iterator[None]:
-    """Lock a folder for this process; see :meth:`Run.locked`."""
-    lock, owner = FileLock(folder / "lock"), folder / "lock.pid"
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock a folder for this process."""
     try:
-        lock.acquire(timeout=PATIENCE)
+        held = FileLock(folder / "lock").acquire(timeout=PATIENCE)
     except Timeout:
-        pid = owner.read_text() if owner.exists() else "unknown"
-        raise BadFileError(folder, f"is in use by the process with number {pid}") from None
-    try:
-        owner.write_text(str(os.getpid()))
+        raise BadFileError(folder, "is in use by another process") from None
+    with held:
         yield
-    finally:
-        owner.unlink(missing_ok=True)
-        lock.release()
 
 
 def check_free(folder: Path) -> None:
@@ -269,7 +254,7 @@ def check_free(folder: Path) -> None:
     check_folder("run folder", folder)
     names = {path.name for path in folder.iterdir()} if folder.exists() else set()
     begun = {name for name in names if UNFINISHED.fullmatch(name)}
-    if names - begun - {"versions.json", COPY, "lock", "lock.pid"}:
+    if names - begun - {"versions.json", COPY, "lock"}:
         raise BadFileError(folder, "is not empty and is no run folder")
     check_ours(folder / "versions.json")
 

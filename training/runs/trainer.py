@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -17,7 +16,7 @@ from viapoint.training.config.configs import TrainConfig
 from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import BadFileError, versions
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.runs.callback import RunCallback, TrainingStalledError
+from viapoint.training.runs.callback import RunCallback, TrainingStalledError, resume_command
 from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, write_config
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
@@ -37,8 +36,7 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
 
     With `config.resume` the run in the folder continues with its own configuration from its last checkpoint, to the
     same result as if it had never stopped; `n_timesteps` may extend it. A training that has ended because it stalled
-    (`stop_when_stalled`) stays as it is. Where a checkpoint is read, the decision to end depends on the learning curve
-    alone, so it is the same with and without interruption.
+    (`stop_when_stalled`) stays as it is: the decision to end depends on the learning curve alone.
 
     Args:
         config: Environment, algorithm, seed, run folder and everything else that a training depends on.
@@ -78,6 +76,7 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
             return run
         check_free(config.folder)
         begun = resolved(config)
+        _warn(begun)
         with _untrained_model(begun) as model:  # before there is a folder: what cannot be built leaves none
             run = Run.create(begun)
             with run.locked():
@@ -95,8 +94,8 @@ def train_or_resume(config: TrainConfig, callback: Callbacks = None) -> Run:
     if not (config.folder / "config.json").is_file():
         return train(config, callback)
     run = Run(config.folder)
-    check_unchanged(run, resolved(config))
-    if run.stopped is not None and run.config.total_timesteps == config.total_timesteps:
+    check_unchanged(run, resolved(dataclasses.replace(config, n_timesteps=run.config.total_timesteps)))
+    if run.ended and run.config.total_timesteps == config.total_timesteps:
         return run
     again = TrainConfig(
         out=config.folder, resume=True, progress=config.progress, n_timesteps=config.total_timesteps
@@ -109,12 +108,24 @@ def resolved(config: TrainConfig) -> TrainConfig:
     return dataclasses.replace(
         config,
         n_timesteps=config.total_timesteps,
-        min_timesteps=None if config.stop_when_stalled is None else config.least_timesteps,
         n_envs=config.copies,
         eval_every=config.evaluation_interval,
         checkpoint_every=config.checkpoint_interval,
-        hyperparameters={**config.preset.arguments(), **config.hyperparameters},
+        hyperparameters=config.all_hyperparameters,
     )
+
+
+def _warn(config: TrainConfig) -> None:
+    """Print what a training of a resolved configuration can hardly learn."""
+    starts = config.hyperparameters.get("learning_starts", 0)
+    if config.total_timesteps <= starts:
+        print(
+            f"n_timesteps={config.total_timesteps}: the network is not updated once, as learning starts after "
+            f"{starts} decisions (learning_starts)",
+            file=sys.stderr,
+        )
+    if not config.task.n_via and config.task.n_obstacles[1] and not config.task.stepwise:
+        print("n_via=0: all movements are straight, and none can pass around an obstacle", file=sys.stderr)
 
 
 @contextmanager
@@ -130,11 +141,11 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
         try:
             model = build(config.algo, config.preset.policy, env, config.hyperparameters, seed=config.seed)
         except UNFIT as error:
-            usual, asked = config.preset.arguments(), config.hyperparameters
-            other = {name: value for name, value in asked.items() if usual.get(name) != value}
-            given = ", ".join(f"{name}={json.dumps(value, default=str)}" for name, value in other.items())
-            made = f"made with {given}" if given else f"made for {config.env}"
-            raise ValueError(f"{config.algo} cannot be {made}: {error}") from error
+            usual = config.preset.arguments()
+            others = {name: each for name, each in config.hyperparameters.items() if usual.get(name) != each}
+            raise ValueError(
+                f"{config.algo} cannot be made for {config.env} with {others}: {error}"
+            ) from error
         yield model
 
 
@@ -150,8 +161,8 @@ def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> N
             _learn(model, run, monitor, callback)
     except OSError as error:
         raise TrainingFailedError(
-            f"training cannot go on: {error}; {run.folder} keeps what was saved up to decision "
-            f"{run.decisions}, and viapoint train --resume goes on from there"
+            f"training cannot go on: {error}; all up to decision {run.decisions} is saved; go on with: "
+            f"{resume_command(run)}"
         ) from error
 
 
@@ -168,27 +179,21 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
         run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
         write_config(run.folder, run.config)
     run.config = dataclasses.replace(run.config, progress=config.progress)
-    began, now = run.versions, versions()
+    began = run.versions
     others = [
-        f"{name} {began[name]} (now {now[name]})" for name in now if began.get(name, now[name]) != now[name]
+        f"{name} {began[name]} (now {now})" for name, now in versions().items() if began.get(name, now) != now
     ]
     if others:
-        print(
-            f"the run began with {', '.join(others)}: it may end otherwise than it would have",
-            file=sys.stderr,
-        )
+        print(f"the run began with {', '.join(others)}: it may end otherwise", file=sys.stderr)
 
 
 def _learn(model: BaseAlgorithm, run: Run, monitor: RunCallback, callback: Callbacks) -> None:
-    restored, passed_over = run.restore(model)
-    for reason in passed_over:
-        print(f"passed over a damaged checkpoint: {reason}", file=sys.stderr)
+    restored = run.restore(model)
     if restored is not None:
-        monitor.restore(restored)
+        monitor.restore(float(restored["seconds"]), model.num_timesteps)
     run.write_curve(monitor.curve)
     remaining = run.config.total_timesteps - model.num_timesteps
-    if remaining > 0 and not monitor.stalled:
-        run.write_end(None)
+    if remaining > 0 and not run.stalled:
         given = [callback] if isinstance(callback, BaseCallback) else list(callback or ())
         callbacks = [monitor, *given]
         try:
@@ -197,6 +202,3 @@ def _learn(model: BaseAlgorithm, run: Run, monitor: RunCallback, callback: Callb
             for each in given:
                 each.on_training_end()
     run.save("final", model)
-    best = monitor.best_record["decisions"] if monitor.curve else None
-    stopped = "stalled" if monitor.stalled else "budget"
-    run.write_end({"stopped": stopped, "decisions": model.num_timesteps, "best_decisions": best})

@@ -6,14 +6,16 @@
 
 Scenes are drawn one after the other, each with a generator of its own. The solution share of a scene is the share of
 random actions whose plan is clear. A scene is kept where its band of shares is still wanted, and where the search finds
-a movement that succeeds in physics.
+a movement that is clear by geometry, if all is decided at the beginning, and succeeds in physics. The spheres of an arm
+are a little larger than the arm, so that success in physics alone could be luck.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import tyro
@@ -35,10 +37,11 @@ from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import (
     BANDS,
     DRAWN,
+    MOVING,
+    OWN,
     SETS,
     FrozenScenes,
     load,
-    rounded,
     shipped_path,
     together,
 )
@@ -175,14 +178,29 @@ class Maker:
         return np.asarray((clearance >= CLEARANCE_MARGIN).mean(axis=-1))
 
     def _solved(self, drawn: FrozenScenes, wanted: Bool | None = None) -> Bool:
-        """Return True for scenes, of those that are wanted, in which a movement of the search succeeds."""
+        """Return True for scenes, of those that are wanted, in which a clear movement of the search succeeds."""
         solved = np.zeros(len(drawn.share), bool)
         rows = np.arange(len(solved)) if wanted is None else np.flatnonzero(wanted)
         if rows.size:
             scenes = drawn.scenes.take(rows)
             decided = self._search.decide(self._simulation.observe(scenes))
             solved[rows] = self._simulation.play(self._search, scenes, decided).success
+            if self.task.whole_movement:
+                problem = Problem.of_scenes(scenes, self.task)
+                clearance = plan_clearances(self.task, problem, decided[:, None], 0.0, 0.0, exact=True)
+                solved[rows] &= clearance[:, 0] >= 0.0
         return solved
+
+
+def rounded(scenes: Scenes) -> Scenes:
+    """Return scenes whose numbers single precision represents."""
+    obstacles = scenes.obstacles._replace(**_single(scenes.obstacles, MOVING))
+    return scenes._replace(obstacles=obstacles, **_single(scenes, OWN))
+
+
+def _single(record: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Return fields of a record in numbers that single precision represents."""
+    return {name: getattr(record, name).astype(np.float32).astype(np.float64) for name in names}
 
 
 def _hardest(found: list[FrozenScenes], number: int) -> FrozenScenes:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Float, Int
 from viapoint.envs.geometry.obstacles import KINDS, MESH, no_obstacles
 from viapoint.envs.scenes.scene import Scenes, resting
 from viapoint.envs.task import Task
@@ -110,6 +110,16 @@ class FrozenScenes:
             self, scenes=self.scenes.take(rows), share=self.share[rows], family=self.family[rows]
         )
 
+    def spread(self, count: int | None) -> FrozenScenes:
+        """Return up to `count` scenes, evenly spread over the set; all if `count` is None."""
+        return self.take(evenly_spread(len(self.share), count))
+
+
+def evenly_spread(number: int, count: int | None) -> Int:
+    """Return up to `count` rows of `number`, evenly spread from the first to the last; all if `count` is None."""
+    kept = number if count is None else min(number, count)
+    return np.linspace(0, number - 1, kept).round().astype(np.int64)
+
 
 def together(parts: Sequence[FrozenScenes]) -> FrozenScenes:
     """Return the scenes of several sets of one task under the name of the first."""
@@ -119,18 +129,6 @@ def together(parts: Sequence[FrozenScenes]) -> FrozenScenes:
         share=np.concatenate([part.share for part in parts]),
         family=np.concatenate([part.family for part in parts]),
     )
-
-
-def rounded(scenes: Scenes) -> Scenes:
-    """Return scenes whose numbers single precision represents."""
-    obstacles = scenes.obstacles
-    obstacles = obstacles._replace(**_single(obstacles, MOVING))
-    return scenes._replace(obstacles=obstacles, **_single(scenes, OWN))
-
-
-def _single(record: Any, names: Sequence[str]) -> dict[str, Any]:
-    """Return fields of a record in numbers that single precision represents."""
-    return {name: getattr(record, name).astype(np.float32).astype(np.float64) for name in names}
 
 
 def shipped_path(name: str, env_id: str) -> Path:
@@ -168,14 +166,13 @@ def load(path: Path, name: str = "") -> FrozenScenes:
     """
     if not path.is_file():
         raise ValueError(f"there is no file of scenes {path}")
-    content = _read(path)
-    packed: dict[str, Any] = {part: content[part] for part in ("kind", *MOVING)}
-    obstacles = no_obstacles(*content["kind"].shape)._replace(**packed)
-    own = {part: content[part] for part in OWN}
+    content: dict[str, Any] = _read(path)
+    obstacles = no_obstacles(*content["kind"].shape)
+    obstacles = obstacles._replace(**{part: content[part] for part in ("kind", *MOVING)})
     frozen = FrozenScenes(
         name=name or str(path),
         task=json.loads(str(content["task"])),
-        scenes=Scenes(obstacles=obstacles, **own),
+        scenes=Scenes(obstacles=obstacles, **{part: content[part] for part in OWN}),
         share=content["share"],
         family=content["family"],
     )
@@ -196,22 +193,17 @@ def _smallest(array: NDArray[Any]) -> NDArray[Any]:
 def _read(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of a file, whose shapes are consistent."""
     try:
-        with path.open("rb") as file:
-            if not zipfile.is_zipfile(file):
-                raise ValueError("it is no archive of arrays, or a part of one")
-            with zipfile.ZipFile(file) as packed:
-                size = sum(part.file_size for part in packed.infolist())
-            if size > LARGEST:
-                raise ValueError(f"its arrays would take {size} bytes, more than {LARGEST}")
-            file.seek(0)
-            with np.load(file, allow_pickle=False) as archive:
-                content = {name: archive[name] for name in (*CONTENT, "task", "sha256")}
+        with zipfile.ZipFile(path) as packed:
+            size = sum(part.file_size for part in packed.infolist())
+        if size > LARGEST:
+            raise ValueError(f"its arrays would take {size} bytes, more than {LARGEST}")
+        with np.load(path, allow_pickle=False) as archive:
+            content = {name: archive[name] for name in (*CONTENT, "task", "sha256")}
         for name in CONTENT:
             if content[name].dtype.kind == "f":
                 content[name] = content[name].astype(np.float64)
         content["kind"] = content["kind"].astype(np.int64)
         _check_content(content)
-        json.loads(str(content["task"]))
     except Exception as error:  # an archive can be broken in any of its layers
         raise ValueError(f"{path} is not a file of scenes: {error or type(error).__name__}") from None
     return content
@@ -221,28 +213,20 @@ def _check_content(content: Mapping[str, NDArray[Any]]) -> None:
     """Raise ValueError unless the task is a record and all arrays are of N > 0 scenes with n obstacles each."""
     if not isinstance(json.loads(str(content["task"])), dict):
         raise ValueError("its task is no record")
-    if content["start"].ndim != 2 or content["kind"].ndim != 2 or not len(content["start"]):
-        raise ValueError("it holds no scenes")
-    number, joints = content["start"].shape
-    rows = content["kind"].shape[1]
-    like = resting(content["start"], np.empty((number, joints)), no_obstacles(number, rows))
-    arrays = {
-        **like._asdict(),
-        **like.obstacles._asdict(),
-        "share": np.empty(number),
-        "family": np.empty(number),
-    }
+    (number, joints), (_, rows) = content["start"].shape, content["kind"].shape
+    like = resting(np.empty((number, joints)), np.empty((number, joints)), no_obstacles(number, rows))
+    per_scene = {"share": np.empty(number), "family": np.empty(number, np.str_)}
+    arrays: dict[str, Any] = {**like._asdict(), **like.obstacles._asdict(), **per_scene}
     for name in CONTENT:
-        shape, numbers = arrays[name].shape, content[name].dtype.kind in "fi"
-        if content[name].shape != shape or numbers is (name == "family"):
-            raise ValueError(
-                f"{name} of {number} scenes is {content[name].dtype} of shape {content[name].shape}"
-            )
-        if numbers and name != "share" and not np.isfinite(content[name]).all():
+        found, wanted = content[name], arrays[name]
+        kinds = "U" if name == "family" else "fi"
+        if found.shape != wanted.shape or not number or found.dtype.kind not in kinds:
+            raise ValueError(f"{name} of {number} scenes is {found.dtype} of shape {found.shape}")
+        if name not in ("share", "family") and not np.isfinite(found).all():
             raise ValueError(f"{name} is not finite")
     if not ((content["kind"] >= -1) & (content["kind"] < MESH)).all():
         raise ValueError("an obstacle has an unknown kind")
-    if not (np.isnan(content["share"]) | ((content["share"] >= 0.0) & (content["share"] <= 1.0))).all():
+    if (content["share"] < 0.0).any() or (content["share"] > 1.0).any():
         raise ValueError("a solution share is not between 0 and 1")
 
 
@@ -259,7 +243,7 @@ def scenes_for(name_or_path: str | Path, task: Task, number: int | None = None) 
     Args:
         name_or_path: One of SETS, or the path of a file.
         task: Task.
-        number: Number of scenes that are drawn where no frozen ones fit.
+        number: Number of scenes, evenly spread over a set; all if not given, or if there are fewer.
 
     Raises:
         ValueError: There is no such set, or its scenes cannot be those of the task.
@@ -268,10 +252,12 @@ def scenes_for(name_or_path: str | Path, task: Task, number: int | None = None) 
     if name not in SETS:
         frozen = load(Path(name_or_path).expanduser())
         _check_fit(frozen, task)
-        return dataclasses.replace(frozen, scenes=_padded(frozen.scenes, task.observation.n_rows))
+        return dataclasses.replace(frozen, scenes=_padded(frozen.scenes, task.observation.n_rows)).spread(
+            number
+        )
     path = shipped_set(name, task)
     if path is not None:
-        return load(path, name)
+        return load(path, name).spread(number)
     if name not in SEEDS:
         raise ValueError(
             f"no {name} scenes are shipped for this task; scenes must be {', '.join(SEEDS)}, which are drawn for it, "

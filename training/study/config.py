@@ -52,7 +52,7 @@ class Trial:
     scenes: tuple[str, ...] = ()
     """Names of the measured sets, or files of scenes."""
     n_scenes: int | None = None
-    """Number of scenes of each set, from the first on; None for all."""
+    """Number of scenes of each set, evenly spread over it; None for all."""
     row: str
     """Name of the row, which is also that of its folder."""
     seed: int = 0
@@ -60,12 +60,12 @@ class Trial:
     """Fields of :class:`TrainConfig`; empty for a baseline."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one measurement each."""
+    refine: tuple[int, ...] = ()
+    """Numbers of proposals that the planner refines, one further measurement each."""
     untrained: bool = False
     """True to measure the network before training, too."""
     method: str = ""
     """Name of a baseline; empty for an agent."""
-    resources: Values = field(default_factory=lambda: {"cpu": 1})
-    """Resources of a node that the trial takes, such as {"cpu": 2, "GPU": 1}."""
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the trial."""
@@ -74,28 +74,20 @@ class Trial:
     def config(self, out: Path) -> TrainConfig:
         """Return the configuration of the training; `policy_kwargs` are merged with those of the preset."""
         given = dict(self.training)
-        given["env_kwargs"] = {**self.env_kwargs, **given.get("env_kwargs", {})}
-        hyperparameters = dict(given.pop("hyperparameters", {}))
+        env_kwargs = {**self.env_kwargs, **given.pop("env_kwargs", {})}
+        hyperparameters = dict(given.get("hyperparameters", {}))
         if "policy_kwargs" in hyperparameters:
-            task = registered_task(self.env_id, **given["env_kwargs"])
+            task = registered_task(self.env_id, **env_kwargs)
             usual = preset_of(task, given.get("algo", "viaq")).arguments().get("policy_kwargs", {})
             hyperparameters["policy_kwargs"] = {**usual, **hyperparameters["policy_kwargs"]}
-        return TrainConfig(
-            env=self.env_id,
-            seed=self.seed,
-            out=self.folder(out),
-            progress=False,
-            hyperparameters=hyperparameters,
-            **given,
-        )
+        given |= {"env_kwargs": env_kwargs, "hyperparameters": hyperparameters}
+        return TrainConfig(env=self.env_id, seed=self.seed, out=self.folder(out), progress=False, **given)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
-    """Search for hyperparameters of one algorithm in one environment."""
+class Search(Trial):
+    """Search for hyperparameters of one algorithm in one environment; the fields of the trial are what all share."""
 
-    trial: Trial
-    """Training that all trials of the search share, with the name of the search."""
     parameters: Values
     """Range or list of values by the path of a field, such as `hyperparameters.learning_rate`."""
     trials: int = 20
@@ -103,29 +95,25 @@ class Search:
     first: tuple[Values, ...] = ()
     """Parameters of the first trials."""
 
-    def with_parameters(self, values: Values) -> Trial:
-        """Return the trial with these parameters, under a name that equal parameters share."""
-        training = _with(self.trial.training, values)
-        return dataclasses.replace(self.trial, training=training, row=f"{self.trial.row}/{_hash(training)}")
+    def with_parameters(self, values: Values, folder: Path) -> TrainConfig:
+        """Return the configuration of a training with these parameters."""
+        trial = dataclasses.replace(self, training=_with(self.training, values))
+        return dataclasses.replace(trial.config(folder), out=folder)
 
     @property
     def key(self) -> str:
         """Name that changes with the description of the search."""
-        return f"{self.trial.row}-{_hash(dataclasses.asdict(self))}"
+        plain = json.dumps(dataclasses.asdict(self), sort_keys=True)
+        return f"{self.row}-{hashlib.sha256(plain.encode()).hexdigest()[:10]}"
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the search."""
-        return self.trial.folder(out).parent
+        return super().folder(out).parent
 
     def is_finished(self, out: Path) -> bool:
         """Return whether the best parameters of this very search are there."""
         path = self.folder(out) / "best.json"
         return path.is_file() and read_json(path).get("key") == self.key
-
-
-def _hash(values: Any) -> str:
-    """Return a short name for plain values, equal for equal ones."""
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:10]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +203,7 @@ def _study(
     for name, fields in _entries(environments):
         fields = {"scenes": scenes, "n_scenes": n_scenes, **fields}
         known[name] = _made(f"environments.{name}", _environment, fields, name, folder)
-    found: list[Trial | Search] = []
+    found: list[Trial] = []
     rows: set[str] = set()
     for make, given in ((_agent, agents), (_baseline, baselines), (_search, searches)):
         for name, fields in _entries(given or {}):
@@ -229,13 +217,10 @@ def _study(
                 found += _made(name, make, {**shared, **fields}, known[env], name)
     if not found:
         raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
-    trials = [each for each in found if isinstance(each, Trial)]
-    return Study(
-        name=default,
-        out=Path(out or f"runs/{default}").expanduser(),
-        trials=tuple(sorted(trials, key=lambda trial: trial.seed)),
-        searches=tuple(each for each in found if isinstance(each, Search)),
-    )
+    searches = tuple(each for each in found if isinstance(each, Search))
+    trials = sorted((each for each in found if not isinstance(each, Search)), key=lambda trial: trial.seed)
+    place = Path(out or f"runs/{default}").expanduser()
+    return Study(name=default, out=place, trials=tuple(trials), searches=searches)
 
 
 def _entries(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -309,18 +294,22 @@ def _agent(
     *,
     seeds: list[int],
     checks: list[int] | None = None,
+    refine: list[int] | None = None,
     untrained: bool = False,
-    resources: dict[str, float] | None = None,
     **training: Any,
 ) -> list[Trial]:
     """Return a trial for each seed of an agent whose configuration is allowed in its environment."""
     numbers = tuple(check_whole("checks", number, 0) for number in checks or [0])
-    if any(numbers) and training.get("algo", "viaq") != "viaq":
-        raise ValueError(f"checks are those of viaq; {training['algo']} has no proposals to check")
+    refined = tuple(check_whole("refine", number, 1) for number in refine or [])
+    if (any(numbers) or refined) and training.get("algo", "viaq") != "viaq":
+        raise ValueError(
+            f"checks and refine are those of viaq; {training['algo']} has no proposals to check or refine"
+        )
+    if refined and registered_task(env["env_id"], **env["env_kwargs"]).replanning:
+        raise ValueError(f"refine is for tasks with one decision for a movement, {env['env_id']} has several")
     if not seeds or len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must hold at least one number and none twice, got {seeds}")
-    own: dict[str, Any] = {"training": training, "checks": numbers, "untrained": untrained}
-    own["resources"] = {"cpu": 1, **(resources or {})}
+    own: dict[str, Any] = {"training": training, "checks": numbers, "refine": refined, "untrained": untrained}
     trials = [Trial(**env, row=row, seed=seed, **own) for seed in seeds]
     for trial in trials:
         config = trial.config(Path())
@@ -356,8 +345,8 @@ def _search(
     for path, given in parameters.items():
         for value in _ends(path, given):  # an impossible value is an error now, and not in the last trial
             _made("parameters", _agent, {"seeds": [0], **_with(training, {path: value})}, env, row)
-    number = check_whole("trials", trials, 1)
-    return [Search(trial=trial, parameters=parameters, trials=number, first=tuple(first or ()))]
+    own: dict[str, Any] = {"parameters": parameters, "trials": check_whole("trials", trials, 1)}
+    return [Search(**env, row=row, seed=trial.seed, training=training, first=tuple(first or ()), **own)]
 
 
 def _ends(path: str, given: Any) -> list[Any]:

@@ -65,7 +65,7 @@ def run_study(
         study: Environments, agents, baselines and searches.
         out: Folder of runs and results; that of the study if not given.
         address: Address HOST:PORT of a Ray cluster whose nodes see the folder; a Ray of this machine if not given.
-        workers: Number of trials at the same time; as many as the cores allow if not given.
+        workers: Number of trials at the same time on this machine; as many as the cores allow if not given.
         told: Function of one line for each trial that ends.
 
     Returns:
@@ -94,7 +94,7 @@ def run_study(
             f"{len(missing)} trials and {len(searches)} searches to do; Ctrl-C stops, the same command goes on"
         )
         with _connected(address, workers):
-            failed += _run_trials(missing, folder, workers, told)
+            failed += _run_trials(missing, folder, told)
             for search in searches:
                 failed += _search(search, folder, workers, told)
     table = tables(study.trials, folder)
@@ -156,19 +156,13 @@ def _connected(address: str | None, workers: int | None) -> Iterator[None]:
         ray.shutdown()
 
 
-def _run_trials(trials: list[Trial], folder: Path, workers: int | None, told: Told) -> list[str]:
+def _run_trials(trials: list[Trial], folder: Path, told: Told) -> list[str]:
     """Run trials as tasks of Ray, and return a line for each that failed."""
     ray, _ = _import_libraries()
-    task = ray.remote(max_retries=RETRIES)(run_trial)
-    waiting = list(reversed(trials))
-    running: dict[Any, Trial] = {}
+    task = ray.remote(num_cpus=1, max_retries=RETRIES)(run_trial)
+    running: dict[Any, Trial] = {task.remote(trial, folder): trial for trial in trials}
     failed = []
-    while waiting or running:
-        while waiting and len(running) < (workers or len(trials)):
-            trial = waiting.pop()
-            others = dict(trial.resources)
-            placed = task.options(num_cpus=others.pop("cpu"), num_gpus=others.pop("GPU", 0), resources=others)
-            running[placed.remote(trial, folder)] = trial
+    while running:
         (done,), _ = ray.wait(list(running))
         label = running.pop(done).folder(Path()).as_posix()
         try:
@@ -209,26 +203,25 @@ def _search(search: Search, folder: Path, workers: int | None, told: Told) -> li
     from ray.tune.schedulers import ASHAScheduler
     from ray.tune.search.optuna import OptunaSearch
 
-    total = search.trial.config(folder).total_timesteps
+    total = search.config(folder).total_timesteps
 
     def work(config: Values) -> None:
         try:
-            settings = search.with_parameters(config).config(folder)
+            settings = search.with_parameters(config, Path(tune.get_context().get_trial_dir()) / "run")
             run = train_or_resume(settings, ReportCallback(settings.folder, tune.report))
             tune.report({"success": run.curve[-1]["success"]["rate"], "decisions": run.decisions})
         except Exception as error:  # settings that cannot be trained do not end a search
             tune.report({"success": 0.0, "decisions": total, "error": _one_line(error)})
 
-    trainable = tune.with_resources(work, dict(search.trial.resources))
     path = folder / "tune" / f"search-{search.key}"
     if tune.Tuner.can_restore(path):
-        tuner = tune.Tuner.restore(str(path), trainable, resume_unfinished=True, restart_errored=True)
+        tuner = tune.Tuner.restore(str(path), work, resume_unfinished=True, restart_errored=True)
     else:
         # Trainings end by themselves, before max_t.
         scheduler = ASHAScheduler(time_attr="decisions", max_t=2 * total, grace_period=max(total // 4, 1))
         first = [dict(each) for each in search.first] or None
         tuner = tune.Tuner(
-            trainable,
+            work,
             param_space={name: _domain(tune, given) for name, given in search.parameters.items()},
             tune_config=tune.TuneConfig(
                 metric="success",
@@ -256,7 +249,7 @@ def _search(search: Search, folder: Path, workers: int | None, told: Told) -> li
     if len(failed) < search.trials:
         told(_write_search(search, results, folder))
         return []
-    return [f"{search.trial.row}: {reason}" for reason in failed]
+    return [f"{search.row}: {reason}" for reason in failed]
 
 
 def _domain(tune: Any, given: Any) -> Any:
@@ -277,11 +270,11 @@ def _write_search(search: Search, results: Any, folder: Path) -> str:
     table = table.sort_values(["decisions", "success"], ascending=False)
     write_bytes(search.folder(folder) / "trials.csv", table.to_csv(index=False).encode())
     best = table.to_dict("records")[0]
-    chosen = search.with_parameters({path: best[path] for path in search.parameters})
-    config = dataclasses.replace(chosen.config(folder), out=None)
+    chosen = search.with_parameters({path: best[path] for path in search.parameters}, folder)
+    config = dataclasses.replace(chosen, out=None)
     record = {"viapoint": "search", "key": search.key, "success": best["success"], "command": config.command}
     write_json(search.folder(folder) / "best.json", {**record, "training": config.as_json()})
-    return f"best of {search.trial.row}, {100.0 * best['success']:.1f} %: {config.command}"
+    return f"best of {search.row}, {100.0 * best['success']:.1f} %: {config.command}"
 
 
 def _one_line(error: BaseException) -> str:

@@ -61,11 +61,13 @@ def run_trial(trial: Trial, out: Path) -> Record:
         for name, model in models.items():
             for checks in trial.checks:
                 methods[f"{name}/{checks}" if checks else name] = agent_method("agent", model, checks)
+            for refine in trial.refine:
+                methods[f"{name}/refine{refine}"] = agent_method("agent", model, 0, refine)
         env_kwargs, decisions = whole_task(config.env, config.env_kwargs), run.decisions
         record["curve"] = [[each["decisions"], each["success"]["rate"]] for each in run.curve]
         record["seconds"] = run.curve[-1]["seconds"] if run.curve else None
     record["rows"] = []
-    env_kwargs["threads"] = int(trial.resources["cpu"])  # other trials have the other cores
+    env_kwargs["threads"] = 1  # other trials have the other cores
     for row, method in methods.items():
         for name, frozen in _sets(trial).items():
             line = {"method": row, "set": name, **_measured(method, frozen, trial.env_id, env_kwargs)}
@@ -137,7 +139,6 @@ def write_results(table: pd.DataFrame, study: Study, folder: Path) -> None:
 def _asked(trial: Trial) -> Record:
     """Return what identifies a trial as plain values."""
     values = dataclasses.asdict(trial)
-    del values["resources"]
     values["scenes"] = {name: frozen.sha256 for name, frozen in _sets(trial).items()}
     plain: Record = json.loads(json.dumps(values))
     return plain
@@ -148,7 +149,7 @@ def _sets(trial: Trial) -> dict[str, FrozenScenes]:
     task = registered_task(trial.env_id, **trial.env_kwargs)
     found = {}
     for name in trial.scenes:
-        found[Path(name).stem] = scenes_for(name, task, trial.n_scenes).take(slice(0, trial.n_scenes))
+        found[Path(name).stem] = scenes_for(name, task, trial.n_scenes)
     return found
 
 

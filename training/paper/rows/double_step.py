@@ -19,6 +19,8 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
+from scipy.interpolate import BPoly
 
 from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory, minimum_jerk_coefficients, point_to_point, retarget
@@ -53,9 +55,8 @@ class DoubleStep(NamedTuple):
 
     def superposed(self, time: Float, nu: int = 0) -> Float:
         """Return the sum of both movements, derivative of order `nu`, shape (T, 2)."""
-        begun = (time >= self.moment)[:, None]
-        corner = self.second(0.0) if nu == 0 else 0.0  # the first target, where the second movement starts
-        return np.asarray(self.first(time, nu) + self.second(time - self.moment, nu) * begun - corner * begun)
+        corner = self.second(0.0) if nu == 0 else 0.0  # the first target, where the second movement waits
+        return np.asarray(self.first(time, nu) + self.second(time - self.moment, nu) - corner)
 
     def planned(self, time: Float, nu: int = 0) -> Float:
         """Return the plan with its revision, derivative of order `nu`, shape (T, 2)."""
@@ -116,26 +117,15 @@ def greatest_distance(movement: DoubleStep) -> float:
     return float(np.linalg.norm(movement.superposed(time) - movement.planned(time), axis=-1).max())
 
 
-def excess_cost(distance: float, moment: float, duration: float, remaining: float) -> float:
-    """Return the jerk cost of the sum beyond that of the plan in closed form, [m^2/s^5]; see the module.
+def excess_cost(movement: DoubleStep) -> float:
+    """Return the jerk cost of the sum beyond that of the plan, [m^2/s^5], in closed form; see the module.
 
-    It is the cost of the rest of the first movement, less that of the quintic from its state over the whole remaining
-    time.
+    It is the cost of the rest of the first movement, less that of a movement from its state in all the time there is.
     """
-    u = moment / duration
-    q = np.array([10 * u**3 - 15 * u**4 + 6 * u**5, 30 * u**2 * (1 - u) ** 2, 60 * u * (1 - u) * (1 - 2 * u)])
-    state = distance * q / duration ** np.arange(3)
-    return _rest_cost(distance, state, duration - moment) - _rest_cost(distance, state, remaining)
-
-
-def _rest_cost(distance: float, state: Float, time: float) -> float:
-    """Return half the integral of squared jerk of the quintic from a state to rest at `distance` in `time`."""
-    position, velocity, acceleration = state * time ** np.arange(3)
-    d = distance - position - velocity - acceleration / 2.0
-    e, f = -velocity - acceleration, -acceleration
-    a, b, c = 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2
-    square = 36 * a * a + 144 * a * b + 192 * b * b + 240 * a * c + 720 * b * c + 720 * c * c
-    return float(square / (2.0 * time**5))
+    first, target = movement.first, TARGETS[NAMES[1]]
+    rest = retarget(first, movement.moment, target, first.duration)
+    slow = retarget(first, movement.moment, target, movement.arrival)
+    return float(rest.cost() - slow.cost())
 
 
 def double_step_claims() -> list[Claim]:
@@ -160,12 +150,12 @@ def double_step_claims() -> list[Claim]:
 def _claims_at(movement: DoubleStep) -> list[Claim]:
     """Return the claims of one moment of revision; the second movement takes as long as the first."""
     when = f"Revised at {1e3 * movement.moment:.0f} ms"
-    expected = 1.0 + _excess_of(movement.moment) / movement.cost("planned")
+    expected = 1.0 + excess_cost(movement) / movement.cost("planned")
     distance = 1e3 * greatest_distance(movement)
     to_T2 = 1e3 * greatest_distance(double_step(movement.moment, goal=TARGETS["T2"]))
     found = peak_speed(movement, "superposed") / peak_speed(movement, "planned")
     motion = simulate_double(movement)
-    arm = motion.peak_speed()
+    arm = motion.speed().max(axis=1)
     return [
         Claim(13, f"{when}: jerk cost of the sum / of the plan, from there on",
               model=(movement.ratio, near(expected, 1e-9))),
@@ -193,29 +183,23 @@ def _jump(movement: DoubleStep) -> float:
     return max(jumps)
 
 
-def _excess_of(moment: float) -> float:
-    """Return the excess cost of the sum in closed form for movements of the usual targets and durations."""
-    distance = float(np.linalg.norm(TARGETS[NAMES[1]] - TARGETS[NAMES[0]]))
-    return excess_cost(distance, moment, STEP_DURATION, STEP_DURATION)
-
-
 def _spread() -> float:
     """Return the greatest relative deviation of the excess from its closed form over random second targets."""
-    generator, moment = np.random.default_rng(0), 0.2
-    goals = TARGETS[NAMES[1]] + generator.uniform(-0.4, 0.4, (100, 2))
-    movements = [double_step(moment, goal=goal) for goal in goals]
-    found = np.array([each.cost("superposed") - each.cost("planned") for each in movements])
-    return float(np.abs(found / _excess_of(moment) - 1.0).max())
+    jumps = np.random.default_rng(0).uniform(-0.4, 0.4, (100, 2))
+    found = []
+    for jump in jumps:
+        movement = double_step(0.2, goal=TARGETS[NAMES[1]] + jump)
+        found.append(movement.cost("superposed") - movement.cost("planned"))
+    return float(np.abs(np.array(found) / excess_cost(double_step(0.2)) - 1.0).max())
 
 
 def replanning_claims() -> list[Claim]:
     """Return the claims of row 11: the quintic of the primer, and replanning."""
     movement = double_step(SWITCH, duration=WHOLE_DURATION)
-    state = movement.first.sample(np.array([SWITCH]))
-    begun = movement.replanned.sample(np.array([0.0]))
-    jump = max(np.abs(a - b).max() / np.abs(a).max() for a, b in zip(state, begun, strict=True))
-    fresh = _solved(state, TARGETS["T5"], STEP_DURATION)
-    apart = 1e3 * np.abs(fresh - movement.replanned.sample(201, 0)[0]).max()
+    state = [part[0] for part in movement.first.sample(np.array([SWITCH]))]
+    fresh = BPoly.from_derivatives([0.0, STEP_DURATION], [state, [TARGETS["T5"], np.zeros(2), np.zeros(2)]])
+    time = np.linspace(0.0, STEP_DURATION, 201)
+    apart = 1e3 * np.abs(fresh(time) - movement.replanned(time)).max()
     motion = simulate_double(movement)
     missed = 1e3 * np.linalg.norm(motion.hand[1, -1] - TARGETS["T5"])
     return [
@@ -224,21 +208,10 @@ def replanning_claims() -> list[Claim]:
         Claim(11, "Replanned 200 times on the way, target unchanged: distance from the one plan", "primer",
               "Eqs. 25 to 27", (1e3 * _replanned(200), at_most(1e-9)), unit="mm"),
         Claim(11, "Target and arrival change on the way: jump of position, velocity, acceleration, relative", "primer",
-              "smooth", (jump, at_most(1e-12))),
+              "smooth", (_jump(movement), at_most(1e-12))),
         Claim(11, "The same against a fresh solution from that state (arm: distance from the new target at the end)",
               "primer", "the same", (apart, at_most(1e-9)), (missed, at_most(1.0)), motion.deviation[1], "mm"),
     ]  # fmt: skip
-
-
-def _solved(state: tuple[Float, ...], goal: Float, duration: float) -> Float:
-    """Solve the six boundary equations of the primer; return positions at 201 instants from a state to rest."""
-    powers = np.arange(6)
-    matrix = np.zeros((6, 6))
-    matrix[0, 0], matrix[1, 1], matrix[2, 2] = 1.0, 1.0, 2.0  # in unit time
-    matrix[3:] = np.ones(6), powers, powers * (powers - 1)
-    given = [state[0][0], state[1][0] * duration, state[2][0] * duration**2, goal, 0.0 * goal, 0.0 * goal]
-    coefficients = np.linalg.solve(matrix, np.array(given))
-    return np.asarray(np.linspace(0.0, 1.0, 201)[:, None] ** powers @ coefficients)
 
 
 def _boundary_error() -> float:
@@ -249,11 +222,8 @@ def _boundary_error() -> float:
     scale = np.tile([duration**0, 1.0 / duration, 1.0 / duration**2], (2, 1))
     x0, dx0, ddx0, xT, dxT, ddxT = values * scale
     coefficients = minimum_jerk_coefficients(x0, dx0, ddx0, xT, dxT, ddxT, duration)
-    powers = np.arange(6)
-    terms = coefficients * duration[:, None] ** powers
-    first, second = (terms * powers).sum(axis=-1), (terms * powers * (powers - 1)).sum(axis=-1)
-    start = [coefficients[:, 0], coefficients[:, 1] * duration, 2.0 * coefficients[:, 2] * duration**2]
-    reached = np.stack([*start, terms.sum(axis=-1), first, second])
+    unit = coefficients.T * duration ** np.arange(6)[:, None]
+    reached = [polyval(end, polyder(unit, nu)) for end in (0.0, 1.0) for nu in range(3)]
     return float((np.abs(reached - values) / np.abs(values).max(axis=0)).max())
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Callable
 from pathlib import Path
@@ -11,18 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from viapoint.envs import Plan, Scenes, Task
+from viapoint.envs import Plan, Scenes
 from viapoint.envs.geometry.obstacles import pack
 from viapoint.envs.scenes.scene import check_scenes, resting
 from viapoint.primitives import speed_valleys
-from viapoint.training.agents.agent import load_agent
+from viapoint.training import GeometrySearch, load_agent
 from viapoint.training.config.checks import DEFAULT_ENV
 from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, Range, at_least, at_most, near
-from viapoint.training.paper.movements import PLANE, Profile, SimulatedMovements, simulate
-from viapoint.training.paper.rows.one_via import FAST, SLOW
+from viapoint.training.paper.movements import PLANE, TARGETS, Profile, SimulatedMovements, simulate
+from viapoint.training.paper.rows.one_via import slow_and_fast
 from viapoint.training.planning.baselines import Method, agent_method
-from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.rollouts.rollout import SceneSimulation
 
 LENGTHS = (0.15, 0.2, 0.25)
@@ -45,10 +43,6 @@ class ObstacleMovements(NamedTuple):
     """Number of all scenes."""
     profiles: list[Profile]
     """Profiles on the simulated arm."""
-    features: pd.DataFrame
-    """Their features, see `features`."""
-    planned_features: pd.DataFrame
-    """Features of the plans."""
 
 
 def light_scenes(n_rows: int) -> Scenes:
@@ -59,18 +53,20 @@ def light_scenes(n_rows: int) -> Scenes:
     """
     ends, lights = [], []
     for length, radius, shift in itertools.product(LENGTHS, RADII, SHIFTS):
-        for row in movements.rows_of_lights(length, radius):
-            along = (row.goal - row.start) / np.linalg.norm(row.goal - row.start)
-            offset = shift[0] * along + shift[1] * movements.left_of(along)
-            moved = row.lights.position + np.append(offset, 0.0)
-            lights.append([dataclasses.replace(row.lights, position=moved)])
-            ends.append((row.start, row.goal))
+        for first, last, row in movements.rows_of_lights(length, radius, shift):
+            ends.append((TARGETS[first], TARGETS[last]))
+            lights.append([row])
     joints = PLANE.joints(np.array(ends))
     return resting(joints[:, 0].copy(), joints[:, 1].copy(), pack(lights, n_rows))
 
 
 def light_movements(agent: Path | None) -> ObstacleMovements:
-    """Simulate the movements of an agent, or without one of a search, around the rows of lights."""
+    """Simulate the movements of an agent, or without one of a search, around the rows of lights.
+
+    Raises:
+        ValueError: The agent's task is not of the hand in the plane, has no boxes, or needs several decisions for a
+            movement; or no movement gets around a row.
+    """
     method: Method
     if agent is None:
         simulation = SceneSimulation(DEFAULT_ENV, 256)
@@ -80,6 +76,12 @@ def light_movements(agent: Path | None) -> ObstacleMovements:
         simulation = SceneSimulation(found.env_id, 256, **found.env_kwargs)
         method = agent_method("agent", found, 0)
     task = simulation.task
+    fits = task.whole_movement and task.space_name == "hand" and task.arm.name == "planar"
+    if not fits or not task.n_obstacles[1] or "box" not in task.shapes:
+        raise ValueError(
+            f"agent must be of a task of the plane with boxes in which one decision is a whole movement, such as "
+            f"{DEFAULT_ENV}; that of {agent} is of {simulation.env_id}"
+        )
     scenes = light_scenes(task.observation.n_rows)
     check_scenes(scenes, task.arm)
     action = method.decide(simulation.observe(scenes), scenes)
@@ -88,30 +90,11 @@ def light_movements(agent: Path | None) -> ObstacleMovements:
     if not success.any():
         raise ValueError(f"{method.name} gets around none of {len(scenes.start)} rows of lights")
     kept = scenes.take(success)
-    plan = task.action.decode(
-        action[success], task.space.coordinates(kept.start), task.space.coordinates(kept.goal)
-    )
+    plan = task.action.decode(action[success], PLANE.coordinates(kept.start), PLANE.coordinates(kept.goal))
     motion = simulate(plan.trajectory())
-    executed, planned = movements.arm_profiles(motion), movements.model_profiles(plan.trajectory())
     return ObstacleMovements(
-        method.name, kept, plan, motion, len(scenes.start), executed, features(executed, plan), features(planned, plan)
-    )  # fmt: skip
-
-
-def check_agent(agent: Path) -> None:
-    """Check that the scenes of the paper are scenes of an agent's task.
-
-    Raises:
-        ValueError: The task is not of the hand in the plane, has no boxes, or needs several decisions for a movement.
-    """
-    found = load_agent(agent)
-    task: Task = found.get_env().get_attr("task", 0)[0]  # type: ignore[union-attr]
-    fits = task.whole_movement and task.space_name == "hand" and task.arm.name == "planar"
-    if not fits or not task.n_obstacles[1] or "box" not in task.shapes:
-        raise ValueError(
-            f"agent must be of a task of the plane with boxes in which one decision is a whole movement, such as "
-            f"{DEFAULT_ENV}; that of {agent} is of {found.env_id}"
-        )
+        method.name, kept, plan, motion, len(scenes.start), movements.arm_profiles(motion)
+    )
 
 
 def features(profiles: list[Profile], plan: Plan) -> pd.DataFrame:
@@ -144,8 +127,10 @@ def features(profiles: list[Profile], plan: Plan) -> pd.DataFrame:
 
 def obstacle_claims(avoidance: ObstacleMovements) -> list[Claim]:
     """Return the claims of row 12."""
-    model, arm = avoidance.planned_features, avoidance.features
+    arm = features(avoidance.profiles, avoidance.plan)
+    model = features(movements.model_profiles(avoidance.plan.trajectory()), avoidance.plan)
     worst, number = avoidance.motion.worst, len(arm)
+    apart, arm_apart, scaled = slow_and_fast(avoidance.plan.trajectory(), 101)
     who = f"{avoidance.name}, {number} movements"
 
     def claim(
@@ -174,24 +159,12 @@ def obstacle_claims(avoidance: ObstacleMovements) -> list[Claim]:
               lambda f: _slope(f.along, f.residual), near(0.035, 0.015)),
         claim("Distance from the model through the point of greatest curvature / distance of the targets: median",
               "close match", lambda f: 100 * f.apart.median(), at_most(5.0), "%"),
-        _scaling_claim(avoidance, who),
+        Claim(12, f"Time scaling: every movement again in 1.1 s and .85 s: greatest distance of the paths ({who})",
+              "8, 11", "the same path", (apart, at_most(1e-9)), (arm_apart, at_most(1.0)),
+              max(each.worst for each in scaled), "mm"),
     ]  # fmt: skip
 
 
 def _slope(place: pd.Series, value: pd.Series) -> float:
     known = value.notna()
     return float(np.polyfit(place[known], value[known], 1)[0])
-
-
-def _scaling_claim(avoidance: ObstacleMovements, who: str) -> Claim:
-    """Return the claim about the same decisions in the two durations of Fig. 11."""
-    fractions, movement = np.linspace(0.0, 1.0, 101), avoidance.plan.trajectory()
-    plans = [movement.stretched(duration) for duration in (SLOW, FAST)]
-    motions = [simulate(plan) for plan in plans]
-    paths = [plan.sample(101, 0)[0] for plan in plans]
-    arm_paths = [np.stack([each.at(row, fractions) for row in range(len(each.hand))]) for each in motions]
-    model, arm = (1e3 * np.linalg.norm(slow - fast, axis=-1).max() for slow, fast in (paths, arm_paths))
-    return Claim(
-        12, f"Time scaling: every movement again in 1.1 s and .85 s: greatest distance of the paths ({who})", "8, 11",
-        "the same path", (model, at_most(1e-9)), (arm, at_most(1.0)), max(each.worst for each in motions), "mm",
-    )  # fmt: skip

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from itertools import pairwise
 
 import numpy as np
 import pandas as pd
-from numpy.polynomial.polynomial import polyder, polydiv, polyval
 from numpy.typing import ArrayLike
+from sympy import Poly
+from sympy.abc import tau as tau1
 
 from viapoint.envs.common.types import Float
-from viapoint.primitives import speed_valleys
+from viapoint.primitives import Trajectory, speed_valleys
 from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, curved, passage_share, simulate
 
-Polynomial = list[Fraction]
 
-
-def passage_polynomial(via: Sequence[Fraction], goal: Sequence[Fraction]) -> Polynomial:
-    """Return the coefficients of 1, tau1, ..., tau1^9 of Eq. C16; its root in (0, 1) is t1 / tf, the start the origin.
+def passage_polynomial(via: Sequence[Fraction], goal: Sequence[Fraction]) -> Poly:
+    """Return the polynomial in tau1 of Eq. C16; its root in (0, 1) is t1 / tf, with the start as the origin.
 
     With E = x1 - x0, D = xf - x0, a = E.D, b = D.D, c = E.E, Eq. C16 (pi . u = 0) is, but for a factor that never
     vanishes, F(tau1) = c - 2 c tau1 - 8 a tau1^3 + 34 a tau1^4 - 36 a tau1^5 + (12 a - 20 b) tau1^6 + 40 b tau1^7
@@ -31,29 +28,13 @@ def passage_polynomial(via: Sequence[Fraction], goal: Sequence[Fraction]) -> Pol
     a = sum((e * d for e, d in zip(via, goal, strict=True)), Fraction(0))
     b = sum((d * d for d in goal), Fraction(0))
     c = sum((e * e for e in via), Fraction(0))
-    return [c, -2 * c, Fraction(0), -8 * a, 34 * a, -36 * a, 12 * a - 20 * b, 40 * b, -27 * b, 6 * b]
+    return Poly([6 * b, -27 * b, 40 * b, 12 * a - 20 * b, -36 * a, 34 * a, -8 * a, 0, -2 * c, c], tau1)
 
 
-def count_roots(polynomial: Polynomial) -> int:
-    """Return the number of different roots in (0, 1) by Sturm's theorem, exactly. Neither end may be a root."""
-    chain = [np.array(polynomial), polyder(np.array(polynomial))]
-    while len(chain[-1]) > 1:
-        _, rest = polydiv(chain[-2], chain[-1])
-        if not rest.any():
-            break
-        chain.append(-rest / abs(rest[-1]))  # scaled, which keeps signs and short numbers
-
-    def sign_changes(place: Fraction) -> int:
-        signs = [value > 0 for value in (polyval(place, each) for each in chain) if value]
-        return sum(first != second for first, second in pairwise(signs))
-
-    return sign_changes(Fraction(0)) - sign_changes(Fraction(1))
-
-
-def root_of(polynomial: Polynomial) -> float:
-    """Return the root in (0, 1) by exact bisection; the polynomial is positive at 0 and negative at 1."""
-    root = movements.first_place(lambda t: polyval(t, polynomial) <= 0, Fraction(0), Fraction(1), halvings=60)
-    return float(root)
+def roots_of(polynomial: Poly) -> list[float]:
+    """Return the different roots in (0, 1), isolated in exact arithmetic. Neither end may be a root."""
+    intervals = polynomial.intervals(eps=Fraction(1, 10**17), inf=0, sup=1)
+    return [float((low + high) / 2) for (low, high), _ in intervals]
 
 
 def closed_form(waypoints: Float, share: float, time: Float) -> Float:
@@ -101,12 +82,12 @@ def passage_claims() -> list[Claim]:
     share = float(passage_share(movement))
     waypoints = movements.via_waypoints(TARGETS[ENDS[0]], TARGETS[ENDS[1]], *EXAMPLE)
     via, goal = ([Fraction(float(each)) for each in point - waypoints[0]] for point in waypoints[1:])
-    root = root_of(passage_polynomial(via, goal))
+    (root,) = roots_of(passage_polynomial(via, goal))
     time = np.linspace(0.0, 1.0, 401)
     formula = 1e3 * np.abs(closed_form(waypoints, share, time) - movement(time)).max()
     motion = simulate(movement)
-    passed = 1e3 * np.linalg.norm(motion.at(0, np.array([share]))[0] - waypoints[1])
-    arm_share = closest_approach(motion, waypoints[1])
+    passed = 1e3 * np.linalg.norm(motion.at(np.array([share]))[0, 0] - waypoints[1])
+    (arm_share,) = closest_approach(motion, waypoints[None, 1])
     return [
         Claim(4, f"Eq. C16 has one root in (0, 1): vias with another count, of {N_VIAS} (exact arithmetic)", "App. C",
               "only one acceptable root", (wrong, near(0.0, 0.0))),
@@ -127,20 +108,20 @@ def _count_and_compare() -> tuple[int, float]:
     goal = (Fraction(1), Fraction(0))
     for along, height in generator.integers((-1500, 1), (2500, 1500), (N_VIAS, 2)):
         via = (Fraction(int(along), 1000), Fraction(int(height), 1000))
-        polynomial = passage_polynomial(via, goal)
-        wrong += count_roots(polynomial) != 1
+        roots = roots_of(passage_polynomial(via, goal))
+        wrong += len(roots) != 1
         points = np.array([[0.0, 0.0], [float(via[0]), float(via[1])], [1.0, 0.0]])
         share = float(passage_share(movements.minimum_jerk_through(points)))
-        difference = max(difference, abs(share - root_of(polynomial)))
+        difference = max(difference, abs(share - roots[0]))
     return wrong, difference
 
 
-def closest_approach(motion: SimulatedMovements, via: Float, row: int = 0) -> float:
-    """Return the time at which the simulated hand is nearest to the via-point, as a fraction of the duration."""
-    distance = np.linalg.norm(motion.hand[row] - via, axis=-1)
-    i = int(np.clip(distance.argmin(), 1, len(distance) - 2))
-    shift, _ = movements.vertex(*distance[i - 1 : i + 2] ** 2)
-    return float((motion.time[i] + shift * movements.TIMESTEP) / motion.duration[row])
+def closest_approach(motion: SimulatedMovements, vias: Float) -> Float:
+    """Return the times at which hands are nearest to via-points (N, 2), as fractions of the durations, shape (N,)."""
+    distance = np.linalg.norm(motion.hand - vias[:, None], axis=-1)
+    rows, nearest = np.arange(len(vias)), np.clip(distance.argmin(axis=1), 1, distance.shape[1] - 2)
+    shift, _ = movements.vertex(*(distance[rows, nearest + k] ** 2 for k in (-1, 0, 1)))
+    return np.asarray((nearest + shift) * motion.time[1] / motion.duration)
 
 
 def features(along: ArrayLike, height: ArrayLike) -> tuple[pd.DataFrame, float]:
@@ -200,23 +181,27 @@ def _threshold_claim(along: float, exact: str, expected: float, tolerance: float
         (profile,) = movements.arm_profiles(simulate(curved(*ENDS, along, -height)))
         return bool(np.isfinite(profile.valley))
 
-    model = valley_threshold(functools.partial(model_has_valley, along))
-    arm = valley_threshold(arm_has_valley, halvings=12)
+    arm = first_place(arm_has_valley, 0.2, 0.5, halvings=12)
     return Claim(
         5, f"Not every curved movement has a valley: for d1/(d1+d2) = {along} only if d3/(d1+d2) exceeds", "1B",
-        f"two peaks and a valley{exact}", (model, near(expected, tolerance)), (arm, near(expected, 0.01)),
-        simulate(curved(*ENDS, along, -arm)).worst,
+        f"two peaks and a valley{exact}", (valley_threshold(along), near(expected, tolerance)),
+        (arm, near(expected, 0.01)), simulate(curved(*ENDS, along, -arm)).worst,
     )  # fmt: skip
 
 
-def model_has_valley(along: float, height: float) -> bool:
-    """Return whether the model's speed has a valley, exactly."""
-    return bool(speed_valleys(curved(*ENDS, along, -height)).time.size)
+def valley_threshold(along: float) -> float:
+    """Return the least d3 / (d1 + d2) for which the model's speed has a valley."""
+    return first_place(
+        lambda d3: speed_valleys(curved(*ENDS, along, -d3)).time.size > 0, 0.2, 0.5, halvings=30
+    )
 
 
-def valley_threshold(has_valley: Callable[[float], bool], halvings: int = 30) -> float:
-    """Return the least d3 / (d1 + d2) with a speed valley, by bisection."""
-    return float(movements.first_place(has_valley, 0.2, 0.5, halvings))
+def first_place(holds: Callable[[float], bool], low: float, high: float, halvings: int) -> float:
+    """Return where in an interval a condition begins to hold, by bisection; it holds at `high`, not at `low`."""
+    for _ in range(halvings):
+        middle = (low + high) / 2.0
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return (low + high) / 2.0
 
 
 def place_claims() -> list[Claim]:
@@ -254,8 +239,7 @@ def arm_shares(along: ArrayLike, height: ArrayLike) -> tuple[Float, float]:
     """Return the times of closest approach to each via-point, as fractions of the duration, and the deviation [mm]."""
     motion = simulate(curved(*ENDS, along, height))
     vias = movements.via_waypoints(TARGETS[ENDS[0]], TARGETS[ENDS[1]], along, height)[:, 1]
-    shares = [closest_approach(motion, via, row) for row, via in enumerate(vias)]
-    return np.array(shares), motion.worst
+    return closest_approach(motion, vias), motion.worst
 
 
 def isochrony_claims() -> list[Claim]:
@@ -285,17 +269,28 @@ def isochrony_claims() -> list[Claim]:
 
 def scaling_claims() -> list[Claim]:
     """Return the claims of row 8."""
-    movement = curved(*ENDS, *THREE_POINTS, np.array([SLOW, FAST]))
-    motion = simulate(movement)
-    slow, fast = movement.sample(401, 0)[0]
-    arm_slow, arm_fast = (motion.at(row, np.linspace(0.0, 1.0, 401)) for row in (0, 1))
-    apart, arm_apart = (
-        1e3 * np.linalg.norm(a - b, axis=-1).max() for a, b in ((slow, fast), (arm_slow, arm_fast))
-    )
-    ratio, arm_ratio = (fast / slow for slow, fast in (movement.peak(1), motion.peak_speed()))
+    movement = curved(*ENDS, *THREE_POINTS)
+    apart, arm_apart, motions = slow_and_fast(movement, 401)
+    ratio = movement.stretched(FAST).peak(1) / movement.stretched(SLOW).peak(1)
+    slow_peak, fast_peak = (motion.speed().max() for motion in motions)
+    worst = max(motion.worst for motion in motions)
     return [
         Claim(8, "The same three points in 1.1 s and .85 s: greatest distance of the paths", "11", "the same path",
-              (apart, at_most(1e-9)), (arm_apart, at_most(1.0)), motion.worst, "mm"),
+              (apart, at_most(1e-9)), (arm_apart, at_most(1.0)), worst, "mm"),
         Claim(8, "Their speeds scale with the durations: ratio of the peaks", "11", "1.1/.85 = 1.294",
-              (ratio, near(SLOW / FAST, 1e-9)), (arm_ratio, near(SLOW / FAST, 0.01)), motion.worst),
+              (ratio, near(SLOW / FAST, 1e-9)), (fast_peak / slow_peak, near(SLOW / FAST, 0.01)), worst),
     ]  # fmt: skip
+
+
+def slow_and_fast(movement: Trajectory, count: int) -> tuple[float, float, list[SimulatedMovements]]:
+    """Carry movements out in the durations of Fig. 11.
+
+    Returns:
+        Greatest distances of both paths at `count` instants of the model and of the arm, [mm]; the simulations.
+    """
+    plans = [movement.stretched(duration) for duration in (SLOW, FAST)]
+    motions = [simulate(plan) for plan in plans]
+    paths = [plan.sample(count, 0)[0] for plan in plans]
+    arm_paths = [motion.at(np.linspace(0.0, 1.0, count)) for motion in motions]
+    model, arm = (1e3 * np.linalg.norm(slow - fast, axis=-1).max() for slow, fast in (paths, arm_paths))
+    return float(model), float(arm), motions

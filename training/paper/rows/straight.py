@@ -7,51 +7,48 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from viapoint import primitives
 from viapoint.envs.common.types import Float
 from viapoint.primitives import Trajectory, point_to_point
 from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, minimum_jerk_through, simulate
 
-DIAGONALS = (("T3", "T6"), ("T1", "T4"), ("T2", "T5"))
-"""The straight movements of Figs. 3 and 4."""
+DIAGONALS = np.array(
+    [[TARGETS["T3"], TARGETS["T6"]], [TARGETS["T1"], TARGETS["T4"]], [TARGETS["T2"], TARGETS["T5"]]]
+)
+"""Ends of the straight movements of Figs. 3 and 4, shape (3, 2, 2), [m]."""
+LENGTHS = np.linalg.norm(DIAGONALS[:, 1] - DIAGONALS[:, 0], axis=-1)
+"""Their lengths, shape (3,), [m]."""
 DURATION = 0.8
-"""Duration of the straight movements, within the paper's 0.5 to 1 s, [s]."""
-
-
-def diagonal_ends() -> Float:
-    """Return the ends of the straight movements of Figs. 3 and 4, shape (3, 2, 2), [m]."""
-    return np.array([[TARGETS[a], TARGETS[b]] for a, b in DIAGONALS])
+"""Their duration, within the paper's 0.5 to 1 s, [s]."""
 
 
 def diagonals(order: int = 3) -> Trajectory:
     """Return the three straight movements of the figures as a batch."""
-    ends = diagonal_ends()
-    return point_to_point(ends[:, 0], ends[:, 1], DURATION, order=order)
+    return point_to_point(DIAGONALS[:, 0], DIAGONALS[:, 1], DURATION, order=order)
 
 
 def relative_peak(speed: Float, peak: float) -> float:
     """Return that peak speed of the three movements, in units of A / t_f, which is farthest from `peak`."""
-    amplitude = np.linalg.norm(np.diff(diagonal_ends(), axis=1)[:, 0], axis=-1)
-    factor = speed * (DURATION / amplitude)
+    factor = speed * (DURATION / LENGTHS)
     return float(factor[np.abs(factor - peak).argmax()])
 
 
 def bow(position: Float) -> Float:
     """Return the greatest distance of paths (..., T, 2) from their chord, relative to its length, shape (...,)."""
-    line = position[..., -1:, :] - position[..., :1, :]
-    offset = position - position[..., :1, :]
-    turn = line[..., 0] * offset[..., 1] - line[..., 1] * offset[..., 0]
-    return np.asarray((np.abs(turn) / (line * line).sum(axis=-1)).max(axis=-1))
+    points = np.broadcast_arrays(position[..., :1, :], position, position[..., -1:, :])
+    _, height = movements.construction(np.stack(points, axis=-2))
+    return np.asarray(height.max(axis=-1))
 
 
 def point_to_point_claims() -> list[Claim]:
     """Return the claims of row 1: straight path and bell-shaped speed."""
     movement = diagonals()
     motion = simulate(movement)
-    peak, arm_peak = relative_peak(movement.peak(1), 1.875), relative_peak(motion.peak_speed(), 1.875)
-    speed = np.linalg.norm(movement.sample(801, 1)[0], axis=-1)
-    arm_speed = np.linalg.norm(motion.velocity(), axis=-1)[:, motion.time <= DURATION]
+    peak, arm_peak = relative_peak(movement.peak(1), 1.875), relative_peak(motion.speed().max(axis=1), 1.875)
+    time = motion.time[motion.time <= DURATION]
+    speed, arm_speed = primitives.speed(movement, time), motion.speed()[:, : len(time)]
     skew, arm_skew = (100 * np.abs(each - each[:, ::-1]).max() / each.max() for each in (speed, arm_speed))
     worst = motion.worst
     return [
@@ -105,25 +102,27 @@ def _placed_shapes() -> tuple[Float, float]:
     waypoints = [movements.via_waypoints(TARGETS[a], TARGETS[b], 0.35, 0.2) for a, b in pairs]
     motion = simulate(minimum_jerk_through(np.stack(waypoints), np.array([0.8, 0.7, 1.0, 1.2, 0.6])))
     shapes = []
-    for row, (start, _, goal) in enumerate(waypoints):
+    for (start, _, goal), path in zip(waypoints, motion.at(np.linspace(0.0, 1.0, 201)), strict=True):
         line = goal - start
         axes = np.stack((line, movements.left_of(line))) / (line @ line)
-        shapes.append((motion.at(row, np.linspace(0.0, 1.0, 201)) - start) @ axes.T)
+        shapes.append((path - start) @ axes.T)
     return np.stack(shapes), motion.worst
 
 
 def joint_claims() -> list[Claim]:
     """Return the claims of row 3: movements that are equal for the hand differ for the joints."""
-    plans = [movements.straight(*ends, DURATION) for ends in (DIAGONALS[0], DIAGONALS[2])]
-    motions = [simulate(each) for each in plans]
-    hand = _differences([np.linalg.norm(each.sample(401, 1)[0], axis=-1) for each in plans]).max()
-    arm_hand = _differences([np.linalg.norm(each.velocity()[0], axis=-1) for each in motions]).max()
-    joints = _differences([movements.joint_motion(each).velocity for each in plans]).min()
-    arm_joints = _differences([each.joint_rates()[0] for each in motions]).min()
+    movement = diagonals()
+    motion = simulate(movement)
+    time = np.linspace(0.0, DURATION, 401)
+    hand, arm_hand = (
+        _differences(speed).max() for speed in (primitives.speed(movement, time), motion.speed())
+    )
+    rates, arm_rates = movements.joint_motion(movement).velocity, motion.derivative(motion.joints)
+    joints, arm_joints = (_differences(each).min() for each in (rates, arm_rates))
     places, placed = same_movement_elsewhere()
     peaks = [np.abs(torque).max(axis=1) for torque in (movements.required_torque(places), placed.torque)]
     torque, arm_torque = ((each.max(axis=0) / each.min(axis=0)).max() for each in peaks)
-    worst = max(each.worst for each in motions)
+    worst = motion.deviation[[0, 2]].max()
     return [
         Claim(3, "Hand speed profiles of T3-T6 and T2-T5, each / its peak: greatest difference", "4", "invariant",
               (hand, at_most(1e-9)), (arm_hand, at_most(0.02)), worst),
@@ -143,7 +142,7 @@ def same_movement_elsewhere() -> tuple[Trajectory, SimulatedMovements]:
     return movement, simulate(movement)
 
 
-def _differences(pair: list[Float]) -> Float:
-    """Return the greatest difference of two profiles (T, ...), each relative to its peak, shape (...)."""
-    first, second = (values / np.abs(values).max(axis=0) for values in pair)
-    return np.asarray(np.abs(first - second).max(axis=0))
+def _differences(profiles: Float) -> Float:
+    """Return the greatest difference of the first and last of profiles (3, T, ...), each relative to its peak."""
+    relative = profiles / np.abs(profiles).max(axis=1, keepdims=True)
+    return np.asarray(np.abs(relative[0] - relative[2]).max(axis=0))
