@@ -35,7 +35,7 @@ from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import KINDS, pack
 from viapoint.training.agents.agent import Agent
 from viapoint.training.live.state import Scene, State
-from viapoint.training.paper.movements import rows_of_lights
+from viapoint.training.paper.movements import TARGETS, rows_of_lights
 from viapoint.training.scene_sets.scene_set import load, shipped_set
 
 MOTION, AGENT, SEARCH = "motion planner", "agent", "geometry search"
@@ -165,9 +165,9 @@ class Arena:
             yield self.scene_of(scenes, row), f"Scene {row} of the set {name}."
 
     def _lights(self) -> Iterator[tuple[Scene, str]]:
-        for row in itertools.cycle(rows_of_lights(half_height=self._sampler.room.height)):
-            sentence = f"From {row.first} to {row.last} past a row of lights, Flash & Hogan 1985."
-            yield Scene(row.start, row.goal, (row.lights,)), sentence
+        for first, last, lights in itertools.cycle(rows_of_lights(half_height=self._sampler.room.height)):
+            sentence = f"From {first} to {last} past a row of lights, Flash & Hogan 1985."
+            yield Scene(TARGETS[first], TARGETS[last], (lights,)), sentence
 
     def scene_of(self, scenes: Scenes, row: int = 0) -> Scene:
         """Return one of the scenes of an environment."""

@@ -17,7 +17,7 @@ from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.clearance import FAR
 from viapoint.envs.geometry.obstacles import pack
-from viapoint.training.live.arena import AGENT, MOTION, OMPL, STRAIGHT, Arena
+from viapoint.training.live.arena import AGENT, MOTION, OMPL, SEARCH, STRAIGHT, Arena
 from viapoint.training.live.state import Movement, Proposal, Scene, State
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.ompl_planner import ompl_motion
@@ -64,11 +64,9 @@ def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Propos
     begin = time.perf_counter()
     action = decide_(observation)
     seconds = time.perf_counter() - begin
-    maker = state.method
-    if state.method == AGENT and state.checks:
+    maker = SEARCH if state.method == AGENT and name == "any" else state.method
+    if name == "own" and state.checks:
         maker = f"{AGENT}, {state.checks} checks"
-    if state.method == AGENT and not arena.agent_decides(state):
-        maker = "geometry search"
     plan = task.action.decode(action, scene.start[None], scene.goal[None]).take(0)
     if state.duration is not None:
         return _by_hand(arena, state, plan.waypoints[1:-1], state.duration)
@@ -146,16 +144,16 @@ def _ranked(arena: Arena, state: State, first: Proposal) -> list[Proposal]:
     scene, (name, task, _) = state.scene, _chooser(arena, state)
     env, by_agent = arena.env(name), name == "own"
     observation, _ = env.reset(options=scene.options())
-    if by_agent and not hasattr(arena.agent.policy, "propose"):  # it proposes one action
+    if by_agent and not hasattr(getattr(arena.agent, "policy", None), "propose"):  # it proposes one action
         return [first]
     if by_agent:
         actions, values = arena.propose(Problem.of_observation(observation, task))
     else:
-        actions = candidate_actions(task, N_CHECKS, replanning=False)
+        actions = candidate_actions(task, N_CHECKS, replanning=False).astype(np.float64)
         assert env.scenes is not None
         # Merits of several actions in one problem are bounds for all but the best.
         each_alone = Problem.of_scenes(env.scenes, task).take(np.zeros(len(actions), np.int64))
-        values = merits(task, each_alone, actions[:, None].astype(np.float64))[:, 0]
+        values = merits(task, each_alone, actions[:, None])[:, 0]
     order = np.argsort(-values, kind="stable")[:N_CANDIDATES]
     ends = (np.repeat(end[None], len(order), axis=0) for end in (scene.start, scene.goal))
     plans = task.action.decode(np.asarray(actions[order], dtype=np.float64), *ends)
@@ -209,10 +207,7 @@ def play(
         goal_of: Function that returns the present goal, shape (D,); None for one that stays.
     """
     observation, _ = env.reset(options=scene.options())
-    if plan is None:
-        decision = env.execute_actions(decide(observation))
-    else:
-        decision = env.execute_plan(_in_batch(plan))
+    decision = env.execute_actions(decide(observation)) if plan is None else env.execute_plan(_in_batch(plan))
     goal, reward = scene.goal, 0.0
     while True:
         rollout, scenes, plans = env.last_rollout[0], env.scenes, env.last_plan
