@@ -39,7 +39,7 @@ from viapoint.training.paper.movements import TARGETS, rows_of_lights
 from viapoint.training.scene_sets.scene_set import load, shipped_set
 
 MOTION, AGENT, SEARCH = "motion planner", "agent", "geometry search"
-STRAIGHT, OMPL = "straight movement", "OMPL"
+STRAIGHT, OMPL, HAND = "straight movement", "OMPL", "by hand"
 """Names of the methods; the motion planner is :func:`~viapoint.training.plan_motion`."""
 MOST_OBSTACLES = 24
 """Greatest number of obstacles of a scene."""

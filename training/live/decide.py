@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import time
@@ -17,9 +16,10 @@ from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.clearance import FAR
 from viapoint.envs.geometry.obstacles import pack
-from viapoint.training.live.arena import AGENT, MOTION, OMPL, SEARCH, STRAIGHT, Arena
+from viapoint.training.live.arena import AGENT, HAND, MOTION, OMPL, SEARCH, STRAIGHT, Arena
 from viapoint.training.live.state import Movement, Proposal, Scene, State
 from viapoint.training.planning.candidates import candidate_actions
+from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.ompl_planner import ompl_motion
 from viapoint.training.planning.plan_motion import SEEDS, checked_motion, plan_motion
 from viapoint.training.planning.problem import Problem
@@ -55,8 +55,7 @@ def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Propos
         return _by_hand(arena, state, state.by_hand, state.duration or state.plan.duration)
     if state.method in (MOTION, OMPL):
         return _planned(arena, state, time_limit)
-    scene, space = state.scene, arena.task.space
-    name, task, decide_ = _chooser(arena, state)
+    scene, (name, task, decide_) = state.scene, _chooser(arena, state)
     try:
         observation, _ = arena.env(name).reset(options=scene.options())
     except ValueError:
@@ -64,14 +63,15 @@ def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Propos
     begin = time.perf_counter()
     action = decide_(observation)
     seconds = time.perf_counter() - begin
-    maker = SEARCH if state.method == AGENT and name == "any" else state.method
-    if name == "own" and state.checks:
-        maker = f"{AGENT}, {state.checks} checks"
     plan = task.action.decode(action, scene.start[None], scene.goal[None]).take(0)
     if state.duration is not None:
         return _by_hand(arena, state, plan.waypoints[1:-1], state.duration)
-    motion = checked_motion(task.arm, space.name, plan, pack([scene.obstacles]), maker)
-    return Proposal(motion, maker, seconds)
+    maker = SEARCH if state.method == AGENT and name == "any" else state.method
+    return Proposal(_checked(arena, scene, plan), maker, seconds)
+
+
+def _checked(arena: Arena, scene: Scene, plan: Plan) -> MotionPlan:
+    return checked_motion(arena.task.arm, arena.task.space_name, plan, pack([scene.obstacles]), "given")
 
 
 def _chooser(arena: Arena, state: State) -> tuple[str, Task, Decide]:
@@ -105,41 +105,37 @@ def _planned(arena: Arena, state: State, time_limit: float) -> Proposal:
 
 def _by_hand(arena: Arena, state: State, vias: Float, duration: float) -> Proposal:
     """Return the plan from start to goal through via-points, shape (K, D), in a duration, [s]."""
-    scene, task = state.scene, arena.task
-    waypoints = np.concatenate((scene.start[None], vias, scene.goal[None]))
+    waypoints = np.concatenate((state.scene.start[None], vias, state.scene.goal[None]))
     plan = Plan(waypoints, np.asarray(primitives.passage_durations(waypoints, np.asarray(duration))))
-    motion = checked_motion(task.arm, task.space_name, plan, pack([scene.obstacles]), "given")
-    return Proposal(motion, state.method, rank=0)
+    return Proposal(_checked(arena, state.scene, plan), HAND)
 
 
 def propose(arena: Arena, state: State) -> tuple[Proposal, ...]:
-    """Return the plan and the best others that differ from it, with their ranks and simulated rewards.
+    """Return the plan and the best others that differ from it, with their simulated rewards.
 
     Where the motion planner found no free movement, it looks once more.
     """
-    first = state.proposals[0]
-    if first.maker == MOTION and first.rank and not first.motion.success:
-        first = decide(arena, state, SECOND_LIMIT)
-    found = [first]
-    if first.maker in (MOTION, OMPL, STRAIGHT):
+    first, found = state.proposals[0], []
+    if first.maker == MOTION and not first.motion.success:
+        return (decide(arena, state, SECOND_LIMIT),)
+    if state.method in (MOTION, OMPL, STRAIGHT):
         return (first,)
-    with contextlib.suppress(ValueError):  # the scene is impossible
-        found = _ranked(arena, state, first)
-        env = arena.env("whole")
-        env.reset(
-            options=state.scene._replace(jumps=(), turns=()).options()
-        )  # no decision knows later changes
-        scenes = env.scenes
-        assert scenes is not None
-        for i, each in enumerate(found):
-            env.begin(scenes)
-            outcome = env.execute_plan(_in_batch(each.motion.plan))
-            if each.motion.success and outcome.info["is_success"][0]:
-                found[i] = each._replace(reward=float(outcome.reward[0]))
+    env = arena.env("whole")
+    try:
+        env.reset(options=state.scene._replace(jumps=(), turns=()).options())  # later changes are not known
+    except ValueError:  # the scene is impossible
+        return (first,)
+    scenes = env.scenes
+    assert scenes is not None
+    for each in _distinct(arena, state, first):
+        env.begin(scenes)
+        outcome = env.execute_plan(_in_batch(each.motion.plan))
+        success = each.motion.success and outcome.info["is_success"][0]
+        found.append(each._replace(reward=float(outcome.reward[0]) if success else None))
     return tuple(found)
 
 
-def _ranked(arena: Arena, state: State, first: Proposal) -> list[Proposal]:
+def _distinct(arena: Arena, state: State, first: Proposal) -> list[Proposal]:
     """Return a plan and the best candidates whose paths differ from it and from one another."""
     scene, (name, task, _) = state.scene, _chooser(arena, state)
     env, by_agent = arena.env(name), name == "own"
@@ -155,34 +151,30 @@ def _ranked(arena: Arena, state: State, first: Proposal) -> list[Proposal]:
         each_alone = Problem.of_scenes(env.scenes, task).take(np.zeros(len(actions), np.int64))
         values = merits(task, each_alone, actions[:, None])[:, 0]
     order = np.argsort(-values, kind="stable")[:N_CANDIDATES]
+    values = values[order]
     ends = (np.repeat(end[None], len(order), axis=0) for end in (scene.start, scene.goal))
     plans = task.action.decode(np.asarray(actions[order], dtype=np.float64), *ends)
-    chosen = first.motion.plan
-    known = np.array([])
-    if chosen.waypoints.shape == plans.waypoints.shape[1:]:
-        same = np.isclose(plans.waypoints, chosen.waypoints, atol=1e-6).all(axis=(1, 2))
-        known = np.flatnonzero(same & np.isclose(plans.duration, chosen.duration))
-    # A chosen plan that is no candidate comes from refinement, and stands before all candidates.
-    shift = 1 if known.size or not first.rank else 2
-    if known.size and first.rank:
-        value = float(values[order[known[0]]]) if by_agent else None
-        first = first._replace(rank=int(known[0]) + 1, value=value)
-    found, packed = [first], pack([scene.obstacles])
-    paths = arena.path(plans, 9)
-    least = norm(paths - arena.path(chosen, 9)).max(axis=-1)
-    while len(found) < N_PROPOSALS and (least > APART).any():
-        i = int((least > APART).argmax())
-        motion = checked_motion(task.arm, task.space_name, plans.take(i), packed, first.maker)
-        value = float(values[order[i]]) if by_agent else None
-        found.append(Proposal(motion, first.maker, first.seconds, i + shift, value))
-        least = np.minimum(least, norm(paths - paths[i]).max(axis=-1))
+    chosen, paths = first.motion.plan, arena.path(plans, 9)
+    apart = norm(paths - arena.path(chosen, 9)).max(axis=-1)
+    same = np.flatnonzero((apart < 1e-6) & np.isclose(plans.duration, chosen.duration))
+    maker = SEARCH
+    if by_agent:
+        maker = AGENT
+        first = first._replace(value=float(values[same[0]]) if same.size else None)
+    found = [first]
+    while len(found) < N_PROPOSALS and (apart > APART).any():
+        i = int((apart > APART).argmax())
+        value = float(values[i]) if by_agent else None
+        found.append(Proposal(_checked(arena, scene, plans.take(i)), maker, value=value))
+        apart = np.minimum(apart, norm(paths - paths[i]).max(axis=-1))
     return found
 
 
 def execute(arena: Arena, state: State, goal_of: Callable[[], Float] | None = None) -> Iterator[Movement]:
     """Execute the plan, decision by decision where it is revised; `goal_of` returns the goal, shape (D,)."""
     assert state.plan is not None
-    if arena.stepwise and arena.agent_decides(state) and state.proposals[state.picked].rank == 1:
+    by_method = state.by_hand is None and state.picked == 0
+    if arena.stepwise and arena.agent_decides(state) and by_method:
         return play(arena.env("steps"), state.scene, arena.act)
     name, _, decide_ = _chooser(arena, state)
     return play(arena.env(name), state.scene, decide_, state.plan.plan, goal_of)
@@ -254,7 +246,7 @@ def profile(arena: Arena, scene: Scene, plan: Plan) -> dict[str, Float]:
 def describe_plan(proposal: Proposal) -> str:
     """Return one sentence on a plan."""
     motion = proposal.motion
-    if not motion.success and proposal.maker == MOTION and proposal.rank:
+    if not motion.success and proposal.maker == MOTION:
         return f"No free movement was found: {motion.reason}. The best one is shown in red."
     if not motion.success:
         return f"This plan fails: {motion.reason}."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +14,12 @@ from mjviser.conversions import get_geom_texture_id, merge_geoms
 
 from viapoint.envs import Arm, Box, Capsule, HalfSpace, Shape, Sphere
 from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.palette import PALETTE
+from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import add_to_model
 from viapoint.training.live.arena import Arena
 from viapoint.training.live.state import State
+from viapoint.training.planning.motion_plan import MotionPlan
 
 if TYPE_CHECKING:
     import viser
@@ -34,6 +35,9 @@ BELOW, ABOVE = np.array([0.0, 0.0, -0.002]), np.array([0.0, 0.0, 0.004])
 """Shifts of proposals and of the executed path, so that the plan stays visible, [m]."""
 RADII = {"start": 0.018, "goal": 0.018, "via": 0.013}
 """Radii of the handles, [m]."""
+PLANE = (-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), 33.0
+SPACE = (2.6, -2.0, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), 38.0
+"""First views: position of the camera, point that it looks at, [m], direction up, and field of view, [degrees]."""
 OPACITY, GHOST, PALE = 0.45, 0.16, 0.25
 """Opacities: of a planar arm and of large obstacles, which hide others; of the arm at the goal; of an old plan."""
 LARGE = 0.16
@@ -114,9 +118,7 @@ class ArmDrawing:
         ground = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
         visible = ~np.isin(model.geom_type, ground) & (model.body_mocapid[model.geom_bodyid] < 0)
         visible &= model.geom_rgba[:, 3] > 0.0
-        drawn_only = visible & (
-            model.geom_group < 3
-        )  # MuJoCo's viewers hide other groups, which only collide
+        drawn_only = visible & (model.geom_group < 3)  # MuJoCo's viewers hide others, which only collide
         groups: dict[tuple[int, Any], list[int]] = {}
         for geom in np.flatnonzero(drawn_only if model_file is not None and drawn_only.any() else visible):
             material = model.geom_matid[geom]
@@ -163,104 +165,73 @@ class View:
         self._nodes: dict[str, Any] = {}
         self._drawn: dict[str, tuple[Any, ...]] = {}
         self._grab = np.zeros(3)
-        size, centre = ((1.7, 1.5), (-0.03, 0.35)) if self._planar else ((2.0, 2.0), (0.0, 0.0))
-        lines = (214, 214, 218)
-        self._scene.add_box(
-            "/table", dimensions=(*size, 0.01), color=_rgb(PALETTE.table), cast_shadow=False,
-            receive_shadow=False, position=(*centre, self._floor - 0.008),
-        )  # fmt: skip
+        lines, centre = (214, 214, 218), (-0.03, 0.35) if self._planar else (0.0, 0.0)
         self._scene.add_grid(
-            "/grid", *size, position=(*centre, self._floor), cell_size=0.1, section_size=0.1,
+            "/grid", 2.0, 2.0, position=(*centre, self._floor), cell_size=0.1, section_size=0.1,
             cell_color=lines, section_color=lines, section_thickness=1.0, shadow_opacity=0.0,
+            plane_color=_rgb(PALETTE.table), plane_opacity=1.0,
         )  # fmt: skip
         for i, (_, colour, mesh) in enumerate(arm.parts):
-            opacity, plain = OPACITY if self._planar else None, colour or PALETTE.arm
             if colour is None and not self._planar:
                 self._nodes[f"/arm/{i}"] = self._scene.add_mesh_trimesh(f"/arm/{i}", mesh)
             else:
-                self._mesh(f"/arm/{i}", mesh, plain, opacity=opacity, shadow=True)
+                self._mesh(f"/arm/{i}", mesh, colour or PALETTE.arm, OPACITY if self._planar else None)
             if not self._planar:
-                self._mesh(f"/ghost/{i}", mesh, plain, opacity=GHOST)
+                self._mesh(f"/ghost/{i}", mesh, colour or PALETTE.arm, GHOST)
+        axes = (True, True, not self._planar)
         self._rings = self._scene.add_transform_controls(
-            "/turn",
-            scale=0.2,
-            disable_axes=True,
-            disable_sliders=True,
-            visible=False,
-            active_axes=(True, True, not self._planar),
+            "/turn", 0.2, disable_axes=True, disable_sliders=True, visible=False, active_axes=axes
         )
         self._rings.on_update(lambda _: act("turn", np.array(self._rings.wxyz)))
         self.look_at_everything()
 
     def look_at_everything(self) -> None:
         """Move the camera to its first view: the plane from above, space from the side, farther in a narrow window."""
-        camera = self._client.camera
-        eye, target, up, angle = (
-            np.array([2.6, -2.0, 1.75]),
-            np.array([0.15, 0.0, 0.42]),
-            (0.0, 0.0, 1.0),
-            38.0,
-        )
-        if self._planar:
-            eye, target, up, angle = (
-                np.array([-0.03, 0.26, 1.75]),
-                np.array([-0.03, 0.29, 0.0]),
-                (0.0, 1.0, 0.0),
-                33.0,
-            )
+        camera, (eye, target, up, angle) = self._client.camera, PLANE if self._planar else SPACE
+        away = max(1.0, 0.75 / max(camera.aspect, 0.1)) * np.subtract(eye, target)
         camera.up_direction = up
-        camera.position = target + max(1.0, 0.75 / max(camera.aspect, 0.1)) * (eye - target)
+        camera.position = target + away
         camera.look_at = target  # after the position, which takes the target along
         camera.fov = float(np.radians(angle))
 
     def draw(self, state: State) -> None:
         """Draw the scene, the plans and the movement; only what has changed is sent."""
         arena, scene, movement, plan = self._arena, state.scene, state.movement, state.plan
-        space = arena.task.space
-        joints, places = space.joints(scene.start), [shape.position for shape in scene.obstacles]
+        joints, places = arena.task.space.joints(scene.start), [shape.position for shape in scene.obstacles]
+        done = []
         if movement is not None:
             rollout, now = movement.rollout, state.instant
-            joints, places = (
-                rollout.joints[now],
-                movement.scenes.obstacles_at(rollout.time[now : now + 1]).centre[0],
-            )
-        self._draw_arm("/arm", joints)
+            joints = rollout.joints[now]
+            places = movement.scenes.obstacles_at(rollout.time[now : now + 1]).centre[0]
+            rows = np.unique(np.linspace(0, now, 40).astype(int))
+            colour = PALETTE.contact if rollout.contact[: now + 1].any() else PALETTE.executed
+            if now > 1:
+                done = [(rollout.hand[rows] + ABOVE, colour)]
+        self._draw_paths("done", done, DONE)
+        self._draw_arm("arm", joints)
         if not self._planar:
-            self._draw_arm("/ghost", space.joints(scene.goal))
+            self._draw_arm("ghost", arena.task.space.joints(scene.goal))
         self._draw_obstacles(scene.obstacles, places, state.selected)
         start, goal = arena.tool(np.stack((scene.start, scene.goal)))
-        self._draw_handle("start", start)
-        self._draw_handle("goal", goal)
+        self._draw_handles("start", [start])
+        self._draw_handles("goal", [goal])
         self._draw_rings(state, goal)
         if plan is None:
             return
-        followed, clear, vias = plan.plan, plan.success, arena.tool(plan.waypoints[1:-1])
+        planned, vias = [self._line(plan)], arena.tool(plan.waypoints[1:-1])
         if movement is not None and movement.plan is not None and arena.task.replanning:
-            followed, clear, vias = movement.plan, True, vias[:0]
-        for i, via in enumerate(vias):
-            self._draw_handle(f"via/{i}", via)
-        self._hide("/handles/via", len(vias))
-        before = [] if state.before is None else [state.before]
-        others = [each.motion for each in state.proposals] if len(state.proposals) > 1 else []
-        self._draw_path("/plan/0", followed, PLAN, PALETTE.plan if clear else PALETTE.contact)
-        for each in before:
-            self._draw_path(
-                "/before/0", each.plan, PLAN, PALETTE.plan if each.success else PALETTE.contact, PALE
-            )
-        self._hide("/before", len(before))
-        for i, each in enumerate(others):
-            colour = _lighter(PALETTE.plan if each.success else PALETTE.contact)
-            self._draw_path(f"/proposals/{i}", each.plan, PROPOSAL, colour, 0.8)
-        self._hide("/proposals", len(others))
-        done = [] if movement is None or state.instant < 2 else [movement.rollout]
-        for rollout in done:
-            rows = np.unique(np.linspace(0, state.instant, 40).astype(int))
-            touched = rollout.contact[: state.instant + 1].any()
-            if self._is_new("/done/0", rollout.hand[rows]):
-                colour = PALETTE.contact if touched else PALETTE.executed
-                self._mesh("/done/0", tube(rollout.hand[rows] + ABOVE, DONE), colour)
-            self._nodes["/done/0"].visible = True
-        self._hide("/done", len(done))
+            planned, vias = [(arena.path(movement.plan), PALETTE.plan)], vias[:0]
+        before = [] if state.before is None else [self._line(state.before)]
+        others = state.proposals if len(state.proposals) > 1 else ()
+        pale = [(path, _lighter(colour)) for path, colour in (self._line(each.motion) for each in others)]
+        self._draw_handles("via", vias)
+        self._draw_paths("plan", planned, PLAN)
+        self._draw_paths("before", before, PLAN, PALE)
+        self._draw_paths("proposal", pale, PROPOSAL, 0.8)
+
+    def _line(self, motion: MotionPlan) -> tuple[Float, Colour]:
+        """Return the path of a plan, and its colour."""
+        return self._arena.path(motion.plan), PALETTE.plan if motion.success else PALETTE.contact
 
     def _draw_rings(self, state: State, goal: Float) -> None:
         """Draw rings that turn the selected obstacle or the tool at the goal; obstacles in the plane stay upright."""
@@ -273,57 +244,47 @@ class View:
     def _draw_arm(self, name: str, joints: Float) -> None:
         if self._is_new(name, joints):
             for i, (turn, position) in enumerate(self._arm.poses(joints)):
-                node = self._nodes[f"{name}/{i}"]
+                node = self._nodes[f"/{name}/{i}"]
                 node.wxyz, node.position = turn, position
 
     def _draw_obstacles(self, shapes: tuple[Shape, ...], places: Any, selected: int | None) -> None:
         for i, (shape, place) in enumerate(zip(shapes, places, strict=False)):
-            name = f"/obstacles/{i}"
-            colour = PALETTE.obstacle if i != selected else _lighter(PALETTE.obstacle)
-            there = name in self._nodes
+            name = f"/obstacle/{i}"
             if self._is_new(name, shape.kind, shape.packed_size, shape.quaternion, id(shape.mesh)):
-                self._mesh(name, obstacle_mesh(shape, self._levels), colour, shadow=True)
+                self._mesh(name, obstacle_mesh(shape, self._levels), PALETTE.obstacle)
             node = self._nodes[name]
-            if not there:
-                self._make_draggable(node, "obstacle", i)
-                node.on_click(lambda _, row=i: self._act("show", "selected", row))
             node.flat_shading = not isinstance(shape, Sphere | Capsule)
             large = isinstance(shape, HalfSpace) or float(shape.packed_size.max()) > LARGE
             node.opacity = OPACITY if large and not self._planar else None
-            node.color, node.position, node.visible = _rgb(colour), place, True
-        self._hide("/obstacles", len(shapes))
+            node.color = _rgb(PALETTE.obstacle if i != selected else _lighter(PALETTE.obstacle))
+            node.position, node.visible = place, True
+        self._hide("obstacle", len(shapes))
 
-    def _draw_path(
-        self, name: str, plan: Any, radius: float, colour: Any, opacity: float | None = None
+    def _draw_paths(
+        self, name: str, paths: list[tuple[Float, Colour]], radius: float, opacity: float | None = None
     ) -> None:
-        """Draw the path of a plan; proposals can be clicked, and the client outlines the one under the pointer."""
-        there, proposal = name in self._nodes, name.startswith("/proposals")
-        if self._is_new(name, plan.waypoints, plan.durations, colour):
-            path = self._arena.path(plan)
-            mesh = tube(SHRUNK * (path + BELOW), SHRUNK * radius) if proposal else tube(path, radius)
-            self._mesh(name, mesh, colour, opacity=opacity)
-        node = self._nodes[name]
-        if proposal and not there:
-            node.scale = 1.0 / SHRUNK
-            node.on_click(lambda _: self._act("pick", int(name.rpartition("/")[2])))
-        node.visible = True
+        """Draw paths, shape (n, 3), [m], with their colours."""
+        scale = SHRUNK if name == "proposal" else 1.0
+        for i, (path, colour) in enumerate(paths):
+            key = f"/{name}/{i}"
+            if self._is_new(key, path, colour):
+                shift = BELOW if name == "proposal" else 0.0
+                self._mesh(key, tube(scale * (path + shift), scale * radius), colour, opacity)
+            self._nodes[key].scale, self._nodes[key].visible = 1.0 / scale, True
+        self._hide(name, len(paths))
 
-    def _draw_handle(self, name: str, place: Float) -> None:
-        """Draw a handle; in space, a line down to the table shows its place."""
-        key = f"/handles/{name}"
-        if key not in self._nodes:
-            kind, _, number = name.partition("/")
-            colour, radius = getattr(PALETTE, kind), RADII[kind]
-            self._nodes[key] = self._scene.add_icosphere(key, radius, color=_rgb(colour), cast_shadow=False)
-            self._make_draggable(self._nodes[key], kind, int(number or 0))
-            if not self._planar:
-                down = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, -1.0]]])
-                self._nodes[f"{key}/drop"] = self._scene.add_line_segments(
-                    f"{key}/drop", down, _rgb(_lighter(colour)), thickness=0.003
-                )
-        self._nodes[key].position, self._nodes[key].visible = place, True
-        if not self._planar:
-            self._nodes[f"{key}/drop"].scale = 1.0, 1.0, max(float(place[2]) - self._floor, 1e-3)
+    def _draw_handles(self, name: str, places: Sequence[Float]) -> None:
+        """Draw handles; in space, lines down to the table show their places."""
+        colour = getattr(PALETTE, name)
+        for i, place in enumerate(places):
+            key = f"/{name}/{i}"
+            if key not in self._nodes:
+                self._mesh(key, trimesh.creation.icosphere(3, RADII[name]), colour)
+            self._nodes[key].position, self._nodes[key].visible = place, True
+            if not self._planar and self._is_new(f"{key}/drop", place):
+                down = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, self._floor - place[2]]]])
+                self._scene.add_line_segments(f"{key}/drop", down, _rgb(_lighter(colour)), thickness=0.003)
+        self._hide(name, len(places))
 
     def _is_new(self, name: str, *values: Any) -> bool:
         """Return True if something differs from what was drawn last under this name."""
@@ -332,20 +293,20 @@ class View:
 
     def _hide(self, name: str, number: int) -> None:
         """Hide the nodes of a name from a number on."""
-        while (node := self._nodes.get(f"{name}/{number}")) is not None:
+        while (node := self._nodes.get(f"/{name}/{number}")) is not None:
             node.visible = False
             number += 1
 
-    def _mesh(
-        self, name: str, mesh: Any, colour: Any, *, opacity: float | None = None, shadow: bool = False
-    ) -> None:
+    def _mesh(self, key: str, mesh: Any, colour: Any, opacity: float | None = None) -> None:
         """Add a mesh, or change the one of this name."""
-        vertices, faces, node = np.float32(mesh.vertices), np.uint32(mesh.faces), self._nodes.get(name)
+        vertices, faces, node = np.float32(mesh.vertices), np.uint32(mesh.faces), self._nodes.get(key)
         if node is not None:
             node.vertices, node.faces, node.color = vertices, faces, _rgb(colour)
             return
-        self._nodes[name] = self._scene.add_mesh_simple(
-            name,
+        _, name, number = key.split("/")
+        shadow = name in ("arm", "obstacle")
+        node = self._nodes[key] = self._scene.add_mesh_simple(
+            key,
             vertices,
             faces,
             color=_rgb(colour),
@@ -353,6 +314,12 @@ class View:
             cast_shadow=shadow,
             receive_shadow=shadow,
         )
+        if name == "proposal":
+            node.on_click(lambda _: self._act("pick", int(number)))
+        if name == "obstacle":
+            node.on_click(lambda _: self._act("show", "selected", int(number)))
+        if name == "obstacle" or name in RADII:
+            self._make_draggable(node, name, int(number))
 
     def _make_draggable(self, node: Any, kind: str, number: int) -> None:
         """Make a node draggable: horizontally, or vertically in space while Shift is held."""
@@ -389,5 +356,6 @@ def _rgb(colour: Any) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _lighter(colour: Any) -> tuple[float, ...]:
-    return tuple(0.45 * each + 0.55 for each in colour)
+def _lighter(colour: Colour) -> Colour:
+    red, green, blue = (0.45 * each + 0.55 for each in colour)
+    return red, green, blue

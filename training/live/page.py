@@ -180,7 +180,7 @@ class Tab:
         state.movement, state.playing, state.before = None, False, state.plan
         proposal = decide(self.arena, state)
         state.proposals, state.picked, state.profile = (proposal,), 0, None
-        if proposal.maker == MOTION and proposal.rank:
+        if proposal.maker == MOTION:
             state.last = proposal.motion
         self._say(describe_plan(proposal), proposal.motion.success)
         self.client.flush()

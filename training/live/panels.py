@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.colors import to_hex
 
 from viapoint.envs.common.palette import PALETTE
 from viapoint.training.live.arena import AGENT, SIZES, Arena
@@ -30,6 +31,13 @@ CODE = (
     '<pre id="viapoint-code" style="background:#f5f5f2;padding:1em;overflow:auto;font-size:0.82em">{}</pre>'
     '<button onclick="navigator.clipboard.writeText(this.previousElementSibling.textContent)">Copy</button>'
 )
+LINE = {"width": 2, "points": {"show": False}}
+LINES: Any = (
+    {"label": "time"},
+    {**LINE, "label": "plan", "stroke": to_hex(PALETTE.plan)},
+    {**LINE, "label": "executed", "stroke": to_hex(PALETTE.executed), "dash": (6, 5)},
+)
+"""Lines of the plots."""
 
 
 class Panels:
@@ -86,18 +94,18 @@ class Panels:
     def _draw_proposals(self, state: State) -> None:
         rows = [
             {
-                "rank": str(each.rank or "you"),
+                "plan": f"#{number}",
                 "reward": "fails" if not each.motion.success else _number(each.reward),
                 "agent's value": _number(each.value),
                 "clearance [mm]": _millimetres(each.motion.clearance),
                 "time [s]": f"{each.motion.duration:.2f}",
             }
-            for each in state.proposals
+            for number, each in enumerate(state.proposals, 1)
         ]
         first = state.proposals[0]
         note = f"{first.maker}, decided in {1e3 * first.seconds:.0f} ms"
         self._table.content = _table(rows, state.picked) + NOTE.format(note)
-        options = tuple(f"#{row['rank']}" for row in rows)
+        options = tuple(row["plan"] for row in rows)
         self._pick.visible = len(options) > 1
         if tuple(self._pick.options) != options:
             self._pick.options = options
@@ -115,11 +123,12 @@ class Panels:
             speed = np.linalg.norm(np.gradient(rollout.hand, time, axis=0), axis=-1)
             executed = {"speed": speed, "clearance": rollout.clearance}
         for name, plot in self._plots.items():
-            planned = np.interp(time, profile["time"], profile[name])
-            lines = [planned, executed.get(name, np.zeros(0))]
+            lines = [np.interp(time, profile["time"], profile[name])]
+            lines += [executed[name]] if name in executed else []
             if name == "clearance":  # in millimetres, where it is small
                 lines = [np.minimum(1e3 * line, 250.0) for line in lines]
             plot.data = (time, *lines)
+            plot.series = LINES[: 1 + len(lines)]
 
     def _draw_comparison(self, state: State) -> None:
         rows = [
@@ -164,14 +173,9 @@ class Panels:
             unit = "m/s³" if self._arena.task.space.of_hand else "rad/s³"
             titles = {"speed": "speed of the hand [m/s]", "jerk": f"jerk of the plan [{unit}]"}
             titles["clearance"] = "clearance [mm]"
-            lines = (
-                {"label": "time"},
-                _line("plan", PALETTE.plan),
-                _line("executed", PALETTE.executed, (6, 5)),
-            )
             self._plots = {
                 name: gui.add_uplot(
-                    (np.zeros(2), np.zeros(2), np.zeros(0)), lines, title=title, height=126,
+                    (np.zeros(2), np.zeros(2)), LINES[:2], title=title, height=126,
                     scales={"x": {"time": False}}, legend={"show": False}, cursor={"show": True},
                     axes=({"size": 30}, {"size": 46}), padding=(10, 10, 0, 0),
                 )
@@ -248,11 +252,6 @@ class Panels:
 def _by_user(function: Callable[[Any], None]) -> Callable[[Any], None]:
     """Return a callback that ignores changes made by the page itself."""
     return lambda event: function(event.target.value) if event.client is not None else None
-
-
-def _line(label: str, colour: Any, dash: tuple[int, ...] = ()) -> Any:
-    stroke = "#" + "".join(f"{round(255 * each):02x}" for each in colour)
-    return {"label": label, "stroke": stroke, "width": 2, "points": {"show": False}, "dash": dash}
 
 
 def _table(rows: list[dict[str, str]], bold: int = -1) -> str:

@@ -81,12 +81,10 @@ class Proposal(NamedTuple):
     """Method that made it."""
     seconds: float = 0.0
     """Time that the decision took, [s]."""
-    rank: int = 1
-    """Rank among all candidates, from 1; 0 for a plan made by hand."""
     value: float | None = None
     """Value by which the agent ranks the plan; None where it does not decide."""
     reward: float | None = None
-    """Reward of the simulated movement; None for a plan that fails, and until it is simulated."""
+    """Reward of the simulated movement; None for one that fails, and until it is simulated."""
 
 
 class Movement(NamedTuple):
