@@ -29,7 +29,6 @@ from viapoint.envs import (
     scene_to_json,
 )
 from viapoint.envs.arms.kinematics import forward
-from viapoint.envs.common.arrays import quaternion_to
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import KINDS, pack
@@ -145,11 +144,9 @@ class Arena:
 
     def scenes(self) -> dict[str, Iterator[tuple[Scene, str]]]:
         """Return endless scenes and sentences on them, by the names of their buttons."""
-        task = self.task
-        kinds = {"Random": self._random()}
+        task, kinds = self.task, {"Random": self._random()}
         for name in ("test", "hard"):
-            path = shipped_set(name, task)
-            if path is not None:
+            if (path := shipped_set(name, task)) is not None:
                 kinds[name.capitalize()] = self._shipped(name, load(path).scenes)
         if task.space.of_hand and task.n_obstacles[1] and not (task.whole_arm or task.replanning):
             kinds["Lights 1985"] = self._lights()
@@ -259,26 +256,19 @@ class Arena:
 
     # Obstacles
 
-    def new_shapes(self, across: Float) -> dict[str, Shape]:
-        """Return obstacles that can be added by name; `across` is a horizontal direction across the movement."""
-        wall = HalfSpace(quaternion=quaternion_to(-across))
-        if self.planar:
-            height = self._sampler.room.height
-            half = 0.5 * np.arctan2(across[1], across[0])
-            bar = Box((0.09, 0.015, height), quaternion=(np.cos(half), 0.0, 0.0, np.sin(half)))
-            return {
-                "post": Cylinder(0.025, height),
-                "bar": bar,
-                "box": Box((0.03, 0.03, height)),
-                "wall": wall,
-            }
-        return {
+    def new_shapes(self) -> dict[str, Shape]:
+        """Return the obstacles that can be added, by name."""
+        shapes: dict[str, Shape] = {
             "sphere": Sphere(0.06),
-            "capsule": Capsule(0.035, 0.1, quaternion=quaternion_to(across)),
+            "capsule": Capsule(0.035, 0.1),
             "box": Box((0.05, 0.05, 0.05)),
             "cylinder": Cylinder(0.04, 0.08),
-            "wall": wall,
         }
+        if self.planar:
+            height = self._sampler.room.height
+            bar, box = Box((0.09, 0.015, height)), Box((0.03, 0.03, height))
+            shapes = {"post": Cylinder(0.025, height), "bar": bar, "box": box}
+        return {**shapes, "wall": HalfSpace()}
 
     def new_obstacle(self, scene: Scene, name: str) -> Shape:
         """Return a new obstacle beside the middle of a movement, clear of the others and of both ends if possible.
@@ -291,18 +281,15 @@ class Arena:
         aside = np.array([-line[1], line[0], 0.0]) / max(float(np.hypot(line[0], line[1])), 1e-9)
         if aside @ middle < 0.0:
             aside = -aside
-        shape = self.new_shapes(aside)[name]
-        ways, others = 0.02 * np.arange(1, 20), scene.obstacles
-        if name == "wall":  # others may stand in a wall
-            ways, others = ways + 0.15, ()
-        else:
-            ways = np.stack((ways, -ways), axis=-1).ravel()
-        for way in ways:
-            placed = dataclasses.replace(shape, position=middle + way * aside)
-            alone = all(other.distance(placed.position, 0.03) > 0.0 for other in others)
-            if alone and self.clearances(ends, pack([[placed]]))[:, 0].min() > 0.0:
-                return placed
-        return dataclasses.replace(shape, position=middle + ways[0] * aside)
+        shape, sides, least, others = self.new_shapes()[name], (aside, -aside), 0.02, scene.obstacles
+        if name == "wall":  # others may stand in it
+            shape, sides, least, others = HalfSpace.facing(-aside), (aside,), 0.17, ()
+        for way, side in itertools.product(least + 0.02 * np.arange(20), sides):
+            shape = dataclasses.replace(shape, position=middle + way * side)
+            alone = all(other.distance(shape.position, 0.03) > 0.0 for other in others)
+            if alone and self.clearances(ends, pack([[shape]]))[:, 0].min() > 0.0:
+                break
+        return shape
 
     def sizes_of(self, shape: Shape) -> dict[str, float]:
         """Return the sizes of an obstacle by the names of their sliders, [m]; in the plane without its height."""

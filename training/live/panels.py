@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.colors import to_hex
 
+from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.palette import PALETTE
 from viapoint.training.live.arena import AGENT, SIZES, Arena
 from viapoint.training.live.state import State
@@ -92,21 +93,25 @@ class Panels:
             self._gui.add_button("Close").on_click(lambda _: modal.close())
 
     def _draw_proposals(self, state: State) -> None:
-        rows = [
-            {
-                "plan": f"#{number}",
-                "reward": "fails" if not each.motion.success else _number(each.reward),
-                "agent's value": _number(each.value),
-                "clearance [mm]": _millimetres(each.motion.clearance),
-                "time [s]": f"{each.motion.duration:.2f}",
-            }
-            for number, each in enumerate(state.proposals, 1)
-        ]
+        rows = []
+        for number, each in enumerate(state.proposals, start=1):
+            motion = each.motion
+            reward = _number(each.reward) if motion.success else "fails"
+            rows.append(
+                (
+                    f"#{number}",
+                    reward,
+                    _number(each.value),
+                    _millimetres(motion.clearance),
+                    f"{motion.duration:.2f}",
+                )
+            )
+        names = "plan", "reward", "agent's value", "clearance [mm]", "time [s]"
         first = state.proposals[0]
         note = f"{first.maker}, decided in {1e3 * first.seconds:.0f} ms"
-        self._table.content = _table(rows, state.picked) + NOTE.format(note)
-        options = tuple(row["plan"] for row in rows)
-        self._pick.visible = len(options) > 1
+        self._table.content = _table(names, rows, state.picked) + NOTE.format(note)
+        self._pick.visible = len(rows) > 1
+        options = tuple(name for name, *_ in rows)
         if tuple(self._pick.options) != options:
             self._pick.options = options
 
@@ -120,32 +125,28 @@ class Panels:
         if movement is not None:
             rollout = movement.rollout
             time = rollout.time
-            speed = np.linalg.norm(np.gradient(rollout.hand, time, axis=0), axis=-1)
-            executed = {"speed": speed, "clearance": rollout.clearance}
+            executed = {
+                "speed": norm(np.gradient(rollout.hand, time, axis=0)),
+                "clearance": rollout.clearance,
+            }
         for name, plot in self._plots.items():
-            lines = [np.interp(time, profile["time"], profile[name])]
-            lines += [executed[name]] if name in executed else []
+            lines = [np.interp(time, profile["time"], profile[name]), executed.get(name, np.full(len(time), np.nan))]
             if name == "clearance":  # in millimetres, where it is small
                 lines = [np.minimum(1e3 * line, 250.0) for line in lines]
             plot.data = (time, *lines)
-            plot.series = LINES[: 1 + len(lines)]
 
     def _draw_comparison(self, state: State) -> None:
-        rows = [
-            {
-                "method": name,
-                "success": "yes" if movement.info["is_success"][0] else "no",
-                "reward": f"{movement.reward:.2f}",
-                "clearance [mm]": _millimetres(movement.info["min_clearance"][0]),
-                "jerk": f"{movement.info['jerk_ratio'][0]:.2f}",
-                "decided in [ms]": f"{1e3 * seconds:.0f}",
-            }
-            for name, seconds, movement in state.results
-        ]
+        rows = []
+        for name, seconds, movement in state.results:
+            info = {key: value[0] for key, value in movement.info.items()}
+            success = "yes" if info["is_success"] else "no"
+            clearance, jerk = _millimetres(info["min_clearance"]), _number(info["jerk_ratio"])
+            rows.append((name, success, _number(movement.reward), clearance, jerk, f"{1e3 * seconds:.0f}"))
+        names = "method", "success", "reward", "clearance [mm]", "jerk", "decided in [ms]"
         note = "Each row is simulated. Jerk is relative to the straight movement."
         if state.comparing:
             note = f"{state.comparing} ..."
-        self._methods.content = (_table(rows) if rows else "") + NOTE.format(note)
+        self._methods.content = (_table(names, rows) if rows else "") + NOTE.format(note)
 
     def _draw_selection(self, state: State) -> None:
         """Show the sizes of the selected obstacle; sliders that the user moves are left alone."""
@@ -212,7 +213,7 @@ class Panels:
                 label = f"{name.capitalize()} [m]"
                 self._sizes[name] = gui.add_slider(label, least, most, 0.001, least, visible=False)
                 self._sizes[name].on_update(_by_user(functools.partial(act, "resize", name)))
-            shapes = gui.add_button_group("Add", tuple(arena.new_shapes(np.array([0.0, 1.0, 0.0]))))
+            shapes = gui.add_button_group("Add", tuple(arena.new_shapes()))
             shapes.on_click(lambda event: act("add", event.target.value))
             self._remove = gui.add_button("Remove the selected one", disabled=True)
             self._remove.on_click(lambda _: act("remove"))
@@ -254,14 +255,12 @@ def _by_user(function: Callable[[Any], None]) -> Callable[[Any], None]:
     return lambda event: function(event.target.value) if event.client is not None else None
 
 
-def _table(rows: list[dict[str, str]], bold: int = -1) -> str:
-    """Return rows as an HTML table; the names are those of the first row."""
-    lines = ["".join(f'<th style="font-weight:500;color:#6b7078">{name}</th>' for name in rows[0])]
+def _table(names: Iterable[str], rows: Iterable[Iterable[str]], bold: int = -1) -> str:
+    """Return an HTML table, with one row in bold."""
+    lines = ["".join(f'<th style="font-weight:500;color:#6b7078">{name}</th>' for name in names)]
     for i, row in enumerate(rows):
-        weight = 700 if i == bold else 400
-        lines.append(
-            "".join(f'<td style="font-weight:{weight}">{html.escape(each)}</td>' for each in row.values())
-        )
+        cell = f'<td style="font-weight:{700 if i == bold else 400}">'
+        lines.append("".join(f"{cell}{html.escape(each)}</td>" for each in row))
     body = "".join(f'<tr style="border-top:1px solid #e6e6e3;text-align:right">{line}</tr>' for line in lines)
     return f'<table style="width:100%;padding:0 0.7em;font-size:0.8em">{body}</table>'
 
