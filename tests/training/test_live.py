@@ -23,7 +23,7 @@ from viapoint.training.agents.agent import SAC
 from viapoint.training.agents.viaq import ViaQ
 from viapoint.training.cli import main as cli
 from viapoint.training.live import drawing
-from viapoint.training.live.arena import AGENT, MOTION, SEARCH, STRAIGHT, Arena
+from viapoint.training.live.arena import AGENT, HAND, MOTION, SEARCH, STRAIGHT, Arena
 from viapoint.training.live.decide import APART, decide, describe_plan, execute, profile, propose
 from viapoint.training.live.page import LivePage
 from viapoint.training.live.state import State
@@ -96,8 +96,6 @@ def test_every_environment_has_scenes_decisions_movements_and_a_drawing(env_id, 
     paths = np.array([arena.path(each.motion.plan) for each in state.proposals])
     for i, j in np.argwhere(~np.eye(len(paths), dtype=bool)):
         assert np.linalg.norm(paths[i] - paths[j], axis=-1).max() > 0.9 * APART
-    ranks = [each.rank for each in state.proposals]
-    assert ranks == sorted(set(ranks))
     movements = list(execute(arena, state, lambda: scene.goal))
     np.testing.assert_allclose(movements[0].rollout.hand[0], arena.tool(scene.start), atol=1e-6)
     if arena.task.whole_movement and state.plan.success:
@@ -124,7 +122,6 @@ def test_the_page_chooses_what_the_agent_chooses(env_id, checks):
     assert first.motion is plan
     assert all(each.value is not None for each in others)
     if not checks:
-        assert first.rank == 1
         assert first.value is not None
 
 
@@ -138,7 +135,7 @@ def test_a_plan_of_the_motion_planner_is_free_or_says_why_not(env_id, arenas):
     cases = [drawn(arena, number) for number in range(6)]
     cases += [scene.with_obstacle(0, touched), scene._replace(goal=scene.goal + 9.0)]
     for number, case in enumerate(cases):
-        state = decided(arena, case, MOTION, last=last)
+        state = decided(arena, case, MOTION, before=last)
         last = state.plan
         assert np.isfinite(state.plan.waypoints).all()
         assert state.plan.success == (not state.plan.reason)
@@ -167,7 +164,7 @@ def test_a_plan_by_hand_is_valued_as_the_same_decision(env_id, arenas):
     chosen = state.proposals[0]
     mine = decided(arena, state.scene, by_hand=chosen.motion.waypoints[1:-1], proposals=state.proposals)
     first, *_ = propose(arena, mine)
-    assert (first.rank, first.motion.waypoints.shape) == (0, chosen.motion.waypoints.shape)
+    assert (first.maker, first.motion.waypoints.shape) == (HAND, chosen.motion.waypoints.shape)
     assert first.motion.clearance == pytest.approx(chosen.motion.clearance, abs=1e-6)
     assert first.motion.duration == pytest.approx(chosen.motion.duration)
     assert first.reward == pytest.approx(chosen.reward, abs=1e-6)

@@ -94,8 +94,8 @@ def _planned(arena: Arena, state: State, time_limit: float) -> Proposal:
         return Proposal(motion, OMPL, time.perf_counter() - begin)
     n_via = int(np.clip(arena.n_via(state), 1, 3))
     seeds: Any = SEEDS
-    if state.last is not None and len(state.last.waypoints) == n_via + 2 and time_limit == TIME_LIMIT:
-        seeds = state.last.waypoints[None, 1:-1]
+    if state.before is not None and len(state.before.waypoints) == n_via + 2 and time_limit == TIME_LIMIT:
+        seeds = state.before.waypoints[None, 1:-1]
     motion = plan_motion(
         *problem, n_via=n_via, seeds=seeds, time_limit=time_limit, duration=state.duration,
         space=task.space_name, ompl=False,

@@ -29,7 +29,7 @@ from viapoint.envs.registration import check_registered
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.config.checks import DEFAULT_ENV, SHIPPED_IDS
 from viapoint.training.config.configs import env_of_arm
-from viapoint.training.live.arena import MOST_OBSTACLES, MOTION, Arena
+from viapoint.training.live.arena import MOST_OBSTACLES, Arena
 from viapoint.training.live.decide import decide, describe_outcome, describe_plan, execute, profile, propose
 from viapoint.training.live.drawing import ArmDrawing, View
 from viapoint.training.live.panels import RESET, Panels
@@ -66,15 +66,9 @@ class Tab:
         self._jobs: dict[Any, tuple[float, Callable[[], None]]] = {}
         self._later: dict[str, Callable[[], None]] = {}
         self._posted = time.perf_counter()
-        self._movements: Iterator[Movement] = iter(())
         self._wake, self._busy, self._closed = threading.Condition(), True, False
         self._thread = threading.Thread(target=self._run, name=f"viapoint-{client.client_id}", daemon=True)
         self._thread.start()
-
-    @property
-    def alive(self) -> bool:
-        """True until the thread has ended."""
-        return self._thread.is_alive()
 
     @property
     def idle(self) -> bool:
@@ -115,11 +109,7 @@ class Tab:
             self.state = State(scene=scene, drawn=scene, origin=origin, method=self.arena.methods[0])
             self._guarded(self.change)
             while not self._closed:
-                job = self._next()
-                if job is not None:
-                    self._guarded(job)
-                elif self.state.playing:
-                    self._guarded(self._advance)
+                self._guarded(self._next())
         except Exception:
             if not self._closed:
                 traceback.print_exc(file=sys.stderr)
@@ -127,21 +117,22 @@ class Tab:
             self.arena.close()
             self._on_end()
 
-    def _next(self) -> Callable[[], None] | None:
+    def _next(self) -> Callable[[], None]:
         """Return the next job; wait for one, but only for a moment while there is something else to do."""
         with self._wake:
-            self._busy = False
-            playing = self.state.playing
-            quiet_in = self._posted + PAUSE - time.perf_counter()
+            self._busy, playing = False, self.state.playing
+            quiet_in = max(self._posted + PAUSE - time.perf_counter(), 0.0)
             if not self._jobs and not self._closed:
-                self._wake.wait(TICK if playing else max(quiet_in, 0.0) if self._later else None)
+                self._wake.wait(TICK if playing else quiet_in if self._later else None)
             self._busy = True
             if self._jobs:
                 self._posted, job = self._jobs.pop(next(iter(self._jobs)))
                 return job
-            if self._later and not playing and time.perf_counter() >= self._posted + PAUSE:
+            if playing:
+                return self._advance
+            if self._later and time.perf_counter() >= self._posted + PAUSE:
                 return self._later.pop(next(iter(self._later)))
-            return None
+            return lambda: None
 
     def _guarded(self, job: Callable[[], None]) -> None:
         """Do a job; an error is told in one sentence."""
@@ -180,15 +171,12 @@ class Tab:
         state.movement, state.playing, state.before = None, False, state.plan
         proposal = decide(self.arena, state)
         state.proposals, state.picked, state.profile = (proposal,), 0, None
-        if proposal.maker == MOTION:
-            state.last = proposal.motion
         self._say(describe_plan(proposal), proposal.motion.success)
         self.client.flush()
         self.latencies.append(time.perf_counter() - self._posted)
         self._later["proposals"] = self._propose
 
     def _propose(self) -> None:
-        """Add other proposals and plots."""
         self.state.proposals = propose(self.arena, self.state)
         self.pick(0)
 
@@ -308,7 +296,7 @@ class Tab:
 
         def step() -> None:
             state = dataclasses.replace(
-                self.state, method=left[0], n_via=None, by_hand=None, duration=None, last=None
+                self.state, method=left[0], n_via=None, by_hand=None, duration=None, before=None
             )
             state.proposals, state.picked = (decide(self.arena, state, time_limit=1.0),), 0
             *_, movement = execute(self.arena, state)
@@ -321,7 +309,8 @@ class Tab:
 
     def save(self) -> None:
         """Save the scene as JSON."""
-        self._download("scene.json", self.state.scene.to_json(self.arena.env_id).encode())
+        content = self.state.scene.to_json(self.arena.env_id).encode()
+        self.client.send_file_download("scene.json", content, save_immediately=True)
 
     def show_code(self) -> None:
         """Show Python code that sets the scene up."""
@@ -334,14 +323,11 @@ class Tab:
         ground, file = Image.new("RGBA", picture.size, "white"), io.BytesIO()
         ground.alpha_composite(picture.convert("RGBA"))
         ground.convert("RGB").save(file, "PNG")
-        self._download("viapoint.png", file.getvalue())
+        self.client.send_file_download("viapoint.png", file.getvalue(), save_immediately=True)
 
     def reset_view(self) -> None:
         """Move the camera to its first view."""
         self._view.look_at_everything()
-
-    def _download(self, name: str, content: bytes) -> None:
-        self.client.send_file_download(name, content, save_immediately=True)
 
 
 class LivePage:
@@ -380,20 +366,20 @@ class LivePage:
         seed: int | None = None,
         **env_kwargs: Any,
     ) -> None:
-        if arm is not None:
-            agent = load_agent(agent) if isinstance(agent, str | Path) else agent
-            named = env if agent is None else agent.env_id
-            env, argument = env_of_arm(str(arm) if isinstance(arm, Path) else arm, named)
-            env_kwargs = {**(env_kwargs or ({} if agent is None else agent.env_kwargs)), **argument}
-        if agent is None and (env or DEFAULT_ENV) in SHIPPED_IDS and not env_kwargs:
-            agent = env or DEFAULT_ENV
         loaded = load_agent(agent) if isinstance(agent, str | Path) else agent
-        if loaded is not None:
-            if env not in (None, loaded.env_id):
-                raise ValueError(f"the agent decides in {loaded.env_id}, not in {env}")
-            env, env_kwargs = loaded.env_id, env_kwargs or loaded.env_kwargs
-        env = env or DEFAULT_ENV
+        own: dict[str, Any] = {} if loaded is None else loaded.env_kwargs
+        known = None if loaded is None else loaded.env_id
+        if arm is not None:
+            env, argument = env_of_arm(str(arm) if isinstance(arm, Path) else arm, known or env)
+            env_kwargs = {**(env_kwargs or own), **argument}
+        env = env or known or DEFAULT_ENV
+        if loaded is None and env in SHIPPED_IDS and not env_kwargs:
+            loaded = load_agent(env)
+            known, own = loaded.env_id, loaded.env_kwargs
+        if known not in (None, env):
+            raise ValueError(f"the agent decides in {known}, not in {env}")
         check_registered(env)
+        env_kwargs = env_kwargs or own
         self._made = env, loaded, seed, env_kwargs
         self._model_file = model_file
         self._warm_up()

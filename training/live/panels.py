@@ -97,15 +97,8 @@ class Panels:
         for number, each in enumerate(state.proposals, start=1):
             motion = each.motion
             reward = _number(each.reward) if motion.success else "fails"
-            rows.append(
-                (
-                    f"#{number}",
-                    reward,
-                    _number(each.value),
-                    _millimetres(motion.clearance),
-                    f"{motion.duration:.2f}",
-                )
-            )
+            known = _number(each.value), _millimetres(motion.clearance), _number(motion.duration)
+            rows.append((f"#{number}", reward, *known))
         names = "plan", "reward", "agent's value", "clearance [mm]", "time [s]"
         first = state.proposals[0]
         note = f"{first.maker}, decided in {1e3 * first.seconds:.0f} ms"
@@ -125,15 +118,15 @@ class Panels:
         if movement is not None:
             rollout = movement.rollout
             time = rollout.time
-            executed = {
-                "speed": norm(np.gradient(rollout.hand, time, axis=0)),
-                "clearance": rollout.clearance,
-            }
+            executed["speed"] = norm(np.gradient(rollout.hand, time, axis=0))
+            executed["clearance"] = rollout.clearance
         for name, plot in self._plots.items():
-            lines = [np.interp(time, profile["time"], profile[name]), executed.get(name, np.full(len(time), np.nan))]
+            lines = [np.interp(time, profile["time"], profile[name])]
+            lines += [executed[name]] if name in executed else []
             if name == "clearance":  # in millimetres, where it is small
                 lines = [np.minimum(1e3 * line, 250.0) for line in lines]
             plot.data = (time, *lines)
+            plot.series = LINES[: 1 + len(lines)]
 
     def _draw_comparison(self, state: State) -> None:
         rows = []
@@ -238,7 +231,7 @@ class Panels:
         self._duration = gui.add_slider("Duration [s]", low, high, 0.01, (low * high) ** 0.5)
         self._duration.on_update(_by_user(lambda value: act("change", duration=value)))
         methods = gui.add_dropdown("Method", arena.methods, hint="Decides after each change of the scene")
-        methods.on_update(_by_user(lambda name: act("change", method=name, last=None, **anew)))
+        methods.on_update(_by_user(lambda name: act("change", method=name, **anew)))
         most = action.n_via if arena.task.replanning else max(4, action.n_via)
         self._vias = gui.add_slider("Via-points", 0, most, 1, action.n_via, disabled=most == action.n_via)
         self._vias.on_update(_by_user(lambda value: act("change", n_via=value, by_hand=None)))

@@ -131,9 +131,7 @@ class State:
     picked: int = 0
     """Index of the proposal that is the plan."""
     before: MotionPlan | None = None
-    """Plan before the last change, which stays pale until a pause."""
-    last: MotionPlan | None = None
-    """Last plan of the motion planner, whose via-points are tried first."""
+    """Plan before the last change, whose via-points are tried first; it stays pale until a pause."""
     profile: Mapping[str, Float] | None = None
     """Time, speed, jerk and clearance of the plan; None until a pause."""
     movement: Movement | None = None
