@@ -14,7 +14,7 @@ import time
 import traceback
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
@@ -33,7 +33,7 @@ from viapoint.training.live.arena import MOST_OBSTACLES, Arena
 from viapoint.training.live.decide import decide, describe_outcome, describe_plan, execute, profile, propose
 from viapoint.training.live.drawing import ArmDrawing, View
 from viapoint.training.live.panels import RESET, Panels
-from viapoint.training.live.state import Movement, Scene, State
+from viapoint.training.live.state import Scene, State
 
 LOOPBACK = "127.0.0.1"
 """Address that only this machine reaches."""
@@ -104,6 +104,7 @@ class Tab:
             self._scenes = self.arena.scenes()
             self.client.gui.set_panel_label("Viapoint")
             self._panels = Panels(self.client, self.arena, self._scenes, self.act)
+            self._speed = 0.5 if self.arena.planar else 1.0  # movements in the plane are short
             self._view = View(self.client, self.arena, drawing, self.act)
             scene, origin = next(next(iter(self._scenes.values())))
             self.state = State(scene=scene, drawn=scene, origin=origin, method=self.arena.methods[0])
@@ -267,7 +268,7 @@ class Tab:
             self._draw()
             return
         self._movements = execute(self.arena, state, lambda: self.state.scene.goal)
-        state.movement, state.playing, self._speed = None, True, self._panels.speed
+        state.movement, state.playing = None, True
 
     def _advance(self) -> None:
         """Show the present instant of a movement; its next part is simulated when this one has been shown."""

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 WIDTH = 330
 """Width of a panel, [pixels]."""
-SPEEDS = {"1 x": 1.0, "1/2 x": 0.5, "1/4 x": 0.25}
-"""Speeds of the playback."""
 RESET = "Reset"
 """Name of the button that undoes all changes of a scene."""
 CHECKS = {"none": 0, "16": 16, "64": 64}
@@ -57,23 +55,17 @@ class Panels:
         self._gui, self._arena, self._act = client.gui, arena, act
         self._selection: Any = ()
         self._plotted: Any = None
+        self._plots: dict[str, Any] = {}
         self._build_results()
         self._build_controls(scene_kinds)
-
-    @property
-    def speed(self) -> float:
-        """Speed of the playback."""
-        return SPEEDS[self._speed.value]
 
     def draw(self, state: State) -> None:
         """Show what was decided, and set the controls."""
         remark, limit, plan = state.origin, self._arena.limit(state.scene), state.plan
         if limit and state.method == AGENT:
             remark += f" The agent was trained {limit}, so the geometry search decides."
-        colour = "#1b7f4b" if state.good else "#c4202b"
-        self._message.content = MESSAGE.format(colour, html.escape(state.message)) + NOTE.format(
-            html.escape(remark)
-        )
+        message = MESSAGE.format("#1b7f4b" if state.good else "#c4202b", html.escape(state.message))
+        self._message.content = message + NOTE.format(html.escape(remark))
         self._execute.label = "Stop" if state.playing else "Execute"
         if plan is not None:
             self._vias.value = len(plan.durations) - 1
@@ -144,41 +136,36 @@ class Panels:
     def _draw_selection(self, state: State) -> None:
         """Show the sizes of the selected obstacle; sliders that the user moves are left alone."""
         row, shapes = state.selected, state.scene.obstacles
-        selection = row, len(shapes), id(state.drawn)
-        if selection == self._selection:
+        if self._selection == (row, len(shapes), id(state.drawn)):
             return
-        self._selection = selection
+        self._selection = row, len(shapes), id(state.drawn)
         values = {} if row is None else self._arena.sizes_of(shapes[row])
         for name, slider in self._sizes.items():
             slider.visible = name in values
-            if name in values:
-                slider.value = float(np.clip(values[name], slider.min, slider.max))
+            slider.value = float(np.clip(values.get(name, 0.0), slider.min, slider.max))
         self._remove.disabled = row is None
         name = "Click an obstacle." if row is None else f"Selected: {shapes[row].name or f'obstacle {row}'}"
         self._selected.content = NOTE.format(html.escape(name))
 
     def _build_results(self) -> None:
-        gui, act = self._gui, self._act
+        gui = self._gui
         panel = gui.add_panel()
         with panel.add_tab("Decision"):
             self._table = gui.add_html("")
             self._pick = gui.add_button_group("Show", ("#1",), visible=False)
-            self._pick.on_click(lambda event: act("pick", list(self._pick.options).index(event.target.value)))
+            self._pick.on_click(lambda event: self._act("pick", int(event.target.value[1:]) - 1))
             unit = "m/s³" if self._arena.task.space.of_hand else "rad/s³"
-            titles = {"speed": "speed of the hand [m/s]", "jerk": f"jerk of the plan [{unit}]"}
-            titles["clearance"] = "clearance [mm]"
-            self._plots = {
-                name: gui.add_uplot(
+            titles = "speed of the hand [m/s]", f"jerk of the plan [{unit}]", "clearance [mm]"
+            for name, title in zip(("speed", "jerk", "clearance"), titles, strict=True):
+                self._plots[name] = gui.add_uplot(
                     (np.zeros(2), np.zeros(2)), LINES[:2], title=title, height=126,
                     scales={"x": {"time": False}}, legend={"show": False}, cursor={"show": True},
                     axes=({"size": 30}, {"size": 46}), padding=(10, 10, 0, 0),
-                )
-                for name, title in titles.items()
-            }  # fmt: skip
+                )  # fmt: skip
             gui.add_html(NOTE.format("time [s]; solid: plan, dashed: executed"))
         with panel.add_tab("Methods"):
             self._methods = gui.add_html("")
-            gui.add_button("Compare in this scene").on_click(lambda _: act("compare"))
+            self._button("Compare in this scene", "compare")
         panel.dock_left()
         panel.set_width(WIDTH)
 
@@ -186,15 +173,12 @@ class Panels:
         gui, arena, act = self._gui, self._arena, self._act
         gui.main_panel.dock_right()
         gui.main_panel.set_width(WIDTH - 20)
-        title = arena.env_id.removeprefix("viapoint/") + (
-            f", {arena.task.arm.name}" if arena.task.arm.file else ""
-        )
-        agent = "no agent" if arena.agent is None else f"agent: {type(arena.agent).__name__}"
-        gui.add_html(NOTE.format(f"<b>{html.escape(title)}</b><br>{agent}"))
+        arm, agent = arena.task.arm, arena.agent
+        title = arena.env_id.removeprefix("viapoint/") + (f", {arm.name}" if arm.file else "")
+        decides = "no agent" if agent is None else f"agent: {type(agent).__name__}"
+        gui.add_html(NOTE.format(f"<b>{html.escape(title)}</b><br>{decides}"))
         self._message = gui.add_html("")
-        self._execute = gui.add_button("Execute", color="green", icon="player-play")
-        self._execute.on_click(lambda _: act("execute"))
-        self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1/2 x")
+        self._execute = self._button("Execute", "execute", color="green", icon="player-play")
         with gui.add_folder("Scene"):
             kinds = gui.add_button_group("", (*scene_kinds, RESET))
             kinds.on_click(lambda event: act("go_to", event.target.value))
@@ -208,19 +192,17 @@ class Panels:
                 self._sizes[name].on_update(_by_user(functools.partial(act, "resize", name)))
             shapes = gui.add_button_group("Add", tuple(arena.new_shapes()))
             shapes.on_click(lambda event: act("add", event.target.value))
-            self._remove = gui.add_button("Remove the selected one", disabled=True)
-            self._remove.on_click(lambda _: act("remove"))
-        turn = gui.add_checkbox(
-            "Turn", False, hint="Rings turn the selected obstacle, or the tool at the goal"
-        )
+            self._remove = self._button("Remove the selected one", "remove", disabled=True)
+        hint = "Rings turn the selected obstacle, or the tool at the goal"
+        turn = gui.add_checkbox("Turn", False, hint=hint)
         turn.on_update(lambda event: act("show", "turning", event.target.value))
         with gui.add_folder("Files", expand_by_default=False):
-            gui.add_button("Save scene (JSON)").on_click(lambda _: act("save"))
+            self._button("Save scene (JSON)", "save")
             upload = gui.add_upload_button("Load scene (JSON)", mime_type="application/json")
             upload.on_upload(lambda event: act("load", event.target.value.content))
-            gui.add_button("Copy as Python").on_click(lambda _: act("show_code"))
-            gui.add_button("Save picture (PNG)").on_click(lambda _: act("save_picture"))
-        gui.add_button("Reset the view").on_click(lambda _: act("reset_view"))
+            self._button("Copy as Python", "show_code")
+            self._button("Save picture (PNG)", "save_picture")
+        self._button("Reset the view", "reset_view")
         drag = "Drag start, goal, via-point and obstacles with the mouse."
         gui.add_html(NOTE.format(drag + ("" if arena.planar else " Hold Shift to move them up and down.")))
 
@@ -236,11 +218,16 @@ class Panels:
         self._vias = gui.add_slider("Via-points", 0, most, 1, action.n_via, disabled=most == action.n_via)
         self._vias.on_update(_by_user(lambda value: act("change", n_via=value, by_hand=None)))
         if hasattr(getattr(arena.agent, "policy", None), "checks"):
-            checks = gui.add_dropdown(
-                "Exact checks", tuple(CHECKS), hint="Proposals whose clearance is computed"
-            )
+            hint = "Proposals whose clearance is computed"
+            checks = gui.add_dropdown("Exact checks", tuple(CHECKS), hint=hint)
             checks.on_update(lambda event: act("change", checks=CHECKS[event.target.value]))
         gui.add_button("Decide anew").on_click(lambda _: act("change", **anew))
+
+    def _button(self, label: str, name: str, **kwargs: Any) -> Any:
+        """Add a button that calls what is done under a name."""
+        button = self._gui.add_button(label, **kwargs)
+        button.on_click(lambda _: self._act(name))
+        return button
 
 
 def _by_user(function: Callable[[Any], None]) -> Callable[[Any], None]:
