@@ -281,9 +281,9 @@ class Arena:
         aside = np.array([-line[1], line[0], 0.0]) / max(float(np.hypot(line[0], line[1])), 1e-9)
         if aside @ middle < 0.0:
             aside = -aside
-        shape, sides, least, others = self.new_shapes()[name], (aside, -aside), 0.02, scene.obstacles
+        shape, sides, least, others = self.new_shapes()[name], [aside, -aside], 0.02, scene.obstacles
         if name == "wall":  # others may stand in it
-            shape, sides, least, others = HalfSpace.facing(-aside), (aside,), 0.17, ()
+            shape, sides, least, others = HalfSpace.facing(-aside), [aside], 0.17, ()
         for way, side in itertools.product(least + 0.02 * np.arange(20), sides):
             shape = dataclasses.replace(shape, position=middle + way * side)
             alone = all(other.distance(shape.position, 0.03) > 0.0 for other in others)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -273,7 +273,7 @@ class View:
             self._nodes[key].scale, self._nodes[key].visible = 1.0 / scale, True
         self._hide(name, len(paths))
 
-    def _draw_handles(self, name: str, places: Sequence[Float]) -> None:
+    def _draw_handles(self, name: str, places: Float | list[Float]) -> None:
         """Draw handles; in space, lines down to the table show their places."""
         colour = getattr(PALETTE, name)
         for i, place in enumerate(places):
