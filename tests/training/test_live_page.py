@@ -115,7 +115,6 @@ def test_what_a_user_does_changes_the_plan(opened):
     assert np.linalg.norm(session.state.scene.goal - goal - SHIFT) < 0.01
     assert len(session.latencies) > number
     np.testing.assert_allclose(session.state.plan.waypoints[-1], session.state.scene.goal, atol=1e-6)
-    assert session.state.proposals[0].rank > 0
 
     tab.press("button", "Execute")
     wait_for(lambda: "Success" in tab.text(MESSAGE) or "Failure" in tab.text(MESSAGE))
