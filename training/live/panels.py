@@ -130,10 +130,12 @@ class Panels:
                 "clearance": rollout.clearance,
             }
         for name, plot in self._plots.items():
-            lines = [np.interp(time, profile["time"], profile[name]), executed.get(name, np.full(len(time), np.nan))]
+            lines = [np.interp(time, profile["time"], profile[name])]
+            lines += [executed[name]] if name in executed else []
             if name == "clearance":  # in millimetres, where it is small
                 lines = [np.minimum(1e3 * line, 250.0) for line in lines]
             plot.data = (time, *lines)
+            plot.series = LINES[: 1 + len(lines)]  # a line without numbers would leave the plot empty
 
     def _draw_comparison(self, state: State) -> None:
         rows = []
