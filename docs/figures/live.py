@@ -59,10 +59,8 @@ def main() -> None:
         )
         time.sleep(1.0)
         browser.wait_for(lambda: steady(tab))
-        state = session.state
-        assert state.plan is not None
-        via = on_screen(tab, session, session.arena.tool(state.plan.waypoints[1]))
-        obstacle = on_screen(tab, session, state.scene.obstacles[OBSTACLE].position)
+        via = on_screen(tab, session, session.arena.tool(session.state.plan.waypoints[1]))
+        obstacle = on_screen(tab, session, session.state.scene.obstacles[OBSTACLE].position)
         plain = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")
     window.close()
     plain.save(IMAGES / "live.webp", quality=82, method=6)

@@ -118,7 +118,7 @@ class Panels:
             if name == "clearance":  # in millimetres, where it is small
                 lines = [np.minimum(1e3 * line, 250.0) for line in lines]
             plot.data = (time, *lines)
-            plot.series = LINES[: 1 + len(lines)]
+            plot.series = LINES[: 1 + len(lines)]  # a line without numbers would leave the plot empty
 
     def _draw_comparison(self, state: State) -> None:
         rows = []
