@@ -107,7 +107,8 @@ def test_what_a_user_does_changes_the_plan(opened):
     settled(session)
     assert session.state.plan.duration == pytest.approx(before + 0.04, abs=0.02)
     tab.press("button", "Decide anew")
-    wait_for(lambda: session.state.plan and session.state.plan.duration == pytest.approx(before, abs=1e-3))
+    settled(session)
+    assert session.state.duration is None
 
     goal, number = session.state.scene.goal, len(session.latencies)
     drag(tab, session, goal, goal + SHIFT)

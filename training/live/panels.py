@@ -113,12 +113,12 @@ class Panels:
             executed["speed"] = norm(np.gradient(rollout.hand, time, axis=0))
             executed["clearance"] = rollout.clearance
         for name, plot in self._plots.items():
-            lines = [np.interp(time, profile["time"], profile[name])]
-            lines += [executed[name]] if name in executed else []
+            planned, other = np.interp(time, profile["time"], profile[name]), np.full(len(time), np.nan)
+            other[0] = planned[0]  # a line without numbers would leave the plot empty
+            lines = [planned, executed.get(name, other)]
             if name == "clearance":  # in millimetres, where it is small
                 lines = [np.minimum(1e3 * line, 250.0) for line in lines]
             plot.data = (time, *lines)
-            plot.series = LINES[: 1 + len(lines)]  # a line without numbers would leave the plot empty
 
     def _draw_comparison(self, state: State) -> None:
         rows = []
@@ -158,7 +158,7 @@ class Panels:
             titles = "speed of the hand [m/s]", f"jerk of the plan [{unit}]", "clearance [mm]"
             for name, title in zip(("speed", "jerk", "clearance"), titles, strict=True):
                 self._plots[name] = gui.add_uplot(
-                    (np.zeros(2), np.zeros(2)), LINES[:2], title=title, height=126,
+                    (np.zeros(2), np.zeros(2), np.zeros(2)), LINES, title=title, height=126,
                     scales={"x": {"time": False}}, legend={"show": False}, cursor={"show": True},
                     axes=({"size": 30}, {"size": 46}), padding=(10, 10, 0, 0),
                 )  # fmt: skip
