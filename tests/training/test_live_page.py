@@ -134,10 +134,10 @@ def test_what_a_user_does_changes_the_plan(opened):
     obstacle = session.state.scene.obstacles[0].position
     drag(tab, session, obstacle, start)
     settled(session)
-    wait_for(lambda: "start" in tab.text(MESSAGE) and "No free movement" in tab.text(MESSAGE))
+    wait_for(lambda: "the start is in contact" in tab.text(MESSAGE))
     assert not session.state.plan.success
     tab.press("button", "Reset")
-    wait_for(lambda: "plan" in tab.text(MESSAGE))
+    wait_for(lambda: "in contact" not in tab.text(MESSAGE))
     np.testing.assert_array_equal(session.state.scene.goal, goal)
     np.testing.assert_array_equal(session.state.scene.obstacles[0].position, obstacle)
 
