@@ -40,14 +40,14 @@ def main() -> None:
     for env_id, middle in INWARDS.items():
         with LivePage(env=env_id, port=0, seed=11) as page:
             tab = window.tab(page.url)
-            (session,) = browser.wait_for(lambda page=page: page.sessions)
-            browser.wait_for(lambda s=session: s.idle and s.proposal)
+            (session,) = browser.wait_for(lambda page=page: page.tabs)
+            browser.wait_for(lambda s=session: s.idle and s.state.plan)
             browser.wait_for(lambda t=tab: steady(t))
-            tool = session.setting.tool
-            goal = tool(session.scene.goal)
+            tool = session.arena.tool
+            goal = tool(session.state.scene.goal)
             other = goal + DISTANCE * np.sign(middle - goal) * (1.0, 1.0, 0.0)
             for k in range(DRAGS):
-                drag(tab, session, tool(session.scene.goal), (other, goal)[k % 2], steps=STEPS)
+                drag(tab, session, tool(session.state.scene.goal), (other, goal)[k % 2], steps=STEPS)
                 time.sleep(0.3)
                 browser.wait_for(lambda s=session: s.idle)
             taken = 1e3 * np.array(session.latencies)

@@ -52,15 +52,15 @@ def main() -> None:
             deviceScaleFactor=1,
             mobile=False,
         )
-        (session,) = browser.wait_for(lambda: page.sessions)
-        browser.wait_for(lambda: session.idle and session.proposal)
+        (session,) = browser.wait_for(lambda: page.tabs)
+        browser.wait_for(lambda: session.idle and session.state.plan)
         tab.run(
             "document.querySelectorAll('.mantine-Notification-closeButton').forEach(each => each.click())"
         )
         time.sleep(1.0)
         browser.wait_for(lambda: steady(tab))
-        via = on_screen(tab, session, session.setting.tool(session.proposal.plan.waypoints[1]))
-        obstacle = on_screen(tab, session, session.scene.obstacles[OBSTACLE].position)
+        via = on_screen(tab, session, session.arena.tool(session.state.plan.waypoints[1]))
+        obstacle = on_screen(tab, session, session.state.scene.obstacles[OBSTACLE].position)
         plain = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")
     window.close()
     plain.save(IMAGES / "live.webp", quality=82, method=6)

@@ -48,10 +48,10 @@ def opened(browser):
         return pages[-1]
 
     def tab(page):
-        before = set(page.sessions)
+        before = set(page.tabs)
         tabs.append(browser.tab(page.url))
-        (session,) = wait_for(lambda: set(page.sessions) - before)
-        wait_for(lambda: session.idle and session.proposal is not None)
+        (session,) = wait_for(lambda: set(page.tabs) - before)
+        wait_for(lambda: session.idle and session.state.plan is not None)
         wait_for(lambda: "plan" in tabs[-1].text(MESSAGE))
         # The library's notice on software rendering would hide a part of the scene.
         tabs[-1].run("document.querySelector('.mantine-Notification-closeButton')?.click()")
@@ -81,7 +81,7 @@ def settled(session):
 
 def on_screen(tab, session, point):
     """Return the pixel at which a point of the world is seen."""
-    camera = session.camera
+    camera = session.client.camera
     x, y, depth = transforms.SO3(camera.wxyz).as_matrix().T @ (np.resize([*point, 0.0], 3) - camera.position)
     left, top, width, height = tab.canvas()
     scale = 0.5 * height / np.tan(0.5 * camera.fov) / depth
@@ -100,22 +100,22 @@ def test_what_a_user_does_changes_the_plan(opened):
         page.url.split("/")[2]
     }
 
-    before = session.proposal.duration
+    before = session.state.plan.duration
     tab.run("document.querySelector('[role=slider]').focus()")
     for _ in range(4):
         tab.key("ArrowRight")
     settled(session)
-    assert session.proposal.duration == pytest.approx(before + 0.04, abs=0.02)
+    assert session.state.plan.duration == pytest.approx(before + 0.04, abs=0.02)
     tab.press("button", "Decide anew")
-    wait_for(lambda: session.proposal and session.proposal.duration == pytest.approx(before, abs=1e-3))
+    settled(session)
+    assert session.state.duration is None
 
-    goal, number = session.scene.goal, session.decisions
+    goal, number = session.state.scene.goal, len(session.latencies)
     drag(tab, session, goal, goal + SHIFT)
     settled(session)
-    assert np.linalg.norm(session.scene.goal - goal - SHIFT) < 0.01
-    assert session.decisions > number
-    np.testing.assert_allclose(session.proposal.plan.waypoints[-1], session.scene.goal, atol=1e-6)
-    assert session.proposal.rank > 0
+    assert np.linalg.norm(session.state.scene.goal - goal - SHIFT) < 0.01
+    assert len(session.latencies) > number
+    np.testing.assert_allclose(session.state.plan.waypoints[-1], session.state.scene.goal, atol=1e-6)
 
     tab.press("button", "Execute")
     wait_for(lambda: "Success" in tab.text(MESSAGE) or "Failure" in tab.text(MESSAGE))
@@ -125,67 +125,68 @@ def test_what_a_user_does_changes_the_plan(opened):
     wait_for(lambda: "motion planner" in tab.text("body") and "Each row is simulated" in tab.text("body"))
     settled(session)
 
-    via = np.array(session.proposal.plan.waypoints[1])
+    via = np.array(session.state.plan.waypoints[1])
     drag(tab, session, via, via + UP)
     settled(session)
-    np.testing.assert_allclose(session.proposal.plan.waypoints[1], via + UP, atol=0.01)
+    np.testing.assert_allclose(session.state.plan.waypoints[1], via + UP, atol=0.01)
 
-    start = session.scene.start
-    obstacle = session.scene.obstacles[0].position
+    start = session.state.scene.start
+    obstacle = session.state.scene.obstacles[0].position
     drag(tab, session, obstacle, start)
     settled(session)
-    wait_for(lambda: "start" in tab.text(MESSAGE) and "No free movement" in tab.text(MESSAGE))
-    assert not session.proposal.clear
+    wait_for(lambda: "the start is in contact" in tab.text(MESSAGE))
+    assert not session.state.plan.success
     tab.press("button", "Reset")
-    wait_for(lambda: "plan" in tab.text(MESSAGE))
-    assert session.proposal is not None
-    np.testing.assert_array_equal(session.scene.goal, goal)
-    np.testing.assert_array_equal(session.scene.obstacles[0].position, obstacle)
+    wait_for(lambda: "in contact" not in tab.text(MESSAGE))
+    np.testing.assert_array_equal(session.state.scene.goal, goal)
+    np.testing.assert_array_equal(session.state.scene.obstacles[0].position, obstacle)
 
 
 def test_scenes_that_the_agent_does_not_know_are_searched(opened):
     open_page, open_tab = opened
     agent = ViaQ("ViaQPolicy", ViaVecEnv(PLANAR, num_envs=1), seed=0)
     tab, session = open_tab(open_page(PLANAR, agent=agent))
-    session.choose("agent")
+    session.act("change", method="agent", n_via=None)
     settled(session)
-    assert session.proposal.predicted is not None
-    number = len(session.scene.obstacles)
+    assert session.state.proposals[0].value is not None
+    number = len(session.state.scene.obstacles)
     tab.press("button", "wall")
     wait_for(lambda: "trained without half-space obstacles" in tab.text("body"))
     settled(session)
-    assert [each.kind for each in session.scene.obstacles[number:]] == ["half_space"]
-    assert session.proposal.predicted is None
+    assert [each.kind for each in session.state.scene.obstacles[number:]] == ["half_space"]
+    assert session.state.proposals[0].value is None
     tab.press("button", "Execute")
     wait_for(lambda: "Success" in tab.text(MESSAGE) or "Failure" in tab.text(MESSAGE))
     tab.press("button", "Random")
     wait_for(lambda: "trained without" not in tab.text("body"))
     settled(session)
-    assert session.proposal.predicted is not None
+    assert session.state.proposals[0].value is not None
 
 
 def test_an_arm_in_space_follows_what_is_dragged_and_turned(opened):
     open_page, open_tab = opened
     tab, session = open_tab(open_page(PANDA, seed=10))  # a scene in which nothing hides the goal
-    arm, goal = session.setting.task.arm, session.scene.goal
+    arm, goal = session.arena.task.arm, session.state.scene.goal
     place = arm.hand(goal)
     aside = np.array([0.0, 0.03, 0.0])
     drag(tab, session, place, place + aside)
     settled(session)
-    moved = arm.hand(session.scene.goal) - place
+    moved = arm.hand(session.state.scene.goal) - place
     assert np.abs(moved - aside).max() < 0.01
-    assert np.abs(session.scene.goal - goal).max() < 0.5  # the nearest posture
+    assert np.abs(session.state.scene.goal - goal).max() < 0.5  # the nearest posture
 
-    tab.press("label", "Turn the goal")
+    tab.press("label", "Turn")
     settled(session)
-    place = arm.hand(session.scene.goal)
+    place = arm.hand(session.state.scene.goal)
     turn = transforms.SO3.from_z_radians(0.1) @ transforms.SO3(
-        session.setting.orientation(session.scene.goal)
+        session.arena.orientation(session.state.scene.goal)
     )
-    session.turn(turn.wxyz)
+    session.act("turn", turn.wxyz)
     settled(session)
-    np.testing.assert_allclose(arm.hand(session.scene.goal), place, atol=1e-3)
-    assert abs(session.setting.orientation(session.scene.goal) @ turn.wxyz) == pytest.approx(1.0, abs=1e-4)
+    np.testing.assert_allclose(arm.hand(session.state.scene.goal), place, atol=1e-3)
+    assert abs(session.arena.orientation(session.state.scene.goal) @ turn.wxyz) == pytest.approx(
+        1.0, abs=1e-4
+    )
 
 
 def test_tabs_are_independent_and_leave_nothing_behind(opened):
@@ -193,43 +194,42 @@ def test_tabs_are_independent_and_leave_nothing_behind(opened):
     page = open_page(PLANAR)
     first, one = open_tab(page)
     second, two = open_tab(page)
-    goal = two.scene.goal
+    goal = two.state.scene.goal
     second.press("button", "Random")
     settled(two)
-    assert not np.array_equal(two.scene.goal, goal)
-    assert np.array_equal(one.scene.goal, goal)
+    assert not np.array_equal(two.state.scene.goal, goal)
+    assert np.array_equal(one.state.scene.goal, goal)
 
     first.call("Page.bringToFront")  # a page in the background is not drawn
     first.press("button", "Random")
     settled(one)
     first.call("Page.reload")
-    wait_for(lambda: one not in page.sessions)
-    wait_for(lambda: len(page.sessions) == 2 and all(each.idle and each.proposal for each in page.sessions))
-    assert not one.alive
+    wait_for(lambda: one not in page.tabs)
+    wait_for(lambda: len(page.tabs) == 2 and all(each.idle and each.state.plan for each in page.tabs))
     second.close()
-    wait_for(lambda: two not in page.sessions and not two.alive)
+    wait_for(lambda: two not in page.tabs)
     gc.collect()
-    assert len(page.sessions) == 1
+    assert len(page.tabs) == 1
 
 
 def test_a_goal_is_dragged_while_the_arm_moves(opened):
     open_page, open_tab = opened
     tab, session = open_tab(open_page(REPLANNING))
     for attempt in range(8):  # on a busy machine the movement may be over before the goal is dragged
-        goal = session.scene.goal
+        goal = session.state.scene.goal
         aside = goal + (ASIDE, -ASIDE)[attempt % 2]
         tab.press("button", "Execute")
         wait_for(lambda: not session.idle)
         drag(tab, session, goal, aside, steps=3)
         settled(session)
-        assert np.linalg.norm(session.scene.goal - aside) < 0.01
+        assert np.linalg.norm(session.state.scene.goal - aside) < 0.01
         if "Success" in tab.text(MESSAGE):
             break
-    hand = np.concatenate([each.hand[:, :2] for each in session.movement])
+    rollout = session.state.movement.rollout
+    hand = rollout.hand[:, :2]
     assert "Success" in tab.text(MESSAGE)
-    assert np.linalg.norm(hand[-1] - session.scene.goal) < 0.01
-    time_ = np.concatenate([each.time for each in session.movement])
-    speed = np.diff(hand, axis=0) / np.diff(time_)[:, None]
+    assert np.linalg.norm(hand[-1] - session.state.scene.goal) < 0.01
+    speed = np.diff(hand, axis=0) / np.diff(rollout.time)[:, None]
     assert np.abs(np.diff(speed, axis=0)).max() < 0.1  # no jump of the velocity, [m/s]
 
 
@@ -246,14 +246,14 @@ def test_files_are_saved_and_impossible_ones_are_refused(opened):
     tab.press("button", "Copy as Python")
     assert "gym.make(" in wait_for(lambda: tab.text("#viapoint-code"))
 
-    scene = session.scene
+    scene = session.state.scene
     first, *others = scene.obstacles
     there = dataclasses.replace(first, position=(*scene.goal, first.position[2]))
-    session.load(scene._replace(obstacles=(there, *others)).to_json(PLANAR).encode())
+    session.act("load", scene._replace(obstacles=(there, *others)).to_json(PLANAR).encode())
     wait_for(lambda: "impossible" in tab.text(MESSAGE))
-    assert session.scene is scene
-    session.load(b"{}")
+    assert session.state.scene is scene
+    session.act("load", b"{}")
     wait_for(lambda: "viapoint-scene" in tab.text(MESSAGE))
-    session.load(scene._replace(goal=scene.goal + 0.01).to_json(PLANAR).encode())
+    session.act("load", scene._replace(goal=scene.goal + 0.01).to_json(PLANAR).encode())
     wait_for(lambda: "plan" in tab.text(MESSAGE))
-    np.testing.assert_allclose(session.scene.goal, scene.goal + 0.01, atol=1e-6)
+    np.testing.assert_allclose(session.state.scene.goal, scene.goal + 0.01, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Page in the browser on which scenes are changed by hand and the agent decides anew."""
+"""Page in the browser on which scenes are changed by hand and the movement is planned anew."""
 
 import importlib.util
 

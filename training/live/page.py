@@ -1,35 +1,338 @@
-"""Server of the live page."""
+"""Server of the live page, and its tabs."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
 import io
 import logging
 import socket
+import sys
+import threading
 import time
+import traceback
 import warnings
+from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import torch
 import viser
+from PIL import Image
 
 from viapoint.envs import Arm
+from viapoint.envs.common.types import Float
 from viapoint.envs.registration import check_registered
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.config.checks import DEFAULT_ENV, SHIPPED_IDS
 from viapoint.training.config.configs import env_of_arm
-from viapoint.training.live.session import Session
-from viapoint.training.live.setting import Shared
+from viapoint.training.live.arena import MOST_OBSTACLES, Arena
+from viapoint.training.live.decide import decide, describe_outcome, describe_plan, execute, profile, propose
+from viapoint.training.live.drawing import ArmDrawing, View
+from viapoint.training.live.panels import RESET, Panels
+from viapoint.training.live.state import Scene, State
 
 LOOPBACK = "127.0.0.1"
 """Address that only this machine reaches."""
-JOIN = 5.0
-"""Time limit for the end of a session, [s]."""
+PAUSE = 0.12
+"""Time without other changes after which proposals and comparisons are computed, [s]."""
+TICK = 0.03
+"""Time between two pictures of a movement, [s]."""
+
+
+class Tab:
+    """One tab: its state, and the thread in which all that a user does changes it.
+
+    Args:
+        client: Tab of the browser.
+        make: Function that returns arm, task and agent, and the drawing of the arm.
+        on_end: Function that is called when the thread has ended.
+    """
+
+    state: State
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        make: Callable[[], tuple[Arena, ArmDrawing]],
+        on_end: Callable[[], object],
+    ) -> None:
+        self.client, self._make, self._on_end = client, make, on_end
+        self.latencies: deque[float] = deque(maxlen=200)
+        """Times from the last changes to the messages with their plans, [s]."""
+        self._jobs: dict[Any, tuple[float, Callable[[], None]]] = {}
+        self._later: dict[str, Callable[[], None]] = {}
+        self._posted = time.perf_counter()
+        self._wake, self._busy, self._closed = threading.Condition(), True, False
+        self._thread = threading.Thread(target=self._run, name=f"viapoint-{client.client_id}", daemon=True)
+        self._thread.start()
+
+    @property
+    def idle(self) -> bool:
+        """True if nothing waits to be done and nothing moves."""
+        with self._wake:
+            return not (self._busy or self._jobs or self._later or self.state.playing)
+
+    def act(self, name: str, *values: Any, **changes: Any) -> None:
+        """Let the thread call a method.
+
+        A waiting call of the same kind is replaced, so that a fast drag skips positions instead of lagging behind.
+        """
+        kind = name, *(value for value in values if isinstance(value, str)), *changes
+        job = functools.partial(getattr(self, name), *values, **changes)
+        with self._wake:
+            self._jobs.pop(kind, None)
+            self._jobs[kind] = time.perf_counter(), job
+            self._wake.notify()
+
+    def close(self, timeout: float = 0.0) -> None:
+        """End the thread after what is being done, and wait for it, [s]."""
+        with self._wake:
+            self._closed = True
+            self._wake.notify()
+        if timeout:
+            self._thread.join(timeout)
+
+    # The thread
+
+    def _run(self) -> None:
+        self.arena, drawing = self._make()
+        try:
+            self._scenes = self.arena.scenes()
+            self.client.gui.set_panel_label("Viapoint")
+            self._panels = Panels(self.client, self.arena, self._scenes, self.act)
+            self._speed = 0.5 if self.arena.planar else 1.0  # movements in the plane are short
+            self._view = View(self.client, self.arena, drawing, self.act)
+            scene, origin = next(next(iter(self._scenes.values())))
+            self.state = State(scene=scene, drawn=scene, origin=origin, method=self.arena.methods[0])
+            self._guarded(self.change)
+            while not self._closed:
+                self._guarded(self._next())
+        except Exception:
+            if not self._closed:
+                traceback.print_exc(file=sys.stderr)
+        finally:
+            self.arena.close()
+            self._on_end()
+
+    def _next(self) -> Callable[[], None]:
+        """Return the next job; wait for one, but only for a moment while there is something else to do."""
+        with self._wake:
+            self._busy, playing = False, self.state.playing
+            quiet_in = max(self._posted + PAUSE - time.perf_counter(), 0.0)
+            if not self._jobs and not self._closed:
+                self._wake.wait(TICK if playing else quiet_in if self._later else None)
+            self._busy = True
+            if self._jobs:
+                self._posted, job = self._jobs.pop(next(iter(self._jobs)))
+                return job
+            if playing:
+                return self._advance
+            if self._later and time.perf_counter() >= self._posted + PAUSE:
+                return self._later.pop(next(iter(self._later)))
+            return lambda: None
+
+    def _guarded(self, job: Callable[[], None]) -> None:
+        """Do a job; an error is told in one sentence."""
+        try:
+            job()
+        except Exception as error:
+            if self._closed:
+                return
+            sentence = " ".join(str(error).split())
+            if not isinstance(error, ValueError | OSError):
+                traceback.print_exc(file=sys.stderr)
+                sentence = f"{type(error).__name__}: {sentence}"
+            self.state.playing = False
+            self._say(f"{sentence[:1].upper()}{sentence[1:].rstrip('.')}.", good=False)
+
+    def _say(self, message: str, good: bool) -> None:
+        self.state.message, self.state.good = message, good
+        self._draw()
+
+    def _draw(self) -> None:
+        with self.client.atomic():  # one message
+            self._view.draw(self.state)
+            self._panels.draw(self.state)
+
+    # Decisions
+
+    def change(self, **changes: Any) -> None:
+        """Decide anew after changes of the state, and show the plan; the rest follows in a pause."""
+        state = self.state
+        for name, value in changes.items():
+            setattr(state, name, value)
+        if "scene" in changes:
+            state.results, state.comparing = (), ""
+            state.origin = changes.get("origin", "")
+            self._later.pop("comparison", None)
+        state.movement, state.playing, state.before = None, False, state.plan
+        proposal = decide(self.arena, state)
+        state.proposals, state.picked, state.profile = (proposal,), 0, None
+        self._say(describe_plan(proposal), proposal.motion.success)
+        self.client.flush()
+        self.latencies.append(time.perf_counter() - self._posted)
+        self._later["proposals"] = self._propose
+
+    def _propose(self) -> None:
+        self.state.proposals = propose(self.arena, self.state)
+        self.pick(0)
+
+    def pick(self, index: int) -> None:
+        """Show one of the proposals as the plan."""
+        state = self.state
+        if index < len(state.proposals):
+            state.picked, state.movement, state.playing, state.before = index, None, False, None
+            proposal = state.proposals[index]
+            state.profile = profile(self.arena, state.scene, proposal.motion.plan)
+            self._say(describe_plan(proposal), proposal.motion.success)
+
+    # Scenes
+
+    def go_to(self, kind: str) -> None:
+        """Go to another scene of a kind, or undo all changes."""
+        self._take(*((self.state.drawn, "") if kind == RESET else next(self._scenes[kind])))
+
+    def load(self, content: bytes) -> None:
+        """Go to the scene of a JSON file; an impossible one is refused."""
+        self._take(self.arena.read(content), "")
+
+    def _take(self, scene: Scene, origin: str) -> None:
+        self.change(scene=scene, drawn=scene, origin=origin, by_hand=None, duration=None, selected=None)
+
+    def drag(self, kind: str, number: int, place: Float) -> None:
+        """Move start, goal, an obstacle or a via-point to another place, shape (3,), [m]."""
+        state, scene, arena = self.state, self.state.scene, self.arena
+        if kind == "start":
+            self.change(scene=scene._replace(start=arena.moved(scene.start, place, scene)), by_hand=None)
+        elif kind == "goal" and state.playing and arena.task.replanning:
+            goal = arena.moved(scene.goal, place, None)
+            if not arena.task.space.inside(goal):
+                raise ValueError("the goal would be out of the arm's reach")
+            state.scene = scene.with_goal(goal)
+        elif kind == "goal":
+            self.change(scene=scene.with_goal(arena.moved(scene.goal, place, scene)), by_hand=None)
+        elif kind == "obstacle" and number < len(scene.obstacles):
+            shape = dataclasses.replace(scene.obstacles[number], position=place)
+            self.change(scene=scene.with_obstacle(number, shape), selected=number)
+        elif kind == "via" and state.plan is not None and number < len(state.plan.durations) - 1:
+            vias = state.plan.waypoints[1:-1].copy()
+            vias[number] = arena.moved(vias[number], place, None)
+            self.change(by_hand=vias)
+
+    def turn(self, quaternion: Float) -> None:
+        """Turn the selected obstacle, or the tool at the goal."""
+        scene, arena, row = self.state.scene, self.arena, self.state.selected
+        if row is None:
+            goal = arena.moved(scene.goal, arena.tool(scene.goal), scene, quaternion)
+            self.change(scene=scene.with_goal(goal), by_hand=None)
+        else:
+            shape = dataclasses.replace(scene.obstacles[row], quaternion=quaternion)
+            self.change(scene=scene.with_obstacle(row, shape))
+
+    def show(self, name: str, value: Any) -> None:
+        """Select an obstacle, unless it has been removed meanwhile, or show the rings that turn it or the goal."""
+        if name != "selected" or value < len(self.state.scene.obstacles):
+            setattr(self.state, name, value)
+            self._draw()
+
+    def resize(self, name: str, value: float) -> None:
+        """Change a size of the selected obstacle."""
+        row, scene = self.state.selected, self.state.scene
+        if row is not None:
+            self.change(scene=scene.with_obstacle(row, self.arena.resized(scene.obstacles[row], name, value)))
+
+    def add(self, kind: str) -> None:
+        """Add an obstacle."""
+        scene = self.state.scene
+        row = len(scene.obstacles)
+        if row >= MOST_OBSTACLES:
+            raise ValueError(f"a scene has at most {MOST_OBSTACLES} obstacles")
+        self.change(scene=scene.with_obstacle(row, self.arena.new_obstacle(scene, kind)), selected=row)
+
+    def remove(self) -> None:
+        """Remove the selected obstacle."""
+        if self.state.selected is not None:
+            self.change(scene=self.state.scene.without(self.state.selected), selected=None)
+
+    # Movements
+
+    def execute(self) -> None:
+        """Begin to play the simulated movement, or stop it."""
+        state = self.state
+        if state.playing:
+            state.playing = False
+            self._draw()
+            return
+        self._movements = execute(self.arena, state, lambda: self.state.scene.goal)
+        state.movement, state.playing = None, True
+
+    def _advance(self) -> None:
+        """Show the present instant of a movement; its next part is simulated when this one has been shown."""
+        state, movement = self.state, self.state.movement
+        if movement is None or state.instant == len(movement.rollout.time) - 1:
+            following = next(self._movements, None)
+            if following is None:
+                assert movement is not None
+                state.playing = False
+                text = describe_outcome(movement.info, in_joints=not self.arena.task.space.of_hand)
+                self._say(text, text.startswith("Success"))
+                return
+            if movement is None or len(following.rollout.time) < len(movement.rollout.time):  # a new episode
+                state.instant, self._began = 0, time.monotonic()
+            state.movement = movement = following
+        times = movement.rollout.time
+        now = int(np.searchsorted(times, (time.monotonic() - self._began) * self._speed))
+        state.instant = min(max(now, state.instant + 1), len(times) - 1)
+        self._draw()
+
+    def compare(self, done: tuple[Any, ...] = ()) -> None:
+        """Compare methods, one after the other in pauses; some are done."""
+        self.state.results, left = done, self.arena.methods[len(done) :]
+        self.state.comparing = left[0] if left else ""
+        self._draw()
+
+        def step() -> None:
+            state = dataclasses.replace(
+                self.state, method=left[0], n_via=None, by_hand=None, duration=None, before=None
+            )
+            state.proposals, state.picked = (decide(self.arena, state, time_limit=1.0),), 0
+            *_, movement = execute(self.arena, state)
+            self.compare((*done, (left[0], state.proposals[0].seconds, movement)))
+
+        if left:
+            self._later["comparison"] = step
+
+    # Files
+
+    def save(self) -> None:
+        """Save the scene as JSON."""
+        content = self.state.scene.to_json(self.arena.env_id).encode()
+        self.client.send_file_download("scene.json", content, save_immediately=True)
+
+    def show_code(self) -> None:
+        """Show Python code that sets the scene up."""
+        arguments = self.arena.arguments["any" if self.arena.limit(self.state.scene) else "own"]
+        self._panels.show_code(self.state.scene.to_python(self.arena.env_id, arguments))
+
+    def save_picture(self) -> None:
+        """Save a picture of the present view, rendered by the browser, as a PNG file on white."""
+        picture = Image.fromarray(self.client.get_render(800, 1280, transport_format="png", timeout=20.0))
+        ground, file = Image.new("RGBA", picture.size, "white"), io.BytesIO()
+        ground.alpha_composite(picture.convert("RGBA"))
+        ground.convert("RGB").save(file, "PNG")
+        self.client.send_file_download("viapoint.png", file.getvalue(), save_immediately=True)
+
+    def reset_view(self) -> None:
+        """Move the camera to its first view."""
+        self._view.look_at_everything()
 
 
 class LivePage:
-    """Page in the browser on which scenes are changed by hand and the agent decides anew.
+    """Page in the browser on which scenes are changed by hand and the movement is planned anew.
 
     Args:
         agent: Agent, run folder, model folder, or id of an environment with a shipped agent. None for the agent that is
@@ -64,27 +367,33 @@ class LivePage:
         seed: int | None = None,
         **env_kwargs: Any,
     ) -> None:
-        if arm is not None:
-            agent = load_agent(agent) if isinstance(agent, str | Path) else agent
-            named = env if agent is None else agent.env_id
-            env, argument = env_of_arm(str(arm) if isinstance(arm, Path) else arm, named)
-            env_kwargs = {**(env_kwargs or ({} if agent is None else agent.env_kwargs)), **argument}
-        if agent is None and (env or DEFAULT_ENV) in SHIPPED_IDS and not env_kwargs:
-            agent = env or DEFAULT_ENV
         loaded = load_agent(agent) if isinstance(agent, str | Path) else agent
-        if loaded is not None:
-            if env not in (None, loaded.env_id):
-                raise ValueError(f"the agent decides in {loaded.env_id}, not in {env}")
-            env, env_kwargs = loaded.env_id, env_kwargs or loaded.env_kwargs
-        env = env or DEFAULT_ENV
+        own: dict[str, Any] = {} if loaded is None else loaded.env_kwargs
+        known = None if loaded is None else loaded.env_id
+        if arm is not None:
+            env, argument = env_of_arm(str(arm) if isinstance(arm, Path) else arm, known or env)
+            env_kwargs = {**(env_kwargs or own), **argument}
+        env = env or known or DEFAULT_ENV
+        if loaded is None and env in SHIPPED_IDS and not env_kwargs:
+            loaded = load_agent(env)
+            known, own = loaded.env_id, loaded.env_kwargs
+        if known not in (None, env):
+            raise ValueError(f"the agent decides in {known}, not in {env}")
         check_registered(env)
-        self._shared = Shared(env, loaded, model_file=model_file, seed=seed, env_kwargs=env_kwargs)
-        self._sessions: dict[int, Session] = {}
-        # A tab may be closed while its session still draws.
+        env_kwargs = env_kwargs or own
+        self._made = env, loaded, seed, env_kwargs
+        self._model_file = model_file
+        self._warm_up()
+        self._tabs: dict[int, Tab] = {}
+        # A tab may be closed while its thread still draws.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         self._server = _serve(port)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        _light(self._server.scene)
+        scene = self._server.scene  # lights in which pale colours are not white
+        scene.configure_environment_map(None)
+        scene.configure_default_lights(enabled=False)
+        scene.add_light_ambient("/ambient", intensity=2.5)
+        scene.add_light_directional("/lamp", intensity=1.2, position=(-0.6, -0.5, 2.0))
         self._server.on_client_connect(self._connect)
         self._server.on_client_disconnect(self._disconnect)
 
@@ -94,9 +403,9 @@ class LivePage:
         return f"http://{LOOPBACK}:{self._server.get_port()}"
 
     @property
-    def sessions(self) -> tuple[Session, ...]:
-        """Sessions of the open tabs."""
-        return tuple(self._sessions.values())
+    def tabs(self) -> tuple[Tab, ...]:
+        """Open tabs."""
+        return tuple(self._tabs.values())
 
     def wait(self) -> None:
         """Wait until the page is closed or Ctrl-C is pressed."""
@@ -104,11 +413,9 @@ class LivePage:
             time.sleep(3600.0)
 
     def close(self) -> None:
-        """Close all sessions and the server."""
-        for session in self.sessions:
-            session.close()
-        for session in self.sessions:
-            session.join(JOIN)
+        """Close all tabs and the server."""
+        for tab in self.tabs:
+            tab.close(timeout=5.0)
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
@@ -118,14 +425,30 @@ class LivePage:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _warm_up(self) -> None:
+        """Decide once, so that the first decision takes no longer than others; find the file that can be drawn."""
+        arena, _ = self._make()
+        file = arena.task.arm.file
+        if self._model_file is None and file:
+            with contextlib.suppress(ValueError):  # MuJoCo alone does not find the meshes of every URDF
+                ArmDrawing(arena.task.arm, arena.env("own").model, file)
+                self._model_file = file
+        scene, _ = next(arena.scenes()["Random"])
+        for method in arena.methods[:2]:
+            decide(arena, State(scene=scene, drawn=scene, method=method))
+        arena.close()
+
+    def _make(self) -> tuple[Arena, ArmDrawing]:
+        arena = Arena(*self._made)
+        return arena, ArmDrawing(arena.task.arm, arena.env("own").model, self._model_file)
+
     def _connect(self, client: viser.ClientHandle) -> None:
         number = client.client_id
-        self._sessions[number] = Session(client, self._shared, lambda: self._sessions.pop(number, None))
+        self._tabs[number] = Tab(client, self._make, lambda: self._tabs.pop(number, None))
 
     def _disconnect(self, client: viser.ClientHandle) -> None:
-        session = self._sessions.get(client.client_id)
-        if session is not None:
-            session.close()
+        if client.client_id in self._tabs:
+            self._tabs[client.client_id].close()
 
 
 def run(config: Any) -> None:
@@ -139,29 +462,15 @@ def run(config: Any) -> None:
 
 def _serve(port: int) -> viser.ViserServer:
     """Start the server on exactly this port of the loopback address, which only this machine reaches."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((LOOPBACK, port))
-        except OSError as error:
-            raise OSError(
-                f"the page cannot listen on port {port} ({error.strerror}); --port chooses another one"
-            ) from None
-        port = probe.getsockname()[1]
+    try:
+        with socket.create_server((LOOPBACK, port)) as probe:
+            port = probe.getsockname()[1]
+    except OSError as error:
+        sentence = f"the page cannot listen on port {port} ({error.strerror}); --port chooses another one"
+        raise OSError(sentence) from None
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     with contextlib.redirect_stdout(io.StringIO()):  # the library prints a box with the address
         server = viser.ViserServer(host=LOOPBACK, port=port, verbose=False)
-    if server.get_port() != port:
-        server.stop()
-        raise OSError(f"the page cannot listen on port {port}; --port chooses another one")
     # The page never asks for a public address, and a message that does gets none: no request leaves the machine.
     server.request_share_url = lambda *_, **__: None
     return server
-
-
-def _light(scene: Any) -> None:
-    """Replace the default lights, in which pale colours are white."""
-    scene.configure_environment_map(None)
-    scene.configure_default_lights(enabled=False)
-    scene.add_light_ambient("/ambient", intensity=2.5)
-    scene.add_light_directional("/lamp", intensity=1.2, position=(-0.6, -0.5, 2.0))

@@ -1,0 +1,310 @@
+"""Arm, task, agent and environments of one tab of the live page, and the obstacles that can be added."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import itertools
+import threading
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+
+from viapoint.envs import (
+    Box,
+    Capsule,
+    Cylinder,
+    HalfSpace,
+    Obstacles,
+    Plan,
+    ReachVectorEnv,
+    Scenes,
+    Shape,
+    Sphere,
+    inverse_kinematics,
+    scene_from_json,
+    scene_to_json,
+)
+from viapoint.envs.arms.kinematics import forward
+from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.geometry.clearance import configuration_clearances
+from viapoint.envs.geometry.obstacles import KINDS, pack
+from viapoint.training.agents.agent import Agent
+from viapoint.training.live.state import Scene, State
+from viapoint.training.paper.movements import TARGETS, rows_of_lights
+from viapoint.training.scene_sets.scene_set import load, shipped_set
+
+MOTION, AGENT, SEARCH = "motion planner", "agent", "geometry search"
+STRAIGHT, OMPL, HAND = "straight movement", "OMPL", "by hand"
+"""Names of the methods; the motion planner is :func:`~viapoint.training.plan_motion`."""
+MOST_OBSTACLES = 24
+"""Greatest number of obstacles of a scene."""
+SIMULATED = ("sphere", "capsule", "cylinder", "box", "half_space")
+"""Shapes that every scene may have."""
+BOX_SIZES = ("half-depth", "half-width", "half-height")
+"""Names of the half lengths of a box."""
+SIZES = {"radius": (0.01, 0.1), "half-length": (0.005, 0.3), **dict.fromkeys(BOX_SIZES, (0.005, 0.5))}
+"""Bounds of the sliders of obstacles, [m]."""
+
+_agent_lock = threading.Lock()  # tabs share an agent
+
+
+class Arena:
+    """Arm, task, agent and environments of one tab.
+
+    Args:
+        env_id: Id of the environment.
+        agent: Agent; None for none.
+        seed: Seed of the random scenes.
+        env_kwargs: Arguments of the environment.
+    """
+
+    def __init__(
+        self, env_id: str, agent: Agent | None, seed: int | None, env_kwargs: Mapping[str, Any]
+    ) -> None:
+        self.env_id, self.agent, self._seed = env_id, agent, seed
+        self.arguments = {"own": dict(env_kwargs)}
+        """Arguments of environments with obstacles as the agent knows them, and with any others."""
+        self._envs: dict[str, ReachVectorEnv] = {}
+        task = self.env("steps").task
+        self.stepwise = task.stepwise
+        """True if the agent acts in every control step; the page plans whole movements instead."""
+        shapes = (*SIMULATED, *(name for name in task.shapes if name not in SIMULATED))
+        self.arguments["any"] = {**env_kwargs, "shapes": shapes, "n_obstacles": (0, MOST_OBSTACLES)}
+        self._changes: dict[str, Any] = {}
+        if self.stepwise:
+            task = task.of_movements()
+            self._changes = {"decide_at": task.decide_at, "reward_weights": task.weights}
+        if task.replanning:  # a movement soon follows a goal that is dragged
+            self._changes["horizon"] = min(task.horizon, 0.1)
+        self.task = self.env("own").task
+        """Task whose actions are whole movements or revisions of them."""
+        self.planar = task.arm.space == "hand"
+        """True if the arm moves in a horizontal plane."""
+        self._sampler = self.task.sampler()
+        methods = [MOTION] * (not task.replanning) + [AGENT] * (agent is not None) + [SEARCH, STRAIGHT]
+        if not task.replanning and importlib.util.find_spec("ompl") is not None:
+            methods.append(OMPL)
+        self.methods = tuple(methods)
+        """Names of the methods that can be chosen; the first one is the default."""
+
+    def env(self, name: str) -> ReachVectorEnv:
+        """Return a batch of one environment, which is made once.
+
+        Args:
+            name: `own`: with obstacles as the agent knows them; `any`: with obstacles of any number and shape;
+                `whole`: the same where a plan is never revised; `steps`: as the id says.
+        """
+        if name not in self._envs:
+            arguments = self.arguments["own" if name in ("own", "steps") else "any"]
+            if name != "steps":
+                arguments = {**arguments, **self._changes}
+            if name == "whole" and self.task.replanning:
+                arguments = {**arguments, "decide_at": (), "horizon": 1e3}
+            env: Any = gym.make_vec(self.env_id, num_envs=1, **arguments)
+            self._envs[name] = env.unwrapped
+        return self._envs[name]
+
+    def close(self) -> None:
+        """Close the environments."""
+        for env in self._envs.values():
+            env.close()
+
+    def act(self, observation: Observation, checks: int = 0) -> Float:
+        """Return the action that the agent chooses, shape (1, m)."""
+        agent: Any = self.agent
+        with _agent_lock:
+            if hasattr(agent.policy, "checks"):
+                agent.policy.checks = checks
+            actions, _ = agent.predict(observation, deterministic=True)
+        return np.asarray(actions, dtype=np.float64)
+
+    def propose(self, problem: Any) -> tuple[Float, Float]:
+        """Return the candidates of the agent in one problem, shape (N, m), and its values of them, shape (N,)."""
+        agent: Any = self.agent
+        with _agent_lock:
+            actions, values = agent.policy.propose(problem)
+        return actions[0], values[0]
+
+    def agent_decides(self, state: State) -> bool:
+        """Return True if the agent decides in a scene, False if the search does in its place."""
+        own = self.stepwise or self.n_via(state) == self.task.n_via
+        return state.method == AGENT and own and not self.limit(state.scene)
+
+    def n_via(self, state: State) -> int:
+        """Return the number of via-points that the user wants, or that the method has by default."""
+        if state.n_via is not None:
+            return state.n_via
+        return 2 if state.method == MOTION else self.task.n_via
+
+    # Scenes
+
+    def scenes(self) -> dict[str, Iterator[tuple[Scene, str]]]:
+        """Return endless scenes and sentences on them, by the names of their buttons."""
+        task, kinds = self.task, {"Random": self._random()}
+        for name in ("test", "hard"):
+            if (path := shipped_set(name, task)) is not None:
+                kinds[name.capitalize()] = self._shipped(name, load(path).scenes)
+        if task.space.of_hand and task.n_obstacles[1] and not (task.whole_arm or task.replanning):
+            kinds["Lights 1985"] = self._lights()
+        return kinds
+
+    def _random(self) -> Iterator[tuple[Scene, str]]:
+        generator = np.random.default_rng(self._seed)
+        while True:
+            yield self.scene_of(self._sampler([generator])), ""
+
+    def _shipped(self, name: str, scenes: Scenes) -> Iterator[tuple[Scene, str]]:
+        for row in itertools.cycle(range(len(scenes.start))):
+            yield self.scene_of(scenes, row), f"Scene {row} of the set {name}."
+
+    def _lights(self) -> Iterator[tuple[Scene, str]]:
+        for first, last, lights in itertools.cycle(rows_of_lights(half_height=self._sampler.room.height)):
+            sentence = f"From {first} to {last} past a row of lights, Flash & Hogan 1985."
+            yield Scene(TARGETS[first], TARGETS[last], (lights,)), sentence
+
+    def scene_of(self, scenes: Scenes, row: int = 0) -> Scene:
+        """Return one of the scenes of an environment."""
+        options = scene_from_json(scene_to_json(scenes, self.task.arm, self.task.space_name, scene=row))
+        arrays = {name: np.array(value) for name, value in options.items() if name != "obstacles"}
+        return Scene(obstacles=tuple(options["obstacles"]), **arrays)
+
+    def read(self, content: str | bytes) -> Scene:
+        """Return the scene of a JSON file; parts that it lacks are drawn.
+
+        Raises:
+            ValueError: The file holds no scene, or an impossible one.
+        """
+        options, env = scene_from_json(content), self.env("any")
+        try:
+            env.reset(options=options)
+        except ValueError as error:
+            raise ValueError(f"the scene file is impossible: {error}") from None
+        assert env.scenes is not None
+        scene = self.scene_of(env.scenes)
+        return scene._replace(obstacles=tuple(options.get("obstacles", scene.obstacles)))  # with their names
+
+    def limit(self, scene: Scene) -> str:
+        """Return the limit of the task that a scene exceeds, as part of a sentence; "" if there is none."""
+        most = self.task.n_obstacles[1]
+        if not most and scene.obstacles:
+            return "without obstacles"
+        known = {name if name in KINDS else "convex_mesh" for name in self.task.shapes}
+        others = [each.kind for each in scene.obstacles if each.kind not in known]
+        if others:
+            return f"without {others[0].replace('_', '-')} obstacles"
+        return f"with at most {most} obstacles" if len(scene.obstacles) > most else ""
+
+    # Geometry
+
+    def tool(self, coordinates: Float) -> Float:
+        """Return places of the tool, shape (..., 3), [m], for coordinates of shape (..., D)."""
+        arm = self.task.arm
+        if not self.task.space.of_hand:
+            return arm.hand(coordinates)
+        level = np.full((*coordinates.shape[:-1], 1), arm.hand(arm.home)[2])
+        return np.concatenate((coordinates, level), axis=-1)
+
+    def path(self, plan: Plan, samples: int = 80) -> Float:
+        """Return places of the tool at evenly spaced times of plans, shape (..., samples, 3), [m]."""
+        times = plan.duration[..., None] * np.linspace(0.0, 1.0, samples)
+        return self.tool(np.asarray(plan.trajectory()(times)))
+
+    def orientation(self, coordinates: Float) -> Float:
+        """Return the orientation of the tool for joint positions, a quaternion."""
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, forward(self.task.arm.chain, coordinates)[1].ravel())
+        return quaternion
+
+    def clearances(self, coordinates: Float, obstacles: Obstacles, times: Float | None = None) -> Float:
+        """Return clearances from the obstacles of one scene and of the arm from itself, shape (T, 2), [m].
+
+        Args:
+            coordinates: Shape (T, D).
+            obstacles: Obstacles at time 0.
+            times: Shape (T,), [s]; 0 by default.
+        """
+        arm, number = self.task.arm, len(coordinates)
+        joints, rows = self.task.space.joints(coordinates), obstacles.take(np.zeros(number, np.int64))
+        when = np.zeros(number) if times is None else times
+        return np.asarray(configuration_clearances(arm.chain, arm.spheres, joints, rows, when))
+
+    def moved(self, coordinates: Float, place: Float, scene: Scene | None, turn: Any = None) -> Float:
+        """Return coordinates with the tool at another place, in joint space the nearest ones that are free.
+
+        Args:
+            coordinates: Present coordinates, shape (D,).
+            place: New place of the tool, shape (3,), [m].
+            scene: Scene whose obstacles are avoided; None for none.
+            turn: New orientation of the tool, a quaternion; the present one by default.
+
+        Raises:
+            ValueError: The arm cannot reach the place.
+        """
+        if self.task.space.of_hand:
+            return np.array(place[:2])
+        if turn is None and len(coordinates) >= 6:  # with fewer joints, the tool cannot have any orientation
+            turn = self.orientation(coordinates)
+        found = inverse_kinematics(self.task.arm, place, turn, seed=coordinates, n_seeds=8)
+        if scene is None:
+            return np.asarray(found[0])
+        free = self.clearances(found, pack([scene.obstacles])).min(axis=-1) > 0.0
+        return np.asarray(found[int(free.argmax())])
+
+    # Obstacles
+
+    def new_shapes(self) -> dict[str, Shape]:
+        """Return the obstacles that can be added, by name."""
+        shapes: dict[str, Shape] = {
+            "sphere": Sphere(0.06),
+            "capsule": Capsule(0.035, 0.1),
+            "box": Box((0.05, 0.05, 0.05)),
+            "cylinder": Cylinder(0.04, 0.08),
+        }
+        if self.planar:
+            height = self._sampler.room.height
+            bar, box = Box((0.09, 0.015, height)), Box((0.03, 0.03, height))
+            shapes = {"post": Cylinder(0.025, height), "bar": bar, "box": box}
+        return {**shapes, "wall": HalfSpace()}
+
+    def new_obstacle(self, scene: Scene, name: str) -> Shape:
+        """Return a new obstacle beside the middle of a movement, clear of the others and of both ends if possible.
+
+        A half-space is a wall along the movement, on the side away from the base of the arm.
+        """
+        ends = np.stack((scene.start, scene.goal))
+        start, goal = self.tool(ends)
+        middle, line = 0.5 * (start + goal), goal - start
+        aside = np.array([-line[1], line[0], 0.0]) / max(float(np.hypot(line[0], line[1])), 1e-9)
+        if aside @ middle < 0.0:
+            aside = -aside
+        shape, sides, least, others = self.new_shapes()[name], [aside, -aside], 0.02, scene.obstacles
+        if name == "wall":  # others may stand in it
+            shape, sides, least, others = HalfSpace.facing(-aside), [aside], 0.17, ()
+        for way, side in itertools.product(least + 0.02 * np.arange(20), sides):
+            shape = dataclasses.replace(shape, position=middle + way * side)
+            alone = all(other.distance(shape.position, 0.03) > 0.0 for other in others)
+            if alone and self.clearances(ends, pack([[shape]]))[:, 0].min() > 0.0:
+                break
+        return shape
+
+    def sizes_of(self, shape: Shape) -> dict[str, float]:
+        """Return the sizes of an obstacle by the names of their sliders, [m]; in the plane without its height."""
+        if isinstance(shape, Box):
+            sizes = dict(zip(BOX_SIZES, map(float, shape.size), strict=True))
+        else:
+            sizes = {name.replace("_", "-"): getattr(shape, name) for name in shape.sizes}
+        upright = ("half-length", "half-height") if self.planar else ()
+        return {name: value for name, value in sizes.items() if name in SIZES and name not in upright}
+
+    def resized(self, shape: Shape, name: str, value: float) -> Shape:
+        """Return an obstacle with another size, see :meth:`sizes_of`."""
+        if isinstance(shape, Box):
+            size = np.array(shape.size)
+            size[BOX_SIZES.index(name)] = value
+            return dataclasses.replace(shape, size=size)
+        changed: dict[str, Any] = {name.replace("-", "_"): value}
+        return dataclasses.replace(shape, **changed)

@@ -1,0 +1,270 @@
+"""Decisions of the live page: plans, ranked proposals, and simulated movements."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from viapoint import primitives
+from viapoint.envs import Plan, ReachVectorEnv, Task
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.geometry.clearance import FAR
+from viapoint.envs.geometry.obstacles import pack
+from viapoint.training.live.arena import AGENT, HAND, MOTION, OMPL, SEARCH, STRAIGHT, Arena
+from viapoint.training.live.state import Movement, Proposal, Scene, State
+from viapoint.training.planning.candidates import candidate_actions
+from viapoint.training.planning.motion_plan import MotionPlan
+from viapoint.training.planning.ompl_planner import ompl_motion
+from viapoint.training.planning.plan_motion import SEEDS, checked_motion, plan_motion
+from viapoint.training.planning.problem import Problem
+from viapoint.training.planning.search import GeometrySearch, merits
+
+TIME_LIMIT, SECOND_LIMIT = 0.03, 0.3
+"""Time limits of the motion planner after a change, and in a pause where that found no free movement, [s]."""
+N_PROPOSALS = 5
+"""Proposals that are shown."""
+N_CANDIDATES = 256
+"""Best candidates among which distinct proposals are looked for."""
+APART = 0.03
+"""Distance by which the paths of two proposals differ somewhere, [m]."""
+N_CHECKS, REFINEMENTS = 512, 3
+"""Candidates of the geometry search, and rounds of refinement around the best of them."""
+NEXT_START = 0.02
+"""Least difference of a coordinate between the present position and a goal that begins a new movement."""
+
+Decide = Callable[[Observation], Float]
+"""Function that returns the action, shape (1, m), for an observation."""
+
+
+def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Proposal:
+    """Return the plan of the method, or by hand; where the scene is impossible, the motion planner says why.
+
+    Args:
+        arena: Arm, agent and environments.
+        state: Scene, method and its settings.
+        time_limit: Time limit of the motion planner, [s].
+    """
+    if state.by_hand is not None:
+        assert state.plan is not None
+        return _by_hand(arena, state, state.by_hand, state.duration or state.plan.duration)
+    if state.method in (MOTION, OMPL):
+        return _planned(arena, state, time_limit)
+    scene, (name, task, decide_) = state.scene, _chooser(arena, state)
+    try:
+        observation, _ = arena.env(name).reset(options=scene.options())
+    except ValueError:
+        return _planned(arena, state, time_limit)
+    begin = time.perf_counter()
+    action = decide_(observation)
+    seconds = time.perf_counter() - begin
+    plan = task.action.decode(action, scene.start[None], scene.goal[None]).take(0)
+    if state.duration is not None:
+        return _by_hand(arena, state, plan.waypoints[1:-1], state.duration)
+    maker = SEARCH if state.method == AGENT and name == "any" else state.method
+    return Proposal(_checked(arena, scene, plan), maker, seconds)
+
+
+def _checked(arena: Arena, scene: Scene, plan: Plan) -> MotionPlan:
+    return checked_motion(arena.task.arm, arena.task.space_name, plan, pack([scene.obstacles]), "given")
+
+
+def _chooser(arena: Arena, state: State) -> tuple[str, Task, Decide]:
+    """Return the environment in which a method decides, the task of its actions, and its function."""
+    if arena.agent_decides(state) and not arena.stepwise:
+        return "own", arena.task, functools.partial(arena.act, checks=state.checks)
+    task = dataclasses.replace(arena.env("any").task, n_via=arena.n_via(state))
+    if state.method == STRAIGHT:
+        return "any", task, lambda _: np.zeros((1, task.action.size))
+    return "any", task, GeometrySearch(task, N_CHECKS, refinements=REFINEMENTS).decide
+
+
+def _planned(arena: Arena, state: State, time_limit: float) -> Proposal:
+    """Return the plan of a motion planner, which also says why there is no free movement."""
+    scene, task = state.scene, arena.task
+    problem = task.arm, scene.start, scene.goal, pack([scene.obstacles])
+    begin = time.perf_counter()
+    if state.method == OMPL:
+        motion = ompl_motion(*problem, space=task.space_name)
+        return Proposal(motion, OMPL, time.perf_counter() - begin)
+    n_via = int(np.clip(arena.n_via(state), 1, 3))
+    seeds: Any = SEEDS
+    if state.before is not None and len(state.before.waypoints) == n_via + 2 and time_limit == TIME_LIMIT:
+        seeds = state.before.waypoints[None, 1:-1]
+    motion = plan_motion(
+        *problem, n_via=n_via, seeds=seeds, time_limit=time_limit, duration=state.duration,
+        space=task.space_name, ompl=False,
+    )  # fmt: skip
+    return Proposal(motion, MOTION, time.perf_counter() - begin)
+
+
+def _by_hand(arena: Arena, state: State, vias: Float, duration: float) -> Proposal:
+    """Return the plan from start to goal through via-points, shape (K, D), in a duration, [s]."""
+    waypoints = np.concatenate((state.scene.start[None], vias, state.scene.goal[None]))
+    plan = Plan(waypoints, np.asarray(primitives.passage_durations(waypoints, np.asarray(duration))))
+    return Proposal(_checked(arena, state.scene, plan), HAND)
+
+
+def propose(arena: Arena, state: State) -> tuple[Proposal, ...]:
+    """Return the plan and the best others that differ from it, with their simulated rewards.
+
+    Where the motion planner found no free movement, it looks once more.
+    """
+    first, found = state.proposals[0], []
+    if first.maker == MOTION and not first.motion.success:
+        return (decide(arena, state, SECOND_LIMIT),)
+    if state.method in (MOTION, OMPL, STRAIGHT):
+        return (first,)
+    env = arena.env("whole")
+    try:
+        env.reset(options=state.scene._replace(jumps=(), turns=()).options())  # later changes are not known
+    except ValueError:  # the scene is impossible
+        return (first,)
+    scenes = env.scenes
+    assert scenes is not None
+    for each in _distinct(arena, state, first):
+        env.begin(scenes)
+        outcome = env.execute_plan(_in_batch(each.motion.plan))
+        success = each.motion.success and outcome.info["is_success"][0]
+        found.append(each._replace(reward=float(outcome.reward[0]) if success else None))
+    return tuple(found)
+
+
+def _distinct(arena: Arena, state: State, first: Proposal) -> list[Proposal]:
+    """Return a plan and the best candidates whose paths differ from it and from one another."""
+    scene, (name, task, _) = state.scene, _chooser(arena, state)
+    env, by_agent = arena.env(name), name == "own"
+    observation, _ = env.reset(options=scene.options())
+    if by_agent and not hasattr(getattr(arena.agent, "policy", None), "propose"):  # it proposes one action
+        return [first]
+    if by_agent:
+        actions, values = arena.propose(Problem.of_observation(observation, task))
+    else:
+        actions = candidate_actions(task, N_CHECKS, replanning=False).astype(np.float64)
+        assert env.scenes is not None
+        # Merits of several actions in one problem are bounds for all but the best.
+        each_alone = Problem.of_scenes(env.scenes, task).take(np.zeros(len(actions), np.int64))
+        values = merits(task, each_alone, actions[:, None])[:, 0]
+    order = np.argsort(-values, kind="stable")[:N_CANDIDATES]
+    values = values[order]
+    ends = (np.repeat(end[None], len(order), axis=0) for end in (scene.start, scene.goal))
+    plans = task.action.decode(np.asarray(actions[order], dtype=np.float64), *ends)
+    chosen, paths = first.motion.plan, arena.path(plans, 9)
+    apart = norm(paths - arena.path(chosen, 9)).max(axis=-1)
+    same = np.flatnonzero((apart < 1e-6) & np.isclose(plans.duration, chosen.duration))
+    maker = SEARCH
+    if by_agent:
+        maker = AGENT
+        first = first._replace(value=float(values[same[0]]) if same.size else None)
+    found = [first]
+    while len(found) < N_PROPOSALS and (apart > APART).any():
+        i = int((apart > APART).argmax())
+        value = float(values[i]) if by_agent else None
+        found.append(Proposal(_checked(arena, scene, plans.take(i)), maker, value=value))
+        apart = np.minimum(apart, norm(paths - paths[i]).max(axis=-1))
+    return found
+
+
+def execute(arena: Arena, state: State, goal_of: Callable[[], Float] | None = None) -> Iterator[Movement]:
+    """Execute the plan, decision by decision where it is revised; `goal_of` returns the goal, shape (D,)."""
+    assert state.plan is not None
+    by_method = state.by_hand is None and state.picked == 0
+    if arena.stepwise and arena.agent_decides(state) and by_method:
+        return play(arena.env("steps"), state.scene, arena.act)
+    name, _, decide_ = _chooser(arena, state)
+    return play(arena.env(name), state.scene, decide_, state.plan.plan, goal_of)
+
+
+def play(
+    env: ReachVectorEnv,
+    scene: Scene,
+    decide: Decide,
+    plan: Plan | None = None,
+    goal_of: Callable[[], Float] | None = None,
+) -> Iterator[Movement]:
+    """Play an episode, and yield the movement so far after each decision.
+
+    When the arm has reached a goal that has been dragged away meanwhile, a new episode begins there.
+
+    Args:
+        env: Batch of one environment.
+        scene: Scene.
+        decide: Function of observations.
+        plan: First plan; None for that of a decision.
+        goal_of: Function that returns the present goal, shape (D,); None for one that stays.
+    """
+    observation, _ = env.reset(options=scene.options())
+    decision = env.execute_actions(decide(observation)) if plan is None else env.execute_plan(_in_batch(plan))
+    goal, reward = scene.goal, 0.0
+    while True:
+        rollout, scenes, plans = env.last_rollout[0], env.scenes, env.last_plan
+        assert scenes is not None
+        reward += float(decision.reward[0])
+        yield Movement(rollout, scenes, None if plans is None else plans.take(0), decision.info, reward)
+        before, goal = goal, goal if goal_of is None else goal_of()
+        moved = not np.array_equal(goal, before)
+        observation = decision.observation
+        if decision.terminated[0] or decision.truncated[0]:
+            here = env.task.space.coordinates(rollout.joints[-1])
+            if not moved or not decision.info["is_success"][0] or np.abs(here - goal).max() < NEXT_START:
+                return
+            places, rest = scenes.obstacles_at(rollout.time[-1:]).centre[0], np.zeros(3)
+            resting = [
+                dataclasses.replace(shape, position=place, velocity=rest)
+                for shape, place in zip(scene.obstacles, places, strict=False)
+            ]
+            scene = Scene(here, goal, tuple(resting))
+            observation, _ = env.reset(options=scene.options())
+        elif moved:
+            observation = env.move_goals(goal[None])
+        decision = env.execute_actions(decide(observation))
+
+
+def _in_batch(plan: Plan) -> Plan:
+    """Return a plan as a batch of one."""
+    return Plan(plan.waypoints[None], plan.durations[None])
+
+
+def profile(arena: Arena, scene: Scene, plan: Plan) -> dict[str, Float]:
+    """Return time, speed of the tool, jerk, and clearance of a plan among obstacles that keep their course."""
+    times = np.linspace(0.0, float(plan.duration), 80)
+    trajectory = plan.trajectory()
+    coordinates = np.asarray(trajectory(times))
+    return {
+        "time": times,
+        "speed": norm(np.gradient(arena.tool(coordinates), times, axis=0)),
+        "jerk": norm(np.asarray(trajectory(times, 3))),
+        "clearance": arena.clearances(coordinates, pack([scene.obstacles]), times)[:, 0],
+    }
+
+
+def describe_plan(proposal: Proposal) -> str:
+    """Return one sentence on a plan."""
+    motion = proposal.motion
+    if not motion.success and proposal.maker == MOTION:
+        return f"No free movement was found: {motion.reason}. The best one is shown in red."
+    if not motion.success:
+        return f"This plan fails: {motion.reason}."
+    clear = (
+        "no obstacle near" if motion.clearance >= 0.999 * FAR else f"{1e3 * motion.clearance:.0f} mm clear"
+    )
+    jerk = f"{motion.jerk:.1f} times the jerk of the straight line"
+    return f"The plan takes {motion.duration:.2f} s, {clear}, with {jerk}."
+
+
+def describe_outcome(info: Mapping[str, Any], in_joints: bool) -> str:
+    """Return one sentence on an executed movement of a batch of one."""
+    values = {name: np.asarray(value).reshape(-1)[0] for name, value in info.items()}
+    if values["collision"]:
+        return f"Failure: the arm touches something after {values['first_contact_time']:.2f} s."
+    if not values["reachable"]:
+        return "Failure: the plan leaves the arm's reach."
+    clearance, error = 1e3 * values["min_clearance"], 1e3 * values["goal_error"]
+    near = "" if clearance >= 999.0 * FAR else f", least clearance {clearance:.0f} mm"
+    state = "Success: at rest" if values["is_success"] else "Failure:"
+    return f"{state} {error:.1f} {'mrad' if in_joints else 'mm'} from the goal after {values['duration']:.2f} s{near}."
