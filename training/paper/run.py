@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import sys
 from collections.abc import Callable
 from functools import partial
 from importlib.resources import files
@@ -14,11 +13,11 @@ import matplotlib.style
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from viapoint.training.config.configs import PaperConfig
 from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import MARK, check_ours, versions, write_bytes, write_json
+from viapoint.training.io.progress import progress_bar
 from viapoint.training.paper import figures
 from viapoint.training.paper.claim import Claim, Number
 from viapoint.training.paper.rows import alternatives, double_step, obstacles, one_via, straight
@@ -92,16 +91,15 @@ Pictures = list[tuple[Path, str]]
 def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], Pictures]:
     """Compute every row, row 12 with an agent or a search, and draw every figure."""
     avoidance = obstacles.light_movements(agent)
-    show_progress = partial(tqdm, file=sys.stderr, dynamic_ncols=True)
 
     def result_of(function: Callable[..., Any]) -> Any:
         return function(avoidance) if function in AROUND_LIGHTS else function()
 
     claims: list[Claim] = []
-    for _, compute in show_progress(ROWS.values(), desc="rows"):
+    for _, compute in progress_bar(iterable=ROWS.values(), desc="rows"):
         claims += result_of(compute)
     pictures: Pictures = []
-    for name, (caption, draw) in show_progress(DRAWINGS.items(), desc="figures"):
+    for name, (caption, draw) in progress_bar(iterable=DRAWINGS.items(), desc="figures"):
         with matplotlib.style.context(figures.STYLE):
             picture, _ = figures.save(result_of(draw), out, name)
         pictures.append((picture, caption))
