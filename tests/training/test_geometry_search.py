@@ -205,7 +205,7 @@ def test_exactly_the_stated_number_of_plans_is_checked(monkeypatch):
     search = GeometrySearch(env.task, 50, refinements=3, per_round=10)
     search.decide(observation)
     assert sum(counted) == search.total_checks == 80
-    assert search.name == "search, 80 checks"
+    assert search.name == "search80"
 
 
 def test_a_plan_that_stays_clear_is_kept():
