@@ -23,10 +23,11 @@ demo: $(READY)   ## train, evaluate, draw and film an agent
 test: $(READY)   ## the whole test suite
 	@$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder --quiet
 
-check: $(READY)  ## format, lint and strict types
+check: $(READY)  ## format, lint, strict types and docstrings
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
+	@$(BIN)/python -m pytest --quiet tests/test_docstrings.py
 
 format: $(READY) ## let ruff put the source in order
 	@$(BIN)/ruff format .

@@ -77,7 +77,7 @@ class Tab:
             return not (self._busy or self._jobs or self._later or self.state.playing)
 
     def act(self, name: str, *values: Any, **changes: Any) -> None:
-        """Let the thread call a method.
+        """Call a method in the thread of the tab.
 
         A waiting call of the same kind is replaced, so that a fast drag skips positions instead of lagging behind.
         """
