@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,12 +53,17 @@ def tube(points: Float, radius: float) -> Any:
     """Return a closed tube along points, shape (n, 3), [m], as a mesh of `trimesh`."""
     along = np.gradient(points, axis=0)
     along = along / np.maximum(norm(along), 1e-12)[:, None]
-    side, sides = np.eye(3)[np.abs(along[0]).argmin()], np.empty_like(points)
-    for i, direction in enumerate(along):  # parallel transport: the tube does not twist
-        side = side - direction * (direction @ side)
-        length = float(np.sqrt(side @ side))
-        side = side / length if length > 1e-9 else np.eye(3)[np.abs(direction).argmin()]
-        sides[i] = side
+    sides = np.empty_like(points)
+    x, y, z = np.eye(3)[np.abs(along[0]).argmin()].tolist()
+    for i, (a, b, c) in enumerate(along.tolist()):  # parallel transport: the tube does not twist
+        share = a * x + b * y + c * z
+        x, y, z = x - share * a, y - share * b, z - share * c
+        length = math.sqrt(x * x + y * y + z * z)
+        if length < 1e-9:
+            x, y, z = np.eye(3)[np.abs(along[i]).argmin()].tolist()
+            length = 1.0
+        x, y, z = x / length, y / length, z / length
+        sides[i] = x, y, z
     angle = 2.0 * np.pi * np.arange(SIDES) / SIDES
     across = np.cross(along, sides)
     ring = np.cos(angle)[:, None] * sides[:, None] + np.sin(angle)[:, None] * across[:, None]
@@ -221,12 +227,15 @@ class View:
         planned, vias = [self._line(plan)], arena.tool(plan.waypoints[1:-1])
         if movement is not None and movement.plan is not None and arena.task.replanning:
             planned, vias = [(arena.path(movement.plan), PALETTE.plan)], vias[:0]
-        before = [] if state.before is None else [self._line(state.before)]
         others = state.proposals if len(state.proposals) > 1 else ()
         pale = [(path, _lighter(colour)) for path, colour in (self._line(each.motion) for each in others)]
         self._draw_handles("via", vias)
+        if state.before is not None and self._is_new("before", state.before.waypoints):
+            colour = PALETTE.plan if state.before.success else PALETTE.contact
+            self._mesh("/before/0", self._nodes["/plan/0"], colour, PALE)  # it still shows the plan before
+        if "/before/0" in self._nodes:
+            self._nodes["/before/0"].visible = state.before is not None
         self._draw_paths("plan", planned, PLAN)
-        self._draw_paths("before", before, PLAN, PALE)
         self._draw_paths("proposal", pale, PROPOSAL, 0.8)
 
     def _line(self, motion: MotionPlan) -> tuple[Float, Colour]:
@@ -250,7 +259,10 @@ class View:
     def _draw_obstacles(self, shapes: tuple[Shape, ...], places: Any, selected: int | None) -> None:
         for i, (shape, place) in enumerate(zip(shapes, places, strict=False)):
             name = f"/obstacle/{i}"
-            if self._is_new(name, shape.kind, shape.packed_size, shape.quaternion, id(shape.mesh)):
+            form = shape.kind, shape.packed_size, shape.quaternion, id(shape.mesh)
+            if not self._is_new(name, *form, place, i == selected):
+                continue  # there may be many, and most stay in a drag
+            if self._is_new(f"{name}/form", *form):
                 self._mesh(name, obstacle_mesh(shape, self._levels), PALETTE.obstacle)
             node = self._nodes[name]
             node.flat_shading = not isinstance(shape, Sphere | Capsule)
@@ -282,8 +294,13 @@ class View:
                 self._mesh(key, trimesh.creation.icosphere(3, RADII[name]), colour)
             self._nodes[key].position, self._nodes[key].visible = place, True
             if not self._planar and self._is_new(f"{key}/drop", place):
-                down = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, self._floor - place[2]]]])
-                self._scene.add_line_segments(f"{key}/drop", down, _rgb(_lighter(colour)), thickness=0.003)
+                down = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, self._floor - place[2]]]], np.float32)
+                if f"{key}/drop" in self._nodes:
+                    self._nodes[f"{key}/drop"].points = down
+                else:
+                    self._nodes[f"{key}/drop"] = self._scene.add_line_segments(
+                        f"{key}/drop", down, _rgb(_lighter(colour)), thickness=0.003
+                    )
         self._hide(name, len(places))
 
     def _is_new(self, name: str, *values: Any) -> bool:
@@ -295,6 +312,7 @@ class View:
         """Hide the nodes of a name from a number on."""
         while (node := self._nodes.get(f"/{name}/{number}")) is not None:
             node.visible = False
+            self._drawn.pop(f"/{name}/{number}", None)  # to be shown again even if it is the same
             number += 1
 
     def _mesh(self, key: str, mesh: Any, colour: Any, opacity: float | None = None) -> None:
