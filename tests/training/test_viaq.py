@@ -177,3 +177,7 @@ def test_refinement_solves_more_than_as_many_checks(made):
         agent_method("agent", model_on(made(REPLANNING)), refine=4)
     with pytest.raises(ValueError, match="refine"):
         model_on(made(REPLANNING), policy_kwargs={**FEW, "refine": 4})
+    replanning = model_on(made(REPLANNING))
+    replanning.policy.refine = 4
+    with pytest.raises(ValueError, match="refine"):
+        replanning.predict(replanning.env.reset())

@@ -103,8 +103,7 @@ class ViaQPolicy(BasePolicy):
         self.replanning = self.task.replanning
         self.candidates, self.refinements, self.per_refinement = candidates, refinements, per_refinement
         self.checks, self.refine = checks, refine
-        if refine and not self.can_refine:
-            raise ValueError(f"refine must be 0 where plans are revised or have no via-points, got {refine}")
+        self._check_refine()
         self.width, self.instants = width, instants
         self.critic = self.make_critic()
         self.critic_target = self.make_critic() if self.replanning else None
@@ -139,6 +138,12 @@ class ViaQPolicy(BasePolicy):
     def can_refine(self) -> bool:
         """True for tasks whose movements begin at rest and have via-points, which can be refined."""
         return not self.replanning and self.task.n_via > 0
+
+    def _check_refine(self) -> None:
+        if self.refine and not self.can_refine:
+            raise ValueError(
+                f"refine must be 0 where plans are revised or have no via-points, got {self.refine}"
+            )
 
     @property
     def shown_instants(self) -> Int:
@@ -195,6 +200,7 @@ class ViaQPolicy(BasePolicy):
 
     def decide(self, observation: Observation) -> Numbers:
         """Return the chosen actions, shape (B, m), for parts of B observations."""
+        self._check_refine()  # it may have been set since
         number = len(observation["joints"])
         pieces = []
         for first in range(0, number, BLOCK):
