@@ -19,6 +19,8 @@ from viapoint.training.planning.benchmark import benchmark_panda, benchmark_prob
 from viapoint.training.planning.export import read_motion, write_motion
 from viapoint.training.planning.motion_plan import UnsafePlanError, execute_plans
 from viapoint.training.planning.movements import OUTSIDE, movement_table
+from viapoint.training.planning.search import registered_task
+from viapoint.training.scene_sets.scene_set import BANDS, scenes_for
 
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 PANDA = arm_of("panda")
@@ -404,3 +406,16 @@ world:
         read_problems(tmp_path)
     with pytest.raises(ValueError, match=r"holds no scene"):
         read_problems(tmp_path / "nothing")
+
+
+def test_narrow_passages_that_a_search_finds_are_planned() -> None:
+    # Ten of these scenes were not solved when every refinement asked for a clearance of 4 cm.
+    task = registered_task("viapoint/PlanarWholeArm-v0")
+    frozen = scenes_for("validation", task, 120)
+    hard = frozen.take(frozen.band == len(BANDS) - 1).scenes
+    start, goal = task.space.coordinates(hard.start), task.space.coordinates(hard.goal)
+    solved = [
+        plan_motion(task.arm, start[i], goal[i], hard.obstacles.take([i]), space="hand").success
+        for i in range(len(start))
+    ]
+    assert sum(solved) >= len(solved) - 2

@@ -493,6 +493,7 @@ def _search(
     near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
     table, fine = movement_table(n_via), fine_table(n_via)
     best, least = None, np.inf
+    tight, widest = None, problem.margin  # the best of those that keep the margin and nothing more
     tried = free = 0
     total = len(given) + 1 + number
     while tried < total and time.perf_counter() < until:
@@ -509,7 +510,11 @@ def _search(
         wanted = max(enough - free, 1)
         done, found = _refined(problem, kept, table, fine, seeds, duration, smooth=SMOOTH, enough=wanted)
         for k in range(done):
-            if found.clearance[k] < kept:
+            clearance = float(found.clearance[k])
+            if clearance < kept:
+                if clearance >= widest:
+                    widest = clearance
+                    tight = _Movement(found.vias[k], fine, int(found.times[k]), duration, "random", clearance)
                 continue
             free += 1
             if free == enough:  # a rough movement is worth some more seeds
@@ -518,10 +523,9 @@ def _search(
                 rank = tried + k - len(given)
                 least = float(found.cost[k])
                 source = "given" if rank < 0 else "random" if rank else "straight, refined"
-                clearance = float(found.clearance[k])
                 best = _Movement(found.vias[k], fine, int(found.times[k]), duration, source, clearance)
         tried += done
-    return best, tried
+    return best or tight, tried
 
 
 def _refined(

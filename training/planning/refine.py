@@ -90,6 +90,11 @@ AIMS = (
 )
 """Aims of the refinements. The first one, of a seed, has little weight of jerk, and ends as soon as the movement is
 free; the others polish free movements."""
+NARROW = Aim(clearance=0.008, jerk=0.02, iterations=20, gain=1.0, stride=2)
+"""Aim of a second refinement of movements that are nearly free: in a narrow passage, a wide clearance on one side is
+paid for with contact on the other."""
+NEARLY = -0.03
+"""Least clearance of movements that are nearly free, [m]."""
 SMOOTH = 1.5
 """Relative jerk cost with which a movement is polished no more."""
 
@@ -104,7 +109,8 @@ class Found(NamedTuple):
     cost: Float
     """Jerk cost in unit time, shape (S,); infinite for movements that are not free."""
     clearance: Float
-    """Least clearance at many instants, shape (S,), [m]; -1 for movements that are not free."""
+    """Least clearance at many instants, shape (S,), [m]; -1 for movements in contact. It is less than the margin for
+    movements in narrow passages, which are not polished and do not count as free."""
 
 
 class _Work(NamedTuple):
@@ -477,9 +483,21 @@ def refine_seeds(
         tried += 1
         offsets[0, :vias] = seeds[each]
         times[0] = _refine(setting, table, start, offsets[0], duration, obstacles, scene, aims[0], unit, work)
+        apart = _clearance(setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin)
+        if NEARLY < apart < margin:
+            times[0] = _refine(
+                setting, table, start, offsets[0], duration, obstacles, scene, NARROW, unit, work
+            )
+            apart = _clearance(
+                setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin
+            )
         found.vias[each] = offsets[0, :vias]
         found.times[each] = times[0]
-        if not is_free(setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin):
+        if apart < margin:
+            if apart >= 0.0:
+                found.clearance[each] = exact_clearance(
+                    setting, fine, times[0], start, offsets[0], duration, obstacles, scene
+                )
             continue
         stage = 0
         _, cost = best_times(table, offsets[0], work.gram)
@@ -512,6 +530,25 @@ def refine_seeds(
         if free >= enough:
             break
     return tried, found
+
+
+@compiled
+def _clearance(
+    setting: Setting,
+    table: MovementTable,
+    times: int,
+    start: Float,
+    offsets: Float,
+    duration: float,
+    obstacles: Obstacles,
+    scene: int,
+    most: float,
+) -> float:
+    """Return the least clearance of a movement at the instants of a table, at most `most`, exact above NEARLY, [m]."""
+    return least_clearance(
+        setting, table, times, start, offsets, duration, obstacles, scene, most, NEARLY, 1e9,
+        memory_of(setting, table, len(start)),
+    )  # fmt: skip
 
 
 @compiled
