@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from viapoint.envs.scenes.layout import Furniture, Place, Room
     from viapoint.envs.scenes.options import Pose, scene_from_json, scene_to_json
     from viapoint.envs.scenes.scene import Scenes
+    from viapoint.envs.sensors import Sensor
     from viapoint.envs.task import Task
     from viapoint.envs.vector_env import ReachVectorEnv
 else:
@@ -70,6 +71,7 @@ __all__ = [
     "RewardWeights",
     "Room",
     "Scenes",
+    "Sensor",
     "Shape",
     "Sphere",
     "Task",

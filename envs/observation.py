@@ -13,6 +13,7 @@ from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.obstacles import POSE_SIZE, Obstacles, observation_rows
 from viapoint.envs.plans import Motion
 from viapoint.envs.replanning import NominalPlan
+from viapoint.envs.sensors import Readings, Sensor
 
 FARTHEST = 2.0
 """Bound of every coordinate and length, [m]."""
@@ -28,7 +29,7 @@ class ObservationLayout:
 
     `joints` [rad], `hand` and `goal` [m]; in joint space `goal_joints` [rad]; where obstacles may be, `obstacles`:
     n rows (kind one-hot, centre [m], first two axes of the frame, half lengths of the bounding box [m], velocity [m/s],
-    present), flattened. While a movement is under way also the reference that the arm follows, `command`, `velocity`
+    present), flattened. With a sensor, `ranges` and `points` of its rays [m], flattened, in place of `obstacles`. While a movement is under way also the reference that the arm follows, `command`, `velocity`
     and `acceleration`, and `time_left` [s]; in tasks with replanning `via` and `remaining` [s], the plan of a zero
     action. What exceeds its bounds is clipped.
     """
@@ -50,6 +51,8 @@ class ObservationLayout:
     """Bound of the command's acceleration."""
     time_limit: float = 0.0
     """Time limit of an episode, [s]."""
+    sensor: Sensor | None = None
+    """Sensor whose readings are observed in place of the obstacles."""
 
     @property
     def row_size(self) -> int:
@@ -64,7 +67,11 @@ class ObservationLayout:
         found = {"joints": joints, "hand": _box(FARTHEST, 3), "goal": _box(FARTHEST, 3)}
         if self.in_joints:
             found["goal_joints"] = joints
-        if self.n_rows:
+        if self.sensor is not None:
+            farthest = self.sensor.range + FARTHEST + float(np.abs(self.sensor.position).max())
+            found["ranges"] = np.zeros(self.sensor.n_rays), np.full(self.sensor.n_rays, self.sensor.range)
+            found["points"] = _box(farthest, 3 * self.sensor.n_rays)
+        elif self.n_rows:
             kinds, pose = np.zeros(len(self.kinds)), [FARTHEST] * 3 + [1.0] * 6
             sizes = [FARTHEST] * 3
             lowest = np.concatenate((kinds, -np.array(pose), np.zeros(3), [-FASTEST] * 3, [0.0]))
@@ -100,6 +107,7 @@ class ObservationLayout:
         command: Motion | None = None,
         time: Float | None = None,
         nominal: NominalPlan | None = None,
+        readings: Readings | None = None,
     ) -> Observation:
         """Return observations of N environments in fresh arrays.
 
@@ -111,14 +119,19 @@ class ObservationLayout:
             command: References that the arms follow, in tasks in which decisions are made during a movement.
             time: Time since the start of each episode, shape (N,), [s].
             nominal: Plans of a zero action, in tasks with replanning.
+            readings: Readings of the sensor, which stand in for the obstacles.
         """
         parts: dict[str, Any] = {
             "joints": joints,
             "hand": hand,
             "goal": goal[1],
             "goal_joints": goal[0],
-            "obstacles": observation_rows(obstacles, self.kinds).reshape(len(joints), -1),
         }
+        if readings is not None:
+            parts["ranges"] = readings.ranges
+            parts["points"] = readings.points.reshape(len(joints), -1)
+        else:
+            parts["obstacles"] = observation_rows(obstacles, self.kinds).reshape(len(joints), -1)
         if command is not None and time is not None:
             parts |= {
                 "command": command.position,

@@ -28,6 +28,8 @@ NAMED: dict[str, dict[str, Any]] = {
         "decide_at": EVENTS,
         "horizon": 0.5,
     },
+    "PlanarSensed": {"sensor": "rays"},
+    "PandaSensed": {**PANDA_OBSTACLES, "sensor": "camera"},
 }
 """Names of tasks and the keyword arguments in which they differ from the defaults."""
 TASKS: dict[str, dict[str, Any]] = {

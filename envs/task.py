@@ -24,8 +24,9 @@ from viapoint.envs.outcome import SETTLING, TOLERANCES, Tolerance
 from viapoint.envs.plans import ActionLayout, SpaceName, Timing
 from viapoint.envs.rewards import RewardWeights
 from viapoint.envs.scenes.families_registry import check_families, default_families
-from viapoint.envs.scenes.sampler import MOST_DRAWN, SceneSampler, is_planar
+from viapoint.envs.scenes.sampler import MOST_DRAWN, SceneSampler, is_planar, room_of
 from viapoint.envs.scenes.scene import MOST_JUMPS
+from viapoint.envs.sensors import Sensor, named_sensor
 from viapoint.envs.spaces import Space, space_of
 from viapoint.envs.steering import Steering
 
@@ -84,6 +85,7 @@ class Task:
     margin: float
     control_step: float
     weights: RewardWeights
+    sensor: Sensor | None = None
 
     @classmethod
     def of(
@@ -105,6 +107,7 @@ class Task:
         margin: float = 0.02,
         control_step: float = 0.04,
         reward_weights: RewardWeights | Mapping[str, float] | None = None,
+        sensor: Sensor | Mapping[str, Any] | str | None = None,
     ) -> Task:
         """Return the task that these keyword arguments of an environment describe.
 
@@ -126,6 +129,12 @@ class Task:
         kinds = check_kinds(names_of("shapes", shapes))
         families = default_families(plane, kinds, most[1]) if families is None else families
         names = names_of("families", families)
+        if isinstance(sensor, str):
+            room = room_of(arm, kinds, most, tall=False)
+            sensor = named_sensor(sensor, arm, room.foot, room.scale)
+        sensor = Sensor.of(sensor)
+        if sensor is not None and not most[1]:
+            raise ValueError("sensor needs n_obstacles of 1 or more: there is nothing to see")
         task = cls(
             arm=arm,
             space_name=space,
@@ -143,6 +152,7 @@ class Task:
             margin=number_of_at_least("margin", margin, 0.0),
             control_step=number_of_at_least("control_step", control_step, 1e-3),
             weights=RewardWeights.of(reward_weights),
+            sensor=sensor,
         )
         if not task.whole_movement and timing != "optimal":
             raise ValueError(f"timing must be optimal where plans are revised or steered, got {timing!r}")
@@ -252,6 +262,7 @@ class Task:
             speed=top,
             acceleration=0.0 if self.whole_movement else self.steering.greatest_acceleration,
             time_limit=0.0 if self.whole_movement else self.time_limit,
+            sensor=self.sensor,
         )
 
     def sampler(self) -> SceneSampler:
@@ -268,6 +279,7 @@ class Task:
             jumps=self.n_jumps,
             moving=self.moving_obstacles,
             durations=(low, self.action.centre, high),
+            viewpoint=None if self.sensor is None else self.sensor.viewpoint,
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -276,6 +288,12 @@ class Task:
         values["arm"] = self.arm.file or self.arm.name
         values["space"] = values.pop("space_name")
         values["reward_weights"] = dataclasses.asdict(values.pop("weights"))
+        sensor = values.pop("sensor")
+        if sensor is not None:
+            values["sensor"] = {
+                name: list(value) if isinstance(value, tuple) else value
+                for name, value in dataclasses.asdict(sensor).items()
+            }
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     @classmethod

@@ -68,6 +68,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         margin: Predicted clearance below which a decision ends, [m].
         control_step: Time for which an action holds with `decide_at="steps"`, [s].
         reward_weights: Some or all of the weights of :class:`~viapoint.envs.rewards.RewardWeights`.
+        sensor: Sensor whose readings are observed in place of the obstacles: `rays`, `camera`, `hand_camera`, a
+            :class:`~viapoint.envs.sensors.Sensor` or a mapping of its fields.
         autoreset_mode: `SameStep`, `NextStep` or `Disabled`.
         render_mode: `human`, `rgb_array` or `rgb_array_list`.
         width: Width of a rendered frame, [pixels].

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from viapoint.training.agents.agent import Agent, load_agent
     from viapoint.training.agents.extractors import SceneExtractor
     from viapoint.training.agents.viaq import ViaQ
+    from viapoint.training.agents.viarank import ViaRank
     from viapoint.training.config.configs import TrainConfig
     from viapoint.training.evaluation.evaluator import EvaluationResult, evaluate
     from viapoint.training.live.page import LivePage
@@ -47,6 +48,7 @@ __all__ = [
     "TrainConfig",
     "UnsafePlanError",
     "ViaQ",
+    "ViaRank",
     "ViaVecEnv",
     "evaluate",
     "load_agent",

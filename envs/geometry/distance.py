@@ -9,8 +9,9 @@ import numpy as np
 
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
+from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.kernels import inlined
-from viapoint.envs.geometry.obstacles import Obstacles
+from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.envs.geometry.shapes import Distance, Shape, as_obstacles, local_distance
 
 
@@ -62,6 +63,23 @@ def point_distance_and_normal(
         axes[scene, row, 1, 0] * nx + axes[scene, row, 1, 1] * ny + axes[scene, row, 1, 2] * nz,
         axes[scene, row, 2, 0] * nx + axes[scene, row, 2, 1] * ny + axes[scene, row, 2, 2] * nz,
     )
+
+
+def point_clearances(obstacles: Obstacles, point: tuple[float, float, float]) -> Float:
+    """Return the signed distance of a point from the nearest obstacle of each of N scenes, shape (N,), at most 1 m."""
+    return np.asarray(_point_clearances(obstacles, *point))
+
+
+@compiled
+def _point_clearances(obstacles: Obstacles, x: float, y: float, z: float) -> Float:
+    """Return the least distances of a point, see :func:`point_clearances`."""
+    found = np.ones(len(obstacles.kind))
+    for scene in range(len(found)):
+        for row in range(obstacles.kind.shape[1]):
+            if obstacles.kind[scene, row] != ABSENT:
+                apart = point_distance(obstacles, scene, row, x, y, z, 0.0, 1.0)
+                found[scene] = min(found[scene], apart)
+    return found
 
 
 def signed_distances(obstacles: Iterable[Shape | Mapping[str, Any]], points: Any, radius: Any = 0.0) -> Float:

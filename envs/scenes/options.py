@@ -15,6 +15,7 @@ from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.clearance import FAR
+from viapoint.envs.geometry.distance import point_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, pack, unpack
 from viapoint.envs.geometry.shapes import (
     REGISTERED_MESHES,
@@ -24,7 +25,7 @@ from viapoint.envs.geometry.shapes import (
     obstacles_from_json,
 )
 from viapoint.envs.plans import SpaceName
-from viapoint.envs.scenes.sampler import Given, SceneSampler
+from viapoint.envs.scenes.sampler import VIEW_MARGIN, Given, SceneSampler
 from viapoint.envs.scenes.scene import (
     ENDS,
     MOST_JUMPS,
@@ -84,6 +85,8 @@ def draw_given(
     shapes = _shapes(options["obstacles"], sampler, number) if "obstacles" in options else None
     obstacles = no_obstacles(number, sampler.rows) if shapes is None else pack(shapes, sampler.rows)
     names = [[shape.name for shape in each] for each in shapes or ()]
+    if sampler.viewpoint is not None:
+        _check_view(obstacles, sampler.viewpoint)
     ends = {name: _end(name, options[name], sampler, obstacles) for name in ENDS if name in options}
     home = np.tile(arm.home, (number, 1))
     scenes = resting(ends.get("start", home), ends.get("goal", home), obstacles)
@@ -111,6 +114,17 @@ def draw_given(
         raise ValueError(str(error)) from None
     check_scenes(drawn, arm, names)
     return drawn
+
+
+def _check_view(obstacles: Obstacles, viewpoint: tuple[float, float, float]) -> None:
+    """Check that no obstacle contains the sensor."""
+    apart = point_clearances(obstacles, viewpoint)
+    if (apart < VIEW_MARGIN).any():
+        scene = int(apart.argmin())
+        raise ValueError(
+            f"options['obstacles'] must be {VIEW_MARGIN} m or more from the sensor at {viewpoint}, got "
+            f"{apart[scene]:.3g} m in scene {scene}"
+        )
 
 
 def _refuse_unknown(names: Mapping[str, Any]) -> None:

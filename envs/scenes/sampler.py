@@ -18,6 +18,7 @@ from viapoint.envs.arms.kinematics import link_poses, sphere_centres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import memory
+from viapoint.envs.geometry.distance import point_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
 from viapoint.envs.plans import SpaceName
 from viapoint.envs.scenes import families_plane, families_space
@@ -59,6 +60,8 @@ REACH_SAMPLES = 2000
 """Configurations among which the reach of an arm is looked for."""
 MOST_DRAWN = 32
 """Greatest number of obstacles that are drawn, unless a task asks for more in every scene; more can be given."""
+VIEW_MARGIN = 0.01
+"""Least distance of obstacles from a sensor that does not move, [m]."""
 ATTEMPTS, FAMILY_ATTEMPTS = 1000, 50
 """Layouts that are drawn for a scene at most, and layouts after which another family is tried."""
 
@@ -93,6 +96,7 @@ class SceneSampler:
         moving: True if obstacles move.
         durations: Shortest, centre and longest duration of a movement, [s]; in joint space relative to the shortest
             duration of the straight movement that the velocity limits of the joints allow.
+        viewpoint: Place of a sensor, from which obstacles keep away, [m]; None for none.
     """
 
     def __init__(
@@ -108,11 +112,12 @@ class SceneSampler:
         jumps: tuple[int, int] = (0, 0),
         moving: bool = False,
         durations: tuple[float, float, float] = (0.5, 0.8, 1.2),
+        viewpoint: tuple[float, float, float] | None = None,
     ) -> None:
         fewest, most = n_obstacles
         self.arm, self.space, self.kinds, self.rows = arm, space, kinds, rows
         self.plane = is_planar(arm)
-        self.families = families
+        self.families, self.viewpoint = families, viewpoint
         most = min(most, max(fewest, MOST_DRAWN))
         self.room = room_of(arm, kinds, (fewest, most), tall)
         self.changes = Changes(*jumps, moving, *durations)
@@ -146,6 +151,8 @@ class SceneSampler:
                 self._write(draft.attempts, i, builds[i](rng, rooms[i]), given)
                 rng.random(out=draft.attempts.numbers[i])
             found = draw_ends(draft, pending)
+            if self.viewpoint is not None:
+                found &= point_clearances(draft.obstacles.take(pending), self.viewpoint) >= VIEW_MARGIN
             found[found] = self._change(draft, pending[found], generators, given)
             pending = pending[~found]
             if not len(pending):

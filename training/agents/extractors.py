@@ -15,6 +15,8 @@ from viapoint.envs.geometry.obstacles import POSE_SIZE
 
 POSITION_SCALE = 5.0
 """Scale of positions, [1/m]: obstacles lie within a few decimetres of the line from start to goal."""
+MOST_POINTS = 256
+"""Greatest number of points of a sensor that are encoded."""
 SHORTEST = 1e-6
 """Length below which the line from hand to goal has no direction, [m]."""
 
@@ -24,8 +26,8 @@ class SceneExtractor(BaseFeaturesExtractor):
 
     Where plans are of the hand, obstacles are seen from the middle of the line from hand to goal, in a frame along
     it; in joint space, from the base. One network encodes each row; the features are the sum and the maximum over the
-    obstacles that are present (Zaheer et al. 2017, Deep Sets, arXiv 1703.06114). The other parts of the observation are
-    scaled to order one.
+    obstacles that are present, or over the points that a sensor sees (Zaheer et al. 2017, Deep Sets, arXiv 1703.06114).
+    The other parts of the observation are scaled to order one.
 
     Args:
         observation_space: Observation space of an environment of this package.
@@ -44,17 +46,21 @@ class SceneExtractor(BaseFeaturesExtractor):
         self.turns = "goal_joints" not in boxes
         """True if obstacles are seen in the frame of the line from hand to goal."""
         self.turned = tuple(name for name in ("velocity", "acceleration") if name in boxes and self.turns)
-        self.plain = tuple(sorted(set(boxes) - {"hand", "goal", "obstacles", *self.turned}))
+        seen = {"obstacles", "ranges", "points"}
+        self.plain = tuple(sorted(set(boxes) - {"hand", "goal", *seen, *self.turned}))
         rest = sum(math.prod(boxes[name].shape) for name in (*self.turned, *self.plain))
-        super().__init__(observation_space, 7 + rest + ("obstacles" in boxes) * 2 * width)
+        self.most = float(boxes["ranges"].high.max()) if "ranges" in boxes else 0.0
+        """Greatest range of the sensor, [m]; 0 where the obstacles themselves are observed."""
+        super().__init__(observation_space, 7 + rest + (not seen.isdisjoint(boxes)) * 2 * width)
         self._scale = {name: float(1.0 / abs(boxes[name].high).max()) for name in (*self.turned, *self.plain)}
         size = math.prod(boxes["obstacles"].shape) if "obstacles" in boxes else 0
         self.n_rows = _rows_of(boxes["obstacles"]) if size else 0
         """Greatest number of obstacles."""
         self.row_size = size // max(self.n_rows, 1)
         """Number of values of one obstacle."""
+        values = 3 if self.most else max(self.row_size - 1, 0)
         self.each = nn.Sequential(
-            nn.Linear(max(self.row_size - 1, 0) + 7, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
+            nn.Linear(values + 7, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
         )
 
     def forward(self, observation: dict[str, Tensor]) -> Tensor:
@@ -68,9 +74,12 @@ class SceneExtractor(BaseFeaturesExtractor):
             flat = observation[name].shape[-1]
             parts.append(_turned(axes[:, :flat, :flat], observation[name]) * self._scale[name])
         parts += [observation[name] * self._scale[name] for name in self.plain]
-        if self.n_rows:
+        origin = middle if self.turns else torch.zeros_like(middle)
+        if self.most:
+            parts += self._of_points(observation, axes, origin, ends)
+        elif self.n_rows:
             rows = observation["obstacles"].reshape(len(hand), self.n_rows, self.row_size)
-            parts += self._encoded(rows, axes, middle if self.turns else torch.zeros_like(middle), ends)
+            parts += self._encoded(rows, axes, origin, ends)
         return torch.cat(parts, dim=-1)
 
     def _axes(self, line: Tensor) -> Tensor:
@@ -85,6 +94,19 @@ class SceneExtractor(BaseFeaturesExtractor):
         axes[:, 0, 0], axes[:, 0, 1] = cosine, sine
         axes[:, 1, 0], axes[:, 1, 1] = -sine, cosine
         return axes
+
+    def _of_points(
+        self, observation: dict[str, Tensor], axes: Tensor, origin: Tensor, ends: Tensor
+    ) -> list[Tensor]:
+        """Return sum and maximum over the points that a sensor sees, shape (B, width) each."""
+        ranges = observation["ranges"]
+        points = observation["points"].reshape(len(ranges), -1, 3)
+        step = -(-points.shape[1] // MOST_POINTS)  # of a large image, evenly spaced points
+        points, hit = points[:, ::step], (ranges[:, ::step] < self.most - 1e-4).to(ranges.dtype)
+        place = POSITION_SCALE * _turned(axes[:, None], points - origin[:, None])
+        about = ends[:, None].expand(-1, points.shape[1], -1)
+        encoded = self.each(torch.cat((place, about), dim=-1)) * hit[..., None]
+        return [encoded.mean(dim=1), encoded.amax(dim=1)]
 
     def _encoded(self, rows: Tensor, axes: Tensor, origin: Tensor, ends: Tensor) -> list[Tensor]:
         """Return sum and maximum over the obstacles that are present, shape (B, width) each."""

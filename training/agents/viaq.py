@@ -315,6 +315,8 @@ def task_of(env: VecEnv) -> Task:
             "ViaQ needs an environment of this package in which an action is a whole movement, such as "
             f"viapoint/PlanarObstacles-v0; got {env.observation_space} with {env.action_space}"
         )
+    if task.sensor is not None:
+        raise ValueError("viaq needs the obstacles; where a sensor sees them, viarank learns to place via-points")
     return task
 
 

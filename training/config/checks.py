@@ -109,6 +109,8 @@ LEAST: dict[str, float] = {
     "top_quantiles_to_drop_per_net": 0,
     "explore_candidates": 2,
     "next_candidates": 1,
+    "labels": 2,
+    "nearest": 1,
     "width": 1,
     "instants": 2,
     "candidates": 1,

@@ -28,7 +28,7 @@ from viapoint.training.config.checks import (
     check_whole,
     unknown_name,
 )
-from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of
+from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of, usual_algorithm
 from viapoint.training.config.words import NamedValues, to_words
 from viapoint.training.planning.search import registered_task
 
@@ -146,8 +146,8 @@ class TrainConfig(Config):
     """Id of the environment."""
     arm: Annotated[str | None, ARM] = None
     """Arm, which becomes one of the arguments of the environment; the usual environment is then one for any arm."""
-    algo: Algorithm = "viaq"
-    """Learning algorithm."""
+    algo: Algorithm | None = None
+    """Learning algorithm; default: viaq, or viarank where obstacles are seen with a sensor."""
     seed: int = 0
     """Seed of all random numbers."""
     n_timesteps: int | None = None
@@ -177,7 +177,7 @@ class TrainConfig(Config):
         if not isinstance(self.env, str):
             raise ValueError(f"env must be the id of an environment, got {self.env!r}")
         check_registered(self.env)
-        if self.algo not in get_args(Algorithm):
+        if self.algo is not None and self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
         check_env_kwargs(self.env_kwargs)
         if self.arm is not None:
@@ -185,6 +185,8 @@ class TrainConfig(Config):
             object.__setattr__(self, "env", env)
             object.__setattr__(self, "env_kwargs", {**self.env_kwargs, **argument})
             object.__setattr__(self, "arm", None)
+        if self.algo is None:
+            object.__setattr__(self, "algo", usual_algorithm(self.task))
         if self.task.stepwise and self.algo not in STEP_PRESETS:
             raise ValueError(
                 f"{self.algo} decides on whole movements; for {self.env} algo must be one of "
@@ -224,7 +226,7 @@ class TrainConfig(Config):
     @property
     def preset(self) -> Preset:
         """Settings for everything that is not given."""
-        return preset_of(self.task, self.algo)
+        return preset_of(self.task, self.algo or usual_algorithm(self.task))
 
     @property
     def all_hyperparameters(self) -> dict[str, Any]:

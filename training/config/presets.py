@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from viapoint.envs.task import Task
 
-Algorithm = Literal["viaq", "sac", "td3", "ppo", "tqc"]
+Algorithm = Literal["viaq", "viarank", "sac", "td3", "ppo", "tqc"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +69,14 @@ PRESETS: dict[str, Preset] = {
         learning_starts=4096,
         learning_rate={"kind": "linear", "start": 3e-3, "end": 3e-5, "end_fraction": 1.0},
     ),
+    "viarank": _preset(
+        40_000,
+        "ViaRankPolicy",  # its defaults are its settings
+        eval_every=5_000,
+        checkpoint_every=20_000,
+        learning_starts=512,
+        learning_rate={"kind": "linear", "start": 2e-3, "end": 2e-5, "end_fraction": 1.0},
+    ),
     "sac": _preset(40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
     "td3": _preset(40_000, **_OFF_POLICY, action_noise={"kind": "normal", "sigma": 0.2}),
     "tqc": _preset(40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
@@ -119,6 +127,19 @@ JOINT_DECISIONS = 16_000
 """Greatest default number of decisions of viaq in joint space, where one costs several times as much."""
 
 
+JOINT_SIGHT: dict[str, Any] = {
+    "batch_size": 32,
+    "labels": 16,
+    "policy_kwargs": {"instants": 16, "nearest": 48, "candidates": 128, "refine": 4},
+}
+"""Settings of viarank in joint space, where the arm has many more places in a movement."""
+
+
+def usual_algorithm(task: Task) -> Algorithm:
+    """Return the algorithm that a task is trained with if none is named."""
+    return "viaq" if task.sensor is None else "viarank"
+
+
 def preset_of(task: Task, algo: Algorithm) -> Preset:
     """Return the default settings of an algorithm for a task."""
     if task.stepwise:
@@ -130,4 +151,6 @@ def preset_of(task: Task, algo: Algorithm) -> Preset:
         preset = REACH_PRESETS.get(algo, preset)
     if algo == "viaq" and not task.space.of_hand:
         preset = dataclasses.replace(preset, n_timesteps=min(preset.n_timesteps, JOINT_DECISIONS))
+    if algo == "viarank" and not task.space.of_hand:
+        preset = dataclasses.replace(preset, hyperparameters={**preset.hyperparameters, **JOINT_SIGHT})
     return preset

@@ -15,6 +15,7 @@ from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.config.checks import unknown_name
+from viapoint.training.planning.cautious import BELIEFS, BeliefMethod, CautiousSearch
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl
 from viapoint.training.planning.ompl_planner import ompl_motion
@@ -263,11 +264,21 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
         ValueError: There is no such baseline.
     """
     known = REPLANNING_METHODS if task.replanning else METHODS
+    if task.sensor is not None and name in PLANNERS:  # planners take the obstacles that they are given
+        planner = PLANNERS[name]
+        return lambda simulation: BeliefMethod(task, "thick", planner(simulation))
     if name in known:
         return known[name]
     found = re.fullmatch(r"(\w+?)([0-9]+)", name)
+    if found is not None and found[1] == "cautious" and task.sensor is not None:
+        number = int(found[2])
+        return lambda simulation: CautiousSearch(task, number)
     if found is not None and found[1] in COUNTED and int(found[2]) >= FEWEST_CHECKS[found[1]]:
         make, checks = COUNTED[found[1]], int(found[2])
         return lambda simulation: make(simulation, checks)
+    belief, _, inner = name.partition(":")
+    if task.sensor is not None and inner and belief in BELIEFS:
+        inside = PLANNERS.get(inner) or factory(inner, task)
+        return lambda simulation: BeliefMethod(task, belief, inside(simulation))
     counted = [f"{each}N" for each in COUNTED]  # N plans are checked
     raise ValueError(unknown_name("baseline", name, [*known, *counted, "untrained"]))

@@ -22,6 +22,7 @@ from viapoint.envs.plans import SHORTEST_DURATION
 from viapoint.envs.replanning import NEARBY, least_remaining
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
+from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.movements import (
     FINE_INSTANTS,
     INSTANTS,
@@ -68,7 +69,10 @@ class Problem(NamedTuple):
 
     @classmethod
     def of_observation(cls, observation: Mapping[str, Any], task: Task) -> Problem:
-        """Return the problems of B observations, parts of shape (B, .) each."""
+        """Return the problems of B observations, parts of shape (B, .) each.
+
+        With a sensor, the obstacles are what is believed: the points that are seen, and some space behind them.
+        """
         parts = {name: np.asarray(part, dtype=np.float64) for name, part in observation.items()}
         number = len(parts["joints"])
         in_joints = task.space_name == "joints"
@@ -76,6 +80,8 @@ class Problem(NamedTuple):
         if "obstacles" in parts:
             rows = task.observation.rows(parts["obstacles"])
             obstacles = obstacles_from_rows(rows, task.shapes)
+        elif task.sensor is not None:
+            obstacles = thick_points(task, Sight.of(observation, task))
         else:
             obstacles = no_obstacles(number)
         if not task.replanning:

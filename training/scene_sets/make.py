@@ -48,6 +48,8 @@ from viapoint.training.scene_sets.scene_set import (
 
 SEEDS = {"validation": 11, "test": 12, "hard": 13, "uniform": 14}
 """First part of the seeds of scenes; the second is the number of the scene."""
+SENSED = 100
+"""Number that is added to the first part for tasks with a sensor, so that their scenes are those of no other task."""
 NUMBERS = {"validation": 500, "test": 1000, "hard": 300, "uniform": 500}
 """Number of scenes of each set."""
 FEWER = {"validation": 200, "test": 250}
@@ -151,8 +153,9 @@ class Maker:
     def _drawn(self, name: str, task: Task, family: str, number: int) -> Iterator[FrozenScenes]:
         """Yield drawn scenes, whose numbers are rounded to what a file holds."""
         sampler = task.sampler()
+        seed = SEEDS[name] + (SENSED if task.sensor else 0)
         for first in range(0, MOST_DRAWN * number, TOGETHER):
-            seeds = [(SEEDS[name], *family.encode(), first + each) for each in range(TOGETHER)]
+            seeds = [(seed, *family.encode(), first + each) for each in range(TOGETHER)]
             scenes = rounded(sampler([np.random.default_rng(seed) for seed in seeds]))
             scenes = scenes.take([row for row in range(TOGETHER) if self._is_possible(scenes.take([row]))])
             share = self._share(scenes)
@@ -183,7 +186,10 @@ class Maker:
         rows = np.arange(len(solved)) if wanted is None else np.flatnonzero(wanted)
         if rows.size:
             scenes = drawn.scenes.take(rows)
-            decided = self._search.decide(self._simulation.observe(scenes))
+            if self.task.sensor:  # what is solved is the scene, not what is seen of it
+                decided = self._search.solve(Problem.of_scenes(scenes, self.task))
+            else:
+                decided = self._search.decide(self._simulation.observe(scenes))
             solved[rows] = self._simulation.play(self._search, scenes, decided).success
             if self.task.whole_movement:
                 problem = Problem.of_scenes(scenes, self.task)

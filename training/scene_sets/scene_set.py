@@ -155,7 +155,8 @@ def _scene_key(task: Mapping[str, Any]) -> tuple[Any, ...]:
     others = tuple(task[name] for name in SCENE_FIELDS)
     changing = task["moving_obstacles"] or list(task["n_jumps"]) != [0, 0]
     when = tuple(task["duration_range"]) if changing else ()
-    return (*(tuple(each) if isinstance(each, list) else each for each in (*kinds, *others)), when)
+    sensor = json.dumps(task.get("sensor"), sort_keys=True)
+    return (*(tuple(each) if isinstance(each, list) else each for each in (*kinds, *others)), when, sensor)
 
 
 def load(path: Path, name: str = "") -> FrozenScenes:

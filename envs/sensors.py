@@ -1,0 +1,358 @@
+"""Range sensors: fans of rays and depth images of the obstacles of a scene.
+
+A sensor sees the first surface along each ray. It does not see backs, nor what lies behind other obstacles. Rays are
+cast against the signed distances of the shapes, so that a new shape is seen without code of its own. The arm is not
+seen: its pose is known, and software of real sensors filters it out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.kinematics import forward, link_poses
+from viapoint.envs.common.arrays import frame_matrices
+from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.validation import finite_array, number_of_at_least, whole_number
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.distance import point_distance_and_normal
+from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, POINT_CLOUD, Obstacles, bounding_boxes
+
+Mount = Literal["world", "hand"]
+MOUNTS = ("world", "hand")
+"""Frames in which the pose of a sensor may be given."""
+MOST_RAYS = 65_536
+"""Greatest number of rays of a sensor."""
+WIDEST_IMAGE = 2.9
+"""Greatest field of view of an image, [rad]: its rays meet a plane."""
+TOUCH = 1e-5
+"""Distance from a surface at which a ray has met it, [m]."""
+MOST_STEPS = 100
+"""Greatest number of steps along a ray towards one obstacle."""
+
+
+class Readings(NamedTuple):
+    """Readings of R rays in N scenes."""
+
+    ranges: Float
+    """Distances along the rays, the greatest range where nothing is met, shape (N, R), [m]."""
+    points: Float
+    """Ends of the rays in the world, shape (N, R, 3), [m]."""
+    seen: Int
+    """Row of the obstacle that a ray meets, -1 for none, shape (N, R); not part of the observation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """Range sensor: a fan of rays, or a depth image of several rows.
+
+    Its frame has x forward, y to the left and z up. The rays of a fan lie in the plane of x and y, at equal angles from
+    the left to the right. Those of an image go through the pixels of a pinhole camera, row by row from the top left.
+    Noise and dropped rays depend on the readings alone, so that a scene looks the same whenever it is looked at.
+
+    Raises:
+        ValueError: A number is out of range.
+
+    Example:
+        >>> from viapoint.envs import Box, Sensor, Task
+        >>> from viapoint.envs.geometry.obstacles import pack
+        >>> sensor = Sensor(columns=3, field_of_view=1.0)
+        >>> box = Box((0.1, 0.1, 0.1), position=(0.5, 0.0, 0.0))
+        >>> sensor.read(Task.of().arm, [[0.0, 1.0]], pack([[box]])).ranges.round(3).tolist()
+        [[1.5, 0.4, 1.5]]
+    """
+
+    mount: Mount = "world"
+    """Frame of the pose: `world`, or `hand` for a sensor that moves with the tool."""
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Origin of the sensor in this frame, [m]."""
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Orientation of the sensor in this frame, (w, x, y, z)."""
+    columns: int = 192
+    """Number of rays in a row."""
+    rows: int = 1
+    """Number of rows; 1 for a fan."""
+    field_of_view: float = 1.5 * math.pi
+    """Angle from the left to the right edge, [rad]."""
+    range: float = 1.5
+    """Greatest distance that is measured, [m]."""
+    noise: float = 0.0
+    """Standard deviation of the distances, [m]."""
+    dropped: float = 0.0
+    """Share of rays that return the greatest range whatever they meet."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if self.mount not in MOUNTS:
+            raise ValueError(f"mount of the sensor must be one of {', '.join(MOUNTS)}, got {self.mount!r}")
+        position = finite_array("position of the sensor", self.position, (3,))
+        quaternion = finite_array("quaternion of the sensor", self.quaternion, (4,))
+        length = float(np.linalg.norm(quaternion))
+        if abs(length - 1.0) > 1e-3:
+            raise ValueError(f"quaternion of the sensor must have the length 1, got {length:.4g}")
+        columns = whole_number("columns of the sensor", self.columns, 1)
+        rows = whole_number("rows of the sensor", self.rows, 1)
+        if columns * rows > MOST_RAYS:
+            raise ValueError(f"a sensor must have at most {MOST_RAYS} rays, got {columns * rows}")
+        widest = 2.0 * math.pi if rows == 1 else WIDEST_IMAGE
+        view = number_of_at_least("field_of_view of the sensor", self.field_of_view, 1e-3)
+        if view > widest + 1e-9:
+            raise ValueError(f"field_of_view of the sensor must be at most {widest:.3g} rad, got {view:g}")
+        checked = {
+            "position": tuple(map(float, position)),
+            "quaternion": tuple(map(float, quaternion / length)),
+            "columns": columns,
+            "rows": rows,
+            "field_of_view": view,
+            "range": number_of_at_least("range of the sensor", self.range, 1e-3, 100.0),
+            "noise": number_of_at_least("noise of the sensor", self.noise, 0.0, 1.0),
+            "dropped": number_of_at_least("dropped of the sensor", self.dropped, 0.0, 1.0),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def of(cls, sensor: Sensor | Mapping[str, Any] | None) -> Sensor | None:
+        """Return a sensor from itself, or from a mapping of its fields.
+
+        Raises:
+            ValueError: The argument is something else, or a number is out of range.
+        """
+        if sensor is None or isinstance(sensor, cls):
+            return sensor
+        if not isinstance(sensor, Mapping):
+            raise ValueError(
+                f"sensor must be None, {', '.join(map(repr, NAMED))}, a Sensor or a mapping of its fields, "
+                f"got {sensor!r}"
+            )
+        unknown = sorted(set(sensor) - {field.name for field in dataclasses.fields(cls)})
+        if unknown:
+            raise ValueError(f"sensor has no field {', '.join(map(repr, unknown))}")
+        return cls(**sensor)
+
+    @property
+    def n_rays(self) -> int:
+        """Number of rays."""
+        return self.columns * self.rows
+
+    @property
+    def viewpoint(self) -> tuple[float, float, float] | None:
+        """Place of the sensor in the world, [m]; None for one that moves."""
+        return self.position if self.mount == "world" else None
+
+    @functools.cached_property
+    def directions(self) -> Float:
+        """Unit vectors of the rays in the frame of the sensor, shape (R, 3)."""
+        column = (np.arange(self.columns) + 0.5) / self.columns - 0.5
+        if self.rows == 1:
+            angle = -self.field_of_view * column
+            return np.stack((np.cos(angle), np.sin(angle), np.zeros_like(angle)), axis=-1)
+        width = 2.0 * math.tan(0.5 * self.field_of_view)
+        row = ((np.arange(self.rows) + 0.5) / self.rows - 0.5) * self.rows / self.columns
+        down, left = np.meshgrid(row, -column, indexing="ij")
+        rays = np.stack((np.ones_like(left), width * left, -width * down), axis=-1).reshape(-1, 3)
+        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+    def pose(self, arm: Arm, joints: Float) -> tuple[Float, Float]:
+        """Return the axes of the sensor as columns, shape (N, 3, 3), and its origins, shape (N, 3), [m].
+
+        Args:
+            arm: Arm.
+            joints: Joint positions, shape (N, J).
+        """
+        rotation = frame_matrices(np.array(self.quaternion))
+        position = np.array(self.position)
+        number = len(joints)
+        if self.mount == "world":
+            return np.tile(rotation, (number, 1, 1)), np.tile(position, (number, 1))
+        links, _ = link_poses(arm.chain, joints)
+        tool = links[:, -1] @ arm.chain.tool_rotation
+        place, _ = forward(arm.chain, joints)
+        return tool @ rotation, place + tool @ position
+
+    def ray_towards(self, local: Any) -> Any:
+        """Return the number of the ray nearest to points, -1 outside the field of view, shape (...), int32.
+
+        Args:
+            local: Points in the frame of the sensor, shape (..., 3), [m].
+        """
+        x, y, z = local[..., 0], local[..., 1], local[..., 2]
+        if self.rows == 1:
+            column = np.floor((0.5 - np.arctan2(y, x) / self.field_of_view) * self.columns)
+            inside = (column >= 0) & (column < self.columns)
+            return np.where(inside, column, -1).astype(np.int32)
+        width = 2.0 * math.tan(0.5 * self.field_of_view)
+        before = np.maximum(x, 1e-9)
+        column = np.floor((0.5 - y / (before * width)) * self.columns)
+        row = np.floor((0.5 - z * self.columns / (before * width * self.rows)) * self.rows)
+        inside = (x > 0.0) & (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
+        return np.where(inside, row * self.columns + column, -1).astype(np.int32)
+
+    def read(self, arm: Arm, joints: Any, obstacles: Obstacles) -> Readings:
+        """Return the readings in N scenes.
+
+        Args:
+            arm: Arm.
+            joints: Joint positions, shape (N, J); they matter for a sensor at the hand.
+            obstacles: Obstacles at their present places.
+        """
+        rotation, origin = self.pose(arm, np.asarray(joints, np.float64))
+        ranges, seen, rays = self._cast(rotation, origin, obstacles)
+        if self.noise or self.dropped:
+            ranges = self._disturbed(ranges, seen)
+        return Readings(ranges, origin[:, None] + ranges[..., None] * rays, seen)
+
+    def hidden(self, rotation: Float, origin: Float, obstacles: Obstacles) -> Bool:
+        """Return True for obstacles that no ray meets, shape (N, n), for poses of the sensor, see :meth:`pose`."""
+        _, seen, _ = self._cast(rotation, origin, obstacles)
+        rows = np.arange(obstacles.kind.shape[1])
+        met = (seen[..., None] == rows).any(axis=1)
+        return np.asarray(obstacles.present & ~met)
+
+    def _cast(self, rotation: Float, origin: Float, obstacles: Obstacles) -> tuple[Float, Int, Float]:
+        """Return exact distances, rows of the obstacles that are met, and the rays, shape (N, R, 3)."""
+        rays = np.ascontiguousarray(np.einsum("nij,rj->nri", rotation, self.directions))
+        centre, half = bounding_boxes(obstacles)
+        ball = np.linalg.norm(half, axis=-1)
+        ball[obstacles.kind == HALF_SPACE] = np.inf
+        ranges = np.full((len(origin), self.n_rays), self.range)
+        seen = np.full(ranges.shape, -1, np.int64)
+        _cast(obstacles, centre, ball, origin, rays, ranges, seen)
+        return ranges, seen, rays
+
+    def _disturbed(self, ranges: Float, seen: Int) -> Float:
+        """Return distances with noise and dropped rays, which are functions of the distances and the rays' numbers."""
+        bits = ranges.view(np.uint64) + np.arange(1, self.n_rays + 1, dtype=np.uint64) * np.uint64(GOLDEN)
+        first, second, third = (_uniform(bits + np.uint64(k)) for k in range(3))
+        # Two uniform numbers give a normal one (G. E. P. Box and M. E. Muller, 1958).
+        normal = np.sqrt(-2.0 * np.log(1.0 - first)) * np.cos(2.0 * np.pi * second)
+        noisy = np.clip(ranges + self.noise * normal, 0.0, self.range)
+        return np.where((seen < 0) | (third < self.dropped), self.range, noisy)
+
+
+NAMED = ("rays", "camera", "hand_camera")
+"""Names of usual sensors, see :func:`named_sensor`."""
+
+
+def named_sensor(name: str, arm: Arm, foot: tuple[float, float, float], scale: float) -> Sensor:
+    """Return a usual sensor for an arm.
+
+    Args:
+        name: `rays`, a fan of 192 rays from the first joint at the height of the hand; `camera`, a depth image from
+            above and behind the base; `hand_camera`, one from the tool along its approach axis, its z axis.
+        arm: Arm.
+        foot: Place of its foot, [m].
+        scale: Size of the arm relative to the reference arm.
+
+    Raises:
+        ValueError: There is no such sensor.
+    """
+    if name == "rays":
+        hand = arm.hand(arm.home)
+        bearing = math.atan2(hand[1] - foot[1], hand[0] - foot[0])
+        turn = math.cos(0.5 * bearing), 0.0, 0.0, math.sin(0.5 * bearing)
+        return Sensor(position=(foot[0], foot[1], float(hand[2])), quaternion=turn, range=1.5 * scale)
+    if name == "camera":
+        eye = np.array(foot) + scale * np.array([-0.35, 0.0, 1.15])
+        target = np.array(foot) + scale * np.array([0.5, 0.0, 0.3])
+        turn = _towards(target - eye)
+        image = {"columns": 48, "rows": 36, "field_of_view": 1.3, "range": 2.5 * scale}
+        return Sensor(position=tuple(eye), quaternion=turn, **image)
+    if name == "hand_camera":
+        turn = math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0
+        return Sensor(
+            mount="hand", quaternion=turn, columns=32, rows=24, field_of_view=1.5, range=1.0 * scale
+        )
+    raise ValueError(f"sensor must be one of {', '.join(NAMED)}, got {name!r}")
+
+
+GOLDEN = 0x9E3779B97F4A7C15
+"""Odd number near 2^64 divided by the golden ratio, the step of SplitMix64."""
+
+
+def _uniform(bits: Any) -> Float:
+    """Return numbers in [0, 1) that look random (SplitMix64, G. L. Steele et al., 2014)."""
+    mixed = bits * np.uint64(GOLDEN)
+    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    mixed ^= mixed >> np.uint64(31)
+    return np.asarray((mixed >> np.uint64(11)) * 2.0**-53)
+
+
+def _towards(direction: Float) -> tuple[float, float, float, float]:
+    """Return the quaternion of a level frame whose x axis has a direction, shape (3,)."""
+    yaw = math.atan2(direction[1], direction[0])
+    pitch = -math.atan2(direction[2], math.hypot(direction[0], direction[1]))
+    a, b = math.cos(0.5 * yaw), math.sin(0.5 * yaw)
+    c, d = math.cos(0.5 * pitch), math.sin(0.5 * pitch)
+    return a * c, -b * d, a * d, b * c
+
+
+@compiled
+def _cast(
+    obstacles: Obstacles,
+    centre: Float,
+    ball: Float,
+    origin: Float,
+    rays: Float,
+    ranges: Float,
+    seen: Int,
+) -> None:
+    """Shorten ranges to the first surface along each ray, and fill in the row of the obstacle.
+
+    Args:
+        obstacles: Obstacles of N scenes.
+        centre: Centres of their bounding balls, shape (N, n, 3), [m].
+        ball: Radii of these balls, infinite for half-spaces, shape (N, n), [m].
+        origin: Origins of the sensors, shape (N, 3), [m].
+        rays: Unit vectors, shape (N, R, 3).
+        ranges: Greatest distances, shape (N, R), [m].
+        seen: Rows, shape (N, R).
+    """
+    for scene in range(len(origin)):
+        for row in range(obstacles.kind.shape[1]):
+            kind = obstacles.kind[scene, row]
+            if kind == ABSENT:
+                continue
+            x0, y0, z0 = origin[scene]
+            radius = ball[scene, row] + TOUCH
+            away_x = centre[scene, row, 0] - x0
+            away_y = centre[scene, row, 1] - y0
+            away_z = centre[scene, row, 2] - z0
+            square = away_x**2 + away_y**2 + away_z**2
+            for ray in range(rays.shape[1]):
+                x, y, z = rays[scene, ray]
+                first, last = 0.0, ranges[scene, ray]
+                if radius < np.inf:
+                    middle = away_x * x + away_y * y + away_z * z
+                    half_square = radius * radius - square + middle * middle
+                    if half_square < 0.0:
+                        continue
+                    half = math.sqrt(half_square)
+                    first, last = max(middle - half, 0.0), min(middle + half, last)
+                way = first
+                for _ in range(MOST_STEPS):
+                    if way >= last:
+                        break
+                    apart, a, b, c = point_distance_and_normal(
+                        obstacles, scene, row, x0 + way * x, y0 + way * y, z0 + way * z, 0.0, 1e9
+                    )
+                    if apart < TOUCH:
+                        ranges[scene, ray] = way
+                        seen[scene, ray] = row
+                        break
+                    step = apart
+                    if kind != POINT_CLOUD:
+                        # A convex shape lies behind the plane through its nearest point: it is met there at the soonest.
+                        closing = -(a * x + b * y + c * z)
+                        if closing <= 0.0:
+                            break
+                        step = apart / closing
+                    way += step

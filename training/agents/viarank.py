@@ -1,0 +1,436 @@
+"""ViaRank: an agent that sees obstacles with a sensor, and ranks candidate plans by their predicted success.
+
+It learns with privileged information (D. Chen et al., Learning by cheating, 2020). In training the true obstacles are
+known, so that computed geometry labels any number of plans of a scene as clear or not. The network predicts these labels
+from the readings alone. Half of the plans that are learned from are those that the network itself prefers: otherwise it
+would be right on average, and too sure of those that it chooses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import is_vectorized_observation
+from torch import Tensor
+from torch.nn import functional
+
+from viapoint.envs.common.types import Float, Int
+from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
+from viapoint.envs.scenes.scene import Scenes, resting
+from viapoint.envs.task import Task
+from viapoint.training.agents.agent import Agent
+from viapoint.training.agents.model_io import ALGORITHMS
+from viapoint.training.agents.sight_network import SightNetwork, sight_inputs
+from viapoint.training.config.checks import check_arguments
+from viapoint.training.planning.beliefs import Sight, thick_points
+from viapoint.training.planning.candidates import candidate_actions
+from viapoint.training.planning.problem import Numbers, Problem
+from viapoint.training.planning.search import (
+    CLEARANCE_MARGIN,
+    plan_clearances,
+    refined_actions,
+)
+
+EFFORT_WEIGHT = 0.05
+"""Weight of the reward of a successful plan beside its probability of success."""
+BLOCK = 16
+"""Scenes that are decided together."""
+
+
+class ViaRankPolicy(BasePolicy):
+    """Policy that ranks candidates by the probability of success that a network predicts from a sensor's readings.
+
+    Args:
+        observation_space: Observation space of the environment.
+        action_space: Action space of the environment.
+        lr_schedule: Learning rate as a function of the remaining progress.
+        task: Task of the environment as plain values, see :meth:`viapoint.envs.task.Task.as_dict`.
+        width: Number of features of a pixel.
+        instants: Instants of a plan at which the arm is looked at.
+        nearest: Number of places of a plan that the network sees.
+        candidates: Number of Sobol points in the action space.
+        refine: Number of best candidates that the planner refines around what is seen; they are ranked, too.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        lr_schedule: Any,
+        *,
+        task: Mapping[str, Any],
+        width: int = 32,
+        instants: int = 32,
+        nearest: int = 16,
+        candidates: int = 512,
+        refine: int = 0,
+        optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        self._own = {
+            "width": width,
+            "instants": instants,
+            "nearest": nearest,
+            "candidates": candidates,
+            "refine": refine,
+        }
+        check_arguments(ViaRankPolicy, self._own)
+        super().__init__(
+            observation_space,
+            action_space,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            **kwargs,
+        )
+        self.task = Task.from_dict(task)
+        if self.task.sensor is None or not self.task.whole_movement:
+            raise ValueError(
+                "viarank needs a task with a sensor whose actions are whole movements, such as viapoint/PlanarSensed-v0"
+            )
+        self.width, self.instants, self.nearest = width, instants, nearest
+        self.candidates, self.refine = candidates, refine
+        self.network = SightNetwork(self.task.sensor, width=width)
+        self.optimizer = self.optimizer_class(
+            self.network.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {"task": self.task.as_dict(), "lr_schedule": self._dummy_schedule}
+        return {**super()._get_constructor_parameters(), **self._own, **own}
+
+    @property
+    def can_refine(self) -> bool:
+        """True for tasks whose movements have via-points, which can be refined."""
+        return self.task.n_via > 0
+
+    def logits(self, problem: Problem, sight: Sight, actions: Numbers) -> tuple[Tensor, NDArray[Any]]:
+        """Return logits of success of actions, and their rewards if they succeed, shape (B, H) each."""
+        inputs, worth = sight_inputs(self.task, problem, sight, actions, self.instants, self.nearest)
+        return self.network(inputs), worth
+
+    @torch.no_grad()
+    def rank(
+        self, problem: Problem, sight: Sight, actions: Numbers
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return ranking criterion and probability of success of actions, shape (B, H) each.
+
+        Args:
+            problem: B problems with the obstacles that are believed to be there.
+            sight: Their readings.
+            actions: Actions, shape (B, H, m).
+        """
+        logits, worth = self.logits(problem, sight, actions)
+        success = torch.sigmoid(logits).numpy()
+        return success + EFFORT_WEIGHT * worth, success
+
+    def decide(self, observation: Mapping[str, NDArray[Any]]) -> tuple[Float, Float]:
+        """Return the best actions of B observations, shape (B, m), and their predicted success, shape (B,).
+
+        Args:
+            observation: Parts of shape (B, .) each.
+        """
+        problem, sight = Problem.of_observation(observation, self.task), Sight.of(observation, self.task)
+        every = candidate_actions(self.task, self.candidates, replanning=False)
+        chosen, success = [], []
+        for first in range(0, len(problem.start), BLOCK):
+            rows = slice(first, first + BLOCK)
+            some = Sight(*(part[rows] for part in sight))
+            there = problem.take(np.arange(len(problem.start))[rows])
+            actions: Numbers = np.broadcast_to(every, (len(there.start), *every.shape))
+            value, likely = self.rank(there, some, actions)
+            if self.refine:
+                top = np.argsort(-value, axis=1, kind="stable")[:, : self.refine]
+                seeds = np.take_along_axis(actions, top[..., None], axis=1)
+                refined = refined_actions(self.task, there, seeds)
+                more, sure = self.rank(there, some, refined)
+                actions = np.concatenate((actions, refined), axis=1)
+                value, likely = np.concatenate((value, more), axis=1), np.concatenate((likely, sure), axis=1)
+            best = np.arange(len(value)), value.argmax(axis=1)
+            chosen.append(actions[best])
+            success.append(likely[best])
+        return np.concatenate(chosen).astype(np.float64), np.concatenate(success).astype(np.float64)
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
+        arrays = {name: each.cpu().numpy() for name, each in observation.items()}
+        return torch.from_numpy(np.ascontiguousarray(self.decide(arrays)[0], dtype=np.float32))
+
+    def forward(self, observation: Any, deterministic: bool = True) -> Tensor:
+        """Return the chosen actions, shape (B, m)."""
+        return self._predict(observation, deterministic)
+
+    def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """Return actions for one observation or a batch, and no state, as policies of Stable-Baselines3 do.
+
+        Raises:
+            ValueError: The observation has other parts than the task's, another number of rays, or is not finite.
+        """
+        parts: Any = self.observation_space
+        if not isinstance(observation, Mapping) or set(observation) != set(parts.spaces):
+            names = ", ".join(observation) if isinstance(observation, Mapping) else type(observation).__name__
+            raise ValueError(f"observation must have the parts {', '.join(parts.spaces)}; got {names}")
+        for name, each in observation.items():
+            size = np.shape(each)[-1:]
+            if size != parts[name].shape:
+                raise ValueError(
+                    f"{name} must have {parts[name].shape[0]} values, as with the sensor of the training; got {size[0]}"
+                )
+            if not np.isfinite(np.asarray(each)).all():
+                raise ValueError(f"observation must be finite; {name} is not")
+        several = is_vectorized_observation(dict(observation), parts)
+        batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
+        actions = np.clip(self.decide(batch)[0], -1.0, 1.0).astype(np.float32)
+        return (actions if several else actions[0]), state
+
+
+class SceneBuffer(ReplayBuffer):
+    """Replay buffer of true scenes and of plans that are labelled in each of them.
+
+    It holds no observations: readings are computed from the scenes when they are sampled.
+
+    Args:
+        buffer_size: Capacity in scenes.
+        observation_space: Observation space.
+        action_space: Action space.
+        device: Device of the networks.
+        n_envs: Number of environments.
+        optimize_memory_usage: Unused; part of the interface of Stable-Baselines3.
+        task: Task of the scenes.
+        plans: Number of plans of a scene.
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        device: Any = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        *,
+        task: Task,
+        plans: int,
+    ) -> None:
+        nothing = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        super().__init__(buffer_size, nothing, nothing, device, n_envs)
+        size, rows, joints = (self.buffer_size, self.n_envs), task.observation.n_rows, len(task.arm.home)
+        self.start, self.goal = np.zeros((*size, joints)), np.zeros((*size, joints))
+        empty = no_obstacles(self.buffer_size * self.n_envs, rows)
+        self.kind = empty.kind.reshape(*size, rows)
+        self.centre = empty.centre.reshape(*size, rows, 3)
+        self.rotation = empty.rotation.reshape(*size, rows, 3, 3)
+        self.sizes = empty.size.reshape(*size, rows, 3)
+        self.plans = np.zeros((*size, plans, task.action.size), np.float32)
+        self._pending: tuple[Scenes, NDArray[Any]] | None = None
+
+    def keep(self, scenes: Scenes, plans: NDArray[Any]) -> None:
+        """Keep the scenes of the present decisions, and plans to label, shape (N, H, m), until they are added."""
+        self._pending = scenes, plans
+
+    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: Any) -> None:
+        """Add the scenes of the last decisions."""
+        assert self._pending is not None
+        scenes, self.plans[self.pos] = self._pending
+        obstacles = scenes.obstacles
+        self.start[self.pos], self.goal[self.pos] = scenes.start, scenes.goal
+        self.kind[self.pos], self.centre[self.pos] = obstacles.kind, obstacles.centre
+        self.rotation[self.pos], self.sizes[self.pos] = obstacles.rotation, obstacles.size
+        self.pos += 1
+        if self.pos == self.buffer_size:
+            self.full, self.pos = True, 0
+
+    def sample_scenes(self, number: int) -> tuple[Scenes, NDArray[Any]]:
+        """Return scenes and their plans, sampled with replacement."""
+        rows = np.random.randint(0, self.size(), size=number)  # noqa: NPY002 - seeded by SB3
+        at = rows, np.random.randint(0, self.n_envs, size=number)  # noqa: NPY002
+        empty = no_obstacles(number, self.kind.shape[-1])
+        obstacles: Obstacles = empty._replace(
+            kind=self.kind[at], centre=self.centre[at], rotation=self.rotation[at], size=self.sizes[at]
+        )
+        return resting(self.start[at], self.goal[at], obstacles), self.plans[at]
+
+
+class ViaRank(Agent, OffPolicyAlgorithm):
+    """Algorithm that learns from labelled plans which movements are clear of obstacles that are seen only in part.
+
+    Args:
+        policy: `ViaRankPolicy`.
+        env: Environment or vector environment of this package with a sensor, in which an action is a whole movement.
+        learning_rate: Learning rate, or a function of the remaining progress.
+        buffer_size: Capacity of the buffer, in scenes.
+        learning_starts: Number of scenes before the first update.
+        batch_size: Scenes in each update.
+        gradient_steps: Updates after each step of all environments.
+        explore_candidates: Candidates of each scene during training, of which the best one is executed.
+        labels: Plans of each scene that are learned from: the better half are the best candidates, the others random.
+        train_freq: Steps of all environments between two rounds of updates.
+        policy_kwargs: Arguments of :class:`ViaRankPolicy`; `env` provides the task.
+        stats_window_size: Episodes over which the logged success is averaged.
+        tensorboard_log: Folder of a TensorBoard log.
+        verbose: 0 for no output, 1 for information, 2 for more of it.
+        seed: Seed of all random numbers.
+        device: Device of the networks.
+
+    Raises:
+        ValueError: A hyperparameter is out of range, or the environment has no sensor.
+
+    Example:
+        >>> from viapoint.training import ViaRank, ViaVecEnv
+        >>> env = ViaVecEnv("viapoint/PlanarSensed-v0", 16, seed=0)
+        >>> agent = ViaRank("ViaRankPolicy", env, learning_starts=16, batch_size=16).learn(32)
+        >>> agent.num_timesteps
+        32
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ViaRankPolicy": ViaRankPolicy}
+    policy: ViaRankPolicy
+    replay_buffer: SceneBuffer | None  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        policy: str | type[ViaRankPolicy],
+        env: Any,
+        learning_rate: float | Schedule = 2e-3,
+        *,
+        buffer_size: int = 50_000,
+        learning_starts: int = 512,
+        batch_size: int = 64,
+        gradient_steps: int = 3,
+        explore_candidates: int = 128,
+        labels: int = 24,
+        train_freq: int | tuple[int, str] = 1,
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: torch.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        self.explore_candidates, self.labels = explore_candidates, labels
+        check_arguments(ViaRank, {"explore_candidates": explore_candidates, "labels": labels})
+        if labels > explore_candidates:
+            raise ValueError(f"labels must be at most explore_candidates, {explore_candidates}, got {labels}")
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            gamma=1.0,
+            gradient_steps=gradient_steps,
+            replay_buffer_class=SceneBuffer,
+            policy_kwargs=dict(policy_kwargs or {}),
+            train_freq=train_freq,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            support_multi_env=True,
+            sde_support=False,
+        )
+        if self.env is not None:
+            self.policy_kwargs.setdefault("task", self._task().as_dict())
+        if _init_setup_model:
+            self._setup_model()
+
+    def _task(self) -> Task:
+        """Return the task of the environment."""
+        assert self.env is not None
+        task = self.env.get_attr("task", indices=0)[0]
+        if task.sensor is None or not task.whole_movement:
+            raise ValueError(
+                "viarank needs an environment with a sensor in which an action is a whole movement, such as "
+                f"viapoint/PlanarSensed-v0; this one has sensor={task.sensor}, decide_at={task.decide_at!r}"
+            )
+        found: Task = task
+        return found
+
+    def _setup_model(self) -> None:
+        task = Task.from_dict(self.policy_kwargs["task"])
+        if self.env is not None and self._task().sensor != task.sensor:
+            raise ValueError(
+                f"the environment must have the sensor of the agent, {task.sensor}, got {self._task().sensor}"
+            )
+        self.replay_buffer_kwargs = {"task": task, "plans": self.labels}
+        super()._setup_model()
+        self.actor = self.policy
+
+    def scenes(self) -> Scenes:
+        """Return the true scenes of the running episodes, which only training looks at."""
+        assert self.env is not None
+        several = self.env.get_attr("scenes")
+        if len(several[0].start) == self.n_envs:
+            whole: Scenes = several[0]
+            return whole
+        return Scenes.together(several)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: Any = None, n_envs: int = 1
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the best of some random candidates, and keep plans of the present scenes to learn from."""
+        assert self.replay_buffer is not None
+        task = self.policy.task
+        observation: Any = self._last_obs
+        every = candidate_actions(task, self.policy.candidates, replanning=False)
+        count = min(self.explore_candidates, len(every))
+        drawn = np.argsort(np.random.uniform(size=(n_envs, len(every))), axis=1)[:, :count]  # noqa: NPY002
+        candidates = every[drawn].astype(np.float32)
+        best = count - min(self.labels // 2, count)
+        if self.num_timesteps < learning_starts:
+            order: Int = np.tile(np.arange(count), (n_envs, 1))
+        else:
+            problem = Problem.of_observation(observation, task)
+            value, _ = self.policy.rank(problem, Sight.of(observation, task), candidates)
+            order = np.argsort(value, axis=1)
+        ranked = np.take_along_axis(candidates, order[..., None], axis=1)
+        spread = np.random.uniform(size=(n_envs, best)).argsort(axis=1)  # noqa: NPY002
+        others = np.take_along_axis(ranked, spread[:, : self.labels - (count - best), None], axis=1)
+        self.replay_buffer.keep(self.scenes(), np.concatenate((ranked[:, best:], others), axis=1))
+        return ranked[:, -1], ranked[:, -1]
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Update the network `gradient_steps` times."""
+        assert self.replay_buffer is not None
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        task, losses = self.policy.task, []
+        for _ in range(gradient_steps):
+            scenes, plans = self.replay_buffer.sample_scenes(batch_size)
+            truth = Problem.of_scenes(scenes, task)
+            clearance = plan_clearances(task, truth, plans, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
+            labels = torch.from_numpy((clearance >= CLEARANCE_MARGIN).astype(np.float32))
+            sight = Sight.of_scenes(scenes, task)
+            believed = truth._replace(obstacles=thick_points(task, sight))
+            logits, _ = self.policy.logits(believed, sight, plans)
+            loss = functional.binary_cross_entropy_with_logits(logits, labels)
+            self.policy.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(self.policy.network.parameters(), 5.0)
+            self.policy.optimizer.step()
+            losses.append(float(loss.detach()))
+            self._n_updates += 1
+        self.logger.record("train/loss", float(np.mean(losses)))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []
+
+
+ALGORITHMS["viarank"] = ViaRank
