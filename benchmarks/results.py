@@ -23,6 +23,19 @@ from viapoint.training.scene_sets.scene_set import SETS, shipped_set
 BASELINES = ("untrained", "straight", "sobol64", "search512", "plan_motion")
 REPLANNING_BASELINES = BASELINES[:-1]
 """Baselines of tasks in which plans are revised: :func:`plan_motion` is for obstacles that rest."""
+SENSED_BASELINES = (
+    "untrained",
+    "straight",
+    "points:search512",
+    "fitted:search512",
+    "thick:search512",
+    "thick:plan_motion",
+    "cautious512",
+    "seen:search512",
+    "known:search512",
+    "known:plan_motion",
+)
+"""Baselines of tasks with a sensor: beliefs with more and more information. The last three need the truth."""
 PAGE = Path("docs/results.md")
 FIELDS = ("env", "scenes", "method", "success", "low", "high", "count", "jerk_ratio", "milliseconds")
 
@@ -41,16 +54,19 @@ class Config:
 
 def rows_of(env_id: str, name: str, n_scenes: int | None) -> Iterator[dict[str, Any]]:
     """Yield the numbers of each method in one set."""
-    refinable = registered_task(env_id).whole_movement
+    task = registered_task(env_id)
+    settings: dict[str, Any] = {"checks": [0, 16], "refine": [4], "baselines": BASELINES}
+    if task.sensor is not None:
+        settings = {"baselines": SENSED_BASELINES}
+    elif task.replanning:
+        settings = {"checks": [0, 16], "baselines": REPLANNING_BASELINES}
     result = evaluate(
         load_agent(env_id),
         env=env_id,
         scenes=name,
         n_scenes=n_scenes,
-        checks=[0, 16],
-        refine=[4] if refinable else [],
-        baselines=BASELINES if refinable else REPLANNING_BASELINES,
         time_decisions=name == "test",
+        **settings,
     )
     for row in result.rows:
         success = row["success"]

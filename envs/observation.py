@@ -29,9 +29,10 @@ class ObservationLayout:
 
     `joints` [rad], `hand` and `goal` [m]; in joint space `goal_joints` [rad]; where obstacles may be, `obstacles`:
     n rows (kind one-hot, centre [m], first two axes of the frame, half lengths of the bounding box [m], velocity [m/s],
-    present), flattened. With a sensor, `ranges` and `points` of its rays [m], flattened, in place of `obstacles`. While a movement is under way also the reference that the arm follows, `command`, `velocity`
-    and `acceleration`, and `time_left` [s]; in tasks with replanning `via` and `remaining` [s], the plan of a zero
-    action. What exceeds its bounds is clipped.
+    present), flattened. With a sensor, `ranges` and `points` of its rays [m], flattened, in place of `obstacles`. While
+    a movement is under way also the reference that the arm follows, `command`, `velocity` and `acceleration`, and
+    `time_left` [s]; in tasks with replanning `via` and `remaining` [s], the plan of a zero action. What exceeds its
+    bounds is clipped.
     """
 
     joint_range: tuple[tuple[float, float], ...]

@@ -350,7 +350,7 @@ def _cast(
                         break
                     step = apart
                     if kind != POINT_CLOUD:
-                        # A convex shape lies behind the plane through its nearest point: it is met there at the soonest.
+                        # A convex shape lies behind the plane through its nearest point, and is met there at the soonest.
                         closing = -(a * x + b * y + c * z)
                         if closing <= 0.0:
                             break

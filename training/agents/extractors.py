@@ -59,9 +59,7 @@ class SceneExtractor(BaseFeaturesExtractor):
         self.row_size = size // max(self.n_rows, 1)
         """Number of values of one obstacle."""
         values = 3 if self.most else max(self.row_size - 1, 0)
-        self.each = nn.Sequential(
-            nn.Linear(values + 7, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
-        )
+        self.each = nn.Sequential(nn.Linear(values + 7, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
 
     def forward(self, observation: dict[str, Tensor]) -> Tensor:
         """Return features, shape (B, features_dim)."""

@@ -186,8 +186,8 @@ def untrained(model: BaseAlgorithm, seed: int = 0) -> BaseAlgorithm:
 
 def _to_decide(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
     """Return hyperparameters with hardly any room for experience, which decisions do not need."""
-    buffer = "buffer_size" if "buffer_size" in hyperparameters else "n_steps"
-    return {**hyperparameters, buffer: 2}
+    small = {name: 2 for name in ("buffer_size", "n_steps") if name in hyperparameters}
+    return {**hyperparameters, **small}
 
 
 def describe(model: BaseAlgorithm) -> dict[str, Any]:

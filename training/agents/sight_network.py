@@ -47,6 +47,13 @@ class SightInputs(NamedTuple):
     plans: Tensor
     """Inputs of whole movements: clearance by the belief, reach, shape (B, H, 2)."""
 
+    def take(self, chosen: Tensor) -> SightInputs:
+        """Return the inputs of some of the movements, by indices of shape (B, h)."""
+        scenes = torch.arange(len(chosen))[:, None]
+        return SightInputs(
+            self.image, self.pixel[scenes, chosen], self.places[scenes, chosen], self.plans[scenes, chosen]
+        )
+
 
 def sight_inputs(
     task: Task, problem: Problem, sight: Sight, actions: Numbers, instants: int, nearest: int

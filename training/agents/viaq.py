@@ -316,7 +316,9 @@ def task_of(env: VecEnv) -> Task:
             f"viapoint/PlanarObstacles-v0; got {env.observation_space} with {env.action_space}"
         )
     if task.sensor is not None:
-        raise ValueError("viaq needs the obstacles; where a sensor sees them, viarank learns to place via-points")
+        raise ValueError(
+            "viaq needs the obstacles; where a sensor sees them, viarank learns to place via-points"
+        )
     return task
 
 

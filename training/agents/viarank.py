@@ -1,13 +1,15 @@
 """ViaRank: an agent that sees obstacles with a sensor, and ranks candidate plans by their predicted success.
 
 It learns with privileged information (D. Chen et al., Learning by cheating, 2020). In training the true obstacles are
-known, so that computed geometry labels any number of plans of a scene as clear or not. The network predicts these labels
-from the readings alone. Half of the plans that are learned from are those that the network itself prefers: otherwise it
-would be right on average, and too sure of those that it chooses.
+known, so that computed geometry labels any number of plans of a scene as clear or not. The network predicts the labels
+from the readings alone. For each update new scenes are drawn, which need no simulation; movements in the environment
+measure how well the agent does. Half of the plans that are learned from are those that the network itself prefers:
+otherwise it would be right on average, and too sure of those that it chooses.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -23,13 +25,12 @@ from stable_baselines3.common.utils import is_vectorized_observation
 from torch import Tensor
 from torch.nn import functional
 
-from viapoint.envs.common.types import Float, Int
-from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
-from viapoint.envs.scenes.scene import Scenes, resting
+from viapoint.envs.common.types import Float
+from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
 from viapoint.training.agents.model_io import ALGORITHMS
-from viapoint.training.agents.sight_network import SightNetwork, sight_inputs
+from viapoint.training.agents.sight_network import SightInputs, SightNetwork, sight_inputs
 from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.candidates import candidate_actions
@@ -121,9 +122,7 @@ class ViaRankPolicy(BasePolicy):
         return self.network(inputs), worth
 
     @torch.no_grad()
-    def rank(
-        self, problem: Problem, sight: Sight, actions: Numbers
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
+    def rank(self, problem: Problem, sight: Sight, actions: Numbers) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return ranking criterion and probability of success of actions, shape (B, H) each.
 
         Args:
@@ -146,7 +145,7 @@ class ViaRankPolicy(BasePolicy):
         chosen, success = [], []
         for first in range(0, len(problem.start), BLOCK):
             rows = slice(first, first + BLOCK)
-            some = Sight(*(part[rows] for part in sight))
+            some = sight.take(rows)
             there = problem.take(np.arange(len(problem.start))[rows])
             actions: Numbers = np.broadcast_to(every, (len(there.start), *every.shape))
             value, likely = self.rank(there, some, actions)
@@ -194,71 +193,17 @@ class ViaRankPolicy(BasePolicy):
         return (actions if several else actions[0]), state
 
 
-class SceneBuffer(ReplayBuffer):
-    """Replay buffer of true scenes and of plans that are labelled in each of them.
-
-    It holds no observations: readings are computed from the scenes when they are sampled.
-
-    Args:
-        buffer_size: Capacity in scenes.
-        observation_space: Observation space.
-        action_space: Action space.
-        device: Device of the networks.
-        n_envs: Number of environments.
-        optimize_memory_usage: Unused; part of the interface of Stable-Baselines3.
-        task: Task of the scenes.
-        plans: Number of plans of a scene.
-    """
+class NoBuffer(ReplayBuffer):
+    """Replay buffer that keeps nothing: scenes to learn from are drawn anew for each update."""
 
     def __init__(
-        self,
-        buffer_size: int,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
-        device: Any = "auto",
-        n_envs: int = 1,
-        optimize_memory_usage: bool = False,
-        *,
-        task: Task,
-        plans: int,
-    ) -> None:
+        self, buffer_size: int, observation_space: Any, action_space: Any, *args: Any, **kwargs: Any
+    ):
         nothing = spaces.Box(-1.0, 1.0, (1,), np.float32)
-        super().__init__(buffer_size, nothing, nothing, device, n_envs)
-        size, rows, joints = (self.buffer_size, self.n_envs), task.observation.n_rows, len(task.arm.home)
-        self.start, self.goal = np.zeros((*size, joints)), np.zeros((*size, joints))
-        empty = no_obstacles(self.buffer_size * self.n_envs, rows)
-        self.kind = empty.kind.reshape(*size, rows)
-        self.centre = empty.centre.reshape(*size, rows, 3)
-        self.rotation = empty.rotation.reshape(*size, rows, 3, 3)
-        self.sizes = empty.size.reshape(*size, rows, 3)
-        self.plans = np.zeros((*size, plans, task.action.size), np.float32)
-        self._pending: tuple[Scenes, NDArray[Any]] | None = None
+        super().__init__(1, nothing, nothing)
 
-    def keep(self, scenes: Scenes, plans: NDArray[Any]) -> None:
-        """Keep the scenes of the present decisions, and plans to label, shape (N, H, m), until they are added."""
-        self._pending = scenes, plans
-
-    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: Any) -> None:
-        """Add the scenes of the last decisions."""
-        assert self._pending is not None
-        scenes, self.plans[self.pos] = self._pending
-        obstacles = scenes.obstacles
-        self.start[self.pos], self.goal[self.pos] = scenes.start, scenes.goal
-        self.kind[self.pos], self.centre[self.pos] = obstacles.kind, obstacles.centre
-        self.rotation[self.pos], self.sizes[self.pos] = obstacles.rotation, obstacles.size
-        self.pos += 1
-        if self.pos == self.buffer_size:
-            self.full, self.pos = True, 0
-
-    def sample_scenes(self, number: int) -> tuple[Scenes, NDArray[Any]]:
-        """Return scenes and their plans, sampled with replacement."""
-        rows = np.random.randint(0, self.size(), size=number)  # noqa: NPY002 - seeded by SB3
-        at = rows, np.random.randint(0, self.n_envs, size=number)  # noqa: NPY002
-        empty = no_obstacles(number, self.kind.shape[-1])
-        obstacles: Obstacles = empty._replace(
-            kind=self.kind[at], centre=self.centre[at], rotation=self.rotation[at], size=self.sizes[at]
-        )
-        return resting(self.start[at], self.goal[at], obstacles), self.plans[at]
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        """Forget a transition."""
 
 
 class ViaRank(Agent, OffPolicyAlgorithm):
@@ -268,9 +213,8 @@ class ViaRank(Agent, OffPolicyAlgorithm):
         policy: `ViaRankPolicy`.
         env: Environment or vector environment of this package with a sensor, in which an action is a whole movement.
         learning_rate: Learning rate, or a function of the remaining progress.
-        buffer_size: Capacity of the buffer, in scenes.
-        learning_starts: Number of scenes before the first update.
-        batch_size: Scenes in each update.
+        learning_starts: Number of decisions before the first update.
+        batch_size: Scenes that are drawn for each update.
         gradient_steps: Updates after each step of all environments.
         explore_candidates: Candidates of each scene during training, of which the best one is executed.
         labels: Plans of each scene that are learned from: the better half are the best candidates, the others random.
@@ -295,7 +239,6 @@ class ViaRank(Agent, OffPolicyAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ViaRankPolicy": ViaRankPolicy}
     policy: ViaRankPolicy
-    replay_buffer: SceneBuffer | None  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -303,11 +246,10 @@ class ViaRank(Agent, OffPolicyAlgorithm):
         env: Any,
         learning_rate: float | Schedule = 2e-3,
         *,
-        buffer_size: int = 50_000,
-        learning_starts: int = 512,
+        learning_starts: int = 64,
         batch_size: int = 64,
         gradient_steps: int = 3,
-        explore_candidates: int = 128,
+        explore_candidates: int = 96,
         labels: int = 24,
         train_freq: int | tuple[int, str] = 1,
         policy_kwargs: dict[str, Any] | None = None,
@@ -326,12 +268,12 @@ class ViaRank(Agent, OffPolicyAlgorithm):
             policy,
             env,
             learning_rate,
-            buffer_size=buffer_size,
+            buffer_size=1,
             learning_starts=learning_starts,
             batch_size=batch_size,
             gamma=1.0,
             gradient_steps=gradient_steps,
-            replay_buffer_class=SceneBuffer,
+            replay_buffer_class=NoBuffer,
             policy_kwargs=dict(policy_kwargs or {}),
             train_freq=train_freq,
             stats_window_size=stats_window_size,
@@ -365,69 +307,72 @@ class ViaRank(Agent, OffPolicyAlgorithm):
             raise ValueError(
                 f"the environment must have the sensor of the agent, {task.sensor}, got {self._task().sensor}"
             )
-        self.replay_buffer_kwargs = {"task": task, "plans": self.labels}
         super()._setup_model()
         self.actor = self.policy
 
-    def scenes(self) -> Scenes:
-        """Return the true scenes of the running episodes, which only training looks at."""
-        assert self.env is not None
-        several = self.env.get_attr("scenes")
-        if len(several[0].start) == self.n_envs:
-            whole: Scenes = several[0]
-            return whole
-        return Scenes.together(several)
+    def _candidates(self, number: int) -> NDArray[np.float32]:
+        """Return random candidates of some scenes, shape (number, H, m)."""
+        every = candidate_actions(self.policy.task, self.policy.candidates, replanning=False)
+        drawn = np.random.uniform(size=(number, len(every))).argsort(axis=1)  # noqa: NPY002 - seeded by SB3
+        return np.asarray(every[drawn[:, : self.explore_candidates]], np.float32)
 
     def _sample_action(
         self, learning_starts: int, action_noise: Any = None, n_envs: int = 1
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the best of some random candidates, and keep plans of the present scenes to learn from."""
-        assert self.replay_buffer is not None
-        task = self.policy.task
+        """Return the best of some random candidates."""
         observation: Any = self._last_obs
-        every = candidate_actions(task, self.policy.candidates, replanning=False)
-        count = min(self.explore_candidates, len(every))
-        drawn = np.argsort(np.random.uniform(size=(n_envs, len(every))), axis=1)[:, :count]  # noqa: NPY002
-        candidates = every[drawn].astype(np.float32)
-        best = count - min(self.labels // 2, count)
-        if self.num_timesteps < learning_starts:
-            order: Int = np.tile(np.arange(count), (n_envs, 1))
-        else:
-            problem = Problem.of_observation(observation, task)
-            value, _ = self.policy.rank(problem, Sight.of(observation, task), candidates)
-            order = np.argsort(value, axis=1)
-        ranked = np.take_along_axis(candidates, order[..., None], axis=1)
-        spread = np.random.uniform(size=(n_envs, best)).argsort(axis=1)  # noqa: NPY002
-        others = np.take_along_axis(ranked, spread[:, : self.labels - (count - best), None], axis=1)
-        self.replay_buffer.keep(self.scenes(), np.concatenate((ranked[:, best:], others), axis=1))
-        return ranked[:, -1], ranked[:, -1]
+        candidates = self._candidates(n_envs)
+        task = self.policy.task
+        problem, sight = Problem.of_observation(observation, task), Sight.of(observation, task)
+        value, _ = self.policy.rank(problem, sight, candidates)
+        actions = candidates[np.arange(n_envs), value.argmax(axis=1)]
+        return actions, actions
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update the network `gradient_steps` times."""
-        assert self.replay_buffer is not None
-        self.policy.set_training_mode(True)
-        self._update_learning_rate(self.policy.optimizer)
-        task, losses = self.policy.task, []
+        policy, task = self.policy, self.policy.task
+        policy.set_training_mode(True)
+        self._update_learning_rate(policy.optimizer)
+        losses = []
         for _ in range(gradient_steps):
-            scenes, plans = self.replay_buffer.sample_scenes(batch_size)
-            truth = Problem.of_scenes(scenes, task)
-            clearance = plan_clearances(task, truth, plans, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
-            labels = torch.from_numpy((clearance >= CLEARANCE_MARGIN).astype(np.float32))
-            sight = Sight.of_scenes(scenes, task)
+            seeds = np.random.randint(0, 2**31, size=batch_size)  # noqa: NPY002 - seeded by SB3
+            scenes = self._sampler([np.random.default_rng(seed) for seed in seeds])
+            truth, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
             believed = truth._replace(obstacles=thick_points(task, sight))
-            logits, _ = self.policy.logits(believed, sight, plans)
+            plans = self._candidates(batch_size)
+            inputs, worth = sight_inputs(task, believed, sight, plans, policy.instants, policy.nearest)
+            chosen = self._chosen(inputs, worth)
+            some = np.take_along_axis(plans, chosen[..., None], axis=1)
+            clearance = plan_clearances(task, truth, some, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
+            labels = torch.from_numpy((clearance >= CLEARANCE_MARGIN).astype(np.float32))
+            logits = policy.network(inputs.take(torch.from_numpy(chosen)))
             loss = functional.binary_cross_entropy_with_logits(logits, labels)
-            self.policy.optimizer.zero_grad()
+            policy.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
-            torch.nn.utils.clip_grad_norm_(self.policy.network.parameters(), 5.0)
-            self.policy.optimizer.step()
+            torch.nn.utils.clip_grad_norm_(policy.network.parameters(), 5.0)
+            policy.optimizer.step()
             losses.append(float(loss.detach()))
             self._n_updates += 1
         self.logger.record("train/loss", float(np.mean(losses)))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
+    @torch.no_grad()
+    def _chosen(self, inputs: SightInputs, worth: NDArray[Any]) -> NDArray[np.int64]:
+        """Return the plans to learn from: the best ones by the present network, and others, shape (B, labels)."""
+        value = torch.sigmoid(self.policy.network(inputs)).numpy() + EFFORT_WEIGHT * worth
+        order = np.argsort(-value, axis=1)
+        best = order[:, : self.labels // 2]
+        others = np.random.uniform(size=(len(order), order.shape[1] - best.shape[1])).argsort(axis=1)  # noqa: NPY002
+        others = best.shape[1] + others[:, : self.labels - best.shape[1]]
+        return np.concatenate((best, np.take_along_axis(order, others, axis=1)), axis=1).astype(np.int64)
+
+    @functools.cached_property
+    def _sampler(self) -> SceneSampler:
+        """Sampler of the scenes that are learned from."""
+        return self.policy.task.sampler()
+
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor"]
+        return [*super()._excluded_save_params(), "actor", "_sampler"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []

@@ -74,7 +74,6 @@ PRESETS: dict[str, Preset] = {
         "ViaRankPolicy",  # its defaults are its settings
         eval_every=5_000,
         checkpoint_every=20_000,
-        learning_starts=512,
         learning_rate={"kind": "linear", "start": 2e-3, "end": 2e-5, "end_fraction": 1.0},
     ),
     "sac": _preset(40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
@@ -124,12 +123,14 @@ REPLANNING_PRESETS: dict[str, Preset] = {
 }
 """Presets of replanning tasks."""
 JOINT_DECISIONS = 16_000
-"""Greatest default number of decisions of viaq in joint space, where one costs several times as much."""
+"""Greatest default number of decisions in joint space, where one costs several times as much."""
 
 
 JOINT_SIGHT: dict[str, Any] = {
     "batch_size": 32,
     "labels": 16,
+    "explore_candidates": 48,
+    "gradient_steps": 6,
     "policy_kwargs": {"instants": 16, "nearest": 48, "candidates": 128, "refine": 4},
 }
 """Settings of viarank in joint space, where the arm has many more places in a movement."""
@@ -152,5 +153,6 @@ def preset_of(task: Task, algo: Algorithm) -> Preset:
     if algo == "viaq" and not task.space.of_hand:
         preset = dataclasses.replace(preset, n_timesteps=min(preset.n_timesteps, JOINT_DECISIONS))
     if algo == "viarank" and not task.space.of_hand:
-        preset = dataclasses.replace(preset, hyperparameters={**preset.hyperparameters, **JOINT_SIGHT})
+        settings = {**preset.hyperparameters, **JOINT_SIGHT}
+        preset = dataclasses.replace(preset, n_timesteps=JOINT_DECISIONS, hyperparameters=settings)
     return preset

@@ -13,7 +13,9 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles, pack, quaternions_of
 from viapoint.envs.geometry.shapes import Box, PointCloud, Shape
 from viapoint.envs.scenes.scene import Scenes
@@ -27,6 +29,8 @@ THICKNESS = {"hand": 0.06, "joints": 0.05}
 """Depth to which the space behind a seen surface is believed to be occupied, [m]."""
 SPACING = 0.015
 """Distance of points behind a surface, and edge of the cubes of which each holds one point, [m]."""
+END_CLEARANCE = 0.01
+"""Clearance that is believed at start and goal, which are known to be free, [m]."""
 CUBES = 1 << 16
 """Greatest number of cubes along an axis."""
 CONNECTED = 0.06
@@ -50,16 +54,28 @@ class Sight(NamedTuple):
     """Shape (B, R, 3), [m]."""
     hit: Bool
     """True for rays that met something, shape (B, R)."""
+    free: Float
+    """Centres of the arm's spheres at start and goal, where nothing can be, shape (B, E, 3), [m]."""
+    free_radius: Float
+    """Radii of these spheres, shape (E,), [m]."""
+
+    def take(self, rows: Any) -> Sight:
+        """Return the readings of some of the scenes, by indices, mask or slice."""
+        return Sight(*(part[rows] for part in self[:-1]), self.free_radius)
 
     @classmethod
     def of(cls, observation: Mapping[str, Any], task: Task) -> Sight:
         """Return the readings of B observations, parts of shape (B, .) each."""
         assert task.sensor is not None
-        joints = np.asarray(observation["joints"], np.float64)
-        ranges = np.asarray(observation["ranges"], np.float64)
-        points = np.asarray(observation["points"], np.float64).reshape(*ranges.shape, 3)
+        parts = {name: np.asarray(part, np.float64) for name, part in observation.items()}
+        ranges, joints = parts["ranges"], parts["joints"]
+        points = parts["points"].reshape(*ranges.shape, 3)
+        ends = [parts["hand"], parts["goal"]]
+        if task.space_name == "joints":
+            ends = [joints, parts["goal_joints"]]
         rotation, origin = task.sensor.pose(task.arm, joints)
-        return cls(origin, rotation, ranges, points, ranges < task.sensor.range - ROUNDING)
+        hit = ranges < task.sensor.range - ROUNDING
+        return cls(origin, rotation, ranges, points, hit, *_spheres_of(task, ends))
 
     @classmethod
     def of_scenes(cls, scenes: Scenes, task: Task) -> Sight:
@@ -68,23 +84,41 @@ class Sight(NamedTuple):
         assert sensor is not None
         rotation, origin = sensor.pose(task.arm, scenes.start)
         found = sensor.read(task.arm, scenes.start, scenes.obstacles)
-        return cls(origin, rotation, found.ranges, found.points, found.ranges < sensor.range - ROUNDING)
+        ends = [scenes.start, scenes.goal]
+        if task.space_name == "hand":
+            ends = [task.arm.hand(joints) for joints in ends]
+        hit = found.ranges < sensor.range - ROUNDING
+        return cls(origin, rotation, found.ranges, found.points, hit, *_spheres_of(task, ends))
+
+
+def _spheres_of(task: Task, ends: list[Float]) -> tuple[Float, Float]:
+    """Return centres and radii of the spheres that are free at both ends, see :class:`Sight`.
+
+    Args:
+        task: Task.
+        ends: Joint positions in joint space, shape (B, J) each; places of the hand in hand space, shape (B, 3) each.
+    """
+    chain, spheres = task.arm.chain, task.arm.spheres
+    if task.space_name == "hand":
+        return np.stack(ends, axis=1), np.full(2, float(spheres.radius[-1]))
+    centres = [sphere_centres(chain, spheres, joints) for joints in ends]
+    return np.concatenate(centres, axis=1), np.tile(spheres.radius, 2)
 
 
 def points_alone(task: Task, sight: Sight) -> Obstacles:
     """Return clouds of the points that were seen."""
-    return _clouds([points[hit] for points, hit in zip(sight.points, sight.hit, strict=True)])
+    return _clouds(sight, [points[hit] for points, hit in zip(sight.points, sight.hit, strict=True)])
 
 
-def thick_points(task: Task, sight: Sight) -> Obstacles:
-    """Return clouds of the points that were seen and of some space behind each."""
-    steps = np.arange(0.0, THICKNESS[task.space_name] + 1e-9, SPACING)
+def thick_points(task: Task, sight: Sight, depth: float | None = None) -> Obstacles:
+    """Return clouds of the points that were seen and of the space behind each, THICKNESS or another depth, [m]."""
+    steps = np.arange(0.0, (THICKNESS[task.space_name] if depth is None else depth) + 1e-9, SPACING)
     found = []
     for origin, points, hit in zip(sight.origin, sight.points, sight.hit, strict=True):
         away = points[hit] - origin
         away /= np.linalg.norm(away, axis=-1, keepdims=True)
         found.append((points[hit][:, None] + steps[:, None] * away[:, None]).reshape(-1, 3))
-    return _clouds(found)
+    return _clouds(sight, found)
 
 
 def fitted_boxes(task: Task, sight: Sight) -> Obstacles:
@@ -129,12 +163,27 @@ def _box_around(points: Float, origin: Float, deepest: float) -> Box:
     return Box(half, position=place, quaternion=quaternions_of(axes))
 
 
-def _clouds(points: list[Float]) -> Obstacles:
-    """Return one cloud for each scene that has points, with one point in each cube of SPACING."""
+def _clouds(sight: Sight, points: list[Float]) -> Obstacles:
+    """Return one cloud for each scene that has points, with one point in each cube of SPACING, and none at the ends."""
     scenes: list[list[Shape]] = []
-    for each in points:
+    for b, each in enumerate(points):
         cubes = np.floor(each / SPACING).astype(np.int64) + CUBES // 2
         numbers = (cubes[:, 0] * CUBES + cubes[:, 1]) * CUBES + cubes[:, 2]
         _, first = np.unique(numbers, return_index=True)
-        scenes.append([PointCloud(each[first], radius=POINT_RADIUS)] if len(each) else [])
+        each = each[first]
+        each = each[_outside(each, sight.free[b], sight.free_radius + POINT_RADIUS + END_CLEARANCE)]
+        scenes.append([PointCloud(each, radius=POINT_RADIUS)] if len(each) else [])
     return pack(scenes, rows=1)
+
+
+@compiled
+def _outside(points: Float, centre: Float, radius: Float) -> Bool:
+    """Return True for points that are outside all spheres, shape (K,)."""
+    found = np.ones(len(points), np.bool_)
+    for k in range(len(points)):
+        for i in range(len(centre)):
+            x, y, z = points[k, 0] - centre[i, 0], points[k, 1] - centre[i, 1], points[k, 2] - centre[i, 2]
+            if x * x + y * y + z * z < radius[i] * radius[i]:
+                found[k] = False
+                break
+    return found

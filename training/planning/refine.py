@@ -95,6 +95,8 @@ NARROW = Aim(clearance=0.008, jerk=0.02, iterations=20, gain=1.0, stride=2)
 paid for with contact on the other."""
 NEARLY = -0.03
 """Least clearance of movements that are nearly free, [m]."""
+ROUNDING = 1e-6
+"""Clearance beyond the margin that is asked for: distances of point clouds that are cut off there are rounded, [m]."""
 SMOOTH = 1.5
 """Relative jerk cost with which a movement is polished no more."""
 
@@ -495,9 +497,10 @@ def refine_seeds(
         found.times[each] = times[0]
         if apart < margin:
             if apart >= 0.0:
-                found.clearance[each] = exact_clearance(
+                exact = exact_clearance(
                     setting, fine, times[0], start, offsets[0], duration, obstacles, scene
                 )
+                found.clearance[each] = min(exact, apart)
             continue
         stage = 0
         _, cost = best_times(table, offsets[0], work.gram)
@@ -544,9 +547,12 @@ def _clearance(
     scene: int,
     most: float,
 ) -> float:
-    """Return the least clearance of a movement at the instants of a table, at most `most`, exact above NEARLY, [m]."""
+    """Return the least clearance of a movement at the instants of a table, about `most` at most, [m].
+
+    It is exact above NEARLY.
+    """
     return least_clearance(
-        setting, table, times, start, offsets, duration, obstacles, scene, most, NEARLY, 1e9,
+        setting, table, times, start, offsets, duration, obstacles, scene, most + ROUNDING, NEARLY, 1e9,
         memory_of(setting, table, len(start)),
     )  # fmt: skip
 
@@ -565,7 +571,7 @@ def is_free(
 ) -> bool:
     """Return True if a movement keeps a margin at the instants of a table; it stops at the first that does not."""
     least = least_clearance(
-        setting, table, times, start, offsets, duration, obstacles, scene, margin, margin, 1e9,
+        setting, table, times, start, offsets, duration, obstacles, scene, margin + ROUNDING, margin, 1e9,
         memory_of(setting, table, len(start)),
     )  # fmt: skip
     return bool(least >= margin)

@@ -1,0 +1,89 @@
+"""Draw what a sensor sees of three scenes, and the plans of the shipped agent: `python docs/figures/sensed.py`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon
+
+from viapoint.envs.common.palette import PALETTE
+from viapoint.envs.geometry.obstacles import unpack
+from viapoint.envs.plans import Movements
+from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.sensors import Sensor
+from viapoint.envs.task import Task
+from viapoint.training import load_agent
+from viapoint.training.plotting.top_view import footprint
+from viapoint.training.scene_sets.scene_set import scenes_for
+
+ENV_ID, SCENES = "viapoint/PlanarSensed-v0", (60, 210, 330)
+"""Environment, and rows of its `validation` set."""
+LIMITS = (-0.62, 0.52), (-0.1, 0.82)
+RAY = "#e8c15a"
+FINE_RAYS = 4_000
+"""Rays with which the seen part of the space is drawn."""
+
+
+def draw_scene(axes: Axes, task: Task, scene: Scenes, agent: object) -> None:
+    """Draw obstacles, rays and plan of one scene."""
+    sensor = task.sensor
+    assert sensor is not None
+    found = sensor.read(task.arm, scene.start, scene.obstacles)
+    origin = np.array(sensor.position)[:2]
+    fine = Sensor(
+        position=sensor.position, quaternion=sensor.quaternion, columns=FINE_RAYS, range=sensor.range
+    ).read(task.arm, scene.start, scene.obstacles)
+    visible = np.concatenate((origin[None], fine.points[0, :, :2]))
+    axes.add_patch(Polygon(visible, facecolor="#fbf4df", edgecolor="none", zorder=0))
+    for shape in unpack(scene.obstacles, 0):
+        for corners in footprint(shape):
+            axes.add_patch(
+                Polygon(corners, facecolor="white", edgecolor=PALETTE.obstacle, hatch="/////", zorder=2)
+            )
+    met = found.seen[0] >= 0
+    for end in found.points[0][met]:
+        axes.plot(*np.stack((origin, end[:2])).T, color=RAY, linewidth=0.5, zorder=1)
+    axes.scatter(*found.points[0][met][:, :2].T, s=7, color=PALETTE.executed, zorder=4)
+    start, goal = task.space.coordinates(scene.start), task.space.coordinates(scene.goal)
+    goals = scene.goal, task.arm.hand(scene.goal)
+    hand = task.arm.hand(scene.start)
+    seen = task.observation.observe(scene.start, hand, goals, scene.obstacles, readings=found)
+    actions, _ = agent.predict(seen, deterministic=True)  # type: ignore[attr-defined]
+    plan = task.action.decode(actions.astype(np.float64), start, goal)
+    path = Movements.of(plan).sample(plan.duration[:, None] * np.linspace(0.0, 1.0, 100)).position[0]
+    axes.plot(*np.stack((start[0], goal[0])).T, color="0.4", linestyle=":", linewidth=1.2, zorder=3)
+    axes.plot(*path.T, color=PALETTE.plan, linewidth=2.5, zorder=5)
+    axes.add_patch(Circle(plan.waypoints[0, 1], 0.012, color=PALETTE.via, zorder=6))
+    axes.add_patch(Circle(start[0], 0.014, color=PALETTE.start, zorder=6))
+    axes.add_patch(Circle(goal[0], 0.016, color=PALETTE.goal, zorder=6))
+    axes.add_patch(Circle(origin, 0.02, color=PALETTE.joint, zorder=6))
+    axes.set(xlim=LIMITS[0], ylim=LIMITS[1], aspect="equal", xticks=[], yticks=[])
+    axes.set_facecolor("#e9e9ec")
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def main() -> None:
+    """Draw the figure."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--agent", default=ENV_ID)
+    parser.add_argument("--out", type=Path, default=Path("docs/images/sensed.png"))
+    parser.add_argument("--scenes", type=int, nargs="+", default=SCENES)
+    given = parser.parse_args()
+    agent = load_agent(given.agent)
+    task: Task = agent.policy.task
+    frozen = scenes_for("validation", task)
+    figure = Figure(figsize=(3.6 * len(given.scenes), 3.1), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, row in zip(figure.subplots(1, len(given.scenes)), given.scenes, strict=True):
+        draw_scene(axes, task, frozen.scenes.take([row]), agent)
+    figure.savefig(given.out, dpi=130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""Laws of sensors: what is seen, and that nothing else is."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+from viapoint.envs import Box, Capsule, ConvexMesh, Cylinder, HalfSpace, Sensor, Sphere, Task, arm_of
+from viapoint.envs.geometry.obstacles import add_to_model, pack
+from viapoint.training.planning.beliefs import Sight, fitted_boxes, thick_points
+from viapoint.training.planning.search import registered_task
+
+PANDA = arm_of("panda")
+CORNERS = np.array([(x, y, z) for x in (-0.1, 0.1) for y in (-0.05, 0.08) for z in (-0.1, 0.12)])
+SCENE = [
+    Box((0.1, 0.05, 0.2), position=(0.8, 0.1, 0.1), quaternion=(0.9239, 0.2209, 0.2209, 0.2209)),
+    Sphere(0.1, position=(0.9, -0.3, 0.2)),
+    Capsule(0.05, 0.1, position=(0.7, 0.4, 0.0), quaternion=(0.8, 0.6, 0.0, 0.0)),
+    Cylinder(0.08, 0.1, position=(0.6, -0.1, -0.2), quaternion=(0.6, 0.0, 0.8, 0.0)),
+    HalfSpace(position=(0.0, 0.0, -0.5)),
+    ConvexMesh(CORNERS, position=(0.9, 0.3, 0.5)),
+]
+
+
+@pytest.mark.parametrize("shape", SCENE, ids=lambda shape: shape.kind)
+def test_ranges_are_those_of_mujoco(shape) -> None:
+    sensor = Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0)
+    found = sensor.read(PANDA, PANDA.home[None], pack([[shape]]))
+    spec = mujoco.MjSpec()
+    add_to_model(spec, [shape])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    geom = np.zeros(1, np.int32)
+    theirs = np.array(
+        [mujoco.mj_ray(model, data, np.zeros(3), ray, None, 1, -1, geom, None) for ray in sensor.directions]
+    )
+    theirs = np.where((theirs < 0.0) | (theirs > 3.0), 3.0, theirs)
+    # Rays that graze an edge may differ.
+    assert (np.abs(found.ranges[0] - theirs) < 1e-4).mean() > 0.995
+    assert (found.ranges[0] < 3.0).any()
+
+
+def test_the_nearest_obstacle_is_seen_and_readings_do_not_depend_on_the_batch() -> None:
+    sensor = Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0, noise=0.01, dropped=0.1)
+    each = [pack([[shape]], rows=1) for shape in SCENE]
+    alone = np.array([sensor.read(PANDA, PANDA.home[None], one).ranges[0] for one in each])
+    batch = sensor.read(PANDA, np.tile(PANDA.home, (len(SCENE), 1)), pack([[shape] for shape in SCENE]))
+    assert np.array_equal(alone, batch.ranges)
+    exact = Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0)
+    separate = np.array([exact.read(PANDA, PANDA.home[None], one).ranges[0] for one in each])
+    together = exact.read(PANDA, PANDA.home[None], pack([SCENE]))
+    assert np.array_equal(together.ranges[0], separate.min(axis=0))
+    met = together.seen[0] >= 0
+    assert np.array_equal(together.seen[0][met], separate.argmin(axis=0)[met])
+
+
+def test_noise_and_dropped_rays_are_as_stated() -> None:
+    wall = pack([[Box((0.01, 5.0, 5.0), position=(1.0, 0.0, 0.0))]])
+    sensor = Sensor(columns=200, rows=150, field_of_view=1.0, range=3.0, noise=0.02, dropped=0.2)
+    noisy = sensor.read(PANDA, PANDA.home[None], wall).ranges[0]
+    exact = Sensor(columns=200, rows=150, field_of_view=1.0, range=3.0)
+    error = (noisy - exact.read(PANDA, PANDA.home[None], wall).ranges[0])[noisy < 3.0]
+    assert np.isclose((noisy == 3.0).mean(), 0.2, atol=0.01)
+    assert np.isclose(error.std(), 0.02, rtol=0.03)
+    assert abs(error.mean()) < 1e-3
+
+
+def test_a_sensor_at_the_hand_moves_with_it() -> None:
+    task = Task.of(arm="panda", n_obstacles=(1, 4), sensor="hand_camera")
+    below = np.array([0.0, 0.0, -0.3])
+    obstacles = pack([[Sphere(0.05, position=PANDA.hand(PANDA.home) + below)]])
+    first = task.sensor.read(PANDA, PANDA.home[None], obstacles)
+    # The first joint turns arm and sensor about the vertical axis; the sphere turned alike looks the same.
+    turned = PANDA.home.copy()
+    turned[0] += 0.5
+    second = task.sensor.read(PANDA, turned[None], pack([[Sphere(0.05, position=PANDA.hand(turned) + below)]]))
+    assert (first.seen >= 0).any()
+    assert np.allclose(first.ranges, second.ranges, atol=1e-4)
+
+
+def test_hidden_obstacles_change_nothing() -> None:
+    from viapoint.training import ViaRank, ViaVecEnv
+
+    task = registered_task("viapoint/PlanarSensed-v0")
+    scenes = task.sampler()([np.random.default_rng(i) for i in range(40)])
+    rotation, origin = task.sensor.pose(task.arm, scenes.start)
+    hidden = task.sensor.hidden(rotation, origin, scenes.obstacles)
+    assert hidden.any(axis=1).sum() >= 8
+    without = scenes._replace(
+        obstacles=scenes.obstacles._replace(kind=np.where(hidden, -1, scenes.obstacles.kind))
+    )
+    env = gym.make_vec("viapoint/PlanarSensed-v0", num_envs=40).unwrapped
+    seen, other = env.begin(scenes), env.begin(without)
+    for name in seen:
+        assert np.array_equal(seen[name], other[name])
+    agent = ViaRank("ViaRankPolicy", ViaVecEnv("viapoint/PlanarSensed-v0", 1), seed=0)
+    assert np.array_equal(agent.predict(seen)[0], agent.predict(other)[0])
+
+
+def test_beliefs_hold_what_is_seen() -> None:
+    for env_id in ("viapoint/PlanarSensed-v0", "viapoint/PandaSensed-v0"):
+        task = registered_task(env_id)
+        scenes = task.sampler()([np.random.default_rng(i) for i in range(5)])
+        sight = Sight.of_scenes(scenes, task)
+        for belief in (thick_points, fitted_boxes):
+            obstacles = belief(task, sight)
+            for b in range(5):
+                from viapoint.envs import signed_distances
+                from viapoint.envs.geometry.obstacles import unpack
+
+                points = sight.points[b][sight.hit[b]]
+                apart = signed_distances(unpack(obstacles, b), points).min(axis=1)
+                assert (apart < 0.03).all()
+
+
+@pytest.mark.parametrize(
+    ("sensor", "error"),
+    [
+        ("eyes", ValueError),
+        (3, ValueError),
+        ({"lens": 1}, ValueError),
+        ({"columns": 0}, ValueError),
+        ({"columns": 1.5}, ValueError),
+        ({"rows": 2, "columns": 40_000}, ValueError),
+        ({"field_of_view": 7.0}, ValueError),
+        ({"rows": 4, "field_of_view": 3.1}, ValueError),
+        ({"range": 0.0}, ValueError),
+        ({"noise": -1.0}, ValueError),
+        ({"dropped": 1.0}, ValueError),
+        ({"position": (0.0, np.nan, 0.0)}, ValueError),
+        ({"quaternion": (1.0, 1.0, 0.0, 0.0)}, ValueError),
+        ({"mount": "foot"}, ValueError),
+    ],
+)
+def test_impossible_sensors_are_refused(sensor, error) -> None:
+    with pytest.raises(error, match="sensor"):
+        Task.of(sensor=sensor)
+
+
+def test_sensors_that_see_nothing_are_refused() -> None:
+    with pytest.raises(ValueError, match="nothing to see"):
+        Task.of(sensor="rays", n_obstacles=0)
+    env = gym.make("viapoint/PlanarSensed-v0")
+    with pytest.raises(ValueError, match="sensor"):
+        env.reset(options={"obstacles": [Cylinder(0.05, 0.04, position=(0.03, 0.0, 0.0))]})
+    env.reset(seed=0)  # it stays usable
