@@ -301,12 +301,13 @@ def _theta(knots: Floats, free_ends: bool) -> Floats:
 
 
 def _residuals(knots: Floats, samples: _Samples) -> Floats:
-    """Return the residuals (M, N D) with the waypoints of least squares, infinite for knots outside the recording."""
+    """Return the residuals (M, N D) with the waypoints of least squares; large ones for knots outside the recording."""
     basis, _ = np.linalg.qr(_basis(knots, samples.time))
     residuals = samples.position - basis @ (basis.mT @ samples.position)
     # A segment without samples leaves its waypoints open.
     outside = (knots[:, :-1] >= 1.0).any(axis=-1) | (knots[:, 1:] <= 0.0).any(axis=-1)
-    return np.where(outside[:, None], np.inf, residuals.reshape(len(knots), -1))
+    residuals = np.where(outside[:, None, None], 10.0 * samples.position, residuals)
+    return residuals.reshape(len(knots), -1)
 
 
 def _expansion(theta: Floats, samples: _Samples, free_ends: bool) -> tuple[Floats, Floats, Floats]:
@@ -315,8 +316,7 @@ def _expansion(theta: Floats, samples: _Samples, free_ends: bool) -> tuple[Float
     tried = theta[:, None] + _STEP * np.eye(count + 1, count, k=-1)  # the first row is theta itself
     residuals = _residuals(_knots(tried.reshape(-1, count), free_ends), samples).reshape(starts, count + 1, -1)
     base = residuals[:, :1]
-    with np.errstate(invalid="ignore"):
-        jacobian = (residuals[:, 1:] - base) / _STEP
+    jacobian = (residuals[:, 1:] - base) / _STEP
     return 0.5 * (base * base).sum(axis=(1, 2)), (jacobian @ base.mT)[..., 0], jacobian @ jacobian.mT
 
 

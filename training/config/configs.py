@@ -470,6 +470,35 @@ class PlanConfig(Config):
 
 
 @dataclass(frozen=True, kw_only=True)
+class FitConfig(Config):
+    """Fit via-points to measured movements.
+
+    The file is a CSV with the columns time, x, y, and optionally z and movement.
+
+    Example: viapoint fit movements.csv --n-via 1 --out fit
+    """
+
+    file: tyro.conf.Positional[Path]
+    """CSV file with one sample in each line, [s] and [m]."""
+    n_via: tuple[int, ...] = ()
+    """Number of via-points, or the fewest and the most to choose among; by default 0 to 3."""
+    free_ends: bool = True
+    """Fit onset and end, too; otherwise a movement begins with its first sample and ends with its last."""
+    out: Path = Path("fit")
+    """Folder for the table fit.csv and the figure fit.png."""
+
+    @property
+    def numbers(self) -> tuple[int, int] | None:
+        """Fewest and most via-points; None for the usual ones."""
+        return (self.n_via[0], self.n_via[-1]) if self.n_via else None
+
+    def _check(self) -> None:
+        if len(self.n_via) > 2:
+            raise ValueError(f"n_via is one number, or the fewest and the most, got {self.n_via}")
+        check_folder("out", self.out)
+
+
+@dataclass(frozen=True, kw_only=True)
 class LiveConfig(AgentConfig):
     """Serve a page in the browser on which goal and obstacles are dragged.
 
