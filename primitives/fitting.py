@@ -39,10 +39,12 @@ USUAL_RANGE = (0, 3)
 """Fewest and most via-points among which n_via=None chooses."""
 
 _BEYOND = 0.25
-"""Time before the first and after the last sample in which a movement may begin and end, in lengths of the recording."""
+"""Time before the first and after the last sample in which a movement may begin and end, in lengths of the
+recording."""
 
-_SHORTEST = 0.02
-"""Shortest segment, in lengths of the recording: via-points closer in time cannot be told apart."""
+_SHORTEST, _LEAST = 0.02, 1e-3
+"""Shortest segment, in durations of the movement: via-points closer in time cannot be told apart; least share of the
+recording that the movement takes."""
 
 _GRID = 8
 """Number of instants among which the first passage times are chosen."""
@@ -256,7 +258,14 @@ def _checked(
     times = np.broadcast_to(to_numpy(time).astype(float), (*batch, count)).reshape(-1, count)
     places = np.broadcast_to(to_numpy(position).astype(float), (*batch, count, dimension))
     places = places.reshape(-1, count, dimension)
-    require(np.diff(times) > 0, time_name, times[:, 1:], "must ascend: sort the samples, and keep one of equal times")
+    if not len(places):
+        raise ValueError(f"{name} must hold one movement or more, got shape {tuple(position.shape)}")
+    require(
+        np.diff(times) > 0,
+        time_name,
+        times[:, 1:],
+        "must ascend: sort the samples, and keep one of equal times",
+    )
     moves = np.ptp(places, axis=1).any(axis=-1)
     require(moves, name, 1.0 * moves, "must change: there is no movement in equal samples")
     return list(zip(times, places, strict=True)), batch, (xp, position)
@@ -279,7 +288,7 @@ def _knots(theta: Floats, free_ends: bool) -> Floats:
     ends = np.cumulative_sum(_shares(theta[..., :count], _SHORTEST), axis=-1, include_initial=True)
     if not free_ends:
         return ends
-    before, inside, _ = np.moveaxis(_shares(theta[..., count:], 0.0), -1, 0)
+    before, inside, _ = np.moveaxis(_shares(theta[..., count:], _LEAST), -1, 0)
     whole = 1.0 + 2.0 * _BEYOND
     return whole * (before[..., None] + inside[..., None] * ends) - _BEYOND
 
@@ -297,7 +306,8 @@ def _theta(knots: Floats, free_ends: bool) -> Floats:
     inner = np.log(np.diff(knots) / (end - onset) - _SHORTEST)
     if not free_ends:
         return inner
-    return np.concatenate([inner, np.log(np.hstack([onset + _BEYOND, end - onset, 1.0 + _BEYOND - end]))], axis=-1)
+    outer = np.hstack([onset + _BEYOND, end - onset, 1.0 + _BEYOND - end]) / (1.0 + 2.0 * _BEYOND)
+    return np.hstack([inner, np.log(outer - _LEAST)])
 
 
 def _residuals(knots: Floats, samples: _Samples) -> Floats:
@@ -314,7 +324,9 @@ def _expansion(theta: Floats, samples: _Samples, free_ends: bool) -> tuple[Float
     """Return half the squares (S,), their gradient (S, P) and the Gauss-Newton matrix (S, P, P) at theta (S, P)."""
     starts, count = theta.shape
     tried = theta[:, None] + _STEP * np.eye(count + 1, count, k=-1)  # the first row is theta itself
-    residuals = _residuals(_knots(tried.reshape(-1, count), free_ends), samples).reshape(starts, count + 1, -1)
+    residuals = _residuals(_knots(tried.reshape(-1, count), free_ends), samples).reshape(
+        starts, count + 1, -1
+    )
     base = residuals[:, :1]
     jacobian = (residuals[:, 1:] - base) / _STEP
     return 0.5 * (base * base).sum(axis=(1, 2)), (jacobian @ base.mT)[..., 0], jacobian @ jacobian.mT

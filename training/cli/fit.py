@@ -33,7 +33,9 @@ def run(config: FitConfig) -> None:
     fits = []
     for movement in movements:
         try:
-            fits.append(fit_via_points(movement.time, movement.position, config.numbers, free_ends=config.free_ends))
+            fits.append(
+                fit_via_points(movement.time, movement.position, config.numbers, free_ends=config.free_ends)
+            )
         except ValueError as error:
             raise BadFileError(config.file, f"movement {movement.name}: {error}") from None
     print(_printed(movements, fits))
@@ -57,7 +59,9 @@ def read_movements(path: Path) -> list[Measured]:
     missing = [name for name in REQUIRED if name not in table]
     if missing:
         found = ", ".join(map(str, table.columns))
-        raise BadFileError(path, f"has no column {', '.join(missing)}; its first line names the columns {found}")
+        raise BadFileError(
+            path, f"has no column {', '.join(missing)}; its first line names the columns {found}"
+        )
     names = [name for name in ("time", *COORDINATES) if name in table]
     numbers = table[names].apply(pd.to_numeric, errors="coerce")
     wrong = np.argwhere(~np.isfinite(numbers.to_numpy(dtype=float)))

@@ -25,6 +25,7 @@ from viapoint.training.config.configs import (
     PaperConfig,
     PlanConfig,
     PlayConfig,
+    RecordConfig,
     StudyConfig,
     TrainConfig,
 )
@@ -40,6 +41,7 @@ COMMANDS: dict[str, tuple[type[Any], str]] = {
     "evaluate": (EvaluateConfig, "cli.commands:evaluate"),
     "plan": (PlanConfig, "cli.plan:run"),
     "play": (PlayConfig, "cli.commands:play"),
+    "record": (RecordConfig, "cli.commands:record"),
     "fit": (FitConfig, "cli.fit:run"),
     "paper": (PaperConfig, "paper.run:run"),
     "demo": (DemoConfig, "cli.demo:run"),
