@@ -20,12 +20,12 @@ import numpy as np
 from .array_api import (
     Array,
     Floats,
-    Namespace,
     as_floats,
     broadcast_batch,
     is_whole,
     leading_shape,
     like,
+    namespace_of,
     require,
     to_numpy,
 )
@@ -49,13 +49,16 @@ recording that the movement takes."""
 _GRID = 8
 """Number of instants among which the first passage times are chosen."""
 
-_STARTS, _FIRST_STEPS, _MOST_STEPS = 5, 10, 80
-"""Number of starts, steps of each, and further steps of the best one."""
+_STAGES = ((20, 4), (5, 8), (1, 80))
+"""Numbers of the best starts that go on, and of their steps."""
+
+_GREATEST = 40.0
+"""Greatest size of a parameter; beyond it a share does not change any more."""
 
 _STEP = 1e-7
 """Step of the difference quotients of the residuals."""
 
-_CONVERGED, _TINY = 1e-12, 1e-28
+_CONVERGED, _TINY = 1e-10, 1e-28
 """Least gain of a step, relative to the squares and absolute, in units of the recording."""
 
 _ROUNDING = 1e-7
@@ -124,6 +127,17 @@ class ViaPointFit:
         return self.trajectory(time - self.onset[..., None], nu)
 
 
+class _Recordings(NamedTuple):
+    """Measured movements, checked."""
+
+    movements: list[tuple[Floats, Floats]]
+    """Times (N,) [s] and positions (N, D) [m] of each movement."""
+    batch: tuple[int, ...]
+    """Leading shape of the results."""
+    kind: Array
+    """Array of the library and dtype that the results have."""
+
+
 class _Samples(NamedTuple):
     """Samples of one movement in units of the recording."""
 
@@ -187,12 +201,12 @@ def fit_via_points(
         ([[0.15, 0.2]], [0.5], 0.001)
     """
     counts = _counts(n_via)
-    movements, batch, like_these = _movements(time, position, 2 * counts[-1] + 5)
+    recordings = _recordings(time, position, 2 * counts[-1] + 5)
     fits = []
-    for times, positions in movements:
+    for times, positions in recordings.movements:
         candidates = [_fit(times, positions, count, free_ends) for count in counts]
         fits.append(min(candidates, key=lambda fit: fit.bic))
-    return _record(fits, batch, *like_these)
+    return _record(fits, recordings.batch, recordings.kind)
 
 
 def _counts(n_via: Any) -> range:
@@ -208,24 +222,20 @@ def _counts(n_via: Any) -> range:
     return range(pair[0], pair[1] + 1)
 
 
-def _movements(
-    time: Any, position: Any, fewest: int
-) -> tuple[list[tuple[Floats, Floats]], tuple[int, ...], tuple[Namespace, Array]]:
-    """Return times (N,) and positions (N, D) of each movement, the leading shape, and the library with an array."""
+def _recordings(time: Any, position: Any, fewest: int) -> _Recordings:
+    """Return the movements of arrays or of a list, after all checks."""
     if not _is_list(position):
-        movements, batch, kind = _checked("time", time, "position", position, fewest)
-        return movements, batch, kind
+        return _checked("time", time, "position", position, fewest)
     times = time if _is_list(time, 1) else [time] * len(position)
     if len(times) != len(position):
         raise ValueError(f"time must hold an array for each of {len(position)} movements, got {len(times)}")
-    movements = []
+    parts = []
     for i, (own_time, own_position) in enumerate(zip(times, position, strict=True)):
-        checked, _, kind = _checked(f"time[{i}]", own_time, f"position[{i}]", own_position, fewest)
-        movements += checked
-    dimensions = {positions.shape[-1] for _, positions in movements}
+        parts.append(_checked(f"time[{i}]", own_time, f"position[{i}]", own_position, fewest))
+    dimensions = sorted({part.kind.shape[-1] for part in parts})
     if len(dimensions) > 1:
-        raise ValueError(f"position must hold movements of one dimension, got {sorted(dimensions)}")
-    return movements, (len(position),), kind
+        raise ValueError(f"position must hold movements of one dimension, got {dimensions}")
+    return _Recordings([part.movements[0] for part in parts], (len(parts),), parts[0].kind)
 
 
 def _is_list(value: Any, axes: int = 2) -> bool:
@@ -238,12 +248,10 @@ def _is_list(value: Any, axes: int = 2) -> bool:
         return False
 
 
-def _checked(
-    time_name: str, time: Any, name: str, position: Any, fewest: int
-) -> tuple[list[tuple[Floats, Floats]], tuple[int, ...], tuple[Namespace, Array]]:
-    """Return the movements of arrays (..., N) and (..., N, D) after all checks, as `_movements` does."""
+def _checked(time_name: str, time: Any, name: str, position: Any, fewest: int) -> _Recordings:
+    """Return the movements of arrays (..., N) and (..., N, D), after all checks."""
     try:
-        xp, (time, position) = as_floats(None, **{time_name: time, name: position})
+        _, (time, position) = as_floats(None, **{time_name: time, name: position})
     except ValueError as error:
         advice = "; leave out samples that were not measured" if "finite" in str(error) else ""
         raise ValueError(f"{error}{advice}") from None
@@ -255,20 +263,16 @@ def _checked(
             f"{name} must have {fewest} or more samples for {(fewest - 5) // 2} via-points, got {count}: measure at a "
             "higher rate, or lower n_via"
         )
+    if 0 in batch:
+        raise ValueError(f"{name} must hold one movement or more, got shape {tuple(position.shape)}")
     times = np.broadcast_to(to_numpy(time).astype(float), (*batch, count)).reshape(-1, count)
     places = np.broadcast_to(to_numpy(position).astype(float), (*batch, count, dimension))
     places = places.reshape(-1, count, dimension)
-    if not len(places):
-        raise ValueError(f"{name} must hold one movement or more, got shape {tuple(position.shape)}")
-    require(
-        np.diff(times) > 0,
-        time_name,
-        times[:, 1:],
-        "must ascend: sort the samples, and keep one of equal times",
-    )
+    ascending = np.diff(times) > 0
+    require(ascending, time_name, times[:, 1:], "must ascend: sort the samples, and keep one of equal times")
     moves = np.ptp(places, axis=1).any(axis=-1)
     require(moves, name, 1.0 * moves, "must change: there is no movement in equal samples")
-    return list(zip(times, places, strict=True)), batch, (xp, position)
+    return _Recordings(list(zip(times, places, strict=True)), batch, position)
 
 
 def _basis(knots: Floats, time: Floats) -> Floats:
@@ -284,7 +288,7 @@ def _knots(theta: Floats, free_ends: bool) -> Floats:
     Any numbers theta stand for ascending knots: the segments are shares of the movement, and the movement, with
     `free_ends`, a share of the recording and what may lie beyond it.
     """
-    count = theta.shape[-1] - 3 * free_ends
+    count = theta.shape[-1] - 2 * free_ends
     ends = np.cumulative_sum(_shares(theta[..., :count], _SHORTEST), axis=-1, include_initial=True)
     if not free_ends:
         return ends
@@ -294,10 +298,11 @@ def _knots(theta: Floats, free_ends: bool) -> Floats:
 
 
 def _shares(theta: Floats, least: float) -> Floats:
-    """Return shares (..., n) of at least `least` that add up to 1: a softmax with a floor."""
-    weights = np.exp(theta - theta.max(axis=-1, keepdims=True))
+    """Return shares (..., n + 1) of at least `least` that add up to 1: a softmax of theta (..., n) and 0 with a floor."""
+    last = np.zeros((*theta.shape[:-1], 1))
+    weights = np.exp(np.concatenate([theta, last], axis=-1).clip(-_GREATEST, _GREATEST))
     weights = weights / weights.sum(axis=-1, keepdims=True)
-    return least + (1.0 - least * theta.shape[-1]) * weights
+    return least + (1.0 - least * weights.shape[-1]) * weights
 
 
 def _theta(knots: Floats, free_ends: bool) -> Floats:
@@ -305,9 +310,10 @@ def _theta(knots: Floats, free_ends: bool) -> Floats:
     onset, end = knots[:, :1], knots[:, -1:]
     inner = np.log(np.diff(knots) / (end - onset) - _SHORTEST)
     if not free_ends:
-        return inner
+        return inner[:, :-1] - inner[:, -1:]
     outer = np.hstack([onset + _BEYOND, end - onset, 1.0 + _BEYOND - end]) / (1.0 + 2.0 * _BEYOND)
-    return np.hstack([inner, np.log(outer - _LEAST)])
+    outer = np.log(outer - _LEAST)
+    return np.hstack([inner[:, :-1] - inner[:, -1:], outer[:, :-1] - outer[:, -1:]])
 
 
 def _residuals(knots: Floats, samples: _Samples) -> Floats:
@@ -324,7 +330,7 @@ def _expansion(theta: Floats, samples: _Samples, free_ends: bool) -> tuple[Float
     """Return half the squares (S,), their gradient (S, P) and the Gauss-Newton matrix (S, P, P) at theta (S, P)."""
     starts, count = theta.shape
     tried = theta[:, None] + _STEP * np.eye(count + 1, count, k=-1)  # the first row is theta itself
-    residuals = _residuals(_knots(tried.reshape(-1, count), free_ends), samples).reshape(
+    residuals = _residuals(_knots(tried.reshape(starts * (count + 1), count), free_ends), samples).reshape(
         starts, count + 1, -1
     )
     base = residuals[:, :1]
@@ -367,7 +373,7 @@ def _moving_part(samples: _Samples) -> tuple[float, float]:
 
 
 def _starts(samples: _Samples, n_via: int, free_ends: bool) -> Floats:
-    """Return the knots (S, K + 2) of least squares among passage times of a grid."""
+    """Return knots (S, K + 2) with passage times of a grid, those of least squares first."""
     grid = max(_GRID, n_via + 3)
     places = np.arange(1, grid + 1) / (grid + 1)
     chosen = list(combinations(places, n_via))
@@ -375,7 +381,7 @@ def _starts(samples: _Samples, n_via: int, free_ends: bool) -> Floats:
     spans = [(0.0, 1.0), _moving_part(samples)] if free_ends else [(0.0, 1.0)]
     knots = np.concatenate([onset + (end - onset) * inner for onset, end in spans])
     squares = np.square(_residuals(knots, samples)).sum(axis=-1)
-    return knots[np.argsort(squares, kind="stable")[:_STARTS]]
+    return knots[np.argsort(squares, kind="stable")]
 
 
 def _fit(time: Floats, position: Floats, n_via: int, free_ends: bool) -> _Fit:
@@ -385,10 +391,10 @@ def _fit(time: Floats, position: Floats, n_via: int, free_ends: bool) -> _Fit:
     size = math.sqrt(np.square(position - centre).sum(axis=-1).mean())
     samples = _Samples((time - first) / length, (position - centre) / size)
     theta = _theta(_starts(samples, n_via, free_ends), free_ends)
-    theta, squares = _descend(theta, samples, free_ends, _FIRST_STEPS)
-    best = squares.argmin()
-    theta, _ = _descend(theta[best : best + 1], samples, free_ends, _MOST_STEPS)
-    (knots,) = _knots(theta, free_ends)
+    for count, steps in _STAGES:
+        theta, squares = _descend(theta[:count], samples, free_ends, steps)
+        theta = theta[np.argsort(squares, kind="stable")]
+    knots = _knots(theta[0], free_ends)
     basis = _basis(knots[None], samples.time)[0]
     points = np.linalg.lstsq(basis, samples.position)[0]
     residual = float(np.square(basis @ points - samples.position).sum())
@@ -403,8 +409,8 @@ def _fit(time: Floats, position: Floats, n_via: int, free_ends: bool) -> _Fit:
     )
 
 
-def _record(fits: list[_Fit], batch: tuple[int, ...], xp: Namespace, other: Array) -> ViaPointFit:
-    """Return the fits in one record with a leading shape, in the library of another array."""
+def _record(fits: list[_Fit], batch: tuple[int, ...], kind: Array) -> ViaPointFit:
+    """Return the fits in one record with a leading shape, in the library and dtype of an array."""
     n_via = np.array([len(fit.knots) - 2 for fit in fits])
     most, dimension = n_via.max(), fits[0].points.shape[-1]
     via_points = np.full((len(fits), most, dimension), np.nan)
@@ -421,7 +427,7 @@ def _record(fits: list[_Fit], batch: tuple[int, ...], xp: Namespace, other: Arra
 
     def shaped(values: Any) -> Array:
         array = np.asarray(values)
-        return like(xp, array.reshape((*batch, *array.shape[1:])), other)
+        return like(namespace_of(kind), array.reshape((*batch, *array.shape[1:])), kind)
 
     return ViaPointFit(
         n_via=n_via.reshape(batch),

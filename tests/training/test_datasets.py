@@ -1,9 +1,13 @@
 """Minari datasets: what was recorded is what the recovered environment does again."""
 
+import sys
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from viapoint.envs import ENV_IDS
 from viapoint.training.cli import main as cli
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.rollouts.datasets import record_dataset
@@ -73,10 +77,16 @@ def test_a_dataset_replays_bit_for_bit(method, words, capsys):
     assert_replays(dataset)
 
 
-def test_an_arm_of_a_file_is_found_again(folder):
-    arm = str(gym.make(PLANE).unwrapped.task.arm.file or "docs/ur5e.xml")
+def test_an_arm_of_a_file_is_found_again():
+    arm = Path(__file__).parents[2] / "docs" / "ur5e.xml"
     record("straight", "--arm", arm, "--env", "viapoint/Reach-v0", "--episodes", 1, "--dataset", "own-v0")
     assert_replays(minari.load_dataset("own-v0"))
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_every_environment_is_recovered(env_id):
+    record("random", "--env", env_id, "--episodes", 1, "--dataset", "any-v0")
+    assert_replays(minari.load_dataset("any-v0"))
 
 
 def test_episodes_are_those_of_the_method_and_have_names_by_default(folder):
@@ -92,6 +102,7 @@ def test_episodes_are_those_of_the_method_and_have_names_by_default(folder):
         (("straight",), "--env"),
         (("nothing", "--env", PLANE), "baseline must be"),
         (("plan_motion", "--env", PLANE), "no actions"),
+        (("straight", "--env", "viapoint/PlanarObstaclesStep-v0"), "random"),
         (("straight", "--env", PLANE, "--episodes", 0), "episodes"),
         (("straight", "--env", PLANE, "--dataset", "name"), "group/name-v0"),
         (("straight", "--env", PLANE, "--dataset", "../name-v0"), "group/name-v0"),
@@ -114,7 +125,7 @@ def test_a_dataset_is_never_replaced():
 
 
 def test_without_the_library_its_extra_is_named(monkeypatch, capsys):
-    monkeypatch.setitem(__import__("sys").modules, "minari", None)
+    monkeypatch.setitem(sys.modules, "minari", None)
     with pytest.raises(SystemExit):
         record("straight", "--env", PLANE)
     assert "pip install 'viapoint[minari]'" in capsys.readouterr().err

@@ -55,7 +55,9 @@ def test_a_file_gives_a_table_and_a_figure(file, tmp_path, capsys):
     assert list(table["n_via"]) == [1, 0]
     assert all(name in printed for name in WAYPOINTS)
     around = table.iloc[0]
-    np.testing.assert_allclose(around[["via1_x", "via1_y", "via1_z"]].astype(float), WAYPOINTS["around"][1], atol=5e-3)
+    np.testing.assert_allclose(
+        around[["via1_x", "via1_y", "via1_z"]].astype(float), WAYPOINTS["around"][1], atol=5e-3
+    )
     np.testing.assert_allclose(around[["duration", "via1_time"]].astype(float), [1.0, 0.5], atol=0.02)
     assert table["via1_x"].isna().tolist() == [False, True]
     assert np.ptp(imread(folder / "fit.png")) > 0.5

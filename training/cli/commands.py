@@ -143,6 +143,8 @@ def record(config: RecordConfig) -> None:
                 f"there is no agent {name!r}; for a baseline, name an environment with --env or --arm"
             )
         env_id, env_kwargs = env, {**config.env_kwargs, **argument}
+        if registered_task(env_id, **env_kwargs).stepwise and name != "random":
+            raise ValueError(f"baselines of {env_id}, which decides in every control step, are random, got {name!r}")
         method = make_method(name, env_id, **env_kwargs)
     dataset = config.dataset or f"{env_id.rpartition('-v')[0]}/{method.name}-v0"
     with scene_progress() as progress:
