@@ -49,8 +49,11 @@ recording that the movement takes."""
 _GRID = 8
 """Number of instants among which the first passage times are chosen."""
 
-_STAGES = ((20, 4), (5, 8), (1, 80))
+_STAGES = ((40, 3), (10, 8), (1, 80))
 """Numbers of the best starts that go on, and of their steps."""
+
+_ENOUGH = 200
+"""Number of samples, evenly spread, with which the best start is found."""
 
 _GREATEST = 40.0
 """Greatest size of a parameter; beyond it a share does not change any more."""
@@ -212,8 +215,8 @@ def fit_via_points(
 def _counts(n_via: Any) -> range:
     """Return the numbers of via-points to try."""
     given = USUAL_RANGE if n_via is None else n_via
-    pair = (given, given) if is_whole(given) else given
-    whole = isinstance(pair, list | tuple) and len(pair) == 2 and all(map(is_whole, pair))
+    pair = given if isinstance(given, list | tuple) else (given, given)
+    whole = len(pair) == 2 and all(map(is_whole, pair))
     if not whole or not pair[0] <= pair[1] <= MOST_VIA_POINTS:
         raise ValueError(
             f"n_via must be a whole number from 0 to {MOST_VIA_POINTS}, a pair (fewest, most) of them, or None for "
@@ -294,19 +297,21 @@ def _knots(theta: Floats, free_ends: bool) -> Floats:
         return ends
     before, inside, _ = np.moveaxis(_shares(theta[..., count:], _LEAST), -1, 0)
     whole = 1.0 + 2.0 * _BEYOND
-    return whole * (before[..., None] + inside[..., None] * ends) - _BEYOND
+    knots: Floats = whole * (before[..., None] + inside[..., None] * ends) - _BEYOND
+    return knots
 
 
 def _shares(theta: Floats, least: float) -> Floats:
-    """Return shares (..., n + 1) of at least `least` that add up to 1: a softmax of theta (..., n) and 0 with a floor."""
+    """Return shares (..., n + 1) from `least` on that add up to 1: a softmax of theta (..., n) and 0, with a floor."""
     last = np.zeros((*theta.shape[:-1], 1))
     weights = np.exp(np.concatenate([theta, last], axis=-1).clip(-_GREATEST, _GREATEST))
     weights = weights / weights.sum(axis=-1, keepdims=True)
-    return least + (1.0 - least * weights.shape[-1]) * weights
+    shares: Floats = least + (1.0 - least * weights.shape[-1]) * weights
+    return shares
 
 
 def _theta(knots: Floats, free_ends: bool) -> Floats:
-    """Return parameters of `_knots` for knots (S, K + 2), whose segments are not the shortest."""
+    """Return the parameters of knots (S, K + 2), the inverse of `_knots`; no segment may be a shortest one."""
     onset, end = knots[:, :1], knots[:, -1:]
     inner = np.log(np.diff(knots) / (end - onset) - _SHORTEST)
     if not free_ends:
@@ -320,8 +325,8 @@ def _residuals(knots: Floats, samples: _Samples) -> Floats:
     """Return the residuals (M, N D) with the waypoints of least squares; large ones for knots outside the recording."""
     basis, _ = np.linalg.qr(_basis(knots, samples.time))
     residuals = samples.position - basis @ (basis.mT @ samples.position)
-    # A segment without samples leaves its waypoints open.
-    outside = (knots[:, :-1] >= 1.0).any(axis=-1) | (knots[:, 1:] <= 0.0).any(axis=-1)
+    # A segment without samples would leave a waypoint open.
+    outside: Any = (knots[:, :-1] >= 1.0).any(axis=-1) | (knots[:, 1:] <= 0.0).any(axis=-1)
     residuals = np.where(outside[:, None, None], 10.0 * samples.position, residuals)
     return residuals.reshape(len(knots), -1)
 
@@ -390,9 +395,11 @@ def _fit(time: Floats, position: Floats, n_via: int, free_ends: bool) -> _Fit:
     centre = position.mean(axis=0)
     size = math.sqrt(np.square(position - centre).sum(axis=-1).mean())
     samples = _Samples((time - first) / length, (position - centre) / size)
-    theta = _theta(_starts(samples, n_via, free_ends), free_ends)
+    every = max(1, len(time) // _ENOUGH)
+    some = _Samples(samples.time[::every], samples.position[::every])
+    theta = _theta(_starts(some, n_via, free_ends), free_ends)
     for count, steps in _STAGES:
-        theta, squares = _descend(theta[:count], samples, free_ends, steps)
+        theta, squares = _descend(theta[:count], samples if count == 1 else some, free_ends, steps)
         theta = theta[np.argsort(squares, kind="stable")]
     knots = _knots(theta[0], free_ends)
     basis = _basis(knots[None], samples.time)[0]
@@ -403,7 +410,7 @@ def _fit(time: Floats, position: Floats, n_via: int, free_ends: bool) -> _Fit:
     return _Fit(
         knots=first + length * knots,
         points=centre + size * points,
-        r_squared=1.0 - residual / len(time),
+        r_squared=max(0.0, 1.0 - residual / len(time)),
         noise=size * math.sqrt(residual / (count - parameters)),
         bic=count * math.log(variance) + parameters * math.log(count),
     )

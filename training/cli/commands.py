@@ -144,7 +144,9 @@ def record(config: RecordConfig) -> None:
             )
         env_id, env_kwargs = env, {**config.env_kwargs, **argument}
         if registered_task(env_id, **env_kwargs).stepwise and name != "random":
-            raise ValueError(f"baselines of {env_id}, which decides in every control step, are random, got {name!r}")
+            raise ValueError(
+                f"baselines of {env_id}, which decides in every control step, are random, got {name!r}"
+            )
         method = make_method(name, env_id, **env_kwargs)
     dataset = config.dataset or f"{env_id.rpartition('-v')[0]}/{method.name}-v0"
     with scene_progress() as progress:

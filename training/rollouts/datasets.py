@@ -98,25 +98,25 @@ def _episode(env: gym.Env[Any, Any], method: Method, number: int, seed: int) -> 
 
     unwrapped: Any = env.unwrapped
     observation, _ = env.reset(seed=seed)
-    seen, actions, rewards, ends, infos = [observation], [], [], [], []
-    while not ends or not any(ends[-1]):
+    seen = [observation]
+    steps: list[tuple[Any, ...]] = []
+    over = False
+    while not over:
         batch = {name: part[None] for name, part in observation.items()}
         decided = method.decide(batch, unwrapped.batch.scenes)[0]
         action = np.clip(decided, -1.0, 1.0).astype(np.float32)
         observation, reward, terminated, truncated, info = env.step(action)
         seen.append(observation)
-        actions.append(action)
-        rewards.append(reward)
-        ends.append((terminated, truncated))
-        infos.append(info)
-    terminations, truncations = np.array(ends).T
+        steps.append((action, reward, terminated, truncated, info))
+        over = terminated or truncated
+    actions, rewards, terminations, truncations, infos = zip(*steps, strict=True)
     return EpisodeBuffer(
         id=number,
         seed=seed,
         observations={name: np.stack([each[name] for each in seen]) for name in seen[0]},
         actions=np.stack(actions),
-        rewards=rewards,
-        terminations=terminations.tolist(),
-        truncations=truncations.tolist(),
+        rewards=list(rewards),
+        terminations=list(terminations),
+        truncations=list(truncations),
         infos={name: np.array([info[name] for info in infos]) for name in infos[0]},
     )
