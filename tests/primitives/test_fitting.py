@@ -35,7 +35,7 @@ def assert_same(found, expected, atol=1e-7):
 
 @ENDS
 @given(st.integers(0, 2), st.integers(1, 3), st.integers(0, 10**6))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60, deadline=None, derandomize=True)
 def test_without_noise_the_movement_is_recovered(free_ends, n_via, dimension, seed):
     rng = np.random.default_rng(seed)
     waypoints, durations, trajectory = movement(rng, n_via, max(dimension, 1 + (n_via > 0)))
@@ -111,14 +111,32 @@ def test_errors_fall_as_the_root_of_the_number_of_samples():
     assert 2.5 < errors[50] / errors[800] < 6.4  # 4 is the root of the ratio of the samples
 
 
+def test_the_noise_is_not_that_which_the_fit_explains():
+    """With few samples, residuals are smaller than the noise by the share of the fitted numbers."""
+    squares = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        time, position = samples(movement(rng, 1)[2], False, rng, 12, noise=0.002)
+        squares.append(float(fit_via_points(time, position, 1, free_ends=False).noise) ** 2)
+    assert 0.0018 < math.sqrt(np.mean(squares)) < 0.0022
+
+
+@pytest.mark.parametrize("part", [slice(0, 50), slice(50, 100), slice(30, 70)])
+def test_via_points_are_passed_within_the_recording(part, rng):
+    for _ in range(5):
+        time, position = samples(movement(rng, 2)[2], False, rng)
+        fit = fit_via_points(time[part], position[part], 2)
+        assert time[part][0] < fit.passage_times[0] < fit.passage_times[1] < time[part][-1]
+
+
 def test_the_number_of_via_points_is_found_where_noise_is_low():
     right = 0
-    for seed in range(60):
+    for seed in range(40):
         rng = np.random.default_rng(seed)
         _, _, trajectory = movement(rng, seed % 3)
         time, position = samples(trajectory, seed % 2 == 0, rng, noise=0.0005)
         right += int(fit_via_points(time, position, free_ends=seed % 2 == 0).n_via) == seed % 3
-    assert right >= 57
+    assert right >= 38
 
 
 def test_a_range_is_searched_and_exact_movements_get_the_fewest(rng):
