@@ -17,7 +17,7 @@ NOISE = (0.5, 1.0, 2.0, 5.0)
 """Standard deviations of the noise of a coordinate, [mm]."""
 DRAWS = 100
 SECONDS: dict[int | None, list[float]] = {}
-"""Times of all fits by the number of via-points that was given, [s]."""
+"""Processor times of all fits by the number of via-points that was given, [s]."""
 RATE = 100.0
 """Samples per second, [Hz]."""
 REST = 0.2
@@ -40,9 +40,9 @@ def fitted(n_via: int, seed: int, noise: float, free_ends: bool, given: int | No
     times = np.arange(-REST * free_ends, 1.0 + REST * free_ends + 1e-9, 1.0 / RATE)
     errors = np.random.default_rng(seed).normal(0.0, 1e-3 * noise, (len(times), 2))
     position = through(*drawn(n_via, seed))(times) + errors
-    begin = time.perf_counter()
+    begin = time.process_time()
     fit = fit_via_points(times, position, given, free_ends=free_ends)
-    SECONDS.setdefault(given, []).append(time.perf_counter() - begin)
+    SECONDS.setdefault(given, []).append(time.process_time() - begin)
     return fit
 
 
@@ -69,7 +69,7 @@ def main() -> None:
     rows = [row(noise, free_ends) for free_ends in (False, True) for noise in NOISE]
     table = pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True)
     one, chosen = (1e3 * np.median(SECONDS[given]) for given in (1, None))
-    speed = f"One via-point takes {one:.0f} ms; the choice among 0 to 3 via-points takes {chosen:.0f} ms (medians)."
+    speed = f"One via-point takes {one:.0f} ms; the choice among 0 to 3 via-points takes {chosen:.0f} ms (medians, one core)."
     before, _, after = PAGE.read_text(encoding="utf-8").partition(BEGIN)
     _, _, after = after.partition(END)
     PAGE.write_text(f"{before}{BEGIN}\n{table}\n\n{speed}\n{END}{after}", encoding="utf-8")
