@@ -69,7 +69,7 @@ def main() -> None:
     rows = [row(noise, free_ends) for free_ends in (False, True) for noise in NOISE]
     table = pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True)
     one, chosen = (1e3 * np.median(SECONDS[given]) for given in (1, None))
-    speed = f"One via-point takes {one:.0f} ms; the choice among 0 to 3 via-points takes {chosen:.0f} ms (medians, one core)."
+    speed = f"One via-point takes {one:.0f} ms; the choice among 0 to 3 takes {chosen:.0f} ms (medians, one core)."
     before, _, after = PAGE.read_text(encoding="utf-8").partition(BEGIN)
     _, _, after = after.partition(END)
     PAGE.write_text(f"{before}{BEGIN}\n{table}\n\n{speed}\n{END}{after}", encoding="utf-8")
