@@ -6,6 +6,7 @@ kind. Units are metres and seconds.
 
 from ._extrema import Extrema
 from .array_api import FREE
+from .fitting import ViaPointFit, fit_via_points
 from .gradients import CostGradient, cost_gradient
 from .minimum_jerk import minimum_jerk_coefficients, point_to_point, through
 from .passage_times import passage_durations
@@ -29,9 +30,11 @@ __all__ = [
     "Extrema",
     "SpeedEvents",
     "Trajectory",
+    "ViaPointFit",
     "cost_gradient",
     "curvature",
     "dimensionless_jerk",
+    "fit_via_points",
     "log_dimensionless_jerk",
     "minimum_duration",
     "minimum_jerk_coefficients",

@@ -16,7 +16,7 @@ PAGES = {
     path.relative_to(ROOT).as_posix(): path for path in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
 }
 PUBLIC = ("viapoint.primitives", "viapoint.envs", "viapoint.training")
-OWN_TESTS = {"docs/bring-your-arm.md", "docs/live.md", "docs/studies.md"}
+OWN_TESTS = {"docs/bring-your-arm.md", "docs/datasets.md", "docs/live.md", "docs/studies.md"}
 """Pages whose examples train for long or need files; tests of their subject run them."""
 every_page = pytest.mark.parametrize("name", sorted(PAGES))
 

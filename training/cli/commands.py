@@ -1,4 +1,4 @@
-"""Commands `train`, `evaluate` and `play`."""
+"""Commands `train`, `evaluate`, `play` and `record`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import gymnasium as gym
 import pandas as pd
 
 from viapoint.training.agents.agent import Agent, load_agent
+from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.config.configs import (
     USUAL_BASELINES,
     EvaluateConfig,
     PlayConfig,
+    RecordConfig,
     TrainConfig,
     env_of_arm,
 )
@@ -25,6 +27,7 @@ from viapoint.training.planning import benchmark_report
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.benchmark import benchmark_problems, read_problems
 from viapoint.training.planning.search import registered_task
+from viapoint.training.rollouts.datasets import dataset_folder, record_dataset
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets.scene_set import evenly_spread, scenes_for
@@ -37,7 +40,7 @@ def train(config: TrainConfig) -> None:
     print(training.train(config))
 
 
-def _named(config: EvaluateConfig | PlayConfig) -> tuple[Agent | None, str, dict[str, Any]]:
+def _named(config: EvaluateConfig | PlayConfig | RecordConfig) -> tuple[Agent | None, str, dict[str, Any]]:
     """Return the agent of a configuration, if any, and the id and the arguments of the environment."""
     agent = None if config.agent is None else load_agent(config.agent)
     if agent is not None and config.env not in (None, agent.env_id):
@@ -123,3 +126,30 @@ def play(config: PlayConfig) -> None:
     record_video(config.video, env, scenes, method.decide, name=method.name)
     env.close()
     print(f"{len(scenes.start)} movements: {config.video}")
+
+
+def record(config: RecordConfig) -> None:
+    """Record episodes of an agent or a baseline as a Minari dataset, and print how to load it."""
+    name = str(config.agent)
+    if name in SHIPPED_IDS or Path(name).expanduser().exists():
+        agent, env_id, env_kwargs = _named(config)
+        if config.env_kwargs:
+            raise ValueError("env_kwargs are for baselines; an agent has those of its training")
+        method = agent_method("agent", agent)
+    else:
+        env, argument = env_of_arm(config.arm, config.env)
+        if env is None:
+            raise ValueError(
+                f"there is no agent {name!r}; for a baseline, name an environment with --env or --arm"
+            )
+        env_id, env_kwargs = env, {**config.env_kwargs, **argument}
+        if registered_task(env_id, **env_kwargs).stepwise and name != "random":
+            raise ValueError(
+                f"baselines of {env_id}, which decides in every control step, are random, got {name!r}"
+            )
+        method = make_method(name, env_id, **env_kwargs)
+    dataset = config.dataset or f"{env_id.rpartition('-v')[0]}/{method.name}-v0"
+    with scene_progress() as progress:
+        found = record_dataset(dataset, env_id, env_kwargs, method, config.episodes, config.seed, progress)
+    print(f"{found.total_episodes} episodes, {found.total_steps} decisions: {dataset_folder(dataset)}")
+    print(f"load them with minari.load_dataset({dataset!r})")

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 PATIENCE = 120.0
 """Time limit of a check in a separate process, [s]."""
 INSTALL, INSTALL_TRAINING = "pip install viapoint", "pip install 'viapoint[training]'"
-EXTRAS = {"mjviser": "live", "optuna": "study", "ray": "study", "viser": "live"}
+EXTRAS = {"minari": "minari", "mjviser": "live", "optuna": "study", "ray": "study", "viser": "live"}
 """Extras of packages that a command imports when it needs them."""
 MODULES = {"pyyaml": "yaml"}
 """Modules of packages with other names."""

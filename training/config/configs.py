@@ -19,6 +19,7 @@ from viapoint.envs.arms.registry import ARM_FILES, arm_names, arm_of
 from viapoint.envs.common.validation import is_number
 from viapoint.envs.registration import ENV_IDS, check_registered
 from viapoint.envs.task import Task
+from viapoint.primitives.fitting import MOST_VIA_POINTS, USUAL_RANGE
 from viapoint.training.config.checks import (
     DEFAULT_ENV,
     SHIPPED_IDS,
@@ -42,6 +43,10 @@ def _listed(ids: Iterable[str]) -> str:
 ENV = tyro.conf.arg(metavar="ID", help=f"Id of a registered environment, such as {_listed(ENV_IDS)}.")
 AGENT = tyro.conf.arg(
     metavar="AGENT", help="Run folder, model folder, or id of an environment with a shipped agent."
+)
+RECORDED = tyro.conf.arg(
+    metavar="METHOD",
+    help="Run folder, model folder, id of an environment with a shipped agent, or baseline, such as random.",
 )
 PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent: {_listed(SHIPPED_IDS)}.")
 ARM = tyro.conf.arg(metavar="ARM", help="Arm: panda, planar, or an MJCF or URDF file.")
@@ -409,6 +414,35 @@ class PlayConfig(AgentConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
+class RecordConfig(AgentConfig):
+    """Record episodes as a Minari dataset for offline learning.
+
+    The method is an agent, or a baseline such as random or search512 in the environment of --env or --arm.
+
+    Example: viapoint record search512 --env viapoint/PlanarObstacles-v0 --episodes 100 --dataset planar/search-v0
+    """
+
+    agent: Annotated[tyro.conf.Positional[str | None], RECORDED] = None
+    """Run folder, model folder, id of an environment with a shipped agent, or name of a baseline."""
+    episodes: int = 100
+    """Number of episodes."""
+    dataset: str | None = None
+    """Name of the dataset; default: <environment>/<method>-v0, in the folder MINARI_DATASETS_PATH."""
+    seed: int = 0
+    """Seed of the first episode; others follow."""
+    env_kwargs: NamedValues = field(default_factory=dict)
+    """Arguments of the environment, values in YAML: n_via=2 n_obstacles=[1,8]; not with an agent."""
+
+    least: ClassVar = {"episodes": 1, "seed": 0}
+
+    def _check(self) -> None:
+        super()._check()
+        if self.agent is None:
+            raise ValueError("name an agent (run folder, model folder or id), or a baseline such as random")
+        check_env_kwargs(self.env_kwargs)
+
+
+@dataclass(frozen=True, kw_only=True)
 class PlanConfig(Config):
     """Plan a smooth movement of an arm around known obstacles.
 
@@ -469,6 +503,38 @@ class PlanConfig(Config):
             given = len(getattr(self, name))
             if given not in (0, length):
                 raise ValueError(f"{name} has {length} numbers, got {given}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitConfig(Config):
+    """Fit via-points to measured movements.
+
+    The file is a CSV with the columns time, x, y, and optionally z and movement.
+
+    Example: viapoint fit movements.csv --n-via 1 --out fit
+    """
+
+    file: tyro.conf.Positional[Path]
+    """CSV file with one sample in each line, [s] and [m]."""
+    n_via: tuple[int, ...] = ()
+    """Number of via-points, or the fewest and the most to choose among; by default 0 to 3."""
+    free_ends: bool = True
+    """Fit onset and end, too; otherwise a movement begins with its first sample and ends with its last."""
+    out: Path = Path("fit")
+    """Folder for the table fit.csv and the figure fit.png."""
+
+    @property
+    def numbers(self) -> tuple[int, int] | None:
+        """Fewest and most via-points; None for the usual ones."""
+        return (self.n_via[0], self.n_via[-1]) if self.n_via else None
+
+    def _check(self) -> None:
+        fewest, most = self.numbers or USUAL_RANGE
+        if len(self.n_via) > 2 or not 0 <= fewest <= most <= MOST_VIA_POINTS:
+            raise ValueError(
+                f"n_via must be one number, or the fewest and the most, from 0 to {MOST_VIA_POINTS}, got {self.n_via}"
+            )
+        check_folder("out", self.out)
 
 
 @dataclass(frozen=True, kw_only=True)

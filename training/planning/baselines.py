@@ -68,7 +68,7 @@ class RandomVias:
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return the best of the random actions, see :class:`Method`."""
-        number, size = len(scenes.start), self._simulation.task.action.size
+        number, size = len(scenes.start), len(self._simulation.task.action_names)
         actions = self._generator.uniform(-1.0, 1.0, (number, self._count, size))
         if self._count == 1:
             return actions[:, 0]

@@ -1,0 +1,79 @@
+"""Errors of fitted via-points against noise: `python benchmarks/fit.py` writes the table of docs/fit.md."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from viapoint.primitives import ViaPointFit, fit_via_points, passage_durations, through
+
+PAGE = Path(__file__).parents[1] / "docs" / "fit.md"
+BEGIN, END = "<!-- table -->", "<!-- end of table -->"
+NOISE = (0.5, 1.0, 2.0, 5.0)
+"""Standard deviations of the noise of a coordinate, [mm]."""
+DRAWS = 100
+SECONDS: dict[int | None, list[float]] = {}
+"""Processor times of all fits by the number of via-points that was given, [s]."""
+RATE = 100.0
+"""Samples per second, [Hz]."""
+REST = 0.2
+"""Time at rest before and after the movement, where its ends are fitted, [s]."""
+
+
+def drawn(n_via: int, seed: int) -> tuple[Any, Any]:
+    """Return waypoints and durations of a movement of 1 s over 0.3 m, with passage times near those of least jerk."""
+    rng = np.random.default_rng((n_via, seed))
+    along = (np.arange(n_via) + rng.uniform(0.7, 1.3, n_via)) / (n_via + 1)
+    side = rng.choice([-1.0, 1.0]) * (-1.0) ** np.arange(n_via)
+    vias = np.stack([0.3 * along, side * rng.uniform(0.05, 0.15, n_via)], axis=-1)
+    waypoints = np.concatenate([[[0.0, 0.0]], vias, [[0.3, 0.0]]])
+    durations = passage_durations(waypoints, 1.0) * rng.uniform(0.9, 1.1, n_via + 1)
+    return waypoints, durations / durations.sum()
+
+
+def fitted(n_via: int, seed: int, noise: float, free_ends: bool, given: int | None) -> ViaPointFit:
+    """Return the fit of one draw, and note its time."""
+    times = np.arange(-REST * free_ends, 1.0 + REST * free_ends + 1e-9, 1.0 / RATE)
+    errors = np.random.default_rng(seed).normal(0.0, 1e-3 * noise, (len(times), 2))
+    position = through(*drawn(n_via, seed))(times) + errors
+    begin = time.process_time()
+    fit = fit_via_points(times, position, given, free_ends=free_ends)
+    SECONDS.setdefault(given, []).append(time.process_time() - begin)
+    return fit
+
+
+def row(noise: float, free_ends: bool) -> dict[str, str]:
+    """Return one line of the table: medians over the draws, and how often the number of via-points is right."""
+    cells = {"noise": f"{noise} mm", "onset and end": "fitted" if free_ends else "given"}
+    for n_via, name in ((1, "one via-point"), (2, "two via-points")):
+        places, passages = [], []
+        for seed in range(DRAWS):
+            waypoints, durations = drawn(n_via, seed)
+            fit = fitted(n_via, seed, noise, free_ends, n_via)
+            places.append(np.linalg.norm(fit.via_points - waypoints[1:-1], axis=-1).mean())
+            passages.append(np.abs(fit.passage_times - np.cumsum(durations)[:-1]).mean())
+        cells[name] = f"{1e3 * np.median(places):.1f} mm, {1e3 * np.median(passages):.1f} ms"
+    for n_via in (0, 1, 2):
+        right = [int(fitted(n_via, seed, noise, free_ends, None).n_via) == n_via for seed in range(DRAWS)]
+        cells[f"{n_via} found"] = f"{100.0 * np.mean(right):.0f} %"
+    print(cells, flush=True)
+    return cells
+
+
+def main() -> None:
+    """Measure, and write the table into the page."""
+    rows = [row(noise, free_ends) for free_ends in (False, True) for noise in NOISE]
+    table = pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True)
+    one, chosen = (1e3 * np.median(SECONDS[given]) for given in (1, None))
+    speed = f"One via-point takes {one:.0f} ms; the choice among 0 to 3 takes {chosen:.0f} ms (medians, one core)."
+    before, _, after = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+    _, _, after = after.partition(END)
+    PAGE.write_text(f"{before}{BEGIN}\n{table}\n\n{speed}\n{END}{after}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

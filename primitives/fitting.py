@@ -1,0 +1,451 @@
+"""Least-squares fit of movements through via-points to measured positions.
+
+With fixed passage times a minimum-jerk movement is linear in its waypoints,
+
+    x(t) = sum_k B_k(t) x_k.                                                                        (1)
+
+So the waypoints of least squares follow from a linear system, and only the times are searched for: variable
+projection (Golub & Pereyra 1973). The search works in units of the recording: time from 0 to 1, positions of size 1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .array_api import (
+    Array,
+    Floats,
+    as_floats,
+    broadcast_batch,
+    is_whole,
+    leading_shape,
+    like,
+    namespace_of,
+    require,
+    to_numpy,
+)
+from .minimum_jerk import through
+from .trajectory import Trajectory
+
+MOST_VIA_POINTS = 8
+"""Greatest number of via-points of a fit."""
+
+USUAL_RANGE = (0, 3)
+"""Fewest and most via-points among which n_via=None chooses."""
+
+_BEYOND = 0.25
+"""Time before the first and after the last sample in which a movement may begin and end, in lengths of the
+recording."""
+
+_SHORTEST, _LEAST = 0.02, 1e-3
+"""Shortest segment, in durations of the movement: via-points closer in time cannot be told apart; least share of the
+recording that the movement takes."""
+
+_GRID = 8
+"""Number of instants among which the first passage times are chosen."""
+
+_STAGES = ((40, 3), (10, 8), (1, 80))
+"""Numbers of the best starts that go on, and of their steps."""
+
+_ENOUGH = 200
+"""Number of samples, evenly spread, with which the best start is found."""
+
+_GREATEST = 40.0
+"""Greatest size of a parameter; beyond it a share does not change any more."""
+
+_STEP = 1e-7
+"""Step of the difference quotients of the residuals."""
+
+_CONVERGED, _TINY = 1e-10, 1e-28
+"""Least gain of a step, relative to the squares and absolute, in units of the recording."""
+
+_ROUNDING = 1e-7
+"""Residual, in sizes of the movement, below which a better fit is only rounding."""
+
+_ENERGY, _BEFORE = 0.01, 0.17
+"""Share of the integral of the squared speed of a reach, and the part of its duration in which it is reached."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViaPointFit:
+    """Minimum-jerk movement through via-points that was fitted to a measured one.
+
+    Movements of a batch may have different numbers of via-points; K is the greatest, and others are padded with NaN.
+    Times are on the clock of the measurement.
+
+    Attributes:
+        n_via: (...,) numbers of via-points.
+        via_points: (..., K, D) [m].
+        passage_times: (..., K) [s].
+        start: (..., D) position before the movement [m].
+        goal: (..., D) position after the movement [m].
+        onset: (...,) beginning of the movement [s].
+        end: (...,) end of the movement [s].
+        r_squared: (...,) explained share of the variance of the positions, from 0 to 1.
+        noise: (...,) standard deviation of the residuals of a coordinate, with the degrees of freedom of the fit [m].
+        bic: (...,) Bayesian information criterion; differences between fits to the same samples have a meaning.
+        trajectory: the movement; its own clock starts at 0 at the onset.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.primitives import fit_via_points, through
+        >>> time = np.linspace(0.0, 1.0, 50)
+        >>> fit = fit_via_points(time, through([[0.0, 0.0], [0.2, 0.1], [0.4, 0.0]], [0.4, 0.6])(time), n_via=1)
+        >>> fit.via_points.round(3).tolist(), fit([0.4]).round(3).tolist()
+        ([[0.2, 0.1]], [[0.2, 0.1]])
+    """
+
+    n_via: Array
+    via_points: Array
+    passage_times: Array
+    start: Array
+    goal: Array
+    onset: Array
+    end: Array
+    r_squared: Array
+    noise: Array
+    bic: Array
+    trajectory: Trajectory
+
+    @property
+    def duration(self) -> Array:
+        """Duration of the movement, (...,) [s]."""
+        return self.end - self.onset
+
+    def __call__(self, time: Array, nu: int = 0) -> Array:
+        """Return the nu-th derivative of the fitted movement at times (T,) or (..., T) of the measurement.
+
+        Returns:
+            (..., T, D) [m/s^nu]. Before the onset and after the end the movement rests.
+
+        Raises:
+            ValueError: time is not finite or does not broadcast; nu is not a whole number of at least 0.
+        """
+        (time,) = self.trajectory.floats(time=time)
+        return self.trajectory(time - self.onset[..., None], nu)
+
+
+class _Recordings(NamedTuple):
+    """Measured movements, checked."""
+
+    movements: list[tuple[Floats, Floats]]
+    """Times (N,) [s] and positions (N, D) [m] of each movement."""
+    batch: tuple[int, ...]
+    """Leading shape of the results."""
+    kind: Array
+    """Array of the library and dtype that the results have."""
+
+
+class _Samples(NamedTuple):
+    """Samples of one movement in units of the recording."""
+
+    time: Floats
+    """Times from 0 to 1, shape (N,)."""
+    position: Floats
+    """Positions of mean 0 and size 1, shape (N, D)."""
+
+
+class _Fit(NamedTuple):
+    """Fit of one movement."""
+
+    knots: Floats
+    """Times of start, via-points and goal, shape (K + 2,) [s]."""
+    points: Floats
+    """Start, via-points and goal, shape (K + 2, D) [m]."""
+    r_squared: float
+    noise: float
+    bic: float
+
+
+def fit_via_points(
+    time: Array,
+    position: Array,
+    n_via: int | tuple[int, int] | None = None,
+    *,
+    free_ends: bool = True,
+) -> ViaPointFit:
+    """Fit a minimum-jerk movement through via-points to measured positions, by least squares.
+
+    The movement begins and ends at rest. Start, via-points, goal, passage times, onset and end are fitted. The onset
+    may lie before the first sample and the end after the last one by up to a quarter of the recording, as in movements
+    that were cut at a threshold of speed.
+
+    The number of via-points, where it is not given, has the least Bayesian information criterion
+    n log(squares / n) + p log n of n coordinates and p fitted numbers. The search for the times begins at the best of a
+    grid of passage times; a better minimum elsewhere cannot be excluded.
+
+    The computation runs in NumPy and double precision for every input and has no gradient.
+
+    Args:
+        time: (N,) or (..., N) ascending times of the samples [s].
+        position: (..., N, D) [m]; or a list of movements of different length (N_i, D), and then `time` is a list too.
+        n_via: number of via-points; (fewest, most) to choose among; None for (0, 3).
+        free_ends: False for a movement that begins with the first sample and ends with the last one.
+
+    Returns:
+        The fit, with the leading shape of the positions, or (M,) for a list of M movements.
+
+    Raises:
+        ValueError: an argument is not finite or has a wrong shape; times do not ascend; nothing moves; there are
+            fewer than 2 n_via + 5 samples, or an unknown n_via.
+
+    Example:
+        >>> import numpy as np
+        >>> from viapoint.primitives import fit_via_points, through
+        >>> time, noise = np.linspace(0.0, 1.2, 120), np.random.default_rng(0).normal(0.0, 0.001, (120, 2))
+        >>> movement = through([[0.0, 0.0], [0.15, 0.20], [0.30, 0.0]], [0.4, 0.6])
+        >>> fit = fit_via_points(time, movement(time - 0.1) + noise)
+        >>> fit.via_points.round(2).tolist(), fit.passage_times.round(1).tolist(), round(float(fit.noise), 4)
+        ([[0.15, 0.2]], [0.5], 0.001)
+    """
+    counts = _counts(n_via)
+    recordings = _recordings(time, position, 2 * counts[-1] + 5)
+    fits = []
+    for times, positions in recordings.movements:
+        candidates = [_fit(times, positions, count, free_ends) for count in counts]
+        fits.append(min(candidates, key=lambda fit: fit.bic))
+    return _record(fits, recordings.batch, recordings.kind)
+
+
+def _counts(n_via: Any) -> range:
+    """Return the numbers of via-points to try."""
+    given = USUAL_RANGE if n_via is None else n_via
+    pair = given if isinstance(given, list | tuple) else (given, given)
+    whole = len(pair) == 2 and all(map(is_whole, pair))
+    if not whole or not pair[0] <= pair[1] <= MOST_VIA_POINTS:
+        raise ValueError(
+            f"n_via must be a whole number from 0 to {MOST_VIA_POINTS}, a pair (fewest, most) of them, or None for "
+            f"{USUAL_RANGE}, got {n_via!r}"
+        )
+    return range(pair[0], pair[1] + 1)
+
+
+def _recordings(time: Any, position: Any, fewest: int) -> _Recordings:
+    """Return the movements of arrays or of a list, after all checks."""
+    if not _is_list(position):
+        return _checked("time", time, "position", position, fewest)
+    times = time if _is_list(time, 1) else [time] * len(position)
+    if len(times) != len(position):
+        raise ValueError(f"time must hold an array for each of {len(position)} movements, got {len(times)}")
+    parts = []
+    for i, (own_time, own_position) in enumerate(zip(times, position, strict=True)):
+        parts.append(_checked(f"time[{i}]", own_time, f"position[{i}]", own_position, fewest))
+    dimensions = sorted({part.kind.shape[-1] for part in parts})
+    if len(dimensions) > 1:
+        raise ValueError(f"position must hold movements of one dimension, got {dimensions}")
+    return _Recordings([part.movements[0] for part in parts], (len(parts),), parts[0].kind)
+
+
+def _is_list(value: Any, axes: int = 2) -> bool:
+    """Return True for a list or tuple whose entries all have this number of axes."""
+    if not isinstance(value, list | tuple) or not value:
+        return False
+    try:
+        return all(np.ndim(each) == axes for each in value)
+    except ValueError:  # ragged lists
+        return False
+
+
+def _checked(time_name: str, time: Any, name: str, position: Any, fewest: int) -> _Recordings:
+    """Return the movements of arrays (..., N) and (..., N, D), after all checks."""
+    try:
+        _, (time, position) = as_floats(None, **{time_name: time, name: position})
+    except ValueError as error:
+        advice = "; leave out samples that were not measured" if "finite" in str(error) else ""
+        raise ValueError(f"{error}{advice}") from None
+    batch = leading_shape(name, position, None, None)
+    count, dimension = position.shape[-2:]
+    batch = broadcast_batch(**{name: batch, time_name: leading_shape(time_name, time, count)})
+    if count < fewest:
+        raise ValueError(
+            f"{name} must have {fewest} or more samples for {(fewest - 5) // 2} via-points, got {count}: measure at a "
+            "higher rate, or lower n_via"
+        )
+    if 0 in batch:
+        raise ValueError(f"{name} must hold one movement or more, got shape {tuple(position.shape)}")
+    times = np.broadcast_to(to_numpy(time).astype(float), (*batch, count)).reshape(-1, count)
+    places = np.broadcast_to(to_numpy(position).astype(float), (*batch, count, dimension))
+    places = places.reshape(-1, count, dimension)
+    ascending = np.diff(times) > 0
+    require(ascending, time_name, times[:, 1:], "must ascend: sort the samples, and keep one of equal times")
+    moves = np.ptp(places, axis=1).any(axis=-1)
+    require(moves, name, 1.0 * moves, "must change: there is no movement in equal samples")
+    return _Recordings(list(zip(times, places, strict=True)), batch, position)
+
+
+def _basis(knots: Floats, time: Floats) -> Floats:
+    """Return B_k (Eq. 1) at times (N,) for M vectors of knots (M, K + 2), shape (M, N, K + 2)."""
+    unit = through(np.eye(knots.shape[-1]), np.diff(knots))  # a movement whose coordinates are the B_k
+    basis: Floats = unit(time - knots[:, :1])
+    return basis
+
+
+def _knots(theta: Floats, free_ends: bool) -> Floats:
+    """Return knots (..., K + 2) in units of the recording.
+
+    Any numbers theta stand for ascending knots: the segments are shares of the movement, and the movement, with
+    `free_ends`, a share of the recording and what may lie beyond it.
+    """
+    count = theta.shape[-1] - 2 * free_ends
+    ends = np.cumulative_sum(_shares(theta[..., :count], _SHORTEST), axis=-1, include_initial=True)
+    if not free_ends:
+        return ends
+    before, inside, _ = np.moveaxis(_shares(theta[..., count:], _LEAST), -1, 0)
+    whole = 1.0 + 2.0 * _BEYOND
+    knots: Floats = whole * (before[..., None] + inside[..., None] * ends) - _BEYOND
+    return knots
+
+
+def _shares(theta: Floats, least: float) -> Floats:
+    """Return shares (..., n + 1) from `least` on that add up to 1: a softmax of theta (..., n) and 0, with a floor."""
+    last = np.zeros((*theta.shape[:-1], 1))
+    weights = np.exp(np.concatenate([theta, last], axis=-1).clip(-_GREATEST, _GREATEST))
+    weights = weights / weights.sum(axis=-1, keepdims=True)
+    shares: Floats = least + (1.0 - least * weights.shape[-1]) * weights
+    return shares
+
+
+def _theta(knots: Floats, free_ends: bool) -> Floats:
+    """Return the parameters of knots (S, K + 2), the inverse of `_knots`; no segment may be a shortest one."""
+    onset, end = knots[:, :1], knots[:, -1:]
+    inner = np.log(np.diff(knots) / (end - onset) - _SHORTEST)
+    if not free_ends:
+        return inner[:, :-1] - inner[:, -1:]
+    outer = np.hstack([onset + _BEYOND, end - onset, 1.0 + _BEYOND - end]) / (1.0 + 2.0 * _BEYOND)
+    outer = np.log(outer - _LEAST)
+    return np.hstack([inner[:, :-1] - inner[:, -1:], outer[:, :-1] - outer[:, -1:]])
+
+
+def _residuals(knots: Floats, samples: _Samples) -> Floats:
+    """Return the residuals (M, N D) with the waypoints of least squares; large ones for knots outside the recording."""
+    basis, _ = np.linalg.qr(_basis(knots, samples.time))
+    residuals = samples.position - basis @ (basis.mT @ samples.position)
+    # A segment without samples would leave a waypoint open.
+    outside: Any = (knots[:, :-1] >= 1.0).any(axis=-1) | (knots[:, 1:] <= 0.0).any(axis=-1)
+    residuals = np.where(outside[:, None, None], 10.0 * samples.position, residuals)
+    return residuals.reshape(len(knots), -1)
+
+
+def _expansion(theta: Floats, samples: _Samples, free_ends: bool) -> tuple[Floats, Floats, Floats]:
+    """Return half the squares (S,), their gradient (S, P) and the Gauss-Newton matrix (S, P, P) at theta (S, P)."""
+    starts, count = theta.shape
+    tried = theta[:, None] + _STEP * np.eye(count + 1, count, k=-1)  # the first row is theta itself
+    residuals = _residuals(_knots(tried.reshape(starts * (count + 1), count), free_ends), samples).reshape(
+        starts, count + 1, -1
+    )
+    base = residuals[:, :1]
+    jacobian = (residuals[:, 1:] - base) / _STEP
+    return 0.5 * (base * base).sum(axis=(1, 2)), (jacobian @ base.mT)[..., 0], jacobian @ jacobian.mT
+
+
+def _descend(theta: Floats, samples: _Samples, free_ends: bool, steps: int) -> tuple[Floats, Floats]:
+    """Return parameters (S, P) after steps of Levenberg and Marquardt, and half their squares (S,)."""
+    squares, gradient, matrix = _expansion(theta, samples, free_ends)
+    damping = np.full(len(theta), 1e-2)
+    for _ in range(steps):
+        size = damping * (np.trace(matrix, axis1=1, axis2=2) + _TINY)
+        damped = matrix + size[:, None, None] * np.eye(theta.shape[1])
+        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+        gain = -(step * gradient).sum(axis=-1)
+        if (gain <= _CONVERGED * squares + _TINY).all():
+            break
+        tried = theta + step
+        new = _expansion(tried, samples, free_ends)
+        better = new[0] < squares
+        theta = np.where(better[:, None], tried, theta)
+        squares = np.where(better, new[0], squares)
+        gradient = np.where(better[:, None], new[1], gradient)
+        matrix = np.where(better[:, None, None], new[2], matrix)
+        damping = np.where(better, damping / 5.0, damping * 4.0).clip(1e-10, 1e10)
+    return theta, squares
+
+
+def _moving_part(samples: _Samples) -> tuple[float, float]:
+    """Return about where a movement begins and ends, from the speed of a smooth curve through all samples."""
+    knots = np.linspace(0.0, 1.0, min(12, len(samples.time) // 2))
+    points = np.linalg.lstsq(_basis(knots[None], samples.time)[0], samples.position)[0]
+    speed = np.square(through(points, np.diff(knots)).sample(200, 1)[0]).sum(axis=-1)
+    reached = np.cumsum(speed) / speed.sum()
+    first, last = np.interp([_ENERGY, 1.0 - _ENERGY], reached, np.linspace(0.0, 1.0, 200))
+    beyond = (last - first) * _BEFORE / (1.0 - 2.0 * _BEFORE)
+    most = 0.9 * _BEYOND
+    return max(first - beyond, -most), min(last + beyond, 1.0 + most)
+
+
+def _starts(samples: _Samples, n_via: int, free_ends: bool) -> Floats:
+    """Return knots (S, K + 2) with passage times of a grid, those of least squares first."""
+    grid = max(_GRID, n_via + 3)
+    places = np.arange(1, grid + 1) / (grid + 1)
+    chosen = list(combinations(places, n_via))
+    inner = np.array([(0.0, *each, 1.0) for each in chosen])
+    spans = [(0.0, 1.0), _moving_part(samples)] if free_ends else [(0.0, 1.0)]
+    knots = np.concatenate([onset + (end - onset) * inner for onset, end in spans])
+    squares = np.square(_residuals(knots, samples)).sum(axis=-1)
+    return knots[np.argsort(squares, kind="stable")]
+
+
+def _fit(time: Floats, position: Floats, n_via: int, free_ends: bool) -> _Fit:
+    """Fit one movement with a number of via-points."""
+    first, length = time[0], time[-1] - time[0]
+    centre = position.mean(axis=0)
+    size = math.sqrt(np.square(position - centre).sum(axis=-1).mean())
+    samples = _Samples((time - first) / length, (position - centre) / size)
+    every = max(1, len(time) // _ENOUGH)
+    some = _Samples(samples.time[::every], samples.position[::every])
+    theta = _theta(_starts(some, n_via, free_ends), free_ends)
+    for count, steps in _STAGES:
+        theta, squares = _descend(theta[:count], samples if count == 1 else some, free_ends, steps)
+        theta = theta[np.argsort(squares, kind="stable")]
+    knots = _knots(theta[0], free_ends)
+    basis = _basis(knots[None], samples.time)[0]
+    points = np.linalg.lstsq(basis, samples.position)[0]
+    residual = float(np.square(basis @ points - samples.position).sum())
+    count, parameters = position.size, points.size + n_via + 2 * free_ends
+    variance = max(residual / count, _ROUNDING**2) * size**2
+    return _Fit(
+        knots=first + length * knots,
+        points=centre + size * points,
+        r_squared=max(0.0, 1.0 - residual / len(time)),
+        noise=size * math.sqrt(residual / (count - parameters)),
+        bic=count * math.log(variance) + parameters * math.log(count),
+    )
+
+
+def _record(fits: list[_Fit], batch: tuple[int, ...], kind: Array) -> ViaPointFit:
+    """Return the fits in one record with a leading shape, in the library and dtype of an array."""
+    n_via = np.array([len(fit.knots) - 2 for fit in fits])
+    most, dimension = n_via.max(), fits[0].points.shape[-1]
+    via_points = np.full((len(fits), most, dimension), np.nan)
+    passage_times = np.full((len(fits), most), np.nan)
+    # A goal that is repeated after no time is no via-point for `through`.
+    waypoints = np.stack([fit.points[[-1] * (most + 2)] for fit in fits])
+    durations = np.zeros((len(fits), most + 1))
+    for i, fit in enumerate(fits):
+        count = n_via[i]
+        via_points[i, :count] = fit.points[1:-1]
+        passage_times[i, :count] = fit.knots[1:-1]
+        waypoints[i, : count + 2] = fit.points
+        durations[i, : count + 1] = np.diff(fit.knots)
+
+    def shaped(values: Any) -> Array:
+        array = np.asarray(values)
+        return like(namespace_of(kind), array.reshape((*batch, *array.shape[1:])), kind)
+
+    return ViaPointFit(
+        n_via=n_via.reshape(batch),
+        via_points=shaped(via_points),
+        passage_times=shaped(passage_times),
+        start=shaped(waypoints[:, 0]),
+        goal=shaped(waypoints[:, -1]),
+        onset=shaped([fit.knots[0] for fit in fits]),
+        end=shaped([fit.knots[-1] for fit in fits]),
+        r_squared=shaped([fit.r_squared for fit in fits]),
+        noise=shaped([fit.noise for fit in fits]),
+        bic=shaped([fit.bic for fit in fits]),
+        trajectory=through(shaped(waypoints), shaped(durations)),
+    )

@@ -1,0 +1,233 @@
+"""Fits of via-points: what was put in comes out, in any frame, and nothing near it fits better."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from viapoint.primitives import fit_via_points, through
+
+ENDS = pytest.mark.parametrize("free_ends", [False, True])
+
+
+def movement(rng, n_via, dimension=2):
+    """Waypoints, durations and trajectory of a random movement, whose via-points are apart in time."""
+    waypoints = rng.uniform(-0.3, 0.3, (n_via + 2, dimension))
+    durations = rng.uniform(0.5, 1.5, n_via + 1)
+    return waypoints, durations, through(waypoints, durations)
+
+
+def samples(trajectory, free_ends, rng, count=100, noise=0.0):
+    """Times and positions of a movement; with free ends, from before its onset or after it until likewise its end."""
+    duration = float(trajectory.duration)
+    before, after = rng.uniform(-0.06, 0.2, 2) * duration * free_ends
+    time = np.linspace(-before, duration + after, count)
+    return time, trajectory(time) + noise * rng.normal(size=(count, trajectory.dimension))
+
+
+def assert_same(found, expected, atol=1e-7):
+    for name in ("via_points", "passage_times", "start", "goal", "onset", "end", "r_squared", "noise"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=atol, err_msg=name)
+
+
+@ENDS
+@given(st.integers(0, 2), st.integers(1, 3), st.integers(0, 10**6))
+@settings(max_examples=60, deadline=None, derandomize=True)
+def test_without_noise_the_movement_is_recovered(free_ends, n_via, dimension, seed):
+    rng = np.random.default_rng(seed)
+    waypoints, durations, trajectory = movement(rng, n_via, max(dimension, 1 + (n_via > 0)))
+    time, position = samples(trajectory, free_ends, rng)
+    fit = fit_via_points(time, position, n_via, free_ends=free_ends)
+    knots = np.concatenate(([0.0], np.cumsum(durations)))
+    np.testing.assert_allclose(fit.via_points, waypoints[1:-1], atol=1e-5)
+    np.testing.assert_allclose(fit.passage_times, knots[1:-1], atol=1e-5)
+    np.testing.assert_allclose([fit.onset, fit.end], knots[[0, -1]], atol=1e-5)
+    np.testing.assert_allclose(fit(time), position, atol=1e-7)
+    assert 1.0 - fit.r_squared < 1e-12
+
+
+@ENDS
+@pytest.mark.parametrize("seed", range(4))
+def test_a_fit_moves_with_space_and_time(free_ends, seed):
+    rng = np.random.default_rng(seed)
+    _, _, trajectory = movement(rng, 1 + seed % 2)
+    time, position = samples(trajectory, free_ends, rng, noise=0.001)
+    n_via = 1 + seed % 2
+    fit = fit_via_points(time, position, n_via, free_ends=free_ends)
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    moved = fit_via_points(
+        3.0 * time - 7.0, 20.0 * position @ turn.T + [5.0, 6.0], n_via, free_ends=free_ends
+    )
+    np.testing.assert_allclose(moved.via_points, 20.0 * fit.via_points @ turn.T + [5.0, 6.0], atol=1e-4)
+    for name in ("passage_times", "onset", "end"):
+        np.testing.assert_allclose(getattr(moved, name), 3.0 * getattr(fit, name) - 7.0, atol=1e-5)
+    np.testing.assert_allclose(moved.duration, 3.0 * fit.duration, atol=1e-5)
+    np.testing.assert_allclose(moved.r_squared, fit.r_squared, atol=1e-9)
+    np.testing.assert_allclose(moved.noise, 20.0 * fit.noise, rtol=1e-6)
+
+
+def squares_at(knots, time, position):
+    """Least sum of squared residuals with given times, from basis movements and a linear solver."""
+    count = len(knots)
+    columns = [
+        through(np.eye(count)[:, k : k + 1], np.diff(knots))(time - knots[0])[:, 0] for k in range(count)
+    ]
+    basis = np.stack(columns, axis=-1)
+    solution = np.linalg.lstsq(basis, position)[0]
+    return np.square(basis @ solution - position).sum()
+
+
+@ENDS
+@pytest.mark.parametrize("n_via", [1, 2, 3])
+def test_no_other_times_nearby_fit_better(free_ends, n_via, rng):
+    _, _, trajectory = movement(rng, n_via)
+    time, position = samples(trajectory, free_ends, rng, noise=0.003)
+    fit = fit_via_points(time, position, n_via, free_ends=free_ends)
+    knots = np.concatenate(([fit.onset], fit.passage_times, [fit.end]))
+    least = squares_at(knots, time, position)
+    assert least == pytest.approx(np.square(fit(time) - position).sum(), rel=1e-9)
+    assert float(fit.noise) == pytest.approx(0.003, rel=0.2)
+    for size in (1e-4, 1e-3, 1e-2):
+        for _ in range(20):
+            change = size * rng.normal(size=n_via + 2)
+            change[[0, -1]] *= free_ends
+            assert squares_at(knots + change, time, position) >= least * (1.0 - 1e-9)
+
+
+def test_errors_fall_as_the_root_of_the_number_of_samples():
+    errors = {}
+    for count in (50, 800):
+        found = []
+        for seed in range(30):
+            rng = np.random.default_rng(seed)
+            waypoints, _, trajectory = movement(rng, 1)
+            time, position = samples(trajectory, False, rng, count, noise=0.002)
+            fit = fit_via_points(time, position, 1, free_ends=False)
+            found.append(np.square(fit.via_points[0] - waypoints[1]).sum())
+        errors[count] = math.sqrt(np.median(found))
+    assert 2.5 < errors[50] / errors[800] < 6.4  # 4 is the root of the ratio of the samples
+
+
+def test_the_noise_is_not_that_which_the_fit_explains():
+    """With few samples, residuals are smaller than the noise by the share of the fitted numbers."""
+    squares = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        time, position = samples(movement(rng, 1)[2], False, rng, 12, noise=0.002)
+        squares.append(float(fit_via_points(time, position, 1, free_ends=False).noise) ** 2)
+    assert 0.0018 < math.sqrt(np.mean(squares)) < 0.0022
+
+
+@pytest.mark.parametrize("part", [slice(0, 50), slice(50, 100), slice(30, 70)])
+def test_via_points_are_passed_within_the_recording(part, rng):
+    for _ in range(5):
+        time, position = samples(movement(rng, 2)[2], False, rng)
+        fit = fit_via_points(time[part], position[part], 2)
+        assert time[part][0] < fit.passage_times[0] < fit.passage_times[1] < time[part][-1]
+
+
+def test_the_number_of_via_points_is_found_where_noise_is_low():
+    right = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        _, _, trajectory = movement(rng, seed % 3)
+        time, position = samples(trajectory, seed % 2 == 0, rng, noise=0.0005)
+        right += int(fit_via_points(time, position, free_ends=seed % 2 == 0).n_via) == seed % 3
+    assert right >= 38
+
+
+def test_a_range_is_searched_and_exact_movements_get_the_fewest(rng):
+    _, _, trajectory = movement(rng, 1)
+    time, position = samples(trajectory, True, rng)
+    found = [int(fit_via_points(time, position, n_via).n_via) for n_via in (None, (0, 2), 2)]
+    assert found == [1, 1, 2]
+
+
+@pytest.mark.parametrize("n_via", [0, 2, None])
+def test_the_explained_share_is_one_of_the_whole(n_via, rng):
+    walk = np.cumsum(rng.normal(size=(5, 40, 2)), axis=1)
+    fit = fit_via_points(np.arange(40.0), walk, n_via)
+    assert ((fit.r_squared >= 0.0) & (fit.r_squared <= 1.0)).all()
+    assert np.isfinite(fit.bic).all()
+
+
+def test_a_batch_holds_the_fits_of_its_movements(rng):
+    several = []
+    for n_via in (0, 1, 2, 1):
+        several.append(samples(movement(rng, n_via)[2], True, rng, noise=0.001))
+    time, position = (np.stack(part) for part in zip(*several, strict=True))
+    batch = fit_via_points(time.reshape(2, 2, 100), position.reshape(2, 2, 100, 2))
+    listed = fit_via_points(list(time), list(position))
+    assert batch.via_points.shape == (2, 2, 2, 2)
+    assert listed.via_points.shape == (4, 2, 2)
+    for i, (own_time, own_position) in enumerate(several):
+        one = fit_via_points(own_time, own_position)
+        count = int(one.n_via)
+        for found, row in ((batch, np.unravel_index(i, (2, 2))), (listed, (i,))):
+            np.testing.assert_array_equal(found.via_points[row][:count], one.via_points)
+            assert np.isnan(found.via_points[row][count:]).all()
+            assert np.isnan(found.passage_times[row][count:]).all()
+            np.testing.assert_array_equal(found.bic[row], one.bic)
+            np.testing.assert_allclose(found(own_time)[row], one(own_time), atol=1e-12)
+
+
+def test_movements_of_different_length_are_fitted_together(rng):
+    several = [samples(movement(rng, 1)[2], True, rng, count, 0.001) for count in (30, 80)]
+    fit = fit_via_points([time for time, _ in several], [position for _, position in several], 1)
+    for i, (time, position) in enumerate(several):
+        np.testing.assert_array_equal(fit.via_points[i], fit_via_points(time, position, 1).via_points)
+    shared = np.linspace(0.0, 1.0, 30)
+    together = fit_via_points(shared, [several[0][1], several[0][1]], 1)
+    np.testing.assert_array_equal(together.end[0], together.end[1])
+
+
+def test_the_kind_of_the_positions_is_kept(rng):
+    time, position = samples(movement(rng, 1)[2], True, rng, noise=0.001)
+    expected = fit_via_points(time, position, 1)
+    tensors = fit_via_points(torch.tensor(time), torch.tensor(position), 1)
+    assert isinstance(tensors.trajectory.coefficients, torch.Tensor)
+    assert_same(tensors, expected)
+    np.testing.assert_allclose(tensors(torch.tensor(time), 1), expected(time, 1), atol=1e-9)
+    single = fit_via_points(time.astype(np.float32), position.astype(np.float32), 1)
+    assert single.via_points.dtype == np.float32
+    assert_same(single, expected, atol=1e-3)
+
+
+TIME, REACH = np.linspace(0.0, 1.0, 20), through([[0.0, 0.0], [0.3, 0.1]], [1.0])(np.linspace(0.0, 1.0, 20))
+MISSING = np.where(np.arange(20)[:, None] == 3, np.nan, REACH)
+NOT_ASCENDING = np.where(np.arange(20) == 3, TIME[2], TIME)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((TIME, MISSING), r"position must be finite.*\(3, 0\).*leave out"),
+        ((TIME * np.nan, REACH), "time must be finite"),
+        ((TIME, REACH[:10]), "time must have shape"),
+        ((TIME, REACH[:, 0]), "position must have shape"),
+        ((TIME[:10], REACH[:10], 3), "position must have 11 or more samples"),
+        ((TIME[::-1], REACH), "time must ascend.*sort"),
+        ((NOT_ASCENDING, REACH), "time must ascend.*equal times"),
+        ((TIME, np.ones((20, 2))), "position must change"),
+        ((TIME, REACH, -1), "n_via must be"),
+        ((TIME, REACH, 9), "n_via must be"),
+        ((TIME, REACH, 1.5), "n_via must be"),
+        ((TIME, REACH, (2, 1)), "n_via must be"),
+        ((TIME, REACH, (0, 1, 2)), "n_via must be"),
+        ((TIME, REACH, "1"), "n_via must be"),
+        ((TIME, REACH, True), "n_via must be"),
+        (([TIME, TIME], [REACH, MISSING]), r"position\[1\] must be finite"),
+        (([TIME], [REACH, REACH]), "time must hold an array for each of 2 movements"),
+        (([TIME, TIME], [REACH, REACH[:, :1]]), "position must hold movements of one dimension"),
+        ((TIME, np.ones((0, 20, 2))), "position must hold one movement or more"),
+        ((TIME, []), "position must have shape"),
+        ((TIME, [[[0.0], [1.0, 2.0]]]), "position must be"),
+        ((TIME, None), "position must be an array"),
+    ],
+)
+def test_bad_input_is_refused_with_advice(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        fit_via_points(*arguments)

@@ -1,0 +1,131 @@
+"""Minari datasets: what was recorded is what the recovered environment does again."""
+
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from viapoint.envs import ENV_IDS
+from viapoint.training.cli import main as cli
+from viapoint.training.planning.baselines import make_method
+from viapoint.training.rollouts.datasets import record_dataset
+
+minari = pytest.importorskip("minari")
+
+PLANE = "viapoint/PlanarObstacles-v0"
+CUSTOM = "test/TwoPosts-v0"
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Keep datasets in a temporary folder, and a custom id in the registry of the test."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    gym.register(
+        CUSTOM,
+        entry_point="viapoint.envs.env:ReachEnv",
+        vector_entry_point="viapoint.envs.vector_env:ReachVectorEnv",
+        kwargs={"n_obstacles": 2, "n_via": 2},
+        disable_env_checker=True,
+    )
+    return tmp_path / "datasets"
+
+
+def record(*words):
+    cli.main(["record", *map(str, words)])
+
+
+def assert_replays(dataset):
+    """Reset with the recorded seeds, repeat the recorded actions, and expect the same bits."""
+    env = dataset.recover_environment()
+    assert env.observation_space == dataset.observation_space
+    metadata = dataset.storage.get_episode_metadata(range(dataset.total_episodes))
+    for episode, about in zip(dataset.iterate_episodes(), metadata, strict=True):
+        observation, _ = env.reset(seed=about["seed"], options=about.get("options"))
+        for k in range(len(episode) + 1):
+            for name, values in episode.observations.items():
+                np.testing.assert_array_equal(observation[name], values[k], err_msg=name, strict=True)
+            if k == len(episode):
+                break
+            observation, reward, terminated, truncated, info = env.step(episode.actions[k])
+            assert reward == episode.rewards[k]
+            assert (terminated, truncated) == (episode.terminations[k], episode.truncations[k])
+            assert info["is_success"] == episode.infos["is_success"][k]
+        assert terminated or truncated
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("method", "words"),
+    [
+        (PLANE, ()),
+        ("search16", ("--env", PLANE, "--env-kwargs", "n_obstacles=[1,3]")),
+        ("random", ("--env", "viapoint/PlanarObstaclesStep-v0")),
+        ("viapoint/PlanarMovingObstacles-v0", ()),
+        ("straight", ("--env", "viapoint/PlanarTargetJump-v0")),
+        ("straight", ("--arm", "panda")),
+        ("random", ("--env", CUSTOM)),
+    ],
+)
+def test_a_dataset_replays_bit_for_bit(method, words, capsys):
+    record(method, *words, "--episodes", 3, "--seed", 5, "--dataset", "group/name-v1")
+    assert "3 episodes" in capsys.readouterr().out
+    dataset = minari.load_dataset("group/name-v1")
+    assert dataset.total_episodes == 3
+    assert_replays(dataset)
+
+
+def test_an_arm_of_a_file_is_found_again():
+    arm = Path(__file__).parents[2] / "docs" / "ur5e.xml"
+    record("straight", "--arm", arm, "--env", "viapoint/Reach-v0", "--episodes", 1, "--dataset", "own-v0")
+    assert_replays(minari.load_dataset("own-v0"))
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_every_environment_is_recovered(env_id):
+    record("random", "--env", env_id, "--episodes", 1, "--dataset", "any-v0")
+    assert_replays(minari.load_dataset("any-v0"))
+
+
+def test_episodes_are_those_of_the_method_and_have_names_by_default(folder):
+    record("straight", "--env", PLANE, "--episodes", 2)
+    dataset = minari.load_dataset("viapoint/PlanarObstacles/straight-v0")
+    assert (folder / "viapoint/PlanarObstacles/straight-v0/data").is_dir()
+    assert [np.abs(episode.actions).max() for episode in dataset.iterate_episodes()] == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("straight",), "--env"),
+        (("nothing", "--env", PLANE), "baseline must be"),
+        (("plan_motion", "--env", PLANE), "no actions"),
+        (("straight", "--env", "viapoint/PlanarObstaclesStep-v0"), "random"),
+        (("straight", "--env", PLANE, "--episodes", 0), "episodes"),
+        (("straight", "--env", PLANE, "--dataset", "name"), "group/name-v0"),
+        (("straight", "--env", PLANE, "--dataset", "../name-v0"), "group/name-v0"),
+        ((PLANE, "--env-kwargs", "n_via=2"), "env_kwargs"),
+        (("straight", "--env", "CartPole-v1"), "CartPole"),
+    ],
+)
+def test_what_cannot_be_recorded_is_told_before_anything_is(words, told, capsys, folder):
+    with pytest.raises(SystemExit):
+        record(*words)
+    assert told in capsys.readouterr().err
+    assert not folder.exists()
+
+
+def test_a_dataset_is_never_replaced():
+    method = make_method("straight", PLANE)
+    record_dataset("same-v0", PLANE, {}, method, 1)
+    with pytest.raises(ValueError, match="exists"):
+        record_dataset("same-v0", PLANE, {}, method, 1)
+
+
+def test_without_the_library_its_extra_is_named(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "minari", None)
+    with pytest.raises(SystemExit):
+        record("straight", "--env", PLANE)
+    assert "pip install 'viapoint[minari]'" in capsys.readouterr().err

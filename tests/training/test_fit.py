@@ -1,0 +1,119 @@
+"""The command `fit`: from the lines of a file to the table and the figure."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.image import imread
+
+from viapoint.primitives import fit_via_points, through
+from viapoint.training.cli import main as cli
+
+WAYPOINTS = {
+    "around": [[0.0, 0.3, 0.1], [0.12, 0.45, 0.1], [0.3, 0.3, 0.2]],
+    "straight": [[0.0, 0.3, 0.1], [0.3, 0.35, 0.1]],
+}
+
+
+def recorded(*columns):
+    """Table of two movements with little noise, which begin and end within the recording."""
+    rng, parts = np.random.default_rng(0), []
+    for name, waypoints in WAYPOINTS.items():
+        trajectory = through(waypoints, [0.5] * (len(waypoints) - 1))
+        time = np.arange(-0.1, float(trajectory.duration) + 0.1, 0.01)
+        position = trajectory(time) + rng.normal(0.0, 2e-4, (len(time), 3))
+        part = pd.DataFrame({"time": time, **dict(zip("xyz", position.T, strict=True)), "movement": name})
+        parts.append(part[list(columns)])
+    return pd.concat(parts) if "movement" in columns else parts[0]
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "movements.csv"
+    recorded("movement", "time", "x", "y", "z").to_csv(path, index=False)
+    return path
+
+
+def run(*words):
+    cli.main(["fit", *map(str, words)])
+
+
+def failed(capsys, *words):
+    """The one line that the command left on the standard error output."""
+    with pytest.raises(SystemExit) as end:
+        run(*words)
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    return line
+
+
+def test_a_file_gives_a_table_and_a_figure(file, tmp_path, capsys):
+    folder = tmp_path / "new" / "fit"
+    run(file, "--out", folder)
+    printed = capsys.readouterr().out
+    table = pd.read_csv(folder / "fit.csv")
+    assert list(table["movement"]) == list(WAYPOINTS)
+    assert list(table["n_via"]) == [1, 0]
+    assert all(name in printed for name in WAYPOINTS)
+    around = table.iloc[0]
+    np.testing.assert_allclose(
+        around[["via1_x", "via1_y", "via1_z"]].astype(float), WAYPOINTS["around"][1], atol=5e-3
+    )
+    np.testing.assert_allclose(around[["duration", "via1_time"]].astype(float), [1.0, 0.5], atol=0.02)
+    assert table["via1_x"].isna().tolist() == [False, True]
+    assert np.ptp(imread(folder / "fit.png")) > 0.5
+    run(file, "--out", folder, "--n-via", 0, 2)  # a folder of the command is written again
+    pd.testing.assert_frame_equal(pd.read_csv(folder / "fit.csv"), table)
+
+
+def test_a_plane_movement_needs_no_other_columns_and_is_that_of_the_function(tmp_path):
+    path, table = tmp_path / "one.csv", recorded("time", "x", "y")
+    table.to_csv(path, index=False)
+    run(path, "--out", tmp_path, "--n-via", 1, "--no-free-ends")
+    fit = fit_via_points(table["time"].to_numpy(), table[["x", "y"]].to_numpy(), 1, free_ends=False)
+    written = pd.read_csv(tmp_path / "fit.csv").iloc[0]
+    np.testing.assert_allclose(written[["via1_x", "via1_y"]].astype(float), fit.via_points[0], atol=1e-9)
+    assert "via1_z" not in written
+
+
+def changed(name, value):
+    """Function that sets an entry of the fourth line of samples."""
+
+    def change(table):
+        table[name] = table[name].astype(object)
+        table.iloc[3, table.columns.get_loc(name)] = value
+        return table
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda table: table.drop(columns="y"), "no column y"),
+        (lambda table: table.drop(columns=["time", "x"]), "no column time, x"),
+        (changed("x", np.nan), "line 5, column x"),
+        (changed("z", "far"), "line 5, column z: far"),
+        (changed("movement", np.nan), "names no movement in line 5"),
+        (lambda table: table[::-1], "movement straight: time must ascend"),
+        (lambda table: table[:6], "movement around: position must have 11 or more"),
+        (lambda table: table[:0], "holds no samples"),
+    ],
+)
+def test_a_file_at_fault_is_told_where(change, told, file, tmp_path, capsys):
+    change(pd.read_csv(file)).to_csv(file, index=False)
+    assert told in failed(capsys, file, "--out", tmp_path / "fit")
+    assert not (tmp_path / "fit").exists()
+
+
+def test_foreign_files_stay(file, tmp_path, capsys):
+    (tmp_path / "fit.csv").write_text("mine")
+    assert "not written by viapoint" in failed(capsys, file, "--out", tmp_path)
+    assert (tmp_path / "fit.csv").read_text() == "mine"
+    assert "is missing" in failed(capsys, tmp_path / "nothing.csv")
+    (tmp_path / "empty.csv").touch()
+    assert "cannot be read as CSV" in failed(capsys, tmp_path / "empty.csv", "--out", tmp_path / "fit")
+
+
+@pytest.mark.parametrize("numbers", [(2, 1), (0, 1, 2), (9,), (-1,)])
+def test_a_wrong_number_of_via_points_is_told_before_the_file_is_read(numbers, capsys):
+    assert "--n-via must be" in failed(capsys, "nothing.csv", "--n-via", *numbers)

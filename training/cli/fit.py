@@ -1,0 +1,120 @@
+"""Command `fit`: via-points of measured movements."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from viapoint.primitives import ViaPointFit, fit_via_points
+from viapoint.training.config.configs import FitConfig
+from viapoint.training.io.files import BadFileError, check_ours, read_bytes, write_bytes
+from viapoint.training.plotting.fitted import Measured, fitted_movements
+
+REQUIRED = ("time", "x", "y")
+"""Columns that a file of movements must have."""
+COORDINATES = ("x", "y", "z")
+"""Names of the coordinates; z may be left out."""
+TABLE, FIGURE = "fit.csv", "fit.png"
+"""Files that are written."""
+DRAWN = 6
+"""Greatest number of movements in the figure."""
+
+
+def run(config: FitConfig) -> None:
+    """Fit the movements of a file, print a table, and write it with a figure."""
+    table, figure = config.out / TABLE, config.out / FIGURE
+    check_ours(figure)
+    if table.exists() and not figure.exists():
+        raise BadFileError(table, "exists and was not written by viapoint; name another folder")
+    movements = read_movements(config.file)
+    fits = []
+    for movement in movements:
+        try:
+            fits.append(
+                fit_via_points(movement.time, movement.position, config.numbers, free_ends=config.free_ends)
+            )
+        except ValueError as error:
+            raise BadFileError(config.file, f"movement {movement.name}: {error}") from None
+    print(_printed(movements, fits))
+    fitted_movements(figure, movements[:DRAWN], fits[:DRAWN])
+    write_bytes(table, _written(movements, fits).to_csv(index=False).encode())
+    shown = "" if len(movements) <= DRAWN else f" of the first {DRAWN} movements"
+    print(f"\ntable: {table}\nfigure{shown}: {figure}")
+
+
+def read_movements(path: Path) -> list[Measured]:
+    """Return the movements of a CSV file with the columns time, x, y, and if there are any, z and movement.
+
+    Raises:
+        BadFileError: A column is missing, or an entry is no number; the message names it.
+    """
+    read_bytes(path)
+    try:
+        table = pd.read_csv(path, skipinitialspace=True)
+    except (ValueError, pd.errors.ParserError) as error:
+        raise BadFileError(path, f"cannot be read as CSV ({' '.join(str(error).split())})") from None
+    missing = [name for name in REQUIRED if name not in table]
+    if missing:
+        found = ", ".join(map(str, table.columns))
+        raise BadFileError(
+            path, f"has no column {', '.join(missing)}; its first line names the columns {found}"
+        )
+    names = [name for name in ("time", *COORDINATES) if name in table]
+    numbers = table[names].apply(pd.to_numeric, errors="coerce")
+    wrong = np.argwhere(~np.isfinite(numbers.to_numpy(dtype=float)))
+    if len(wrong):
+        row, column = wrong[0]
+        raise BadFileError(
+            path,
+            f"has no number in line {row + 2}, column {names[column]}: {table[names[column]].iloc[row]}; leave out "
+            "lines that were not measured",
+        )
+    labels = table["movement"] if "movement" in table else pd.Series(1, index=table.index)
+    if labels.isna().any():
+        raise BadFileError(path, f"names no movement in line {int(labels.isna().argmax()) + 2}")
+    movements = []
+    for label, rows in numbers.groupby(labels, sort=False):
+        values = rows.to_numpy(dtype=float)
+        movements.append(Measured(str(label), values[:, 0], values[:, 1:]))
+    if not movements:
+        raise BadFileError(path, "holds no samples")
+    return movements
+
+
+def _printed(movements: list[Measured], fits: list[ViaPointFit]) -> str:
+    """Return one line for each movement, for people."""
+    rows = []
+    for movement, fit in zip(movements, fits, strict=True):
+        points = [f"({', '.join(f'{value:.3f}' for value in point)})" for point in fit.via_points]
+        row = {
+            "movement": movement.name,
+            "via-points [m]": " ".join(points) or "none",
+            "passage times [s]": " ".join(f"{time:.3f}" for time in fit.passage_times) or "-",
+            "duration [s]": f"{float(fit.duration):.3f}",
+            "residuals [mm]": f"{1e3 * float(fit.noise):.2f}",
+            "R^2": f"{float(fit.r_squared):.5f}",
+        }
+        rows.append(row)
+    printed: Any = pd.DataFrame(rows).to_markdown(index=False, tablefmt="simple", disable_numparse=True)
+    return str(printed)
+
+
+def _written(movements: list[Measured], fits: list[ViaPointFit]) -> pd.DataFrame:
+    """Return one line for each movement with all numbers."""
+    rows = []
+    for movement, fit in zip(movements, fits, strict=True):
+        row: dict[str, Any] = {"movement": movement.name, "n_via": int(fit.n_via)}
+        for name in ("onset", "end", "duration", "r_squared", "noise", "bic"):
+            row[name] = float(getattr(fit, name))
+        places = {"start": fit.start, "goal": fit.goal}
+        for k, (time, point) in enumerate(zip(fit.passage_times, fit.via_points, strict=True), start=1):
+            row[f"via{k}_time"] = float(time)
+            places[f"via{k}"] = point
+        for place, point in places.items():
+            for name, value in zip(COORDINATES, point, strict=False):
+                row[f"{place}_{name}"] = float(value)
+        rows.append(row)
+    return pd.DataFrame(rows)
