@@ -74,7 +74,9 @@ def test_a_sensor_at_the_hand_moves_with_it() -> None:
     # The first joint turns arm and sensor about the vertical axis; the sphere turned alike looks the same.
     turned = PANDA.home.copy()
     turned[0] += 0.5
-    second = task.sensor.read(PANDA, turned[None], pack([[Sphere(0.05, position=PANDA.hand(turned) + below)]]))
+    second = task.sensor.read(
+        PANDA, turned[None], pack([[Sphere(0.05, position=PANDA.hand(turned) + below)]])
+    )
     assert (first.seen >= 0).any()
     assert np.allclose(first.ranges, second.ranges, atol=1e-4)
 

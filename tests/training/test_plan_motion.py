@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from viapoint.envs import Box, Capsule, Cylinder, Pose, Sphere, Task, arm_of, obstacles_to_json
+from viapoint.envs import Box, Capsule, Cylinder, PointCloud, Pose, Sphere, Task, arm_of, obstacles_to_json
 from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.arms.load import load_arm
 from viapoint.envs.geometry.clearance import configuration_clearances
@@ -419,3 +419,14 @@ def test_narrow_passages_that_a_search_finds_are_planned() -> None:
         for i in range(len(start))
     ]
     assert sum(solved) >= len(solved) - 2
+
+
+def test_points_of_an_obstacle_are_planned_around_like_the_obstacle() -> None:
+    # Distances of point clouds are cut off at a limit; a rounding error there made every movement count as in contact.
+    surface = np.random.default_rng(0).uniform(-1.0, 1.0, (3000, 3))
+    surface[np.arange(3000), np.random.default_rng(1).integers(0, 3, 3000)] = 1.0
+    cloud = PointCloud(surface * POST.size + POST.position, radius=0.01)
+    plan = plan_motion(PANDA, PANDA.home, GOAL, [cloud], ompl=False)
+    assert plan.success
+    assert plan.seeds < 50
+    assert plan.clearance > 0.0

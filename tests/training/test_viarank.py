@@ -1,0 +1,101 @@
+"""Laws of agents that see obstacles with a sensor."""
+
+import numpy as np
+import pytest
+
+from viapoint.envs import Task
+from viapoint.training import ViaQ, ViaRank, ViaVecEnv, evaluate, load_agent
+from viapoint.training.planning.beliefs import Sight
+from viapoint.training.planning.places import places_of
+from viapoint.training.planning.problem import Problem, moves_of
+from viapoint.training.planning.search import plan_clearances, registered_task
+from viapoint.training.scene_sets.scene_set import scenes_for
+
+ENV = "viapoint/PlanarSensed-v0"
+
+
+@pytest.fixture(scope="module")
+def agent():
+    small = {"candidates": 128}
+    env = ViaVecEnv(ENV, 32, seed=0)
+    return ViaRank("ViaRankPolicy", env, seed=0, gradient_steps=8, policy_kwargs=small).learn(320)
+
+
+def test_it_learns_in_seconds(agent) -> None:
+    # The untrained network solves 2 % of these scenes, and a search that knows only the points 20 %.
+    result = evaluate(agent, scenes="validation", n_scenes=100, time_decisions=False)
+    assert result.success_rate > 0.35
+
+
+def test_models_are_saved_and_loaded(agent, tmp_path) -> None:
+    agent.save(tmp_path / "model")
+    loaded = load_agent(tmp_path / "model")
+    observation = ViaVecEnv(ENV, 8, seed=3).reset()
+    assert np.array_equal(agent.predict(observation)[0], loaded.predict(observation)[0])
+
+
+def test_places_are_those_of_the_movement() -> None:
+    task = registered_task(ENV)
+    scenes = task.sampler()([np.random.default_rng(i) for i in range(4)])
+    problem, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (4, 6, task.action.size))
+    moves = moves_of(task, problem, actions)
+    places = places_of(task, problem, moves, sight, np.arange(64))
+    start, goal = task.space.coordinates(scenes.start), task.space.coordinates(scenes.goal)
+    assert np.allclose(
+        places.centre[:, :, 0, 0, :2][places.inside], np.repeat(start[:, None], 6, 1)[places.inside]
+    )
+    assert np.allclose(
+        places.centre[:, :, -1, 0, :2][places.inside], np.repeat(goal[:, None], 6, 1)[places.inside]
+    )
+    # A place at a seen point has the depth 0.
+    ranges = sight.ranges[0][sight.hit[0]]
+    local = ranges[:, None] * task.sensor.directions[sight.hit[0]]
+    assert np.array_equal(task.sensor.ray_towards(local), np.flatnonzero(sight.hit[0]))
+
+
+def test_full_knowledge_is_the_best_belief() -> None:
+    result = evaluate(
+        env=ENV,
+        scenes="validation",
+        n_scenes=60,
+        baselines=["known:search512", "seen:search512", "thick:plan_motion", "points:search512"],
+        time_decisions=False,
+    )
+    rate = {row["method"]: row["success"]["rate"] for row in result.rows}
+    assert rate["known:search512"] > 0.95
+    assert rate["known:search512"] > rate["seen:search512"] > rate["points:search512"]
+
+
+def test_sets_of_scenes_are_solvable_and_partly_hidden() -> None:
+    task = registered_task(ENV)
+    frozen = scenes_for("validation", task)
+    known = registered_task("viapoint/PlanarObstacles-v0")
+    assert not np.isin(frozen.scenes.start[:, 0], scenes_for("validation", known).scenes.start[:, 0]).any()
+    rotation, origin = task.sensor.pose(task.arm, frozen.scenes.start)
+    hidden = task.sensor.hidden(rotation, origin, frozen.scenes.obstacles)
+    assert 0.1 < hidden.sum() / frozen.scenes.obstacles.present.sum() < 0.5
+    problem = Problem.of_scenes(frozen.scenes, task)
+    straight = np.zeros((len(frozen.share), 1, task.action.size))
+    assert (plan_clearances(task, problem, straight, 0.01, 0.0)[:, 0] < 0.01).all()
+
+
+def test_other_tasks_and_observations_are_refused(agent) -> None:
+    with pytest.raises(ValueError, match="sensor"):
+        ViaRank("ViaRankPolicy", ViaVecEnv("viapoint/PlanarObstacles-v0", 1))
+    with pytest.raises(ValueError, match="viarank"):
+        ViaQ("ViaQPolicy", ViaVecEnv(ENV, 1))
+    with pytest.raises(ValueError, match="labels"):
+        ViaRank("ViaRankPolicy", ViaVecEnv(ENV, 1), labels=100)
+    observation = ViaVecEnv(ENV, 2, seed=0).reset()
+    with pytest.raises(ValueError, match="finite"):
+        agent.predict({**observation, "ranges": np.full((2, 192), np.nan, np.float32)})
+    with pytest.raises(ValueError, match="192 values"):
+        agent.predict({**observation, "ranges": observation["ranges"][:, :100]})
+    with pytest.raises(ValueError, match="parts"):
+        agent.predict({name: part for name, part in observation.items() if name != "points"})
+
+
+def test_tasks_with_sensors_are_written_and_read() -> None:
+    task = Task.of(arm="panda", n_obstacles=(1, 4), sensor="camera")
+    assert Task.from_dict(task.as_dict()) == task
