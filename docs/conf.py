@@ -30,7 +30,10 @@ autodoc_typehints_description_target = "documented"
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 nitpick_ignore_regex = [  # annotations with names of other packages, and of modules that are not exported
-    ("py:.*", r"(numpy|np|gymnasium|gym|torch|mujoco|stable_baselines3|collections|pathlib|typing|types)\..*"),
+    (
+        "py:.*",
+        r"(numpy|np|gymnasium|gym|torch|mujoco|stable_baselines3|collections|pathlib|typing|types)\..*",
+    ),
     ("py:exc", ".*Error"),
     ("py:(class|obj)", r"(?!viapoint\.(primitives|envs|training)\.[A-Z]\w*$).*"),
 ]

@@ -55,7 +55,9 @@ def write(path: Path, text: str) -> None:
 def package_page(package: str) -> str:
     """Return the page of a package: its docstring, and its names with a sentence on each."""
     module = importlib.import_module(package)
-    rows = [f"   * - :py:obj:`~{package}.{name}`\n     - {summary(package, name)}\n" for name in module.__all__]
+    rows = [
+        f"   * - :py:obj:`~{package}.{name}`\n     - {summary(package, name)}\n" for name in module.__all__
+    ]
     names = "".join(f"   {package}.{name}\n" for name in module.__all__)
     table = f".. list-table::\n   :widths: 30 70\n\n{''.join(rows)}"
     listed = f".. toctree::\n   :hidden:\n\n{names}"

@@ -19,9 +19,9 @@ DOTS = 80
 
 def run(path: Path) -> list[dict[str, Any]]:
     """Execute the code cells of a notebook in one namespace and its folder, and return its cells with outputs."""
-    import matplotlib
+    import matplotlib as mpl
 
-    matplotlib.use("Agg")
+    mpl.use("Agg")
     cells: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["cells"]
     space: dict[str, Any] = {"__name__": "__main__"}
     number = 0
@@ -61,16 +61,18 @@ def display(data: dict[str, Any]) -> dict[str, Any]:
 
 def figures() -> list[str]:
     """Return the open figures of Matplotlib as base64 of small PNG files, and close them."""
-    from matplotlib import pyplot
+    from matplotlib import pyplot as plt
     from PIL import Image
 
     found = []
-    for number in pyplot.get_fignums():
+    for number in plt.get_fignums():
         drawn, small = io.BytesIO(), io.BytesIO()
-        pyplot.figure(number).savefig(drawn, dpi=DOTS, bbox_inches="tight")
-        Image.open(drawn).convert("RGB").quantize(64, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+        plt.figure(number).savefig(drawn, dpi=DOTS, bbox_inches="tight")
+        Image.open(drawn).convert("RGB").quantize(64, dither=Image.Dither.NONE).save(
+            small, "PNG", optimize=True
+        )
         found.append(base64.b64encode(small.getvalue()).decode())
-    pyplot.close("all")
+    plt.close("all")
     return found
 
 
