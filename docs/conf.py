@@ -39,7 +39,7 @@ nitpick_ignore_regex = [  # annotations with names of other packages, and of mod
 ]
 
 html_theme, html_title, html_short_title = "furo", f"Viapoint {version}", "Viapoint"
-html_static_path, html_css_files = ["site"], ["site.css"]
+html_static_path, html_css_files, html_favicon = ["site"], ["site.css"], "site/favicon.svg"
 html_copy_source = html_show_sphinx = False
 html_theme_options = {
     "light_css_variables": {"color-brand-primary": "#1d4f91", "color-brand-content": "#1d4f91"},
