@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,22 +64,35 @@ def table() -> list[Shape]:
     return [board, *legs]
 
 
-def frames_of(plan: MotionPlan, colours: list[tuple[float, ...]], step: int = 1) -> list[Frame]:
+def frames_of(plan: MotionPlan, colours: Sequence[Sequence[float]], step: int = 1) -> list[Frame]:
     """Return every so many of the pictures of the executed movement; obstacles have colours of their own."""
+    recorded = executed([plan])[1].recorded(0)
+    states = frame_steps(recorded.rollout.time, round(FPS / SPEED))[::step]
+    return pictures(plan, colours, states / len(recorded.rollout.time))
+
+
+def pictures(
+    plan: MotionPlan,
+    colours: Sequence[Sequence[float]],
+    shares: Iterable[float],
+    size: tuple[int, int] = SIZE,
+    **view_of: Any,
+) -> list[Frame]:
+    """Return pictures of the executed movement at shares of its duration; `view_of` are arguments of `stage`."""
     outcome, episodes = executed([plan])
     if not outcome.is_success[0]:
         raise RuntimeError("the movement touches something")
     recorded = episodes.recorded(0)
-    view = SceneView(episodes.simulator.single(), *SIZE)
-    stage(view.model)
+    view = SceneView(episodes.simulator.single(), *size)
+    stage(view.model, **view_of)
     for number, colour in enumerate(colours):
         view.model.geom(f"obstacle_{number}").rgba[:] = colour
     view.model.geom("hand").size[0] *= 1.1  # its surface and that of the finger would be in one place
-    canvas = Canvas(view.model, *SIZE, supersampling=2)
+    canvas = Canvas(view.model, *size, supersampling=2)
     view.scene = canvas.scene
     found = []
-    for state in frame_steps(recorded.rollout.time, round(FPS / SPEED))[::step]:
-        view.write(picture_of(episodes.task, recorded, int(state)))
+    for share in shares:
+        view.write(picture_of(episodes.task, recorded, round(share * len(recorded.rollout.time))))
         canvas.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
         found.append(canvas.draw())
     canvas.close()
