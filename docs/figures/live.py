@@ -21,14 +21,13 @@ SEED, OBSTACLE = 11, 0
 LEFT, RIGHT = 352, 988
 """Columns of the numbers beside the panels, [pixels]."""
 PANELS = (
-    (LEFT, 150),
-    (LEFT, 240),
-    (LEFT, 550),
-    (RIGHT, 125),
-    (RIGHT, 181),
-    (RIGHT, 278),
-    (RIGHT, 395),
-    (RIGHT, 545),
+    (LEFT, 100),
+    (LEFT, 225),
+    (RIGHT, 128),
+    (RIGHT, 167),
+    (RIGHT, 233),
+    (RIGHT, 360),
+    (RIGHT, 525),
 )
 """Places of the numbers of the panels' parts, [pixels]."""
 ASIDE = 24
