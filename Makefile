@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 RUN    := runs/demo
 
-.PHONY: help demo test check format scenes versions bench clean
+.PHONY: help demo test docs check format scenes versions bench clean
 
 help:            ## list the commands
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 18
@@ -22,6 +22,9 @@ demo: $(READY)   ## train, evaluate, draw and film an agent
 
 test: $(READY)   ## the whole test suite
 	@$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder --quiet
+
+docs: $(READY)   ## this site, without warnings, in docs/_build/html
+	@$(BIN)/sphinx-build --fail-on-warning --keep-going --nitpicky --quiet docs docs/_build/html
 
 check: $(READY)  ## format, lint, strict types and docstrings
 	@$(BIN)/ruff format --check .
@@ -43,4 +46,4 @@ bench: $(READY)  ## throughput as ratios
 	@$(BIN)/python benchmarks/speed.py
 
 clean:           ## remove the virtual environment, caches and runs
-	rm -rf $(VENV) runs build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) runs build dist docs/_build docs/api docs/project *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -29,7 +29,7 @@ PUBLISHED = (
     "| *cuRobo (published; on a GPU, 800 problems)* | 100 | | | 38 | | 1.3 | | |",
 )
 """Rows from the papers on VAMP (Thomason et al. 2024) and cuRobo (Sundaralingam et al. 2023)."""
-FIGURE = DOCS / "figures" / "planning.png"
+FIGURE = DOCS / "images" / "planning.png"
 DEVELOPED_ON = 20
 """Greatest number of the problems that were looked at during development."""
 PLANNERS = ("straight", "plan_motion", "plan_motion+ompl", "search512", "ompl")

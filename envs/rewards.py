@@ -21,7 +21,7 @@ CLEARANCE_UNIT = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class RewardWeights:
-    """Weights of the terms of the reward, 0 or more; see :func:`reward_terms`.
+    """Weights of the terms of the reward, 0 or more; see `reward_terms`.
 
     Example:
         >>> from viapoint.envs import RewardWeights

@@ -194,7 +194,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Args:
             seed: Environment i is seeded with `seed + i`, or with `seed[i]`.
             options: `start`, `goal` and `obstacles` set up a given scene, see
-                :func:`~viapoint.envs.scenes.options.draw_given`; `reset_mask`, shape (num_envs,), names the
+                `viapoint.envs.scenes.options.draw_given`; `reset_mask`, shape (num_envs,), names the
                 environments to reset, all others keep their episodes.
 
         Raises:

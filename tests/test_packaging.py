@@ -1,10 +1,14 @@
-"""The wheel holds what the tree holds: built offline from a copy, so nothing is left in the tree."""
+"""Wheel and source distribution hold what the tree holds, and work: built offline from a copy of the tree."""
 
+import os
 import re
 import shutil
 import subprocess
 import sys
+import sysconfig
+import tarfile
 import tomllib
+import venv
 import zipfile
 from pathlib import Path
 
@@ -12,24 +16,78 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("primitives", "envs", "training")
-BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
+BUILD = "import sys; from setuptools import build_meta as b; getattr(b, sys.argv[1])(sys.argv[2])"
+USE = """
+import sys
+for name in ("torch", "stable_baselines3", "matplotlib", "pandas", "tyro"):
+    sys.modules[name] = None  # of extras, which are not installed there
+import numpy, viapoint.envs, viapoint.primitives, viapoint.training
+from viapoint.envs import TASKS, Task
+for kwargs in TASKS.values():
+    Task.of(**kwargs)
+viapoint.primitives.point_to_point([0.0], [1.0], 1.0)
+print(viapoint.envs.__file__, viapoint.primitives.__file__, viapoint.training.__file__)
+"""
+"""Script that uses the package with the packages that it always needs."""
+
+
+def build(kind, source, target):
+    """Build a `wheel` or an `sdist` offline, and return its path."""
+    target.mkdir(exist_ok=True)
+    command = [sys.executable, "-c", BUILD, f"build_{kind}", str(target)]
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (path,) = target.iterdir()
+    return path
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    """The wheel of the tree, opened."""
-    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+def source(tmp_path_factory):
+    """A copy of the tree, in which builds may leave files."""
+    folder = tmp_path_factory.mktemp("source")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source / name)
+        shutil.copy(ROOT / name, folder / name)
     for name in FOLDERS:
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    build = subprocess.run(
-        [sys.executable, "-c", BUILD, str(target)], cwd=source, capture_output=True, text=True
-    )
-    assert build.returncode == 0, build.stderr
-    (path,) = target.glob("*.whl")
-    with zipfile.ZipFile(path) as archive:
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel_path(source, tmp_path_factory):
+    """The wheel of the tree."""
+    return build("wheel", source, tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def wheel(wheel_path):
+    """The wheel of the tree, opened."""
+    with zipfile.ZipFile(wheel_path) as archive:
         yield archive
+
+
+def test_the_wheel_of_the_source_distribution_is_the_same(source, wheel, tmp_path):
+    """Installers that build from source get every file, too."""
+    sdist = build("sdist", source, tmp_path / "sdist")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(tmp_path, filter="data")
+    again = build("wheel", tmp_path / sdist.name.removesuffix(".tar.gz"), tmp_path / "wheel")
+    with zipfile.ZipFile(again) as archive:
+        assert sorted(archive.namelist()) == sorted(wheel.namelist())
+
+
+def test_the_wheel_works_in_an_environment_with_the_packages_that_are_always_needed(wheel_path, tmp_path):
+    """The environment is new; packages come from this one, so that nothing is downloaded, and extras are hidden."""
+    venv.create(tmp_path / "clean", with_pip=False)
+    python = tmp_path / "clean" / "bin" / "python"
+    install = ["pip", "--python", str(python), "install", "--quiet", "--no-deps", "--no-index"]
+    subprocess.run([sys.executable, "-m", *install, str(wheel_path)], check=True, capture_output=True)
+    environment = {**os.environ, "PYTHONPATH": sysconfig.get_path("purelib")}  # after those of the new one
+    script = f"import sys; sys.path.append(sys.path.pop(1))\n{USE}"
+    done = subprocess.run(
+        [str(python), "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert all(Path(file).is_relative_to(tmp_path / "clean") for file in done.stdout.split())
 
 
 def test_modules_models_scenes_and_agents_are_inside_and_nothing_else(wheel):

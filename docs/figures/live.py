@@ -1,4 +1,4 @@
-"""Pictures of the live page for README and docs/live.md, from a headless Chromium."""
+"""Picture of the live page for docs/live.md, from a headless Chromium."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ SEED, OBSTACLE = 11, 0
 LEFT, RIGHT = 352, 988
 """Columns of the numbers beside the panels, [pixels]."""
 PANELS = (
-    (LEFT, 150),
-    (LEFT, 240),
-    (LEFT, 550),
-    (RIGHT, 125),
-    (RIGHT, 181),
-    (RIGHT, 278),
-    (RIGHT, 395),
-    (RIGHT, 545),
+    (LEFT, 100),
+    (LEFT, 225),
+    (RIGHT, 128),
+    (RIGHT, 167),
+    (RIGHT, 233),
+    (RIGHT, 360),
+    (RIGHT, 525),
 )
 """Places of the numbers of the panels' parts, [pixels]."""
 ASIDE = 24
@@ -36,7 +35,7 @@ ASIDE = 24
 
 
 def main() -> None:
-    """Write both pictures."""
+    """Write the picture."""
     sys.path.append(str(ROOT / "tests" / "training"))
     import browser
     from test_live_page import on_screen, steady
@@ -63,7 +62,6 @@ def main() -> None:
         obstacle = on_screen(tab, session, session.state.scene.obstacles[OBSTACLE].position)
         plain = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")
     window.close()
-    plain.save(IMAGES / "live.webp", quality=82, method=6)
     marked, font = plain.copy(), ImageFont.truetype(findfont("DejaVu Sans:bold"), 15)
     draw = ImageDraw.Draw(marked)
     for number, place in enumerate((*PANELS, *((x + ASIDE, y + ASIDE) for x, y in (via, obstacle))), start=1):

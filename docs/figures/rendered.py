@@ -1,4 +1,4 @@
-"""Rendered pictures and animations of the documentation: `python docs/figures/rendered.py`."""
+"""Rendered pictures of the documentation: `python docs/figures/rendered.py`."""
 
 from __future__ import annotations
 
@@ -8,15 +8,23 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import mujoco
 import numpy as np
+from hero import WOOD, pictures, stage
 from PIL import Image
 
-from viapoint.envs import load_arm
+from viapoint.envs import Box, Pose, inverse_kinematics, load_arm
+from viapoint.envs.arms.arm import asset
+from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Frame
+from viapoint.envs.geometry.obstacles import add_to_model, unpack
+from viapoint.envs.rendering.gl import Canvas
+from viapoint.envs.rendering.scene_view import GLOWING, PLAN, ShapeWriter
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training import GeometrySearch, load_agent
+from viapoint.training import GeometrySearch, load_agent, plan_motion
 from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.planning.baselines import Method, Straight, agent_method
+from viapoint.training.planning.search import registered_task
 from viapoint.training.plotting.video import play
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import scenes_for
@@ -29,20 +37,23 @@ STILLS = {
     "planar_whole_arm.png": "viapoint/PlanarWholeArm-v0",
 }
 """Tasks of the pictures of single movements."""
-FILMED = 4
-"""Number of scenes of the animation."""
 TRIED = 100
 """Scenes among which those that are shown are chosen."""
 CLEAREST = 0.012
 """Least clearance of a movement that is shown, [m]."""
-MOMENT = 0.45
-"""Moment of a movement that is shown, as a fraction of its duration."""
-SPEED = 0.5
-"""Speed of the animation relative to real time."""
 GAP = 6
 """Gap between frames side by side, [pixels]."""
-PAUSE = 700
-"""Pause after each movement of the animation, [ms]."""
+SHELVES, MOMENT = (39, 82, 71), 0.6
+"""Rows of the validation set that are shown in space, and the moment, as a fraction of the duration."""
+CORNER: dict[str, Any] = {
+    "camera": np.array([1.75, -1.25, 1.05]),
+    "look_at": np.array([0.28, 0.02, 0.40]),
+    "field": 30.0,
+}
+"""View of the scenes in space."""
+UR5E = ROOT / "docs" / "ur5e.xml"
+UR5E_HOME = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
+ARM_COLOUR, JOINT_COLOUR = (0.80, 0.83, 0.87, 1.0), (0.36, 0.55, 0.75, 1.0)
 
 
 class Shown(NamedTuple):
@@ -75,13 +86,6 @@ def shown(env_id: str, number: int) -> Shown:
     return Shown(method, plain, scenes.take(rows))
 
 
-def film(env: gym.Env[Any, Any], scene: Scenes, method: Method) -> list[Frame]:
-    """Return the frames of an episode, which ends with the first contact."""
-    play(env, scene, method.decide)
-    frames: Any = env.unwrapped.render()
-    return list(frames)
-
-
 def still(path: Path, env_id: str) -> None:
     """Render one movement of a task."""
     some = shown(env_id, 1)
@@ -92,51 +96,61 @@ def still(path: Path, env_id: str) -> None:
     Image.fromarray(frame).save(path, optimize=True)
 
 
-def animation(path: Path, env_id: str, size: int = 320) -> None:
-    """Save episodes of a task as an endless animation."""
-    env = gym.make(env_id, render_mode="rgb_array_list", width=size, height=size)
-    some = shown(env_id, FILMED)
-    films = [film(env, some.scenes.take([row]), some.method) for row in range(FILMED)]
-    env.close()
-    each = round(1000.0 / (env.metadata["render_fps"] * SPEED))
-    images = [Image.fromarray(frame) for frames in films for frame in frames]
-    durations = [time for frames in films for time in (*[each] * (len(frames) - 1), PAUSE)]
-    options: Any = {"duration": durations, "loop": 0, "quality": 80, "method": 4}
-    images[0].save(path, save_all=True, append_images=images[1:], **options)
-
-
 def side_by_side(frames: Sequence[Frame]) -> Image.Image:
     """Return frames in one row with white gaps between them."""
     gap = np.full((len(frames[0]), GAP, 3), 255, np.uint8)
     return Image.fromarray(np.concatenate([part for frame in frames for part in (gap, frame)][1:], axis=1))
 
 
-def beside_straight(path: Path, env: gym.Env[Any, Any], some: Shown) -> None:
-    """Render a moment of a movement beside the contact of the straight one."""
-    frames, hit = (film(env, some.scenes, method) for method in (some.method, some.straight))
-    side_by_side((frames[round(MOMENT * (len(frames) - 1))], hit[-1])).save(path, optimize=True)
-    env.close()
+def in_space(path: Path) -> None:
+    """Render the Panda in some scenes, each with a plan."""
+    task = registered_task(IN_SPACE)
+    scenes = scenes_for("validation", task).scenes
+    frames = []
+    for row in SHELVES:
+        obstacles = unpack(scenes.obstacles, row)
+        plan = plan_motion(task.arm, scenes.start[row], scenes.goal[row], obstacles, rng=0)
+        frames += pictures(plan, [WOOD] * len(obstacles), [MOMENT], (318, 300), **CORNER)
+    side_by_side(frames).save(path, optimize=True)
 
 
-def in_space(path: Path, side: int = 480) -> None:
-    """Render the Panda among furniture."""
-    env = gym.make(IN_SPACE, render_mode="rgb_array_list", width=side, height=side)
-    beside_straight(path, env, shown(IN_SPACE, 1))
-
-
-def own_arm(path: Path, seed: int = 7, side: int = 480) -> None:
-    """Render the arm of the page on arms of one's own: the plan of a search beside the straight movement."""
-    ur5e = load_arm(
-        ROOT / "docs" / "ur5e.xml",
-        tool="hand",
-        joints=("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"),
-        home=(0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28),
-        velocity_limit=np.pi,
-    )
-    simulation = SceneSimulation("viapoint/Obstacles-v0", arm=ur5e)
-    some = Shown(GeometrySearch(simulation.task), Straight(simulation), simulation.draw(1, seed))
-    env = gym.make("viapoint/Obstacles-v0", arm=ur5e, render_mode="rgb_array_list", width=side, height=side)
-    beside_straight(path, env, some)
+def own_arm(path: Path) -> None:
+    """Render the file of the page on arms of one's own, at two moments of a plan."""
+    arm = load_arm(UR5E, home=UR5E_HOME)
+    board = Box((0.25, 0.02, 0.20), position=(0.58, 0.0, 0.20))
+    shelf = Box((0.20, 0.20, 0.02), position=(0.45, 0.45, 0.58))
+    down = (0.0, 1.0, 0.0, 0.0)
+    start = inverse_kinematics(arm, (0.45, -0.35, 0.20), down)[0]
+    goal = Pose((0.45, 0.45, 0.20), down)
+    plan = plan_motion(arm, start, goal, [board, shelf], margin=0.01, enough=16, rng=0)
+    print(plan)
+    spec = mujoco.MjSpec.from_string(asset("stage.xml"))
+    spec.attach(mujoco.MjSpec.from_file(str(UR5E)), prefix="arm_", frame=spec.worldbody.add_frame())
+    add_to_model(spec, [board, shelf], rgba=WOOD)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    stage(model, np.array([1.80, -0.95, 1.10]), np.array([0.25, 0.06, 0.42]), 37.0)
+    for number in range(model.ngeom):
+        geom = model.geom(number)
+        if not geom.name.startswith(("table", "obstacle")):
+            geom.rgba[:] = ARM_COLOUR if geom.contype[0] else JOINT_COLOUR
+    motion = plan.joints(rate=200)
+    canvas = Canvas(model, 480, 360, supersampling=2)
+    frames = []
+    for moment in (0.5, 1.0):
+        data.qpos[:] = motion.position[round(moment * (len(motion.time) - 1))]
+        mujoco.mj_forward(model, data)
+        camera = mujoco.MjvCamera()
+        camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera("view").id
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, everything, canvas.scene)
+        canvas.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
+        shapes = ShapeWriter(canvas.scene)
+        shapes.line(arm.hand(motion.position), PLAN, PALETTE.plan)
+        shapes.ball(arm.hand(plan.waypoints[-1:])[0], 0.018, PALETTE.goal, GLOWING)
+        frames.append(canvas.draw())
+    canvas.close()
+    side_by_side(frames).save(path, optimize=True)
 
 
 def main() -> None:
@@ -147,7 +161,6 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     for name, env_id in STILLS.items():
         still(out / name, env_id)
-    animation(out / "reaching.webp", IN_PLANE)
     in_space(out / "panda_obstacles.png")
     own_arm(out / "own_arm.png")
     for path in sorted(out.iterdir()):

@@ -149,8 +149,10 @@ class ShapeWriter:
         self._scene = scene
 
     def ball(self, centre: Float, radius: float, colour: Colour, glow: float = MATT) -> None:
-        """Add a sphere at `centre` (3,) [m]."""
-        self._geom(mujoco.mjtGeom.mjGEOM_SPHERE, (radius,) * 3, centre, colour, glow)
+        """Add a sphere at `centre` (3,) [m], without a shadow."""
+        geom = self._geom(mujoco.mjtGeom.mjGEOM_SPHERE, (radius,) * 3, centre, colour, glow)
+        if geom is not None:
+            geom.castshadow = False
 
     def disc(self, centre: Float, radius: float, height: float, colour: Colour, glow: float = MATT) -> None:
         """Add a flat cylinder that stands on `centre` (3,) [m]."""

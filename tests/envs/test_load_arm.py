@@ -69,7 +69,7 @@ def check_it_is_the_arm_of(text, arm):
             needed = torques(arm.chain, joints, rates, changes)
             np.testing.assert_allclose(needed, data.qfrc_inverse + data.qfrc_constraint, rtol=1e-3, atol=1e-2)
         centres = sphere_centres(arm.chain, arm.spheres, joints)
-        for geom in range(model.ngeom):
+        for geom in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
             if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_BOX.value:
                 points = data.geom_xpos[geom][None]
             else:

@@ -9,15 +9,8 @@ import pytest
 from viapoint.training.cli import doctor
 from viapoint.training.cli import main as cli
 
-GOOD, GONE = "print('fine')\n", "import no_such_module\n"
+GOOD, GONE = "print('fine')", "import no_such_module"
 EXTRA = ("torch", "stable_baselines3", "sb3_contrib", "tyro", "rich", "matplotlib", "safetensors")
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    """No checks in processes of their own."""
-    for name in ("STEP", "FRAME", "LEARN"):
-        monkeypatch.setattr(doctor, name, GOOD)
 
 
 def report(capsys, *words):
@@ -33,11 +26,12 @@ def test_all_is_well_here(capsys, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("script", "exit_code", "remedy"), [("STEP", 1, "'mujoco>=4'"), ("FRAME", 0, "libegl1")]
+    ("name", "exit_code", "remedy"), [("MuJoCo engine", 1, "'mujoco>=4'"), ("OpenGL", 0, "libegl1")]
 )
-def test_what_is_missing_is_named_with_the_remedy(script, exit_code, remedy, capsys, monkeypatch, quick):
-    monkeypatch.setattr(doctor, script, GONE)
-    monkeypatch.setattr(doctor, "missing_packages", lambda: ["torch"])  # agents are not tried then
+def test_what_is_missing_is_named_with_the_remedy(name, exit_code, remedy, capsys, monkeypatch):
+    checks = {each: check._replace(script=GOOD) for each, check in doctor.CHECKS.items()}
+    checks[name] = checks[name]._replace(script=GONE)
+    monkeypatch.setattr(doctor, "CHECKS", checks)
     code, printed = report(capsys)
     assert code == exit_code
     assert "no_such_module" in printed
@@ -45,23 +39,15 @@ def test_what_is_missing_is_named_with_the_remedy(script, exit_code, remedy, cap
 
 
 def test_a_crash_and_a_hang_end_no_report(monkeypatch):
-    assert not doctor.in_a_process("it", "import os; os.abort()", "do this").works
+    assert not doctor.outcome("import os; os.abort()")[0]
     monkeypatch.setattr(doctor, "PATIENCE", 0.2)
-    assert not doctor.in_a_process("it", "import time; time.sleep(60)", "").works
-
-
-def test_packages_of_training_are_told_from_those_that_are_always_needed():
-    extras = dict(doctor.requirements())
-    assert (extras["numpy"], extras["torch"]) == ("", "training")
-    assert "mypy" not in extras
-    assert doctor.installed("numpy")
-    assert not doctor.installed("no-such-package")
+    assert not doctor.outcome("import time; time.sleep(60)")[0]
 
 
 def test_runs_need_a_folder_that_can_be_written(tmp_path):
     (tmp_path / "file").write_text("")
-    assert doctor.disk(tmp_path / "a" / "b").works
-    assert not doctor.disk(tmp_path / "file" / "runs").works
+    assert doctor.outcome(doctor.FOLDER, str(tmp_path / "a" / "b"))[0]
+    assert not doctor.outcome(doctor.FOLDER, str(tmp_path / "file" / "runs"))[0]
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 

@@ -117,7 +117,7 @@ class ViaVecEnv(VecEnv):
         return int(getattr(self.venv.unwrapped, "physics_steps", 0))
 
     def reset(self) -> Observation:
-        """Start a new episode in every copy, with the options of :meth:`set_options`, if any."""
+        """Start a new episode in every copy, with the options of `set_options`, if any."""
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         given: Any = self._options
         self._reset_options()  # refused ones must not be met again
@@ -145,7 +145,7 @@ class ViaVecEnv(VecEnv):
             Observation, reward (N,), done (N,) and N info dictionaries. The dictionaries hold what the environment
             reports of the decision and `TimeLimit.truncated`, as those of Stable-Baselines3's `make_vec_env`. At the
             end of an episode they also hold `terminal_observation` and `episode` (return r, length l, wall time t [s]
-            since the start, and those metrics of :data:`LOGGED` that the environment reports).
+            since the start, and those metrics of `LOGGED` that the environment reports).
         """
         observation, reward, terminated, truncated, info = self.venv.step(self._actions)
         done = terminated | truncated

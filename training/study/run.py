@@ -124,7 +124,7 @@ def _import_libraries() -> tuple[Any, Any]:
         import ray
         from ray import tune
     except ModuleNotFoundError as error:
-        raise ImportError(explain_import_error(error, "a study"), name=error.name) from None
+        raise ModuleNotFoundError(explain_import_error(error, "a study"), name=error.name) from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return ray, tune
 
