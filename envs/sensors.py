@@ -158,7 +158,7 @@ class Sensor:
         row = ((np.arange(self.rows) + 0.5) / self.rows - 0.5) * self.rows / self.columns
         down, left = np.meshgrid(row, -column, indexing="ij")
         rays = np.stack((np.ones_like(left), width * left, -width * down), axis=-1).reshape(-1, 3)
-        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
     def pose(self, arm: Arm, joints: Float) -> tuple[Float, Float]:
         """Return the axes of the sensor as columns, shape (N, 3, 3), and its origins, shape (N, 3), [m].
@@ -263,8 +263,10 @@ def named_sensor(name: str, arm: Arm, foot: tuple[float, float, float], scale: f
         eye = np.array(foot) + scale * np.array([-0.35, 0.0, 1.15])
         target = np.array(foot) + scale * np.array([0.5, 0.0, 0.3])
         turn = _towards(target - eye)
-        image = {"columns": 48, "rows": 36, "field_of_view": 1.3, "range": 2.5 * scale}
-        return Sensor(position=tuple(eye), quaternion=turn, **image)
+        place = float(eye[0]), float(eye[1]), float(eye[2])
+        return Sensor(
+            position=place, quaternion=turn, columns=48, rows=36, field_of_view=1.3, range=2.5 * scale
+        )
     if name == "hand_camera":
         turn = math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0
         return Sensor(
@@ -350,7 +352,7 @@ def _cast(
                         break
                     step = apart
                     if kind != POINT_CLOUD:
-                        # A convex shape lies behind the plane through its nearest point, and is met there at the soonest.
+                        # A convex shape lies behind the plane through its nearest point.
                         closing = -(a * x + b * y + c * z)
                         if closing <= 0.0:
                             break

@@ -21,9 +21,9 @@ from viapoint.training import load_agent
 from viapoint.training.plotting.top_view import footprint
 from viapoint.training.scene_sets.scene_set import scenes_for
 
-ENV_ID, SCENES = "viapoint/PlanarSensed-v0", (60, 210, 330)
+ENV_ID, SCENES = "viapoint/PlanarSensed-v0", (300, 420, 450)
 """Environment, and rows of its `validation` set."""
-LIMITS = (-0.62, 0.52), (-0.1, 0.82)
+LIMITS = (-0.5, 0.42), (-0.06, 0.7)
 RAY = "#e8c15a"
 FINE_RAYS = 4_000
 """Rays with which the seen part of the space is drawn."""

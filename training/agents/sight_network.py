@@ -1,15 +1,15 @@
 """Network that predicts the success of movements from what a sensor sees.
 
 The readings are an image of one row or several. A convolutional network turns each pixel into features, which may hold
-what usually stands behind such a front. A movement is a set of places of the arm's spheres. The features of the pixel in
-whose direction a place lies, its distance and its depth behind the surface are the inputs of one network for all places
-(an implicit decoder, as in L. Mescheder et al., Occupancy networks, 2019). The greatest and the mean of its outputs over
-the places (C. R. Qi et al., PointNet, 2017), and clearances that are computed with a belief, tell the logit of success.
+what usually stands behind such a front. A movement is a set of places of the arm's spheres. Inputs of one network for
+all places are the features of the pixel in whose direction a place lies, its distance, and its depth behind the surface
+(an implicit decoder, as in L. Mescheder et al., Occupancy networks, 2019). The greatest and the mean of its outputs
+(C. R. Qi et al., PointNet, 2017), and the clearance that is computed with a belief, tell the logit of success.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -85,7 +85,7 @@ def sight_inputs(
     nearest = min(nearest, beyond.shape[-1])
     some = np.argpartition(-beyond, nearest - 1, axis=-1)[..., :nearest]
 
-    def chosen(values: Single) -> Single:
+    def chosen(values: Any) -> Any:
         return np.take_along_axis(values, some, axis=-1)
 
     centre = places.centre.reshape(number, plans, -1, 3)

@@ -187,7 +187,8 @@ class ViaRankPolicy(BasePolicy):
                 )
             if not np.isfinite(np.asarray(each)).all():
                 raise ValueError(f"observation must be finite; {name} is not")
-        several = is_vectorized_observation(dict(observation), parts)
+        given: Any = dict(observation)
+        several = is_vectorized_observation(given, parts)
         batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
         actions = np.clip(self.decide(batch)[0], -1.0, 1.0).astype(np.float32)
         return (actions if several else actions[0]), state

@@ -229,9 +229,14 @@ class TrainConfig(Config):
             raise ValueError(f"env_kwargs of {self.env}: {error}") from error
 
     @property
+    def algorithm(self) -> Algorithm:
+        """Learning algorithm, also where none is named."""
+        return self.algo or usual_algorithm(self.task)
+
+    @property
     def preset(self) -> Preset:
         """Settings for everything that is not given."""
-        return preset_of(self.task, self.algo or usual_algorithm(self.task))
+        return preset_of(self.task, self.algorithm)
 
     @property
     def all_hyperparameters(self) -> dict[str, Any]:

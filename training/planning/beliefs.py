@@ -61,7 +61,9 @@ class Sight(NamedTuple):
 
     def take(self, rows: Any) -> Sight:
         """Return the readings of some of the scenes, by indices, mask or slice."""
-        return Sight(*(part[rows] for part in self[:-1]), self.free_radius)
+        return self._replace(
+            **{name: part[rows] for name, part in self._asdict().items() if name != "free_radius"}
+        )
 
     @classmethod
     def of(cls, observation: Mapping[str, Any], task: Task) -> Sight:

@@ -137,7 +137,9 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
         raise ValueError(f"env_kwargs of {config.env}: {error}") from error
     with closing(env):
         try:
-            model = build(config.algo, config.preset.policy, env, config.hyperparameters, seed=config.seed)
+            model = build(
+                config.algorithm, config.preset.policy, env, config.hyperparameters, seed=config.seed
+            )
         except UNFIT as error:
             usual = config.preset.arguments()
             others = {name: each for name, each in config.hyperparameters.items() if usual.get(name) != each}

@@ -313,7 +313,7 @@ def _agent(
     trials = [Trial(**env, row=row, seed=seed, **own) for seed in seeds]
     for trial in trials:
         config = trial.config(Path())
-        check_hyperparameters(config.algo, config.hyperparameters)
+        check_hyperparameters(config.algorithm, config.hyperparameters)
     return trials
 
 
