@@ -151,18 +151,14 @@ class Episodes:
             command = self._motion
         elif nominal is not None:
             command = nominal.state
-        obstacles, readings = self.scenes.obstacles_at(time), None
-        if task.sensor is not None:
-            readings = task.sensor.read(task.arm, state.joints, obstacles)
         return task.observation.observe(
             state.joints,
             state.hand,
             (goal, task.arm.hand(goal)),
-            obstacles,
+            self.scenes.obstacles_at(time),
             command,
             time,
             nominal,
-            readings,
         )
 
     def decide(self, actions: Float, active: Bool | None = None) -> Decision:

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from viapoint.envs.arms.arm import Arm
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.obstacles import POSE_SIZE, Obstacles, observation_rows
 from viapoint.envs.plans import Motion
 from viapoint.envs.replanning import NominalPlan
-from viapoint.envs.sensors import Readings, Sensor
+from viapoint.envs.sensors import Sensor
 
 FARTHEST = 2.0
 """Bound of every coordinate and length, [m]."""
@@ -35,7 +36,7 @@ class ObservationLayout:
     bounds is clipped.
     """
 
-    joint_range: tuple[tuple[float, float], ...]
+    arm: Arm
     kinds: tuple[str, ...]
     """Kinds that obstacles may have."""
     n_rows: int
@@ -63,7 +64,7 @@ class ObservationLayout:
     @functools.cached_property
     def bounds(self) -> dict[str, tuple[Float, Float]]:
         """Lower and upper bounds of the parts."""
-        low, high = np.array(self.joint_range).T
+        low, high = self.arm.joint_range.T
         joints = low - BEYOND_LIMIT, high + BEYOND_LIMIT
         found = {"joints": joints, "hand": _box(FARTHEST, 3), "goal": _box(FARTHEST, 3)}
         if self.in_joints:
@@ -108,7 +109,6 @@ class ObservationLayout:
         command: Motion | None = None,
         time: Float | None = None,
         nominal: NominalPlan | None = None,
-        readings: Readings | None = None,
     ) -> Observation:
         """Return observations of N environments in fresh arrays.
 
@@ -120,7 +120,6 @@ class ObservationLayout:
             command: References that the arms follow, in tasks in which decisions are made during a movement.
             time: Time since the start of each episode, shape (N,), [s].
             nominal: Plans of a zero action, in tasks with replanning.
-            readings: Readings of the sensor, which stand in for the obstacles.
         """
         parts: dict[str, Any] = {
             "joints": joints,
@@ -128,7 +127,8 @@ class ObservationLayout:
             "goal": goal[1],
             "goal_joints": goal[0],
         }
-        if readings is not None:
+        if self.sensor is not None:
+            readings = self.sensor.read(self.arm, joints, obstacles)
             parts["ranges"] = readings.ranges
             parts["points"] = readings.points.reshape(len(joints), -1)
         else:

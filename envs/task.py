@@ -253,7 +253,7 @@ class Task:
         """Layout of the observations."""
         top = 2.0 * max(self.steering.top_speed) if not self.whole_movement else 0.0
         return ObservationLayout(
-            joint_range=tuple((float(low), float(high)) for low, high in self.arm.joint_range),
+            arm=self.arm,
             kinds=self.shapes,
             n_rows=self.n_obstacles[1],
             dimension=self.space.dimension,

@@ -52,7 +52,7 @@ def draw_scene(axes: Axes, task: Task, scene: Scenes, agent: object) -> None:
     start, goal = task.space.coordinates(scene.start), task.space.coordinates(scene.goal)
     goals = scene.goal, task.arm.hand(scene.goal)
     hand = task.arm.hand(scene.start)
-    seen = task.observation.observe(scene.start, hand, goals, scene.obstacles, readings=found)
+    seen = task.observation.observe(scene.start, hand, goals, scene.obstacles)
     actions, _ = agent.predict(seen, deterministic=True)  # type: ignore[attr-defined]
     plan = task.action.decode(actions.astype(np.float64), start, goal)
     path = Movements.of(plan).sample(plan.duration[:, None] * np.linspace(0.0, 1.0, 100)).position[0]

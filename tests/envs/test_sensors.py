@@ -5,8 +5,19 @@ import mujoco
 import numpy as np
 import pytest
 
-from viapoint.envs import Box, Capsule, ConvexMesh, Cylinder, HalfSpace, Sensor, Sphere, Task, arm_of
-from viapoint.envs.geometry.obstacles import add_to_model, pack
+from viapoint.envs import (
+    Box,
+    Capsule,
+    ConvexMesh,
+    Cylinder,
+    HalfSpace,
+    Sensor,
+    Sphere,
+    Task,
+    arm_of,
+    signed_distances,
+)
+from viapoint.envs.geometry.obstacles import add_to_model, pack, unpack
 from viapoint.training.planning.beliefs import Sight, fitted_boxes, thick_points
 from viapoint.training.planning.search import registered_task
 
@@ -100,20 +111,21 @@ def test_hidden_obstacles_change_nothing() -> None:
     assert np.array_equal(agent.predict(seen)[0], agent.predict(other)[0])
 
 
-def test_beliefs_hold_what_is_seen() -> None:
-    for env_id in ("viapoint/PlanarSensed-v0", "viapoint/PandaSensed-v0"):
-        task = registered_task(env_id)
-        scenes = task.sampler()([np.random.default_rng(i) for i in range(5)])
-        sight = Sight.of_scenes(scenes, task)
-        for belief in (thick_points, fitted_boxes):
-            obstacles = belief(task, sight)
-            for b in range(5):
-                from viapoint.envs import signed_distances
-                from viapoint.envs.geometry.obstacles import unpack
-
-                points = sight.points[b][sight.hit[b]]
-                apart = signed_distances(unpack(obstacles, b), points).min(axis=1)
-                assert (apart < 0.03).all()
+@pytest.mark.parametrize("belief", [thick_points, fitted_boxes])
+@pytest.mark.parametrize("env_id", ["viapoint/PlanarSensed-v0", "viapoint/PandaSensed-v0"])
+def test_beliefs_hold_what_is_seen_and_leave_the_ends_free(env_id, belief) -> None:
+    task = registered_task(env_id)
+    scenes = task.sampler()([np.random.default_rng(i) for i in range(5)])
+    sight = Sight.of_scenes(scenes, task)
+    obstacles = belief(task, sight)
+    for b in range(5):
+        points = sight.points[b][sight.hit[b]]
+        ends = np.linalg.norm(points[:, None] - sight.free[b], axis=-1) - sight.free_radius
+        far = points[ends.min(axis=1) > 0.06]
+        assert (signed_distances(unpack(obstacles, b), far).min(axis=1) < 0.03).all()
+        if belief is thick_points:
+            free = signed_distances(unpack(obstacles, b), sight.free[b], sight.free_radius)
+            assert (free > 0.009).all()
 
 
 @pytest.mark.parametrize(
