@@ -1,9 +1,10 @@
-"""Draw what a sensor sees of three scenes, and the plans of the shipped agent: `python docs/figures/sensed.py`."""
+"""Draw what a sensor sees, the plans of the shipped agent, and how sure it is: `python docs/figures/sensed.py`."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,17 +20,20 @@ from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training import load_agent
 from viapoint.training.plotting.top_view import footprint
+from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import scenes_for
 
 ENV_ID, SCENES = "viapoint/PlanarSensed-v0", (300, 420, 450)
 """Environment, and rows of its `validation` set."""
 LIMITS = (-0.5, 0.42), (-0.06, 0.7)
 RAY = "#e8c15a"
+BINS = 8
+"""Numbers of equally many scenes in which success is counted."""
 FINE_RAYS = 4_000
 """Rays with which the seen part of the space is drawn."""
 
 
-def draw_scene(axes: Axes, task: Task, scene: Scenes, agent: object) -> None:
+def draw_scene(axes: Axes, task: Task, scene: Scenes, agent: Any) -> None:
     """Draw obstacles, rays and plan of one scene."""
     sensor = task.sensor
     assert sensor is not None
@@ -53,7 +57,7 @@ def draw_scene(axes: Axes, task: Task, scene: Scenes, agent: object) -> None:
     goals = scene.goal, task.arm.hand(scene.goal)
     hand = task.arm.hand(scene.start)
     seen = task.observation.observe(scene.start, hand, goals, scene.obstacles)
-    actions, _ = agent.predict(seen, deterministic=True)  # type: ignore[attr-defined]
+    actions, _ = agent.predict(seen, deterministic=True)
     plan = task.action.decode(actions.astype(np.float64), start, goal)
     path = Movements.of(plan).sample(plan.duration[:, None] * np.linspace(0.0, 1.0, 100)).position[0]
     axes.plot(*np.stack((start[0], goal[0])).T, color="0.4", linestyle=":", linewidth=1.2, zorder=3)
@@ -66,6 +70,26 @@ def draw_scene(axes: Axes, task: Task, scene: Scenes, agent: object) -> None:
     axes.set_facecolor("#e9e9ec")
     for spine in axes.spines.values():
         spine.set_visible(False)
+
+
+def draw_calibration(axes: Axes, env_id: str, agent: Any) -> None:
+    """Draw the share of successes against the predicted probability, in all `validation` scenes."""
+    task: Task = agent.policy.task
+    scenes = scenes_for("validation", task).scenes
+    simulation = SceneSimulation(env_id)
+    actions, predicted = agent.policy.decide(simulation.observe(scenes))
+    success = simulation(scenes, actions).success
+    order = np.argsort(predicted)
+    bins = np.array_split(order, BINS)
+    x = np.array([predicted[rows].mean() for rows in bins])
+    y = np.array([success[rows].mean() for rows in bins])
+    error = float((np.abs(x - y) * [len(rows) for rows in bins]).sum() / len(order))
+    axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
+    axes.plot(x, y, "o-", color=PALETTE.executed, markersize=5)
+    axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", xlabel="predicted success", ylabel="success")
+    name = env_id.removeprefix("viapoint/").removesuffix("-v0")
+    axes.set_title(f"{name}: expected calibration error {error:.2f}", fontsize=9)
+    print(f"{name}: predicted {predicted.mean():.3f}, success {success.mean():.3f}, error {error:.3f}")
 
 
 def main() -> None:
@@ -83,6 +107,11 @@ def main() -> None:
     for axes, row in zip(figure.subplots(1, len(given.scenes)), given.scenes, strict=True):
         draw_scene(axes, task, frozen.scenes.take([row]), agent)
     figure.savefig(given.out, dpi=130)
+    figure = Figure(figsize=(6.4, 3.1), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, env_id in zip(figure.subplots(1, 2), (ENV_ID, "viapoint/PandaSensed-v0"), strict=True):
+        draw_calibration(axes, env_id, load_agent(env_id))
+    figure.savefig(given.out.with_name("sensed_calibration.png"), dpi=130)
 
 
 if __name__ == "__main__":
