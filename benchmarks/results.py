@@ -57,7 +57,7 @@ def rows_of(env_id: str, name: str, n_scenes: int | None) -> Iterator[dict[str, 
     task = registered_task(env_id)
     settings: dict[str, Any] = {"checks": [0, 16], "refine": [4], "baselines": BASELINES}
     if task.sensor is not None:
-        settings = {"baselines": SENSED_BASELINES}
+        settings = {"refine": [16], "baselines": SENSED_BASELINES}
     elif task.replanning:
         settings = {"checks": [0, 16], "baselines": REPLANNING_BASELINES}
     result = evaluate(

@@ -85,7 +85,7 @@ def test_plans_are_as_clear_as_they_are_said_to_be(env_id, name):
 def test_where_no_seed_is_free_a_path_is_followed():
     pytest.importorskip("ompl")
     arm = benchmark_panda()
-    problem = next(each for each in benchmark_problems() if each.name == "cage 1")
+    problem = next(each for each in benchmark_problems() if each.name == "bookshelf_thin 20")
     plan = plan_motion(arm, problem.start, problem.goal, problem.obstacles, seeds=0, n_via=1, time_limit=20.0)
     assert (plan.success, plan.source) == (True, "ompl")
     assert not plan_motion(

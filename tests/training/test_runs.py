@@ -42,6 +42,8 @@ def new(algo, env, **hyperparameters):
 )  # the preset is for 64 environments
 @pytest.mark.parametrize("algo", PRESETS)
 def test_a_model_decides_the_same_after_a_round_trip(algo, env, tmp_path):
+    if algo == "viarank":
+        env = ViaVecEnv("viapoint/PlanarSensed-v0", 4, seed=0, threads=1)
     model = new(algo, env)
     save_model(model, tmp_path)
     np.random.seed(7)  # noqa: NPY002 - SB3 draws from it

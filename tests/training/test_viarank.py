@@ -72,9 +72,7 @@ def test_sets_of_scenes_are_solvable_and_partly_hidden() -> None:
     frozen = scenes_for("validation", task)
     known = registered_task("viapoint/PlanarObstacles-v0")
     assert not np.isin(frozen.scenes.start[:, 0], scenes_for("validation", known).scenes.start[:, 0]).any()
-    rotation, origin = task.sensor.pose(task.arm, frozen.scenes.start)
-    hidden = task.sensor.hidden(rotation, origin, frozen.scenes.obstacles)
-    assert 0.1 < hidden.sum() / frozen.scenes.obstacles.present.sum() < 0.5
+    assert 0.1 < frozen.hidden.mean() < 0.5
     problem = Problem.of_scenes(frozen.scenes, task)
     straight = np.zeros((len(frozen.share), 1, task.action.size))
     assert (plan_clearances(task, problem, straight, 0.01, 0.0)[:, 0] < 0.01).all()
@@ -98,9 +96,10 @@ def test_other_tasks_are_refused(env_id, algorithm, policy, arguments) -> None:
     [
         {"ranges": np.full((2, 192), np.nan, np.float32)},
         {"ranges": np.ones((2, 100), np.float32)},
+        {"points": np.ones((2, 576), np.float32)},
         {"obstacles": np.zeros((2, 3), np.float32)},
     ],
-    ids=["not finite", "another sensor", "another task"],
+    ids=["not finite", "other rays", "another place of the sensor", "another task"],
 )
 def test_other_observations_are_refused(agent, change) -> None:
     with pytest.raises(ValueError):

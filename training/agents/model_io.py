@@ -186,8 +186,10 @@ def untrained(model: BaseAlgorithm, seed: int = 0) -> BaseAlgorithm:
 
 def _to_decide(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
     """Return hyperparameters with hardly any room for experience, which decisions do not need."""
-    small = {name: 2 for name in ("buffer_size", "n_steps") if name in hyperparameters}
-    return {**hyperparameters, **small}
+    for name in ("buffer_size", "n_steps"):  # the second one is another thing where there is a replay buffer
+        if name in hyperparameters:
+            return {**hyperparameters, name: 2}
+    return dict(hyperparameters)
 
 
 def describe(model: BaseAlgorithm) -> dict[str, Any]:

@@ -43,6 +43,8 @@ from viapoint.training.planning.search import (
 
 EFFORT_WEIGHT = 0.05
 """Weight of the reward of a successful plan beside its probability of success."""
+SAME_RAY = 0.02
+"""Greatest distance of a point from the ray of the sensor, [m]."""
 BLOCK = 16
 """Scenes that are decided together."""
 
@@ -190,8 +192,20 @@ class ViaRankPolicy(BasePolicy):
         given: Any = dict(observation)
         several = is_vectorized_observation(given, parts)
         batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
+        self._check_rays(Sight.of(batch, self.task))
         actions = np.clip(self.decide(batch)[0], -1.0, 1.0).astype(np.float32)
         return (actions if several else actions[0]), state
+
+    def _check_rays(self, sight: Sight) -> None:
+        """Check that points lie on the rays of the sensor that the agent was trained with."""
+        sensor = self.task.sensor
+        assert sensor is not None
+        rays = np.einsum("nij,rj->nri", sight.rotation, sensor.directions)
+        apart = np.abs(sight.origin[:, None] + sight.ranges[..., None] * rays - sight.points).max(initial=0.0)
+        if apart > SAME_RAY:
+            raise ValueError(
+                f"points must lie on the rays of the sensor of the training, {sensor}, got {apart:.2g} m from them"
+            )
 
 
 class NoBuffer(ReplayBuffer):
@@ -311,6 +325,19 @@ class ViaRank(Agent, OffPolicyAlgorithm):
         super()._setup_model()
         self.actor = self.policy
 
+    def set_env(self, env: Any, force_reset: bool = True) -> None:
+        """Set the training environment.
+
+        Raises:
+            ValueError: Its spaces or its sensor differ from those of the agent.
+        """
+        before = self.env
+        super().set_env(env, force_reset)
+        mine, theirs = self.policy.task.sensor, self._task().sensor
+        if mine != theirs:
+            self.env = before
+            raise ValueError(f"the environment must have the sensor of the agent, {mine}, got {theirs}")
+
     def _candidates(self, number: int) -> NDArray[np.float32]:
         """Return random candidates of some scenes, shape (number, H, m)."""
         every = candidate_actions(self.policy.task, self.policy.candidates, replanning=False)
@@ -336,14 +363,17 @@ class ViaRank(Agent, OffPolicyAlgorithm):
         self._update_learning_rate(policy.optimizer)
         losses = []
         for _ in range(gradient_steps):
+            # New scenes for each update: the network cannot learn them by heart.
             seeds = np.random.randint(0, 2**31, size=batch_size)  # noqa: NPY002 - seeded by SB3
             scenes = self._sampler([np.random.default_rng(seed) for seed in seeds])
             truth, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
             believed = truth._replace(obstacles=thick_points(task, sight))
+            # Some plans are labelled: those that the network would choose, and others.
             plans = self._candidates(batch_size)
             inputs, worth = sight_inputs(task, believed, sight, plans, policy.instants, policy.nearest)
             chosen = self._chosen(inputs, worth)
             some = np.take_along_axis(plans, chosen[..., None], axis=1)
+            # The labels are privileged: they need the true obstacles, which the inputs do not tell.
             clearance = plan_clearances(task, truth, some, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
             labels = torch.from_numpy((clearance >= CLEARANCE_MARGIN).astype(np.float32))
             logits = policy.network(inputs.take(torch.from_numpy(chosen)))

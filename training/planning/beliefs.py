@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -130,8 +131,9 @@ def fitted_boxes(task: Task, sight: Sight) -> Obstacles:
         seen = points[hit]
         shapes: list[Shape] = []
         if len(seen):
-            pairs = cKDTree(seen).sparse_distance_matrix(cKDTree(seen), CONNECTED)
-            number, group = connected_components(pairs)
+            first, second = cKDTree(seen).query_pairs(CONNECTED, output_type="ndarray").T
+            near = coo_array((np.ones(len(first)), (first, second)), shape=(len(seen), len(seen)))
+            number, group = connected_components(near, directed=False)
             for each in range(number):
                 shapes.append(_box_around(seen[group == each], origin, THICKNESS[task.space_name]))
         scenes.append(shapes)

@@ -75,6 +75,24 @@ class FrozenScenes:
         return np.where(np.isnan(self.share), -1, bands(self.share))
 
     @property
+    def hidden(self) -> Float:
+        """Share of the obstacles of each scene that the sensor does not see at all, shape (N,); NaN without a sensor.
+
+        Example:
+            >>> from viapoint.training.planning.search import registered_task
+            >>> from viapoint.training.scene_sets.scene_set import scenes_for
+            >>> frozen = scenes_for("validation", registered_task("viapoint/PlanarSensed-v0"), 100)
+            >>> float(frozen.hidden.mean()) > 0.1
+            True
+        """
+        task = Task.from_dict(self.task)
+        if task.sensor is None:
+            return np.full(self.share.shape, np.nan)
+        rotation, origin = task.sensor.pose(task.arm, self.scenes.start)
+        hidden = task.sensor.hidden(rotation, origin, self.scenes.obstacles)
+        return np.asarray(hidden.sum(axis=1) / self.scenes.obstacles.present.sum(axis=1))
+
+    @property
     def sha256(self) -> str:
         """Hash of task, scenes, shares and families; the compression of the file does not count."""
         digest = hashlib.sha256(json.dumps(self.task, sort_keys=True).encode())
