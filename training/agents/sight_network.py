@@ -160,6 +160,9 @@ class SightNetwork(nn.Module):
         self.of_place = nn.Linear(FEATURES, 2 * width, bias=False)
         self.each = nn.Sequential(nn.ReLU(), nn.Linear(2 * width, width), nn.ReLU())
         self.last = nn.Sequential(nn.Linear(2 * width + 2, 2 * width), nn.ReLU(), nn.Linear(2 * width, 1))
+        self.calibration: Tensor
+        self.register_buffer("calibration", torch.tensor([1.0, 0.0]))
+        """Slope and offset of the logit of the plan that is chosen; it is the best of many, and its logit too high."""
 
     def forward(self, inputs: SightInputs) -> Tensor:
         """Return the logits of success, shape (B, H)."""

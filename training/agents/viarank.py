@@ -17,6 +17,8 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import expit, logit
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -43,6 +45,8 @@ from viapoint.training.planning.search import (
 
 EFFORT_WEIGHT = 0.05
 """Weight of the reward of a successful plan beside its probability of success."""
+CALIBRATION, CALIBRATION_SCENES = 3_000_017, 320
+"""First part of the seeds of scenes for the calibration, far from those of training, and their number."""
 SAME_RAY = 0.02
 """Greatest distance of a point from the ray of the sensor, [m]."""
 BLOCK = 16
@@ -142,7 +146,14 @@ class ViaRankPolicy(BasePolicy):
         Args:
             observation: Parts of shape (B, .) each.
         """
-        problem, sight = Problem.of_observation(observation, self.task), Sight.of(observation, self.task)
+        actions, success = self.best(
+            Problem.of_observation(observation, self.task), Sight.of(observation, self.task)
+        )
+        slope, offset = self.network.calibration.tolist()
+        return actions, expit(slope * logit(success) + offset)
+
+    def best(self, problem: Problem, sight: Sight) -> tuple[Float, Float]:
+        """Return the best actions of B problems, shape (B, m), and probabilities that are too high, shape (B,)."""
         every = candidate_actions(self.task, self.candidates, replanning=False)
         chosen, success = [], []
         for first in range(0, len(problem.start), BLOCK):
@@ -356,6 +367,12 @@ class ViaRank(Agent, OffPolicyAlgorithm):
         actions = candidates[np.arange(n_envs), value.argmax(axis=1)]
         return actions, actions
 
+    def learn(self, *args: Any, **kwargs: Any) -> Any:
+        """Learn, and calibrate the predicted success at the end; the arguments are those of Stable-Baselines3."""
+        trained = super().learn(*args, **kwargs)
+        self.calibrate()
+        return trained
+
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update the network `gradient_steps` times."""
         policy, task = self.policy, self.policy.task
@@ -396,6 +413,33 @@ class ViaRank(Agent, OffPolicyAlgorithm):
         others = np.random.uniform(size=(len(order), order.shape[1] - best.shape[1])).argsort(axis=1)  # noqa: NPY002
         others = best.shape[1] + others[:, : self.labels - best.shape[1]]
         return np.concatenate((best, np.take_along_axis(order, others, axis=1)), axis=1).astype(np.int64)
+
+    def calibrate(self, number: int = CALIBRATION_SCENES) -> None:
+        """Fit predicted success to what geometry says of the chosen plans in scenes that are drawn, always the same.
+
+        The choice of plans does not change. The two numbers are those of J. Platt, Probabilistic outputs for support
+        vector machines, 1999.
+        """
+        policy, task = self.policy, self.policy.task
+        policy.set_training_mode(False)
+        chances, labels = [], []
+        for first in range(0, number, BLOCK):
+            scenes = self._sampler(
+                [np.random.default_rng((CALIBRATION, first + each)) for each in range(BLOCK)]
+            )
+            truth, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
+            actions, success = policy.best(truth._replace(obstacles=thick_points(task, sight)), sight)
+            clearance = plan_clearances(task, truth, actions[:, None], 0.0, 0.0, exact=True)[:, 0]
+            chances.append(logit(success))
+            labels.append(clearance >= 0.0)
+        x, y = np.concatenate(chances), np.concatenate(labels)
+
+        def loss(numbers: Float) -> float:
+            z = numbers[0] * x + numbers[1]
+            return float(np.mean(np.logaddexp(0.0, z) - y * z) + 1e-3 * (numbers[0] - 1.0) ** 2)
+
+        slope, offset = minimize(loss, np.array([1.0, 0.0]), bounds=((0.05, 20.0), (-20.0, 20.0))).x
+        policy.network.calibration.copy_(torch.tensor([slope, offset]))
 
     @functools.cached_property
     def _sampler(self) -> SceneSampler:

@@ -142,6 +142,9 @@ class RunCallback(BaseCallback):
         if self._validation is None or (self.curve and self.curve[-1]["decisions"] == self.num_timesteps):
             return
         seconds, began = self.seconds, time.monotonic()
+        calibrate = getattr(self.model, "calibrate", None)
+        if calibrate is not None:  # of agents that predict their success
+            calibrate()
         result = evaluate_methods(
             [agent_method("agent", self.model)],
             self._validation,
