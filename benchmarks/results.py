@@ -99,9 +99,8 @@ def table(rows: list[dict[str, Any]]) -> str:
         mine = {row["scenes"]: row for row in rows if row["method"] == method}
         cells = [f"{mine[name]['success']} ({mine[name]['low']}-{mine[name]['high']})" for name in sets]
         last = mine["test"]
-        lines.append(
-            f"| {method} | {' | '.join(cells)} | {last['jerk_ratio'] or '-'} | {last['milliseconds'] or '-'} |"
-        )
+        numbers = [last[name] if float(last[name] or 0.0) else "-" for name in ("jerk_ratio", "milliseconds")]
+        lines.append(f"| {' | '.join((method, *cells, *map(str, numbers)))} |")
     return "\n".join(lines)
 
 
