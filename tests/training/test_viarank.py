@@ -117,6 +117,23 @@ def test_other_observations_are_refused(agent, change) -> None:
         agent.predict({**ViaVecEnv(ENV, 2, seed=0).reset(), **change})
 
 
+@pytest.mark.parametrize(
+    ("env_id", "name"),
+    [
+        ("viapoint/PlanarObstacles-v0", "cautious64"),
+        ("viapoint/PlanarObstacles-v0", "thick:search64"),
+        (ENV, "cautious0"),
+        (ENV, "thin:search64"),
+        (ENV, "thick:straight"),
+        (ENV, "thick:cautious64"),
+        (ENV, "thick:points:search64"),
+    ],
+)
+def test_baselines_that_mean_nothing_are_refused(env_id, name) -> None:
+    with pytest.raises(ValueError):
+        evaluate(env=env_id, baselines=[name], n_scenes=2)
+
+
 def test_tasks_with_sensors_are_written_and_read() -> None:
     task = Task.of(arm="panda", n_obstacles=(1, 4), sensor="camera")
     assert Task.from_dict(task.as_dict()) == task

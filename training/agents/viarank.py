@@ -122,11 +122,6 @@ class ViaRankPolicy(BasePolicy):
         """True for tasks whose movements have via-points, which can be refined."""
         return self.task.n_via > 0
 
-    def logits(self, problem: Problem, sight: Sight, actions: Numbers) -> tuple[Tensor, NDArray[Any]]:
-        """Return logits of success of actions, and their rewards if they succeed, shape (B, H) each."""
-        inputs, worth = sight_inputs(self.task, problem, sight, actions, self.instants, self.nearest)
-        return self.network(inputs), worth
-
     @torch.no_grad()
     def rank(self, problem: Problem, sight: Sight, actions: Numbers) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return ranking criterion and probability of success of actions, shape (B, H) each.
@@ -136,8 +131,8 @@ class ViaRankPolicy(BasePolicy):
             sight: Their readings.
             actions: Actions, shape (B, H, m).
         """
-        logits, worth = self.logits(problem, sight, actions)
-        success = torch.sigmoid(logits).numpy()
+        inputs, worth = sight_inputs(self.task, problem, sight, actions, self.instants, self.nearest)
+        success = torch.sigmoid(self.network(inputs)).numpy()
         return success + EFFORT_WEIGHT * worth, success
 
     def decide(self, observation: Mapping[str, NDArray[Any]]) -> tuple[Float, Float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Protocol
 
 import numpy as np
@@ -219,9 +219,16 @@ def refined_search(simulation: SceneSimulation, checks: int) -> Method:
 COUNTED: dict[str, Callable[[SceneSimulation, int], Method]] = {
     "search": refined_search,
     "sobol": lambda simulation, checks: GeometrySearch(simulation.task, checks),
+    "cautious": lambda simulation, checks: CautiousSearch(simulation.task, checks),
 }
 """Factories of baselines whose names end in the number of plans that they check, such as `search512`."""
-FEWEST_CHECKS = {"search": 4, "sobol": 1}
+FEWEST_CHECKS = {"search": 4, "sobol": 1, "cautious": 1}
+SENSED = ("cautious",)
+"""Those of them that need a sensor."""
+WITH_BELIEFS = ("search", "sobol")
+"""Those of them that plan with any belief."""
+DEFAULT_BELIEF = "thick"
+"""Belief of planners where none is named."""
 
 PLANNERS: dict[str, Callable[[SceneSimulation], PlannerMethod]] = {
     "plan_motion": lambda simulation: PlannerMethod(simulation, "plan_motion", plan_motion),
@@ -264,21 +271,29 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
         ValueError: There is no such baseline.
     """
     known = REPLANNING_METHODS if task.replanning else METHODS
-    if task.sensor is not None and name in PLANNERS:  # planners take the obstacles that they are given
-        planner = PLANNERS[name]
-        return lambda simulation: BeliefMethod(task, "thick", planner(simulation))
-    if name in known:
+    sensed = task.sensor is not None
+    belief, _, planner = name.rpartition(":")
+    if sensed and name in PLANNERS:  # they take the obstacles that they are given, which are not known here
+        belief = DEFAULT_BELIEF
+    if sensed and belief in BELIEFS:
+        make = PLANNERS.get(planner) or _counted(planner, WITH_BELIEFS)
+        if make is not None:
+            return lambda simulation: BeliefMethod(task, belief, make(simulation))
+    elif name in known:
         return known[name]
+    counted = [each for each in COUNTED if sensed or each not in SENSED]
+    found = _counted(name, counted)
+    if found is not None:
+        return found
+    names = [*known, *(f"{each}N" for each in counted), "untrained"]  # N plans are checked
+    names += [f"{each}:METHOD" for each in BELIEFS] if sensed else []
+    raise ValueError(unknown_name("baseline", name, names))
+
+
+def _counted(name: str, allowed: Collection[str]) -> Callable[[SceneSimulation], Method] | None:
+    """Return the factory of a baseline whose name ends in the number of plans that it checks; None for others."""
     found = re.fullmatch(r"(\w+?)([0-9]+)", name)
-    if found is not None and found[1] == "cautious" and task.sensor is not None:
-        number = int(found[2])
-        return lambda simulation: CautiousSearch(task, number)
-    if found is not None and found[1] in COUNTED and int(found[2]) >= FEWEST_CHECKS[found[1]]:
-        make, checks = COUNTED[found[1]], int(found[2])
-        return lambda simulation: make(simulation, checks)
-    belief, _, inner = name.partition(":")
-    if task.sensor is not None and inner and belief in BELIEFS:
-        inside = PLANNERS.get(inner) or factory(inner, task)
-        return lambda simulation: BeliefMethod(task, belief, inside(simulation))
-    counted = [f"{each}N" for each in COUNTED]  # N plans are checked
-    raise ValueError(unknown_name("baseline", name, [*known, *counted, "untrained"]))
+    if found is None or found[1] not in allowed or int(found[2]) < FEWEST_CHECKS[found[1]]:
+        return None
+    make, checks = COUNTED[found[1]], int(found[2])
+    return lambda simulation: make(simulation, checks)

@@ -485,13 +485,15 @@ def refine_seeds(
         tried += 1
         offsets[0, :vias] = seeds[each]
         times[0] = _refine(setting, table, start, offsets[0], duration, obstacles, scene, aims[0], unit, work)
-        apart = _clearance(setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin)
+        apart = _clearance(
+            setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin, NEARLY
+        )
         if NEARLY < apart < margin:
             times[0] = _refine(
                 setting, table, start, offsets[0], duration, obstacles, scene, NARROW, unit, work
             )
             apart = _clearance(
-                setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin
+                setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin, NEARLY
             )
         found.vias[each] = offsets[0, :vias]
         found.times[each] = times[0]
@@ -545,14 +547,12 @@ def _clearance(
     duration: float,
     obstacles: Obstacles,
     scene: int,
-    most: float,
+    margin: float,
+    floor: float,
 ) -> float:
-    """Return the least clearance of a movement at the instants of a table, about `most` at most, [m].
-
-    It is exact above NEARLY.
-    """
+    """Return the least clearance of a movement at the instants of a table, [m]; exact from `floor` to `margin`."""
     return least_clearance(
-        setting, table, times, start, offsets, duration, obstacles, scene, most + ROUNDING, NEARLY, 1e9,
+        setting, table, times, start, offsets, duration, obstacles, scene, margin + ROUNDING, floor, 1e9,
         memory_of(setting, table, len(start)),
     )  # fmt: skip
 
@@ -570,11 +570,8 @@ def is_free(
     margin: float,
 ) -> bool:
     """Return True if a movement keeps a margin at the instants of a table; it stops at the first that does not."""
-    least = least_clearance(
-        setting, table, times, start, offsets, duration, obstacles, scene, margin + ROUNDING, margin, 1e9,
-        memory_of(setting, table, len(start)),
-    )  # fmt: skip
-    return bool(least >= margin)
+    apart = _clearance(setting, table, times, start, offsets, duration, obstacles, scene, margin, margin)
+    return bool(apart >= margin)
 
 
 @compiled

@@ -21,7 +21,7 @@ from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its im
 from viapoint.training.agents.model_io import check_hyperparameters
 from viapoint.training.config.checks import check_arguments, check_env_kwargs, check_whole, unknown_name
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.config.presets import preset_of
+from viapoint.training.config.presets import preset_of, usual_algorithm
 from viapoint.training.io.files import read_json, read_yaml
 from viapoint.training.planning.baselines import check_method
 from viapoint.training.planning.search import registered_task
@@ -78,7 +78,8 @@ class Trial:
         hyperparameters = dict(given.get("hyperparameters", {}))
         if "policy_kwargs" in hyperparameters:
             task = registered_task(self.env_id, **env_kwargs)
-            usual = preset_of(task, given.get("algo", "viaq")).arguments().get("policy_kwargs", {})
+            algo = given.get("algo") or usual_algorithm(task)
+            usual = preset_of(task, algo).arguments().get("policy_kwargs", {})
             hyperparameters["policy_kwargs"] = {**usual, **hyperparameters["policy_kwargs"]}
         given |= {"env_kwargs": env_kwargs, "hyperparameters": hyperparameters}
         return TrainConfig(env=self.env_id, seed=self.seed, out=self.folder(out), progress=False, **given)
