@@ -203,7 +203,7 @@ def evaluate(
         baselines: Names, or objects with `name` and `decide`. Names are `untrained` (the agent's network before
             training), `straight`, `random`, `random16`, `random80`, `plan_motion`, `ompl`, `searchN` and `sobolN` (N
             checked plans), in tasks with replanning `unrevised` (the first plan alone), and in tasks with a sensor
-            `cautiousN` and BELIEF:METHOD, see :mod:`viapoint.training.planning.cautious`.
+            `cautiousN` and BELIEF:METHOD, such as `thick:search512`.
         time_decisions: Measure the wall time of single decisions.
         progress: Function of the method's name, the number of finished scenes and the number of all scenes.
 

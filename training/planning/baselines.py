@@ -224,9 +224,9 @@ COUNTED: dict[str, Callable[[SceneSimulation, int], Method]] = {
 """Factories of baselines whose names end in the number of plans that they check, such as `search512`."""
 FEWEST_CHECKS = {"search": 4, "sobol": 1, "cautious": 1}
 SENSED = ("cautious",)
-"""Those of them that need a sensor."""
+"""Counted baselines that need a sensor."""
 WITH_BELIEFS = ("search", "sobol")
-"""Those of them that plan with any belief."""
+"""Counted baselines that plan with any belief."""
 DEFAULT_BELIEF = "thick"
 """Belief of planners where none is named."""
 
