@@ -2,6 +2,7 @@
 
 python benchmarks/results.py                                  # all tasks; hours
 python benchmarks/results.py --env viapoint/PandaObstacles-v0 # others keep their numbers
+python benchmarks/results.py --only runs                      # only the trainings of benchmarks/sb3.py
 """
 
 from __future__ import annotations
@@ -10,12 +11,12 @@ import csv
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import tyro
 
-from viapoint.training import evaluate, load_agent
+from viapoint.training import Run, evaluate, load_agent
 from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.planning.search import registered_task
 from viapoint.training.scene_sets.scene_set import SETS, shipped_set
@@ -50,9 +51,13 @@ class Config:
     """Ids of environments with a shipped agent."""
     n_scenes: int | None = None
     """Number of scenes of each set; default: all of them."""
+    only: Literal["everything", "runs"] = "everything"
+    """What is measured; "runs" keeps the other numbers."""
+    runs: Path = Path("runs/sb3")
+    """Folder of trainings of algorithms of Stable-Baselines3 by benchmarks/sb3.py, which get a row each."""
 
 
-def rows_of(env_id: str, name: str, n_scenes: int | None) -> Iterator[dict[str, Any]]:
+def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
     """Yield the numbers of each method in one set."""
     task = registered_task(env_id)
     settings: dict[str, Any] = {"checks": [0, 16], "refine": [4], "baselines": BASELINES}
@@ -60,27 +65,33 @@ def rows_of(env_id: str, name: str, n_scenes: int | None) -> Iterator[dict[str, 
         settings = {"refine": [16], "baselines": SENSED_BASELINES}
     elif task.replanning:
         settings = {"checks": [0, 16], "baselines": REPLANNING_BASELINES}
-    result = evaluate(
-        load_agent(env_id),
-        env=env_id,
-        scenes=name,
-        n_scenes=n_scenes,
-        time_decisions=name == "test",
-        **settings,
-    )
-    for row in result.rows:
-        success = row["success"]
-        yield {
-            "env": env_id,
-            "scenes": name,
-            "method": row["method"],
-            "success": round(100.0 * success["rate"], 1),
-            "low": round(100.0 * success["low"], 1),
-            "high": round(100.0 * success["high"], 1),
-            "count": success["of"],
-            "jerk_ratio": _rounded(row["jerk_ratio"], 1.0),
-            "milliseconds": _rounded(row["decision_time"], 1e3),
-        }
+    common: dict[str, Any] = {"env": env_id, "scenes": name, "n_scenes": config.n_scenes}
+    common["time_decisions"] = name == "test"
+    if config.only == "everything":
+        for row in evaluate(load_agent(env_id), **common, **settings).rows:
+            yield _numbers(env_id, name, row["method"], row)
+    short = env_id.removeprefix("viapoint/").removesuffix("-v0")
+    for folder in sorted(config.runs.glob(f"{short}-*")):
+        run = Run(folder)
+        method = f"{run.config.algorithm.upper()}, {run.curve[-1]['decisions']:,} decisions"
+        row = evaluate(load_agent(folder), **common, baselines=[]).rows[0]
+        yield _numbers(env_id, name, method, row)
+
+
+def _numbers(env_id: str, name: str, method: str, row: dict[str, Any]) -> dict[str, Any]:
+    """Return a row of the file for a row of an evaluation."""
+    success = row["success"]
+    return {
+        "env": env_id,
+        "scenes": name,
+        "method": method,
+        "success": round(100.0 * success["rate"], 1),
+        "low": round(100.0 * success["low"], 1),
+        "high": round(100.0 * success["high"], 1),
+        "count": success["of"],
+        "jerk_ratio": _rounded(row["jerk_ratio"], 1.0),
+        "milliseconds": _rounded(row["decision_time"], 1e3),
+    }
 
 
 def _rounded(value: float | None, unit: float) -> float | str:
@@ -126,10 +137,15 @@ def main() -> None:
             every = list(csv.DictReader(file))
     for env_id in config.env:
         task = registered_task(env_id)
-        rows = [row for row in every if row["env"] != env_id]
+        found = []
         for name in SETS:
             if name != "validation" and shipped_set(name, task) is not None:
-                rows += list(rows_of(env_id, name, config.n_scenes))
+                found += list(rows_of(config, env_id, name))
+        measured = {row["method"] for row in found}
+        rows = [row for row in every if row["env"] != env_id]
+        if config.only == "runs":
+            rows = [row for row in every if row["env"] != env_id or row["method"] not in measured]
+        rows += found
         every = sorted(rows, key=lambda row: SHIPPED_IDS.index(row["env"]))
         with config.out.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, FIELDS)

@@ -65,6 +65,10 @@ class Pairs(NamedTuple):
     inside: Tensor
     """True for movements within reach and joint ranges, shape (B, H)."""
 
+    def to(self, device: torch.device) -> Pairs:
+        """Return the same pairs on a device."""
+        return Pairs(*(each.to(device) for each in self))
+
 
 def pairs_of(
     task: Task,

@@ -49,10 +49,14 @@ class SightInputs(NamedTuple):
 
     def take(self, chosen: Tensor) -> SightInputs:
         """Return the inputs of some of the movements, by indices of shape (B, h)."""
-        scenes = torch.arange(len(chosen))[:, None]
+        scenes = torch.arange(len(chosen), device=chosen.device)[:, None]
         return SightInputs(
             self.image, self.pixel[scenes, chosen], self.places[scenes, chosen], self.plans[scenes, chosen]
         )
+
+    def to(self, device: torch.device) -> SightInputs:
+        """Return the same inputs on a device."""
+        return SightInputs(*(each.to(device) for each in self))
 
 
 def sight_inputs(
@@ -174,7 +178,7 @@ class SightNetwork(nn.Module):
         features = image.flatten(2).transpose(1, 2)  # (B, pixels, features)
         row, column = inputs.pixel // self.columns, inputs.pixel % self.columns
         pixel = (row // self.stride) * columns + column // self.stride
-        first = torch.arange(len(pixel))[:, None, None] * features.shape[1]
+        first = torch.arange(len(pixel), device=pixel.device)[:, None, None] * features.shape[1]
         there = functional.embedding(first + pixel, features.flatten(0, 1))
         hidden = self.each(there + self.of_place(inputs.places))
         pooled = torch.cat((hidden.amax(dim=2), hidden.mean(dim=2), inputs.plans), dim=-1)

@@ -209,10 +209,11 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         inputs = policy.inputs(problem, batch.actions[:, None], until)
         values = Values(*(each[:, 0] for each in critic(inputs)))
         following = self._following(batch)
-        ended = torch.from_numpy(batch.ended)
+        device = policy.device
+        ended = torch.from_numpy(batch.ended).to(device)
         goes_on = (1.0 - ended) * self.gamma if following is not None else torch.zeros_like(ended)
-        known = torch.from_numpy(np.isfinite(batch.outcomes.success))
-        outcomes = Outcomes(*(torch.nan_to_num(torch.from_numpy(each)) for each in batch.outcomes))
+        known = torch.from_numpy(np.isfinite(batch.outcomes.success)).to(device)
+        outcomes = Outcomes(*(torch.from_numpy(each).nan_to_num().to(device) for each in batch.outcomes))
         contact, arrival, effort = outcomes.contact, outcomes.success, outcomes.effort_terms
         if following is not None:
             arrival = torch.where(ended > 0.5, arrival, self.gamma * torch.sigmoid(following.arrival))
@@ -228,7 +229,7 @@ class ViaQ(Agent, OffPolicyAlgorithm):
             ),
         }
         if not bool(known.all()):
-            target = torch.from_numpy(batch.reward)
+            target = torch.from_numpy(batch.reward).to(device)
             if following is not None:
                 target = target + goes_on * critic.value(following).detach()
             losses["reward"] = _mean(

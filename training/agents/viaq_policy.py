@@ -165,7 +165,9 @@ class ViaQPolicy(BasePolicy):
         effort = np.stack((moves.rough, moves.relative, np.log(moves.relative), spare), axis=-1)
         pairs = pairs_of(self.task, problem, moves, self.shown_instants, until)
         ends = seen_ends(self.task, problem)
-        return PlanInputs(_tensor(ends), _tensor(actions), _tensor(effort), pairs)
+        # Geometry is computed on the processor, the networks may be on another device.
+        own = (_tensor(values).to(self.device) for values in (ends, actions, effort))
+        return PlanInputs(*own, pairs.to(self.device))
 
     @torch.inference_mode()
     def values(self, problem: Problem, actions: Numbers) -> Numbers:
@@ -173,7 +175,7 @@ class ViaQPolicy(BasePolicy):
 
         In replanning tasks a first action of zero, which keeps the plan, gets a bonus of KEEP.
         """
-        values: Numbers = self.critic.merit(self.critic(self.inputs(problem, actions))).numpy()
+        values: Numbers = self.critic.merit(self.critic(self.inputs(problem, actions))).cpu().numpy()
         if self.replanning:
             values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
         return values
@@ -278,7 +280,7 @@ class ViaQPolicy(BasePolicy):
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         arrays = {name: each.cpu().numpy() for name, each in observation.items()}
-        return torch.from_numpy(np.ascontiguousarray(self.decide(arrays), dtype=np.float32))
+        return torch.as_tensor(self.decide(arrays), dtype=torch.float32, device=self.device)
 
     def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
         """Return actions for one observation or a batch, and no state, as policies of Stable-Baselines3 do.

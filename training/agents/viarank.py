@@ -132,7 +132,8 @@ class ViaRankPolicy(BasePolicy):
             actions: Actions, shape (B, H, m).
         """
         inputs, worth = sight_inputs(self.task, problem, sight, actions, self.instants, self.nearest)
-        success = torch.sigmoid(self.network(inputs)).numpy()
+        # Geometry is computed on the processor, the network may be on another device.
+        success = torch.sigmoid(self.network(inputs.to(self.device))).cpu().numpy()
         return success + EFFORT_WEIGHT * worth, success
 
     def decide(self, observation: Mapping[str, NDArray[Any]]) -> tuple[Float, Float]:
@@ -171,7 +172,7 @@ class ViaRankPolicy(BasePolicy):
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         arrays = {name: each.cpu().numpy() for name, each in observation.items()}
-        return torch.from_numpy(np.ascontiguousarray(self.decide(arrays)[0], dtype=np.float32))
+        return torch.as_tensor(self.decide(arrays)[0], dtype=torch.float32, device=self.device)
 
     def forward(self, observation: Any, deterministic: bool = True) -> Tensor:
         """Return the chosen actions, shape (B, m)."""
@@ -383,12 +384,13 @@ class ViaRank(Agent, OffPolicyAlgorithm):
             # Some plans are labelled: those that the network would choose, and others.
             plans = self._candidates(batch_size)
             inputs, worth = sight_inputs(task, believed, sight, plans, policy.instants, policy.nearest)
+            inputs = inputs.to(policy.device)
             chosen = self._chosen(inputs, worth)
             some = np.take_along_axis(plans, chosen[..., None], axis=1)
             # The labels are privileged: they need the true obstacles, which the inputs do not tell.
             clearance = plan_clearances(task, truth, some, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
-            labels = torch.from_numpy((clearance >= CLEARANCE_MARGIN).astype(np.float32))
-            logits = policy.network(inputs.take(torch.from_numpy(chosen)))
+            labels = torch.from_numpy((clearance >= CLEARANCE_MARGIN).astype(np.float32)).to(policy.device)
+            logits = policy.network(inputs.take(torch.from_numpy(chosen).to(policy.device)))
             loss = functional.binary_cross_entropy_with_logits(logits, labels)
             policy.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
@@ -402,7 +404,7 @@ class ViaRank(Agent, OffPolicyAlgorithm):
     @torch.no_grad()
     def _chosen(self, inputs: SightInputs, worth: NDArray[Any]) -> NDArray[np.int64]:
         """Return the plans to learn from: the best ones by the present network, and others, shape (B, labels)."""
-        value = torch.sigmoid(self.policy.network(inputs)).numpy() + EFFORT_WEIGHT * worth
+        value = torch.sigmoid(self.policy.network(inputs)).cpu().numpy() + EFFORT_WEIGHT * worth
         order = np.argsort(-value, axis=1)
         best = order[:, : self.labels // 2]
         others = np.random.uniform(size=(len(order), order.shape[1] - best.shape[1])).argsort(axis=1)  # noqa: NPY002

@@ -1,0 +1,137 @@
+"""Train algorithms of Stable-Baselines3 on the tasks with obstacles, for some minutes on one core each.
+
+python benchmarks/sb3.py --minutes 30 --jobs 2     # trains into runs/sb3; an interrupted training begins again
+python benchmarks/results.py --only runs           # adds their rows to the tables of results.md
+
+The learning curves go to docs/sb3_curves.csv and docs/images/sb3_curves.png.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+import shutil
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import tyro
+from matplotlib.figure import Figure
+from stable_baselines3.common.callbacks import BaseCallback
+
+from viapoint.training import TrainConfig, train
+from viapoint.training.plotting.plots import style_axes
+
+TASKS = (
+    "PlanarObstacles",
+    "PlanarWholeArm",
+    "PandaObstacles",
+    "PlanarMovingObstacles",
+    "PandaMovingObstacles",
+    "PlanarSensed",
+    "PandaSensed",
+)
+COLORS = {"sac": "#1f5fa8", "tqc": "#2a9d8f", "ppo": "#d1495b"}
+CURVES, PICTURE = Path("docs/sb3_curves.csv"), Path("docs/images/sb3_curves.png")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Train SAC, TQC and PPO with `SceneExtractor` and the settings of their presets."""
+
+    minutes: float = 30.0
+    """Length of each training."""
+    task: tuple[str, ...] = TASKS
+    """Names of tasks."""
+    algo: tuple[str, ...] = tuple(COLORS)
+    """Names of algorithms."""
+    seed: int = 0
+    """Seed of the trainings."""
+    jobs: int = 2
+    """Trainings at a time."""
+    out: Path = Path("runs/sb3")
+    """Folder of the runs."""
+
+
+class StopAfter(BaseCallback):
+    """Callback that ends a training after some seconds."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__()
+        self.end = time.monotonic() + seconds
+
+    def _on_step(self) -> bool:
+        return time.monotonic() < self.end
+
+
+def train_one(config: Config, task: str, algo: str) -> None:
+    """Train one algorithm on one task, unless its run has ended."""
+    folder = config.out / f"{task}-{algo}-{config.seed}"
+    if (folder / "final").is_dir():
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    settings: Any = {"env": f"viapoint/{task}-v0", "algo": algo, "seed": config.seed, "out": folder}
+    often = 10_000 if algo == "ppo" else 2_000
+    unlimited = TrainConfig(**settings, n_timesteps=10**7, eval_every=often, eval_scenes=100, progress=False)
+    train(unlimited, StopAfter(60.0 * config.minutes))
+    print(f"{folder} has ended", flush=True)
+
+
+def curves_of(folder: Path) -> list[dict[str, Any]]:
+    """Return the learning curves of all runs as rows."""
+    rows = []
+    for path in sorted(folder.glob("*/learning_curve.jsonl")):
+        task, algo, seed = path.parent.name.split("-")
+        for line in path.read_text(encoding="utf-8").splitlines():
+            record = json.loads(line)
+            row = {"task": task, "algo": algo, "seed": seed, "decisions": record["decisions"]}
+            row["success"] = round(100.0 * record["success"]["rate"], 1)
+            rows.append({**row, "seconds": round(record["seconds"])})
+    return rows
+
+
+def draw(rows: list[dict[str, Any]]) -> None:
+    """Draw success on the validation scenes against decisions, a panel for each task."""
+    figure = Figure(figsize=(10.0, 4.6), layout="constrained")
+    tasks = [name for name in TASKS if any(row["task"] == name for row in rows)]
+    panels = figure.subplots(2, 4, sharey=True).ravel()
+    for panel, task in itertools.zip_longest(panels, tasks):
+        if task is None:
+            panel.set_axis_off()
+            continue
+        for algo, color in COLORS.items():
+            mine = [row for row in rows if row["task"] == task and row["algo"] == algo]
+            decisions = [row["decisions"] / 1000.0 for row in mine]
+            panel.plot(decisions, [row["success"] for row in mine], color=color, label=algo.upper())
+        panel.set_title(task, fontsize=10)
+        panel.set_ylim(0.0, 100.0)
+        panel.set_xlim(left=0.0)
+        style_axes(panel)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="lower right", bbox_to_anchor=(0.93, 0.2))
+    figure.supxlabel("decisions [1,000]", fontsize=10)
+    figure.supylabel("success on validation scenes [%]", fontsize=10)
+    figure.savefig(PICTURE, dpi=130)
+
+
+def main() -> None:
+    """Train, and write the curves and their picture."""
+    config = tyro.cli(Config)
+    pairs = list(itertools.product(config.task, config.algo))
+    with ProcessPoolExecutor(config.jobs, mp_context=get_context("spawn")) as pool:
+        trainings = [pool.submit(train_one, config, task, algo) for task, algo in pairs]
+        for training in trainings:
+            training.result()
+    rows = curves_of(config.out)
+    with CURVES.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    draw(rows)
+
+
+if __name__ == "__main__":
+    main()
