@@ -120,7 +120,9 @@ def write_page(rows: list[dict[str, Any]]) -> None:
     text = PAGE.read_text(encoding="utf-8")
     for env_id in dict.fromkeys(row["env"] for row in rows):
         heading = f"### {env_id.removeprefix('viapoint/').removesuffix('-v0')}\n\n"
-        before, _, after = text.partition(heading)
+        before, found, after = text.partition(heading)
+        if not found:
+            continue  # tasks without obstacles are not on the page
         mine = [row for row in rows if row["env"] == env_id]
         _, _, rest = after.partition("\n\n")  # after the old table
         text = f"{before}{heading}{table(mine)}\n\n{rest}"
