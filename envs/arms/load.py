@@ -16,7 +16,6 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
-from viapoint.envs.arms.cache import key_of, read_arm, write_arm
 from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
 from viapoint.envs.arms.choices import (
     KNOWN_TORQUES,
@@ -31,6 +30,7 @@ from viapoint.envs.arms.choices import (
     known_limits,
 )
 from viapoint.envs.arms.kinematics import torques
+from viapoint.envs.arms.stored import cached_path, read_cached, write_cached
 from viapoint.envs.arms.urdf import Urdf, read_urdf
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least
@@ -172,11 +172,11 @@ def load_arm(
     }
     notes = list(urdf.notes)
     whole = _compiled(spec, notes)
-    key = key_of(whole, {**given, "name": name, "notes": notes, "urdf": urdf[2:]})
-    arm = read_arm(key)
+    path = cached_path(whole, {**given, "name": name, "notes": notes, "urdf": urdf[2:]})
+    arm = read_cached(path)
     if arm is None:
         arm = _load(whole, name, f"{name} {spec.modelname}", urdf, notes, **given)
-        write_arm(key, arm)
+        write_cached(path, arm)
     for note in arm.notes:
         if note.startswith(WARNING):
             warnings.warn(note.removeprefix(WARNING), stacklevel=2)
