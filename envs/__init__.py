@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from viapoint.envs.arms.inverse_kinematics import inverse_kinematics
     from viapoint.envs.arms.load import load_arm
     from viapoint.envs.arms.registry import arm_of, register_arm
-    from viapoint.envs.env import ReachEnv
+    from viapoint.envs.env import ReachEnv, RecordMovements
     from viapoint.envs.geometry.distance import signed_distances
     from viapoint.envs.geometry.obstacles import Obstacles, observation_rows, obstacles_from_rows
     from viapoint.envs.geometry.shapes import (
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
         register_mesh,
     )
     from viapoint.envs.plans import Plan
-    from viapoint.envs.record_video import RecordMovements
     from viapoint.envs.rewards import RewardWeights
     from viapoint.envs.scenes.families_registry import register_scene_family
     from viapoint.envs.scenes.layout import Furniture, Place, Room

@@ -10,14 +10,14 @@ import numpy as np
 from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float, Int, Observation
 from viapoint.envs.events import NEVER, Event, EventPredictor
-from viapoint.envs.executor import Executor, Pieces, Segment
-from viapoint.envs.geometry.obstacles import KINDS
+from viapoint.envs.executor import Executor, Pieces
+from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
 from viapoint.envs.limits import slowdowns
 from viapoint.envs.outcome import SETTLING, Outcome, Rollout, straight_jerk_cost
 from viapoint.envs.plans import Motion, Movements, Plan, checked_plan, jerk_cost_between
 from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed
 from viapoint.envs.rewards import reward_terms
-from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.scenes.scene import Scenes, resting
 from viapoint.envs.simulator import Simulator
 from viapoint.envs.task import Task
 
@@ -68,8 +68,9 @@ class Episodes:
             task.arm, n_obstacles=task.observation.n_rows, num_envs=number, meshes=meshes
         )
         self.executor = Executor(self.simulator, task.space, task.tolerance)
-        self.scenes: Scenes | None = None
-        """Scenes of the running episodes; None before the first start."""
+        home = np.tile(task.arm.home, (number, 1))
+        self.scenes = resting(home, home.copy(), no_obstacles(number, task.observation.n_rows))
+        """Scenes of the running episodes."""
         self.history: list[History] = [[] for _ in range(number)]
         """Plans of the running episodes."""
         self._finished: tuple[Int, Scenes, list[tuple[History, Pieces]]] | None = None
@@ -94,7 +95,7 @@ class Episodes:
     @property
     def time(self) -> Float:
         """Time since the start of each episode, shape (n,), [s]."""
-        return np.asarray(self.executor.state.steps * self.simulator.timestep)
+        return self.executor.state.steps * self.simulator.timestep
 
     def start(self, rows: Int, scenes: Scenes, *, keep: bool = False) -> None:
         """Start episodes with the arms at rest at the start and the obstacles in place.
@@ -105,15 +106,12 @@ class Episodes:
             keep: True to keep the records of the episodes before.
         """
         self._finished = None
-        if keep and self.scenes is not None:
+        if keep:
             records = [(self.history[row], self.executor.past[row]) for row in rows]
             self._finished = rows, self.scenes.take(rows), records
         if not keep and len(rows) == len(self.begun):
             self.last_plan = None
-        if self.scenes is None:
-            self.scenes = scenes
-        else:
-            self.scenes = self.scenes.put(rows, scenes)
+        self.scenes = self.scenes.put(rows, scenes)
         self._moving = bool(self.scenes.obstacles.velocity.any() or self.scenes.turn_velocity.any())
         self.executor.begin(rows, scenes.start, scenes.obstacles_at(np.zeros(len(rows))))
         space = self.task.space
@@ -130,7 +128,6 @@ class Episodes:
 
     def goals(self, time: Float) -> Float:
         """Return the goals at one time for each episode, in coordinates of the space, shape (n, D)."""
-        assert self.scenes is not None
         return self.task.space.coordinates(self.scenes.goals(time))
 
     @property
@@ -138,11 +135,10 @@ class Episodes:
         """Plans that a zero action leads to, and the present references."""
         since = (self.executor.state.steps - self._began) * self.simulator.timestep
         goal = self.goals(self.time)
-        return nominal_plan(self.task.action, self.plan, np.asarray(since), self.begun, self._start, goal)
+        return nominal_plan(self.task.action, self.plan, since, self.begun, self._start, goal)
 
     def observe(self) -> Observation:
         """Return the present observations."""
-        assert self.scenes is not None
         state, task, time = self.executor.state, self.task, self.time
         goal = self.scenes.goals(time)
         nominal = self.nominal if task.replanning else None
@@ -161,14 +157,13 @@ class Episodes:
             nominal,
         )
 
-    def decide(self, actions: Float, active: Bool | None = None) -> Decision:
+    def decide(self, actions: Float, active: Bool) -> Decision:
         """Make one decision in each environment and execute it until it ends.
 
         Args:
             actions: Shape (n, m), in [-1, 1].
-            active: True for environments that take part, shape (n,); by default all. Results of others mean nothing.
+            active: True for environments that take part, shape (n,). Results of others mean nothing.
         """
-        active = np.ones(len(actions), bool) if active is None else active
         if self.task.stepwise:
             return self._steer(actions, active)
         if self.task.whole_movement:
@@ -206,13 +201,11 @@ class Episodes:
 
     def move_goals(self, joints: Float) -> None:
         """Replace the goals of the running episodes by joint positions, shape (n, J); they jump no more."""
-        assert self.scenes is not None
         self.scenes.goal[:] = joints
         self.scenes.jumps[:] = 0.0
 
     def recorded(self, row: int) -> Recorded:
         """Return the running episode of one environment; where it has not moved yet, the one before if it is kept."""
-        assert self.scenes is not None
         scene, history, pieces = self.scenes.take([row]), self.history[row], self.executor.past[row]
         if not self.executor.state.steps[row] and self._finished is not None:
             rows, scenes, records = self._finished
@@ -225,7 +218,6 @@ class Episodes:
 
     def _follow(self, plan: Plan, revised: Bool, active: Bool) -> Decision:
         """Follow plans, new ones where they were revised, until the decisions end."""
-        assert self.scenes is not None
         state, scenes = self.executor.state, self.scenes
         first = ~self.begun
         before, begin = self._outcome(np.zeros(len(first), bool)), state.steps.copy()
@@ -233,11 +225,7 @@ class Episodes:
         ends = self._events(self.plan, self._began, begin, scenes, self.goals)
         last = np.where(state.reachable & active, ends.step, begin)
         self._run_until(last)
-        event = np.where(state.collision, Event.CONTACT, ends.event)
-        event = np.where(state.reachable, event, Event.REACH)
-        event = np.where(state.unstable, Event.UNSTABLE, event)
-        final = ends.final & (event == Event.ARRIVAL)
-        return self._decision(before, begin, first, final, event)
+        return self._decision(before, begin, first, ends.final, ends.event)
 
     def _adopt(self, plan: Plan, rows: Int) -> None:
         """Begin new plans in some episodes, as slow as the arm's limits need them.
@@ -253,9 +241,8 @@ class Episodes:
         adopted = within | ~self.begun[rows]
         rows, plan = rows[adopted], plan.take(adopted)
         state.stretch[rows] = np.maximum(state.stretch[rows], stretch[adopted])
-        if (
-            given.waypoints.shape != self.plan.waypoints.shape
-        ):  # whole movements have any number of via-points
+        # Whole movements have any number of via-points.
+        if given.waypoints.shape != self.plan.waypoints.shape:
             self.plan = Plan(*(part.copy() for part in given))
         put(self.plan, rows, plan)
         self._movements = Movements.of(self.plan)
@@ -302,8 +289,7 @@ class Episodes:
 
     def _run_until(self, last: Int) -> None:
         """Run the episodes until a physics step each; obstacles keep their velocity in every piece of it."""
-        assert self.scenes is not None
-        state, timestep = self.executor.state, self.simulator.timestep
+        state, timestep, space = self.executor.state, self.simulator.timestep, self.task.space
         turns = self._events.steps(self.scenes.turn_time)
         while True:
             rows = np.flatnonzero((state.steps < last) & ~state.collision & ~state.unstable)
@@ -312,30 +298,28 @@ class Episodes:
             now = state.steps[rows]
             turn = np.where(turns[rows] > now[:, None], turns[rows], NEVER).min(axis=1, initial=NEVER)
             steps = np.minimum(last[rows], turn) - now
-            time = np.asarray(now * timestep)
             scenes = self.scenes.take(rows)
-            goal = self.task.space.coordinates(scenes.goals((now + steps) * timestep))
-            segment = Segment(rows, steps, scenes.obstacles_at(time), goal)
-            begin, whole = state.steps.copy(), self.task.whole_movement
-            self.executor.run(segment, self._references, resume=not whole, moving=self._moving)
-            since = (begin - self._began)[rows]
-            done = since + (state.steps - begin)[rows]
-            movements = take(self._movements, rows)
-            state.jerk_cost[rows] += jerk_cost_between(
-                movements, np.asarray(since * timestep), np.asarray(done * timestep)
+            obstacles = scenes.obstacles_at(now * timestep)
+            goal = space.coordinates(scenes.goals((now + steps) * timestep))
+            resume = not self.task.whole_movement
+            self.executor.run(
+                rows, steps, obstacles, goal, self._references, resume=resume, moving=self._moving
             )
+            movements, began = take(self._movements, rows), self._began[rows]
+            done = state.steps[rows] - began
+            cost = jerk_cost_between(movements, (now - began) * timestep, done * timestep)
+            state.jerk_cost[rows] += cost
 
     def _references(self, rows: Int, number: int) -> Motion:
         """Return references of plans from now on, shape (n, T + 1, D) each."""
         since = (self.executor.state.steps - self._began)[rows]
-        times = np.asarray(self.simulator.timestep * (since[:, None] + np.arange(number + 1)))
+        times = self.simulator.timestep * (since[:, None] + np.arange(number + 1))
         return take(self._movements, rows).sample(times)
 
     # Decisions of one control step
 
     def _steer(self, wanted: Float, active: Bool) -> Decision:
         """Follow velocities for one control step; where the references leave the reach, the arm stays."""
-        assert self.scenes is not None
         task, state = self.task, self.executor.state
         steering, first = task.steering, state.steps == 0
         before, begin = self._outcome(np.zeros(len(first), bool)), state.steps.copy()
@@ -351,60 +335,74 @@ class Episodes:
                 return steering.follow(take(self._motion, some), velocity[some], count)
 
             scenes = self.scenes.take(rows)
-            goal = task.space.coordinates(scenes.goal)
+            obstacles, goal = scenes.obstacles_at(self.time[rows]), task.space.coordinates(scenes.goal)
             steps = np.full(len(rows), number)
-            segment = Segment(rows, steps, scenes.obstacles_at(self.time[rows]), goal)
-            self.executor.run(segment, references, resume=True, moving=self._moving)
+            self.executor.run(rows, steps, obstacles, goal, references, resume=True, moving=self._moving)
             state.jerk_cost[rows] += steering.jerk_cost(motion, velocity[rows])
             put(self._motion, rows, Motion(*(part[rows, -1] for part in ahead)))
         self.begun[:] = True
         settled = state.rest * self.simulator.timestep >= SETTLING - 1e-9
-        event = np.full(len(first), int(Event.HORIZON))
-        event = np.where(settled, Event.ARRIVAL, event)
+        event = np.where(settled, Event.ARRIVAL, Event.HORIZON)
         event = np.where(state.steps >= self._events.limit, Event.TIME_LIMIT, event)
-        event = np.where(state.collision, Event.CONTACT, event)
-        event = np.where(state.reachable, event, Event.REACH)
-        event = np.where(state.unstable, Event.UNSTABLE, event)
         return self._decision(before, begin, first, settled, event)
 
     # Outcomes
 
     def _decision(self, before: Outcome, begin: Int, first: Bool, final: Bool, event: Int) -> Decision:
-        """Return the results of a decision that ended with an event."""
-        assert self.scenes is not None
-        state, task, timestep = self.executor.state, self.task, self.simulator.timestep
+        """Return the results of a decision that ended with an event, if nothing went wrong."""
+        state, task = self.executor.state, self.task
+        event = np.where(state.collision, Event.CONTACT, event)
+        event = np.where(state.reachable, event, Event.REACH)
+        event = np.where(state.unstable, Event.UNSTABLE, event)
+        if not task.stepwise:
+            final = final & (event == Event.ARRIVAL)
         after = self._outcome(final)
         ended = final | (event >= Event.CONTACT)
-        truncated = (event == Event.TIME_LIMIT) & ~final if task.stepwise else np.zeros(len(event), bool)
+        truncated = (event == Event.TIME_LIMIT) & ~final & task.stepwise
         length = norm(task.space.coordinates(self.scenes.goal) - self._start)
         terms = reward_terms(
             before, after, first, ended, length, self._zero_duration, task.tolerance.unit, task.weights
         )
-        elapsed = np.asarray((state.steps - begin) * timestep)
+        elapsed = (state.steps - begin) * self.simulator.timestep
         times = {"elapsed": elapsed, "time": self.time, "event": event}
         info = {**after._asdict(), **terms.as_info(), **times}
         return Decision(self.observe(), terms.total(), ended & ~truncated, truncated, info)
 
     def _outcome(self, final: Bool) -> Outcome:
         """Return the metrics so far, where `final` is True for arms that have arrived at their last goal."""
-        assert self.scenes is not None
         state, task, timestep = self.executor.state, self.task, self.simulator.timestep
-        bounds, time = task.tolerance, self.time
+        time, touched = self.time, state.collision
         goal = self.goals(time)
         here = state.hand[:, :2] if task.space.of_hand else state.joints
         error = norm(here - goal) if task.space.of_hand else np.abs(here - goal).max(axis=-1)
-        arrived = final & (error < bounds.goal) & (state.last_speed < bounds.speed)
+        arrived = final & (error < task.tolerance.goal) & (state.last_speed < task.tolerance.speed)
         if task.stepwise:
             duration = time - np.where(final, state.rest * timestep, 0.0)
         else:
             ends = self._began * timestep + self.plan.duration
             duration = np.where(self.begun, np.minimum(time, ends), 0.0)
-        cost = straight_jerk_cost(self._straight_length(time), np.maximum(duration, timestep))
-        return state.outcome(arrived & state.sound, error, duration, cost, timestep)
+        straight = straight_jerk_cost(self._straight_length(time), np.maximum(duration, timestep))
+        return Outcome(
+            is_success=arrived & ~touched & state.within & state.reachable & ~state.unstable,
+            collision=touched,
+            first_contact_time=np.where(touched, state.first_contact * timestep, -1.0),
+            min_clearance=state.min_clearance.copy(),
+            self_clearance=state.self_clearance.copy(),
+            planned_clearance=state.planned_clearance.copy(),
+            goal_error=error,
+            duration=duration,
+            path_length=state.path_length.copy(),
+            jerk_cost=state.jerk_cost.copy(),
+            jerk_ratio=np.maximum(state.jerk_cost / straight, 1.0),
+            peak_speed=state.peak_speed.copy(),
+            tracking_error=np.sqrt(state.deviation / np.maximum(state.steps, 1)),
+            reachable=state.reachable.copy(),
+            unstable=state.unstable.copy(),
+            stretch=state.stretch.copy(),
+        )
 
     def _straight_length(self, time: Float) -> Float:
         """Return the length of the straight lines from target to target until a time for each episode, shape (n,)."""
-        assert self.scenes is not None
         before = self.task.space.coordinates(self.scenes.goal)
         length = norm(before - self._start)
         jumps, times = self.scenes.jumps, self.scenes.jump_times
@@ -419,7 +417,6 @@ class Episodes:
 
     def state(self) -> dict[str, Any]:
         """Return the state of the running episodes as arrays, for :meth:`restore`; films of the past are not part."""
-        assert self.scenes is not None
         return {
             "scenes": self.scenes.as_dict(),
             "metrics": {name: part.copy() for name, part in self.executor.state._asdict().items()},

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from viapoint.envs.geometry.shapes import IN_TABLES
 from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Rollout, Tolerance
 from viapoint.envs.plans import Motion
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.simulator import MOST_BETWEEN, SimulationLog, Simulator
+from viapoint.envs.simulator import MOST_BETWEEN, Simulator
 from viapoint.envs.spaces import Space
 
 BLOCK, SIMILAR = 32, 1.1
@@ -42,19 +41,6 @@ Pieces = list[tuple[Float, Float, Bool]]
 """Joint positions [rad] and references after each step, and contacts before it, in pieces of an episode."""
 
 
-class Segment(NamedTuple):
-    """Task of the executor: n episodes that go on for a number of steps each."""
-
-    rows: Int
-    """Episodes in increasing order, shape (n,)."""
-    steps: Int
-    """Physics steps of each, 1 or more, shape (n,)."""
-    obstacles: Obstacles
-    """Obstacles of these episodes, at their present places and with the velocities that they keep."""
-    goal: Float
-    """Goals in coordinates of the space, shape (n, D)."""
-
-
 class Executor:
     """Executor of references in the simulations of one thread.
 
@@ -67,8 +53,8 @@ class Executor:
     def __init__(self, simulator: Simulator, space: Space, tolerance: Tolerance) -> None:
         self.simulator, self.space, self.tolerance = simulator, space, tolerance
         arm = simulator.arm
-        number, joints = len(simulator.batch.state), len(arm.joint_names)
-        self.state = EpisodeState.empty(number, joints)
+        number = len(simulator.batch.state)
+        self.state = EpisodeState.empty(number, len(arm.joint_names))
         """Metrics of the running episodes."""
         self.past: list[Pieces] = [[] for _ in range(number)]
         """Records of the running episodes."""
@@ -83,26 +69,39 @@ class Executor:
         for row in rows:
             self.past[row] = []
 
-    def run(self, segment: Segment, references: References, *, resume: bool, moving: bool) -> None:
-        """Execute a segment and add it to the metrics; an episode stops at its first contact.
+    def run(
+        self,
+        rows: Int,
+        steps: Int,
+        obstacles: Obstacles,
+        goal: Float,
+        references: References,
+        *,
+        resume: bool,
+        moving: bool,
+    ) -> None:
+        """Execute references in n episodes and add what comes of it to their metrics.
+
+        An episode stops at its first contact.
 
         Args:
-            segment: Episodes, and for how long they go on.
+            rows: Episodes in increasing order, shape (n,).
+            steps: Physics steps of each, 1 or more, shape (n,).
+            obstacles: Obstacles of these episodes, at their present places and with the velocities that they keep.
+            goal: Goals in coordinates of the space, shape (n, D).
             references: Function that returns the references.
             resume: True if the episodes may go on afterwards.
             moving: True if obstacles move.
         """
-        order = np.argsort(segment.steps, kind="stable")
-        length = segment.steps[order]
+        order = np.argsort(steps, kind="stable")
+        length = steps[order]
         first = 0
         while first < len(order):
             similar = int(np.searchsorted(length, SIMILAR * length[first], side="right"))
             last = min(similar, first + BLOCK)
             some = np.sort(order[first:last])
-            block = Segment(
-                segment.rows[some], segment.steps[some], segment.obstacles.take(some), segment.goal[some]
-            )
-            self._run_block(block, references, resume, moving)
+            block = rows[some], steps[some], obstacles.take(some), goal[some]
+            self._run_block(*block, references, resume, moving)
             first = last
 
     def rollout(self, pieces: Pieces, scene: Scenes) -> Rollout:
@@ -118,72 +117,60 @@ class Executor:
         clearance = configuration_clearances(arm.chain, arm.spheres, joints, every, np.zeros(len(time)))
         return Rollout(time, planned, joints, arm.hand(joints), contact, clearance[:, 0])
 
-    def _run_block(self, block: Segment, references: References, resume: bool, moving: bool) -> None:
-        """Execute one block."""
-        arm, timestep = self.simulator.arm, self.simulator.timestep
-        number = int(block.steps.max())
+    def _run_block(
+        self,
+        rows: Int,
+        steps: Int,
+        obstacles: Obstacles,
+        goal: Float,
+        references: References,
+        resume: bool,
+        moving: bool,
+    ) -> None:
+        """Execute episodes of about the same length; the arguments are those of :meth:`run`."""
+        simulator, arm, placed = self.simulator, self.simulator.arm, self._placed
+        timestep, number = simulator.timestep, int(steps.max())
         # A few steps more than needed, so that no control depends on the longest movement of the block.
-        motion = references(block.rows, number + CONTROL_STRIDE)
+        motion = references(rows, number + CONTROL_STRIDE)
         path, rates, accelerations = self.space.joint_motion(motion)
         controls = arm.controls(path, rates, accelerations, CONTROL_STRIDE)[:, :number]
         centres = None
         if moving:
             time = timestep * np.arange(number)[:, None, None]
-            centres = block.obstacles.centre[:, None] + time * block.obstacles.velocity[:, None]
-        log = self.simulator.rollout(block.rows, controls, block.steps, centres, resume=resume)
-        self._look_between(block, log)
-        steps = _measure(
-            arm.chain,
-            arm.spheres,
-            arm.reach,
+            centres = obstacles.centre[:, None] + time * obstacles.velocity[:, None]
+        joints, contact, unstable = simulator.rollout(rows, controls, steps, centres, resume=resume)
+        body = arm.chain, arm.spheres, arm.reach
+        # Contacts between two physics steps
+        for i, k, states in _risky_steps(
+            *body, joints, contact, steps, obstacles, timestep, simulator.thinnest, placed
+        ):
+            if not contact[i, : k + 1].any():
+                times = timestep * np.arange(k + 1, k + 3)[:, None, None]
+                places = obstacles.centre[i] + times * obstacles.velocity[i]
+                ends = joints[i, k : k + 2]
+                contact[i, k + 1] = simulator.touches_between(int(rows[i]), ends, places, states)
+        done = _measure(
+            *body,
             arm.joint_range,
             self.space.of_hand,
-            log.joints,
-            log.contact,
+            joints,
+            contact,
             motion.position,
             path,
-            block.steps,
-            block.obstacles,
+            steps,
+            obstacles,
             timestep,
-            block.goal,
+            goal,
             self.tolerance.goal,
             self.tolerance.speed,
             self.state,
-            block.rows,
-            self._placed,
+            rows,
+            placed,
         )
-        for i, row in enumerate(block.rows):
-            end = steps[i]
-            piece = log.joints[i, :end], motion.position[i, 1 : end + 1], log.contact[i, :end]
-            self.past[row].append(piece)
-        self.state.unstable[block.rows] |= log.unstable
-
-    def _look_between(self, block: Segment, log: SimulationLog) -> None:
-        """Mark contacts between physics steps, which bodies have that are thin compared with their way in a step."""
-        arm, timestep = self.simulator.arm, self.simulator.timestep
-        risky = _risky_steps(
-            arm.chain,
-            arm.spheres,
-            arm.reach,
-            log.joints,
-            log.contact,
-            block.steps,
-            block.obstacles,
-            timestep,
-            self.simulator.thinnest,
-            self._placed,
-        )
-        for i, k, number in risky:
-            if log.contact[i, : k + 1].any():
-                continue
-            ends = log.joints[i, k], log.joints[i, k + 1]
-            before, after = (
-                block.obstacles.centre[i] + timestep * (k + later) * block.obstacles.velocity[i]
-                for later in (1, 2)
-            )
-            log.contact[i, k + 1] = self.simulator.touches_between(
-                int(block.rows[i]), ends, (before, after), number
-            )
+        for i, row in enumerate(rows):
+            end = done[i]
+            self.past[row].append((joints[i, :end], motion.position[i, 1 : end + 1], contact[i, :end]))
+        self.state.unstable[rows] |= unstable
 
 
 @compiled
@@ -219,19 +206,8 @@ def _risky_steps(
     """Return steps in which the arm may have passed through something thin: scene, step, and states to look at.
 
     Bodies move by more than half their thickness in these steps, from a state without contact to another, and both
-    clearances together are less than the way: otherwise no state between them can be in contact.
-
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        reach: Reach of the joints.
-        joints: Joint positions after each step, shape (n, T, J), [rad].
-        contact: True where there is a contact at the state before a step, shape (n, T).
-        steps: Number of steps of each scene, shape (n,).
-        obstacles: Obstacles of n scenes.
-        timestep: Length of a step, [s].
-        thinnest: Half the thickness of the thinnest part of the arm, [m].
-        placed: Memory.
+    clearances together are less than the way: otherwise no state between them can be in contact. `thinnest` is half the
+    thickness of the thinnest part of the arm, [m]; the other arguments are those of :func:`_measure`.
     """
     found = [(0, 0, 0) for _ in range(0)]
     if obstacles.kind.shape[1] == 0:

@@ -160,38 +160,6 @@ class EpisodeState(NamedTuple):
         """True where the arm has been in contact, shape (N,)."""
         return np.asarray(self.first_contact >= 0)
 
-    @property
-    def sound(self) -> Bool:
-        """True where nothing rules out success so far, shape (N,)."""
-        return np.asarray(~self.collision & self.within & self.reachable & ~self.unstable)
-
-    def outcome(
-        self, success: Bool, goal_error: Float, duration: Float, straight_cost: Float, timestep: float
-    ) -> Outcome:
-        """Return the metrics so far, of which the first three are given.
-
-        `straight_cost` is the jerk cost of straight movements of these durations, shape (N,), and `timestep` the length
-        of a physics step, [s].
-        """
-        return Outcome(
-            is_success=success,
-            collision=self.collision,
-            first_contact_time=np.where(self.collision, self.first_contact * timestep, -1.0),
-            min_clearance=self.min_clearance.copy(),
-            self_clearance=self.self_clearance.copy(),
-            planned_clearance=self.planned_clearance.copy(),
-            goal_error=goal_error,
-            duration=duration,
-            path_length=self.path_length.copy(),
-            jerk_cost=self.jerk_cost.copy(),
-            jerk_ratio=np.maximum(self.jerk_cost / straight_cost, 1.0),
-            peak_speed=self.peak_speed.copy(),
-            tracking_error=np.sqrt(self.deviation / np.maximum(self.steps, 1)),
-            reachable=self.reachable.copy(),
-            unstable=self.unstable.copy(),
-            stretch=self.stretch.copy(),
-        )
-
 
 def straight_jerk_cost(length: Float, duration: Float | float) -> Float:
     """Return the jerk cost of straight minimum-jerk movements from rest to rest, [m^2/s^5] or [rad^2/s^5].

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -12,7 +11,7 @@ from mujoco import batch
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.obstacles import MESH, Obstacles, geoms_of
+from viapoint.envs.geometry.obstacles import MESH, Obstacles, geom_fields, geom_meshes, quaternions_of
 
 OUT_OF_THE_WAY = np.array([0.0, 0.0, -10.0])
 """Position of absent obstacles, [m]."""
@@ -20,47 +19,6 @@ MOVING = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_P
 """Parts of a control sequence with moving obstacles: controls, then the obstacles' positions."""
 MOST_BETWEEN = 64
 """Greatest number of states between two physics steps that are checked for contact."""
-
-
-class SimulationLog(NamedTuple):
-    """Record of n simulations over T physics steps."""
-
-    joints: Float
-    """Joint positions after each step, shape (n, T, J), [rad]."""
-    contact: Bool
-    """True where there is a contact at the state before a step, shape (n, T)."""
-    unstable: Bool
-    """True for simulations that MuJoCo stopped with a warning, shape (n,)."""
-
-
-class MeshGeom(NamedTuple):
-    """Geom of a mesh as MuJoCo compiled it: in a frame of its own, along the axes of inertia of the mesh."""
-
-    mesh: int
-    """Index of the mesh in the model."""
-    position: Float
-    """Origin of the frame in that of the shape, shape (3,), [m]."""
-    quaternion: Float
-    """Orientation of the frame in that of the shape, shape (4,)."""
-    size: Float
-    """Shape (3,), [m]."""
-    bound: float
-    """Radius of the bounding sphere, [m]."""
-    box: Float
-    """Centre and half lengths of the bounding box, shape (6,), [m]."""
-
-    @classmethod
-    def of_model(cls, model: mujoco.MjModel, name: str) -> MeshGeom:
-        """Return the geom of a name."""
-        geom = model.geom(name)
-        return cls(
-            mesh=int(geom.dataid[0]),
-            position=geom.pos.copy(),
-            quaternion=geom.quat.copy(),
-            size=geom.size.copy(),
-            bound=float(geom.rbound[0]),
-            box=model.geom_aabb[geom.id].copy(),
-        )
 
 
 class Simulator:
@@ -87,24 +45,19 @@ class Simulator:
         """Half the thickness of the thinnest geom of the arm that can touch an obstacle, [m]."""
         self._rest = self.batch.state[0].copy()
         self._geoms = np.array([self.model.geom(f"obstacle_{row}").id for row in range(n_obstacles)], int)
-        self._meshes = {name: MeshGeom.of_model(self.model, f"mesh_{name}_0") for name in meshes}
-        self._fields: dict[str, Any] = {}
+        self._meshes = tuple(meshes)
+        fields = []
         if n_obstacles:
-            names = (
-                "geom_type",
-                "geom_size",
-                "geom_rbound",
-                "geom_aabb",
-                *(("geom_dataid",) if meshes else ()),
-            )
-            self._fields = {name: self.batch.expand(name) for name in names}
+            fields = ["geom_type", "geom_size", "geom_rbound", "geom_aabb"]
+            fields += ["geom_dataid"] if meshes else []
+        self._fields = {name: self.batch.expand(name) for name in fields}
         self._offset = np.zeros((num_envs, n_obstacles, 3))
         self._present = np.zeros((num_envs, n_obstacles), bool)
         self._probe: tuple[mujoco.MjModel, mujoco.MjData] | None = None
 
     def single(self) -> Simulator:
         """Return a simulator of the same arm and as many obstacles, with one simulation."""
-        return Simulator(self.arm, n_obstacles=len(self._geoms), num_envs=1, meshes=tuple(self._meshes))
+        return Simulator(self.arm, n_obstacles=len(self._geoms), num_envs=1, meshes=self._meshes)
 
     def place(self, sims: Int, joints: Float, obstacles: Obstacles) -> None:
         """Place the arms of n simulations at rest at joint positions (n, J), and the obstacles of n scenes."""
@@ -112,19 +65,18 @@ class Simulator:
         self.batch.bind("qpos")[sims] = joints
         if not len(self._geoms):
             return
-        geoms = geoms_of(obstacles)
-        rows = np.ix_(sims, self._geoms)
-        self._fields["geom_type"][rows] = geoms.type
-        self._fields["geom_size"][rows] = geoms.size
-        self._fields["geom_rbound"][rows] = geoms.bound
-        self._fields["geom_aabb"][rows] = geoms.box
-        position = geoms.position.copy()
-        quaternion = geoms.quaternion.copy()
+        for name, values in geom_fields(obstacles).items():
+            self._fields[name][np.ix_(sims, self._geoms)] = values
+        position, quaternion = obstacles.centre.copy(), quaternions_of(obstacles.rotation)
+        names = geom_meshes(obstacles)
         for scene, row in np.argwhere(obstacles.kind == MESH):
-            mesh = self._meshes[geoms.mesh[scene, row]]
-            self._put_mesh(mesh, int(sims[scene]), int(self._geoms[row]))
-            position[scene, row] += obstacles.rotation[scene, row] @ mesh.position
-            mujoco.mju_mulQuat(quaternion[scene, row], geoms.quaternion[scene, row], mesh.quaternion)
+            # MuJoCo gives the geom of a mesh a frame of its own, along the axes of inertia.
+            mesh = self.model.geom(f"mesh_{names[scene, row]}_0").id
+            for name, field in self._fields.items():
+                field[sims[scene], self._geoms[row]] = getattr(self.model, name)[mesh]
+            position[scene, row] += obstacles.rotation[scene, row] @ self.model.geom_pos[mesh]
+            outer = quaternion[scene, row].copy()
+            mujoco.mju_mulQuat(quaternion[scene, row], outer, self.model.geom_quat[mesh])
         self._offset[sims] = position - obstacles.centre
         self._present[sims] = obstacles.present
         self.batch.bind("mocap_pos")[sims] = np.where(obstacles.present[..., None], position, OUT_OF_THE_WAY)
@@ -132,7 +84,7 @@ class Simulator:
 
     def rollout(
         self, sims: Int, controls: Float, steps: Int, centres: Float | None = None, *, resume: bool = False
-    ) -> SimulationLog:
+    ) -> tuple[Float, Bool, Bool]:
         """Run n simulations, in increasing order, each for its own number of steps, 1 to T.
 
         All run for T steps. To `resume` later, each is set back to its state after its own steps.
@@ -143,12 +95,16 @@ class Simulator:
             steps: Steps of each simulation, shape (n,).
             centres: Centres of moving obstacles before each step, shape (n, T, rows, 3), [m]; None if all rest.
             resume: True if the simulations go on afterwards.
+
+        Returns:
+            Joint positions after each step, shape (n, T, J), [rad]; True where there is a contact at the state before a
+            step, shape (n, T); True for simulations that MuJoCo stopped with a warning, shape (n,).
         """
         number = controls.shape[1]
-        warnings = self._warnings(sims)
-        kept = (
-            ("qpos", "qvel", "qacc_warmstart", *(("act",) if self.model.na else ())) if resume else ("qpos",)
-        )
+        warnings = self.batch.warning[sims].copy()
+        kept = ["qpos"]
+        if resume:
+            kept += ["qvel", "qacc_warmstart", *(["act"] if self.model.na else [])]
         if centres is None:
             out = self.batch.rollout(number, controls, record=(*kept, "ncon"), ids=sims)
         else:
@@ -167,19 +123,17 @@ class Simulator:
         joints, contact = out["qpos"], out["ncon"] > 0
         # A simulation that stops repeats its record; one that went on after its own steps was sound in them.
         stopped = (joints[each, last] == joints[:, -1]).all(axis=-1)
-        unstable = (self._warnings(sims) > warnings) & stopped
-        unstable |= ~np.isfinite(joints[each, last]).all(axis=-1)
-        return SimulationLog(joints, contact, unstable)
+        warned = (self.batch.warning[sims] > warnings).reshape(len(sims), -1).any(axis=-1)
+        unstable = (warned & stopped) | ~np.isfinite(joints[each, last]).all(axis=-1)
+        return joints, contact, unstable
 
-    def touches_between(
-        self, sim: int, joints: tuple[Float, Float], centres: tuple[Float, Float], number: int
-    ) -> bool:
+    def touches_between(self, sim: int, joints: Float, centres: Float, number: int) -> bool:
         """Return True if there is a contact between two physics steps, at `number` states on a straight line.
 
         Args:
             sim: Index of the simulation.
-            joints: Joint positions at both steps, shape (J,) each, [rad].
-            centres: Centres of the obstacles at both steps, shape (rows, 3) each, [m].
+            joints: Joint positions at both steps, shape (2, J), [rad].
+            centres: Centres of the obstacles at both steps, shape (2, rows, 3), [m].
             number: Number of states between the steps that are looked at.
         """
         if self._probe is None:
@@ -204,17 +158,6 @@ class Simulator:
         places = np.where(self._present[sim][:, None], centres + self._offset[sim], OUT_OF_THE_WAY)
         data.mocap_pos[:] = places
         data.mocap_quat[:] = self.batch.bind("mocap_quat")[sim].reshape(-1, 4)
-
-    def _put_mesh(self, mesh: MeshGeom, sim: int, geom: int) -> None:
-        """Make a geom that of a mesh."""
-        self._fields["geom_type"][sim, geom] = mujoco.mjtGeom.mjGEOM_MESH
-        self._fields["geom_dataid"][sim, geom] = mesh.mesh
-        self._fields["geom_size"][sim, geom] = mesh.size
-        self._fields["geom_rbound"][sim, geom] = mesh.bound
-        self._fields["geom_aabb"][sim, geom] = mesh.box
-
-    def _warnings(self, sims: Int) -> Any:
-        return self.batch.warning[sims].reshape(len(sims), -1).sum(axis=-1)
 
 
 def _thinnest_geom(model: mujoco.MjModel) -> float:

@@ -19,15 +19,13 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.common.types import Bool, Float, Int, Observation
 from viapoint.envs.common.validation import (
     as_given,
-    checked_actions,
     finite_array,
     masked_rows,
-    reset_options,
     seeds_of,
     whole_number,
 )
 from viapoint.envs.episodes import Decision, Episodes, History
-from viapoint.envs.geometry.obstacles import check_simulated
+from viapoint.envs.geometry.obstacles import geom_meshes
 from viapoint.envs.outcome import Rollout
 from viapoint.envs.plans import Plan
 from viapoint.envs.rendering.renderer import RENDER_MODES, EpisodeRenderer
@@ -112,7 +110,11 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self.task = Task.of(**task)
         """Task of an episode: what an agent may compute with before it moves."""
         self.num_envs = whole_number("num_envs", num_envs, 1)
-        self.autoreset_mode = _mode_of(autoreset_mode)
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            modes = ", ".join(mode.value for mode in AutoresetMode)
+            raise ValueError(f"autoreset_mode must be one of {modes}, got {autoreset_mode!r}") from None
         self.metadata = {**SINGLE_METADATA, "autoreset_mode": self.autoreset_mode}
         self.render_mode = render_mode
         number = whole_number("threads", threads, 0) or os.cpu_count() or 1
@@ -162,7 +164,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """Scenes of the running episodes; None before the first reset."""
         if not self._running:
             return None
-        return Scenes.together([each.scenes for each in self._episodes if each.scenes is not None])
+        return Scenes.together([each.scenes for each in self._episodes])
 
     @property
     def last_rollout(self) -> tuple[Rollout, ...]:
@@ -200,21 +202,26 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Raises:
             ValueError: A given scene is impossible; the environments are unchanged.
         """
-        options = reset_options(options)
-        self._check_changes(options)
+        if options is not None and not isinstance(options, Mapping):
+            raise ValueError(f"options must be a mapping from names to values, or None, got {options!r}")
+        options = dict(options or {})
+        for name in ("jumps", "turns"):
+            if name in options and not self.task.replanning:
+                raise ValueError(
+                    f"options[{name!r}] need an environment with decide_at=('target', ...), which are events of a "
+                    f"movement; here it is {self.task.decide_at!r}"
+                )
         rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self._running)
         generators, first_seed = self._seeded(seed, rows)
         # Nothing changes before all scenes are there: impossible ones raise an error.
         tried = [copy.deepcopy(generators[i]) for i in rows]
         scenes = draw_given(options, self._samplers[0], tried)
-        check_simulated(scenes.obstacles)
+        geom_meshes(scenes.obstacles)
         for i, generator in zip(rows, tried, strict=True):
             generators[i] = generator
         self.generators = generators
         self._np_random, self._np_random_seed = generators[0], first_seed
         self._start(rows, scenes)
-        for flags in (self.terminated, self.truncated, self._over):
-            flags[rows] = False
         if self.render_mode == "human":
             self._renderers[0].render()
         return self.observe(), {}
@@ -235,10 +242,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             raise gym.error.ResetNeeded(
                 f"episode {int(over.argmax())} is over: call reset(options={{'reset_mask': ...}}) before step()"
             )
-        actions = checked_actions(actions, self.num_envs, self.action_names)
-        decision = self._joined(
-            self._each(lambda episodes, share: episodes.decide(actions[share], ~over[share]))
-        )
+        decision = self._decide(actions, ~over)
         if over.any():  # with next-step autoreset, the next episodes begin instead
             self._restart(over)
             for part in (decision.reward, *decision.info.values()):
@@ -250,10 +254,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def begin(self, scenes: Scenes) -> Observation:
         """Start scenes that were drawn or checked before, one in each environment, and return first observations."""
-        rows = np.arange(self.num_envs)
-        self._start(rows, scenes)
-        for flags in (self.terminated, self.truncated, self._over):
-            flags[rows] = False
+        self._start(np.arange(self.num_envs), scenes)
         return self.observe()
 
     def execute_actions(self, actions: Any, active: Bool | None = None) -> Decision:
@@ -267,11 +268,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                 nothing.
         """
         self._check_running()
-        actions = checked_actions(actions, self.num_envs, self.action_names)
-        some = np.ones(self.num_envs, bool) if active is None else active
-        decision = self._joined(
-            self._each(lambda episodes, share: episodes.decide(actions[share], some[share]))
-        )
+        decision = self._decide(actions, np.ones(self.num_envs, bool) if active is None else active)
         self._show()
         return decision
 
@@ -289,11 +286,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         durations = finite_array("durations of the plan", plan.durations, (self.num_envs, None))
         whole = Plan(waypoints, durations)
         # Nothing moves before all plans are checked.
-        plans = {
-            id(episodes): episodes.checked(whole.take(share))
-            for episodes, share in zip(self._episodes, self._shares, strict=True)
-        }
-        return self._joined(self._each(lambda episodes, share: episodes.execute(plans[id(episodes)])))
+        plans = {}
+        for episodes, share in zip(self._episodes, self._shares, strict=True):
+            plans[episodes] = episodes.checked(whole.take(share))
+        return self._joined(self._each(lambda episodes, _: episodes.execute(plans[episodes])))
 
     def move_goals(self, goals: Any) -> Observation:
         """Move the targets of the running episodes, which jump no more, and return the new observations.
@@ -314,8 +310,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             row = int(inside.argmin())
             raise ValueError(f"goals must be within the arm's reach, got {goals[row].tolist()} in row {row}")
         joints = space.joints(goals)
-        assert self.scenes is not None
-        check_jumps(self.scenes._replace(goal=joints), self.arm)
+        scenes = Scenes.together([each.scenes for each in self._episodes])
+        check_jumps(scenes._replace(goal=joints), self.arm)
         self._each(lambda episodes, share: episodes.move_goals(joints[share]))
         return self.observe()
 
@@ -401,6 +397,15 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             self._pool = ThreadPoolExecutor(len(self._shares), thread_name_prefix="viapoint")
         return list(self._pool.map(job, self._episodes, self._shares))
 
+    def _decide(self, actions: Any, active: Bool) -> Decision:
+        """Make one decision in some environments; results of others mean nothing."""
+        name = f"actions of all environments ({', '.join(self.action_names)})"
+        actions = finite_array(name, actions, (self.num_envs, len(self.action_names)))
+        actions = np.clip(actions, -1.0, 1.0)
+        return self._joined(
+            self._each(lambda episodes, share: episodes.decide(actions[share], active[share]))
+        )
+
     def _joined(self, parts: list[Decision]) -> Decision:
         """Return the decisions of all environments together."""
         observation = _together([part.observation for part in parts])
@@ -454,16 +459,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             inside = np.isin(rows, share)
             if inside.any():
                 episodes.start(rows[inside] - share[0], scenes.take(inside))
+        for flags in (self.terminated, self.truncated, self._over):
+            flags[rows] = False
         self._running = True
-
-    def _check_changes(self, options: Mapping[str, Any]) -> None:
-        """Check that the task has decisions during a movement, if a scene is to change."""
-        for name in ("jumps", "turns"):
-            if name in options and not self.task.replanning:
-                raise ValueError(
-                    f"options[{name!r}] need an environment with decide_at=('target', ...), which are events of a "
-                    f"movement; here it is {self.task.decide_at!r}"
-                )
 
     def _check_running(self) -> None:
         """Raise an error before the first reset."""
@@ -489,12 +487,3 @@ def _together(parts: list[dict[str, Any]]) -> dict[str, Any]:
     if len(parts) == 1:
         return parts[0]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
-    """Return an autoreset mode from itself or its name."""
-    try:
-        return AutoresetMode(mode)
-    except ValueError:
-        names = ", ".join(each.value for each in AutoresetMode)
-        raise ValueError(f"autoreset_mode must be one of {names}, got {mode!r}") from None

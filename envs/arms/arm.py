@@ -195,14 +195,14 @@ def arm_from_xml(
     """
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
-    chain, links = _chain(model, data, tuple(joints), tool)
+    chain, links, frames = _chain(model, data, tuple(joints), tool)
+    capsules = _capsules(model, data, links, frames)
     home = np.array(home, dtype=np.float64)
     data.qpos[model.jnt_qposadr[[model.joint(each).id for each in joints]]] = home
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     bodies = [model.body(i).name for i in range(1, model.nbody) if model.body(i).name in links]
     touching = touching_at_home(model, data, bodies)
-    capsules = _capsules(model, chain, tuple(joints), links)
     covered = cover(chain, capsules, links, home, touching, exclude or {})
     ranges = np.array([model.joint(each).range for each in joints])
     covered = _without_distant_pairs(chain, covered, ranges)
@@ -299,8 +299,8 @@ def _controls(
 
 def _chain(
     model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[str, ...], tool: str
-) -> tuple[Chain, dict[str, int]]:
-    """Return the chain of some joints, and the link that each body of the arm moves with.
+) -> tuple[Chain, dict[str, int], list[tuple[Float, Float]]]:
+    """Return the chain of some joints, the link that each body of the arm moves with, and frames of links at 0.
 
     Bodies that are fixed to the world and have collision geoms are the base.
     """
@@ -313,6 +313,7 @@ def _chain(
         turn = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
         frames.append((_with_last_axis(turn, data.xaxis[joint]), data.xanchor[joint].copy()))
     links: dict[str, int] = {}
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     moved: list[list[int]] = [[] for _ in joints]
     of_body = {int(model.jnt_bodyid[joint]): link + 1 for link, joint in enumerate(numbers)}
     for body in range(1, model.nbody):
@@ -320,7 +321,7 @@ def _chain(
         if carrier in of_body:
             links[model.body(body).name] = of_body[carrier]
             moved[of_body[carrier] - 1].append(body)
-        elif carrier == 0 and _collides(model, body):
+        elif carrier == 0 and (collides & (model.geom_bodyid == body)).any():
             links[model.body(body).name] = 0
     mass, centre, inertia = np.zeros(len(joints)), np.zeros((len(joints), 3)), np.zeros((len(joints), 3, 3))
     for link, bodies in enumerate(moved):
@@ -352,21 +353,16 @@ def _chain(
         gravity=model.opt.gravity.copy(),
         first_two=FirstTwo.of(origin, rotation, tool_origin),
     )
-    return chain, links
+    return chain, links, frames
 
 
 def _capsules(
-    model: mujoco.MjModel, chain: Chain, joints: tuple[str, ...], links: dict[str, int]
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    links: dict[str, int],
+    frames: list[tuple[Float, Float]],
 ) -> list[Capsule]:
-    """Return the collision geoms of the arm in the frames of its links."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = 0.0
-    mujoco.mj_kinematics(model, data)
-    rotation = [np.eye(3)]
-    origin = [np.zeros(3)]
-    for turn, shift in zip(chain.rotation, chain.origin, strict=True):
-        origin.append(origin[-1] + rotation[-1] @ shift)
-        rotation.append(rotation[-1] @ turn)
+    """Return the collision geoms of the arm, whose joints are at 0, in the frames of its links."""
     found = []
     for geom in range(model.ngeom):
         name = model.body(model.geom_bodyid[geom]).name
@@ -379,16 +375,10 @@ def _capsules(
             )
         half = size[1] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
         axis = half * data.geom_xmat[geom].reshape(3, 3)[:, 2]
-        link = links[name]
-        ends = [rotation[link].T @ (data.geom_xpos[geom] + way * axis - origin[link]) for way in (-1.0, 1.0)]
-        found.append(Capsule(name, ends[0], ends[1], float(size[0])))
+        turn, place = frames[links[name]]
+        centre = data.geom_xpos[geom] - place
+        found.append(Capsule(name, turn.T @ (centre - axis), turn.T @ (centre + axis), float(size[0])))
     return found
-
-
-def _collides(model: mujoco.MjModel, body: int) -> bool:
-    """Return True for a body with a geom that takes part in contacts."""
-    geoms = model.geom_bodyid == body
-    return bool((geoms & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))).any())
 
 
 def _set_contacts(spec: mujoco.MjSpec, arm: Arm) -> None:

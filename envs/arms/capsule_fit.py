@@ -54,6 +54,8 @@ class FittedCapsule(NamedTuple):
     """Greatest distance of a point of the capsule from the geom, [m]."""
     corners: Float
     """Corners of the piece of the geom that the capsule was fitted to, shape (n, 3), [m]; none if it is exact."""
+    geom: int = -1
+    """Number of the geom."""
 
 
 class Body(NamedTuple):
@@ -80,20 +82,20 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
     if kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE):
         half = size[1] if kind == Geom.mjGEOM_CAPSULE else 0.0
         ends = np.array([(0.0, 0.0, -half), (0.0, 0.0, half)])
-        return [FittedCapsule(ends, float(size[0]), 0.0, np.empty((0, 3)))]
+        return [FittedCapsule(ends, float(size[0]), 0.0, np.empty((0, 3)), geom)]
     try:
         corners, larger = polytope_around(model, geom)
         found = cover_points(corners, tolerance - larger)
     except ValueError as error:
         raise ValueError(f"geom {model.geom(geom).name or geom}: {error}") from None
-    return [each._replace(excess=each.excess + larger) for each in found]
+    return [each._replace(excess=each.excess + larger, geom=geom) for each in found]
 
 
-def split(model: mujoco.MjModel, geom: int, capsule: FittedCapsule) -> list[FittedCapsule]:
+def split(model: mujoco.MjModel, capsule: FittedCapsule) -> list[FittedCapsule]:
     """Return two capsules with less excess that together contain what a capsule of :func:`cover_geom` contains."""
-    corners, larger = polytope_around(model, geom)
+    corners, larger = polytope_around(model, capsule.geom)
     halves = _best_halves(capsule.corners, _body(corners), 0.5 * (capsule.excess - larger))
-    return [each._replace(excess=each.excess + larger) for each in halves]
+    return [each._replace(excess=each.excess + larger, geom=capsule.geom) for each in halves]
 
 
 def polytope_around(model: mujoco.MjModel, geom: int) -> tuple[Float, float]:

@@ -76,38 +76,46 @@ def choose_tool(model: mujoco.MjModel, given: Any, base: str | None) -> Tool:
     if isinstance(given, str):
         return _named_tool(model, given)
     if given is not None:
-        return _tool_at_point(model, given)
-    inside = _under(model, base)
+        try:
+            name, point = given
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"tool must be a site, a body, or a pair of body and point, got {given!r:.60}"
+            ) from None
+        tool = _named_tool(model, name, "body")
+        return tool._replace(position=finite_array("tool", point, (3,)), name=f"a point of {name!r}")
+    names = [model.body(index).name for index in range(1, model.nbody)]
+    if base is not None and base not in names:
+        raise ValueError(
+            f"there is no body {base!r} in the file; there are: {', '.join(filter(None, names))}"
+        )
+    root = 0 if base is None else int(model.body(base).id)
+    chains: dict[int, list[str]] = {}
+    for body in range(model.nbody):
+        chain = chain_joints(model, body, base)
+        if root in (body, *ancestors(model, body)) and len(chain) >= LEAST_CHAIN:
+            chains[body] = chain
     for pattern in TOOL_NAMES:
         for kind, number in (("site", model.nsite), ("body", model.nbody)):
-            bodies: dict[int, str] = {}
+            found: dict[int, str] = {}
             for index in range(number):
                 part = getattr(model, kind)(index)
                 body = int(part.bodyid[0]) if kind == "site" else index
-                if (
-                    inside(body)
-                    and len(chain_joints(model, body, base)) >= LEAST_CHAIN
-                    and _fits(pattern, part.name)
-                ):
-                    bodies.setdefault(body, part.name)
-            names = list(bodies.values())
-            if len(names) == 1:
-                return _named_tool(model, names[0], kind)
-            if len(names) > 1:
-                last = {tuple(chain_joints(model, body, base)): name for body, name in bodies.items()}
-                longest = max(last, key=len)
-                if all(set(chain) <= set(longest) for chain in last):
-                    return _named_tool(model, last[longest], kind)
+                # The name of the robot may be its prefix.
+                fits = re.fullmatch(rf"(.*[_/:])?{pattern}", part.name, re.IGNORECASE)
+                if fits and body in chains:
+                    found.setdefault(body, part.name)
+            if not found:
+                continue
+            # Of several on one chain, the last one counts.
+            last = max(reversed(found), key=lambda body: len(chains[body]))
+            if any(not set(chains[body]) <= set(chains[last]) for body in found):
                 raise ValueError(
-                    f"there are several tools: {', '.join(names)}; name one with tool=, or a side with base="
+                    f"there are several tools: {', '.join(found.values())}; name one with tool=, or a side with base="
                 )
+            return _named_tool(model, found[last], kind)
     body = _tip(model, base)
     return Tool(body, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), f"the frame of {model.body(body).name!r}")
-
-
-def _fits(pattern: str, name: str) -> bool:
-    """Return True if a name, without the prefix of its robot, fits a pattern."""
-    return re.fullmatch(rf"(.*[_/:])?{pattern}", name, re.IGNORECASE) is not None
 
 
 def _named_tool(model: mujoco.MjModel, name: str, kind: str = "") -> Tool:
@@ -123,18 +131,6 @@ def _named_tool(model: mujoco.MjModel, name: str, kind: str = "") -> Tool:
         f"there is no site or body {name!r} in the file; sites are {', '.join(filter(None, sites)) or 'none'}; bodies "
         f"are {', '.join(filter(None, bodies)) or 'none'}"
     )
-
-
-def _tool_at_point(model: mujoco.MjModel, given: Any) -> Tool:
-    """Return a point of a body as the tool."""
-    try:
-        name, point = given
-    except (TypeError, ValueError):
-        raise ValueError(
-            f"tool must be a site, a body, or a pair of body and point, got {given!r:.60}"
-        ) from None
-    found = _named_tool(model, name, "body")
-    return found._replace(position=finite_array("tool", point, (3,)), name=f"a point of {name!r}")
 
 
 def chain_joints(model: mujoco.MjModel, body: int, base: str | None = None) -> list[str]:
@@ -185,23 +181,6 @@ def ancestors(model: mujoco.MjModel, body: int) -> list[int]:
         body = int(model.body_parentid[body])
         found.append(body)
     return found
-
-
-def _under(model: mujoco.MjModel, base: str | None) -> Callable[[int], bool]:
-    """Return a function that tells whether a body hangs on the base.
-
-    Raises:
-        ValueError: There is no such body.
-    """
-    if base is None:
-        return lambda body: True
-    names = [model.body(index).name for index in range(1, model.nbody)]
-    if base not in names:
-        raise ValueError(
-            f"there is no body {base!r} in the file; there are: {', '.join(filter(None, names))}"
-        )
-    root = int(model.body(base).id)
-    return lambda body: root in (body, *ancestors(model, body))
 
 
 def _tip(model: mujoco.MjModel, base: str | None) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.chain import Chain
-from viapoint.envs.arms.kinematics import jacobians, link_frames, tool_jacobian, transform
+from viapoint.envs.arms.kinematics import link_frames, tool_jacobian, transform
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.compiled import compiled
@@ -56,7 +56,7 @@ def solve_symmetric(matrix: Float, vector: Float, number: int) -> None:
 
 
 @compiled
-def _descend(
+def descend(
     chain: Chain,
     joint_range: Float,
     position: Float,
@@ -142,31 +142,6 @@ def _descend(
         if moved < STALLED:
             break
     return away
-
-
-@compiled
-def solve_pose(
-    chain: Chain,
-    joint_range: Float,
-    position: Float,
-    axes: Float,
-    joints: Float,
-    rotation: Float,
-    origin: Float,
-) -> bool:
-    """Move joints from where they are so that the tool has a place and axes; return False if that fails.
-
-    The arguments are those of :func:`_descend`.
-    """
-    return _descend(chain, joint_range, position, axes, True, joints, rotation, origin) == 0.0
-
-
-@compiled
-def solve_position(
-    chain: Chain, joint_range: Float, position: Float, joints: Float, rotation: Float, origin: Float
-) -> bool:
-    """Move joints from where they are so that the tool has a place; return False if that fails."""
-    return _descend(chain, joint_range, position, np.zeros((3, 3)), False, joints, rotation, origin) == 0.0
 
 
 @compiled
@@ -302,7 +277,6 @@ def _least_distance(arm: Arm, position: Float, begin: Float) -> float:
         found = least_squares(
             lambda joints: arm.hand(joints) - position,
             np.clip(configuration, low + INSIDE, high - INSIDE),
-            jac=lambda joints: jacobians(arm.chain, joints)[:3],
             bounds=(low, high),
         )
         least = min(least, float(np.linalg.norm(found.fun)))
@@ -356,7 +330,7 @@ def inverse_kinematics(
     rotation, origin = np.empty((joints + 1, 3, 3)), np.empty((joints + 1, 3))
     found: list[Float] = []
     for configuration in begin.copy():
-        error = _descend(
+        error = descend(
             arm.chain,
             arm.joint_range,
             position,

@@ -263,17 +263,6 @@ def _all_tools(chain: Chain, joints: Float, tool_rotation: Float, tool_origin: F
 
 
 @compiled
-def _all_jacobians(chain: Chain, joints: Float, jacobian: Float) -> None:
-    n_joints = joints.shape[1]
-    rotation, origin = np.empty((n_joints + 1, 3, 3)), np.empty((n_joints + 1, 3))
-    tool_rotation, tool_origin = np.empty((3, 3)), np.empty(3)
-    for n in range(joints.shape[0]):
-        link_frames(chain, joints[n], rotation, origin)
-        tool_frame(chain, rotation, origin, tool_rotation, tool_origin)
-        tool_jacobian(chain, rotation, origin, tool_origin, jacobian[n])
-
-
-@compiled
 def _all_torques(chain: Chain, q: Float, v: Float, a: Float, torque: Float) -> None:
     for n in range(q.shape[0]):
         inverse_dynamics(chain, q[n], v[n], a[n], torque[n])
@@ -321,14 +310,6 @@ def link_poses(chain: Chain, joints: Float) -> tuple[Float, Float]:
     rotation, origin = np.empty((len(flat), links, 3, 3)), np.empty((len(flat), links, 3))
     _all_frames(chain, flat, rotation, origin)
     return rotation.reshape(*batch, links, 3, 3), origin.reshape(*batch, links, 3)
-
-
-def jacobians(chain: Chain, joints: Float) -> Float:
-    """Return the derivatives of the tool's position and rotation vector by the joints, (..., 6, J), world axes."""
-    flat, batch = _flat("joints", chain, joints)
-    jacobian = np.empty((len(flat), 6, flat.shape[1]))
-    _all_jacobians(chain, flat, jacobian)
-    return jacobian.reshape(*batch, 6, flat.shape[1])
 
 
 def torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:

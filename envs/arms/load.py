@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,12 +16,12 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
-from viapoint.envs.arms.cache import key_of, read_arm, write_arm
 from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
 from viapoint.envs.arms.choices import (
     KNOWN_TORQUES,
     KNOWN_VELOCITIES,
     LEAST_GAP,
+    Tool,
     ancestors,
     arm_joints,
     chain_joints,
@@ -29,6 +30,7 @@ from viapoint.envs.arms.choices import (
     known_limits,
 )
 from viapoint.envs.arms.kinematics import torques
+from viapoint.envs.arms.stored import cached_path, read_cached, write_cached
 from viapoint.envs.arms.urdf import Urdf, read_urdf
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least
@@ -47,8 +49,6 @@ WARNING = "warning: "
 """Beginning of notes that are told as warnings, too."""
 GENERIC_NAMES = ("arm", "model", "robot", "scene")
 """Names of files that do not tell the arm; it gets the name of the model."""
-TOOL = "viapoint_tool"
-"""Name of the site that is added for the tool."""
 MIN_JOINTS = 2
 """Least number of joints."""
 MIN_TOLERANCE, MAX_TOLERANCE = 0.005, 1.0
@@ -59,8 +59,6 @@ LEFT_SHARE, LEFT_MOST = 0.25, 0.002
 """Distance at home that capsules leave between bodies, as a share of that of the geoms, and at most, [m]."""
 LEAST_EXCESS = 0.001
 """Excess of capsules below which they are not split, [m]."""
-POSITION_TOLERANCE = 1e-6
-"""Greatest difference of positions and axes that count as equal, [m]."""
 MIN_INERTIA = 1e-12
 """Least principal moment of inertia of a body, [kg m^2]."""
 INERTIA_MARGIN = 2e-5
@@ -76,24 +74,33 @@ RESERVED = ("", "world", "meshes")
 class Parsed(NamedTuple):
     """Arm in the form of its file."""
 
-    whole: mujoco.MjModel
-    """Model of the file."""
     model: mujoco.MjModel
-    """Model with the arm's joints only; all other joints are fixed. Bodies and geoms have the same numbers."""
+    """Model of the file."""
     rest: mujoco.MjData
-    """Places with all joints at 0."""
+    """Places with the arm's joints at 0, and all others as in the first keyframe or at their reference."""
+    moved: mujoco.MjData
+    """Places in any configuration."""
     joints: tuple[str, ...]
+    tool: Tool
     links: dict[int, int]
     """Link of each body of the arm, 0 for the base, in the order of the file."""
+    names: dict[int, str]
+    """Names of these bodies in the model of the arm: those of the file, where it has free ones."""
     geoms: dict[int, list[int]]
     """Geoms of each of these bodies that count for collisions; bodies without any are left out."""
 
+    def pair(self, bodies: tuple[int, int]) -> frozenset[str]:
+        """Return the names of a pair of bodies."""
+        return frozenset(self.names[body] for body in bodies)
 
-class Fit(NamedTuple):
-    """Capsule of a body, and the geom that it covers."""
-
-    geom: int
-    capsule: FittedCapsule
+    def compared(self, exclude: Mapping[frozenset[str], str]) -> list[tuple[int, int]]:
+        """Return the pairs of bodies with geoms of links that are neither the same nor consecutive, nor excluded."""
+        found = []
+        for first, second in itertools.combinations(self.geoms, 2):
+            apart = abs(self.links[first] - self.links[second])
+            if apart > 1 and self.pair((first, second)) not in exclude:
+                found.append((first, second))
+        return found
 
 
 def load_arm(
@@ -165,11 +172,11 @@ def load_arm(
     }
     notes = list(urdf.notes)
     whole = _compiled(spec, notes)
-    key = key_of(whole, {**given, "name": name, "notes": notes, "urdf": urdf[2:]})
-    arm = read_arm(key)
+    path = cached_path(whole, {**given, "name": name, "notes": notes, "urdf": urdf[2:]})
+    arm = read_cached(path)
     if arm is None:
-        arm = _load(spec, whole, name, urdf, notes, **given)
-        write_arm(key, arm)
+        arm = _load(whole, name, f"{name} {spec.modelname}", urdf, notes, **given)
+        write_cached(path, arm)
     for note in arm.notes:
         if note.startswith(WARNING):
             warnings.warn(note.removeprefix(WARNING), stacklevel=2)
@@ -177,9 +184,9 @@ def load_arm(
 
 
 def _load(
-    spec: mujoco.MjSpec,
     whole: mujoco.MjModel,
     name: str,
+    known_as: str,
     urdf: Urdf,
     notes: list[str],
     *,
@@ -193,53 +200,48 @@ def _load(
     velocity_limit: Any,
     tolerance: float,
 ) -> Arm:
-    """Return the arm of a compiled specification, which is changed; see :func:`load_arm`."""
+    """Return the arm of a model; see :func:`load_arm`."""
     chosen = choose_tool(whole, tool, base)
     notes.insert(0, f"tool: {chosen.name!r}")
-    if joints is None:
+    names = joints
+    if names is None:
         names = _joint_names(arm_joints(whole, chain_joints(whole, chosen.body, base), notes))
         notes.append(f"joints: {', '.join(names)}")
-    else:
-        names = joints
-        _check_exist("joint", names, [joint.name for joint in spec.joints])
-    carrier = next(body for body in spec.bodies if body.id == chosen.body)
-    carrier.add_site(name=TOOL, pos=chosen.position, quat=chosen.quaternion)
+    there = [whole.joint(index).name for index in range(whole.njnt)]
+    missing = [each for each in names if each not in there]
+    if missing:
+        named = ", ".join(filter(None, there)) or "none"
+        raise ValueError(f"there is no joint {', '.join(map(repr, missing))} in the file; there are: {named}")
     ranges = _ranges(whole, names, joint_range, notes)
-    known_as = f"{name} {spec.modelname}"
     velocity = _velocities(whole, names, velocity_limit, urdf.velocity_limits, known_as, notes)
     torque, stated = _torques(whole, names, torque_limit, known_as, notes)
     for what, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
         if not (limit > 0.0).all():
             raise ValueError(f"{what} must be positive, got {limit}")
-    keyframe = _keyframe(whole, names)
-    parsed = _parse(spec, whole, names, notes)
+    parsed = _parse(whole, names, chosen, notes)
+    # Pairs that cannot touch are not compared: those of the file, and those that are always near and always apart.
     exclude = dict.fromkeys(_excluded(parsed, urdf.never_touch), "excluded in the file")
     never = f"in contact in none of {NEAR_LOOKED_AT:,} configurations, though always near"
-    pairs = _compared_pairs(parsed, exclude)
-    low, high = ranges.T
-    drawn = np.random.default_rng(0).uniform(low, high, (NEAR_LOOKED_AT, len(names)))
-    looked_at = np.array(
-        [
-            [*_distances(parsed, _at(parsed.model, parsed.joints, each), pairs).values()]
-            for each in drawn[:LOOKED_AT]
-        ]
-    )
-    near = [pair for pair, away in zip(pairs, looked_at.T, strict=True) if np.median(away) < NEAR]
+    pairs = parsed.compared(exclude)
+    drawn = np.random.default_rng(0).uniform(*ranges.T, (NEAR_LOOKED_AT, len(names)))
+    looked_at = np.array([_distances(parsed, each, pairs) for each in drawn[:LOOKED_AT]])
+    near = list(itertools.compress(pairs, np.median(looked_at, axis=0) < NEAR))
     apart = _apart(parsed, near, drawn)
-    meeting = set(near) - set(apart)
-    exclude |= dict.fromkeys((_names(parsed, pair) for pair in apart), never)
-    movable = [pair for pair, away in zip(pairs, looked_at.T, strict=True) if away.max() > 0.0]
-    movable = [pair for pair in movable if _names(parsed, pair) not in exclude]
-    home = _home(parsed, ranges, home, keyframe, movable, notes)
+    exclude |= dict.fromkeys(map(parsed.pair, apart), never)
+    movable = itertools.compress(pairs, looked_at.max(axis=0) > 0.0)
+    home = _home(parsed, ranges, home, [pair for pair in movable if parsed.pair(pair) not in exclude], notes)
     zero = np.zeros(3) if origin is None else finite_array("origin", origin, (3,))
-    distances = _distances(parsed, _at(parsed.model, parsed.joints, home), _compared_pairs(parsed, exclude))
-    near = [pair for pair, away in distances.items() if 0.0 < away < LEAST_GAP]
-    exclude |= dict.fromkeys((_names(parsed, pair) for pair in _apart(parsed, near, drawn)), never)
-    distances = {
-        pair: away for pair, away in distances.items() if away > 0.0 and _names(parsed, pair) not in exclude
-    }
+    # Bodies that are near at home get smaller capsules, or are not compared, either.
+    pairs = parsed.compared(exclude)
+    at_home = _distances(parsed, home, pairs)
+    close = itertools.compress(pairs, (at_home > 0.0) & (at_home < LEAST_GAP))
+    exclude |= dict.fromkeys(map(parsed.pair, _apart(parsed, close, drawn)), never)
+    distances = {}
+    for pair, away in zip(pairs, at_home.tolist(), strict=True):
+        if away > 0.0 and parsed.pair(pair) not in exclude:
+            distances[pair] = away
     tolerances = dict.fromkeys(parsed.geoms, tolerance)
-    for pair in meeting:
+    for pair in set(near) - set(apart):
         tolerances.update(dict.fromkeys(pair, min(FINE, tolerance)))
     xml, excess = _fitted(parsed, ranges, zero, home, distances, tolerances)
     arm = arm_from_xml(
@@ -330,15 +332,6 @@ def _joint_names(joints: Any) -> tuple[str, ...]:
             f"joints must be {MIN_JOINTS} or more different names, in order from the base to the tool, got {joints!r}"
         )
     return names
-
-
-def _check_exist(kind: str, wanted: Sequence[str], there: Sequence[str]) -> None:
-    missing = [name for name in wanted if name not in there]
-    if missing:
-        named = ", ".join(filter(None, there)) or "none"
-        raise ValueError(
-            f"there is no {kind} {', '.join(map(repr, missing))} in the file; there are: {named}"
-        )
 
 
 def _per_joint(name: str, values: Any, joints: tuple[str, ...]) -> Float:
@@ -461,55 +454,52 @@ def _velocities(
     return np.where(missing, DEFAULT_VELOCITY_LIMIT, found)
 
 
-def _keyframe(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float | None:
-    """Return the joints in the first keyframe, shape (J,); None without one."""
-    if not model.nkey:
-        return None
-    return np.array(model.key_qpos[0, [int(model.joint(name).qposadr[0]) for name in joints]])
-
-
-def _home(
-    parsed: Parsed,
-    ranges: Float,
-    given: Any,
-    keyframe: Float | None,
-    pairs: list[tuple[int, int]],
-    notes: list[str],
-) -> Float:
+def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[tuple[int, int]], notes: list[str]) -> Float:
     """Return the home configuration, shape (J,), in which some pairs of bodies do not touch."""
-    joints = parsed.joints
+    model, joints = parsed.model, parsed.joints
     if given is not None:
         home = _per_joint("home", given, joints)
         outside = (home < ranges[:, 0]) | (home > ranges[:, 1])
         if outside.any():
             raise ValueError(f"home is outside the range of {', '.join(itertools.compress(joints, outside))}")
         return home
-
-    def apart(home: Float) -> float:
-        return min(_distances(parsed, _at(parsed.model, parsed.joints, home), pairs).values(), default=1.0)
-
-    candidates = {"the file's keyframe": keyframe} if keyframe is not None else {}
+    candidates = {}
+    if model.nkey:
+        address = [int(model.joint(name).qposadr[0]) for name in joints]
+        candidates["the file's keyframe"] = model.key_qpos[0, address].copy()
     candidates["zeros"] = np.zeros(len(joints))
-    home, origin = choose_home(ranges, candidates, apart)
+    home, origin = choose_home(
+        ranges, candidates, lambda home: float(_distances(parsed, home, pairs).min(initial=1.0))
+    )
     notes.append(f"home: {origin}")
     return home
 
 
-def _parse(spec: mujoco.MjSpec, whole: mujoco.MjModel, joints: tuple[str, ...], notes: list[str]) -> Parsed:
-    """Return the arm of a specification, which is changed."""
-    model = _isolate(spec, joints, whole)
-    _check_order(model, joints)
-    rest = mujoco.MjData(model)
-    rest.qpos[:] = 0.0
-    mujoco.mj_kinematics(model, rest)
+def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: list[str]) -> Parsed:
+    """Return the arm of a model: the bodies that its joints move, and what they stand on."""
     carriers = [int(model.joint(name).bodyid[0]) for name in joints]
+    moves_with = np.zeros(model.nbody, int)
+    for body in range(1, model.nbody):
+        moves_with[body] = moves_with[model.body_parentid[body]]
+        if body in carriers:
+            moves_with[body] = carriers.index(body) + 1
+    _check_order(model, joints, carriers)
+    if moves_with[tool.body] != len(joints):
+        raise ValueError(f"the tool does not move with the last joint, {joints[-1]!r}")
+    rest = mujoco.MjData(model)
+    rest.qpos[:] = model.key_qpos[0] if model.nkey else model.qpos0
+    _move(rest, joints, np.zeros(len(joints)))
     root = int(model.body_rootid[carriers[0]])
-    links = {}
+    links: dict[int, int] = {}
+    names: dict[int, str] = {}
     for body in range(model.nbody):
-        if model.body_weldid[body] in carriers:
-            links[body] = carriers.index(model.body_weldid[body]) + 1
-        elif model.body_weldid[body] == 0 and (body == 0 or model.body_rootid[body] == root):
-            links[body] = 0
+        link = int(moves_with[body])
+        if link or body == 0 or model.body_rootid[body] == root:
+            links[body] = link
+            name = str(model.body(body).name)
+            if body == 0 or name in RESERVED or name.startswith("obstacle_"):
+                name = f"body_{body}" if link else f"base_{body}"
+            names[body] = name
     geoms = _collision_geoms(model, links)
     if not any(links[body] for body in geoms):
         raise ValueError(
@@ -519,7 +509,7 @@ def _parse(spec: mujoco.MjSpec, whole: mujoco.MjModel, joints: tuple[str, ...], 
     others = {model.body(body).name or str(body) for body in model.geom_bodyid[collides] if body not in links}
     if others:
         notes.append(f"left out, not part of the arm: {', '.join(sorted(others))}")
-    return Parsed(whole, model, rest, joints, links, geoms)
+    return Parsed(model, rest, copy.copy(rest), joints, tool, links, names, geoms)
 
 
 def _collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, list[int]]:
@@ -539,76 +529,8 @@ def _collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, 
     return found
 
 
-def _isolate(spec: mujoco.MjSpec, joints: tuple[str, ...], whole: mujoco.MjModel) -> mujoco.MjModel:
-    """Return the model without actuators, constraints and sensors, all other joints fixed as in the first keyframe."""
-    for part in (
-        *spec.actuators,
-        *spec.equalities,
-        *spec.sensors,
-        *spec.tendons,
-        *spec.keys,
-        *spec.excludes,
-        *spec.pairs,
-    ):
-        spec.delete(part)
-    others = [joint for joint in spec.joints if joint.name not in joints]
-    fixed = _keyframe_places(whole, joints) if whole.nkey else None
-    if fixed is not None:
-        # Numbers are read first, because `set_frame` takes those of all bodies away.
-        for number, body in {joint.parent.id: joint.parent for joint in others}.items():
-            _fix_body(number, body, whole, fixed)
-    for joint in others:
-        spec.delete(joint)
-    for body in spec.bodies:
-        body.mocap = False
-    model = spec.compile()
-    if fixed is not None:
-        _check_fixed(model, whole, fixed, joints)
-    return model
-
-
-def _keyframe_places(whole: mujoco.MjModel, joints: tuple[str, ...]) -> mujoco.MjData:
-    """Return the places of all parts with the arm's joints at rest and the others as in the first keyframe."""
-    data = mujoco.MjData(whole)
-    data.qpos[:] = whole.key_qpos[0]
-    for name in joints:
-        address = whole.joint(name).qposadr
-        data.qpos[address] = whole.qpos0[address]
-    mujoco.mj_kinematics(whole, data)
-    return data
-
-
-def _fix_body(number: int, body: Any, whole: mujoco.MjModel, fixed: mujoco.MjData) -> None:
-    """Write a body's pose into the model, in a frame of its own because the body may be inside another frame."""
-    parent = whole.body_parentid[number]
-    turn = fixed.xmat[parent].reshape(3, 3).T
-    body.set_frame(body.parent.add_frame())
-    body.pos = turn @ (fixed.xpos[number] - fixed.xpos[parent])
-    body.quat = _quaternion(turn @ fixed.xmat[number].reshape(3, 3))
-    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-
-
-def _check_fixed(
-    model: mujoco.MjModel, whole: mujoco.MjModel, fixed: mujoco.MjData, joints: tuple[str, ...]
-) -> None:
-    """Check that the arm's joints and all bodies are still where the file has them."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    apart = [np.abs(data.xpos - fixed.xpos).max(), np.abs(data.xmat - fixed.xmat).max()]
-    for name in joints:
-        here, there = model.joint(name).id, whole.joint(name).id
-        apart.append(np.abs(data.xanchor[here] - fixed.xanchor[there]).max())
-        apart.append(np.abs(data.xaxis[here] - fixed.xaxis[there]).max())
-    if max(apart) > POSITION_TOLERANCE:
-        raise ValueError(
-            "joints that are left out cannot be fixed as in the file's keyframe, because that moves other parts; write "
-            "their positions into the file and remove the keyframe"
-        )
-
-
-def _check_order(model: mujoco.MjModel, joints: tuple[str, ...]) -> None:
-    """Check that each joint carries the next one, and the last one the tool."""
-    bodies = [int(model.joint(name).bodyid[0]) for name in joints]
+def _check_order(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[int]) -> None:
+    """Check that each joint carries the next one."""
     for i in range(1, len(joints)):
         first, second = joints[i - 1], joints[i]
         if bodies[i - 1] == bodies[i]:
@@ -618,61 +540,32 @@ def _check_order(model: mujoco.MjModel, joints: tuple[str, ...]) -> None:
             )
         if bodies[i - 1] not in ancestors(model, bodies[i]):
             raise ValueError(f"joints must be in order from the base: {first!r} does not carry {second!r}")
-    if model.body_weldid[int(model.site(TOOL).bodyid[0])] != bodies[-1]:
-        raise ValueError(f"the tool does not move with the last joint, {joints[-1]!r}")
-
-
-def _body_name(parsed: Parsed, body: int) -> str:
-    """Return the name of a body of the arm in its model: that of the file, where it has one that is free."""
-    name = str(parsed.model.body(body).name)
-    if body == 0 or name in RESERVED or name.startswith("obstacle_"):
-        return f"base_{body}" if parsed.links[body] == 0 else f"body_{body}"
-    return name
 
 
 def _collide_in_file(parsed: Parsed, first: int, second: int) -> bool:
     """Return True if MuJoCo would let geoms of two bodies collide: contact bits, excluded and explicit pairs."""
-    whole = parsed.whole
+    model = parsed.model
     low, high = sorted((first, second))
-    if (low << 16) + high in whole.exclude_signature:
+    if (low << 16) + high in model.exclude_signature:
         return False
-    explicit = {
-        frozenset(pair) for pair in zip(whole.pair_geom1.tolist(), whole.pair_geom2.tolist(), strict=True)
-    }
+    explicit = set(map(frozenset, zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)))
     for a, b in itertools.product(parsed.geoms[first], parsed.geoms[second]):
-        bits = whole.geom_contype[a] & whole.geom_conaffinity[b]
-        bits |= whole.geom_contype[b] & whole.geom_conaffinity[a]
+        bits = model.geom_contype[a] & model.geom_conaffinity[b]
+        bits |= model.geom_contype[b] & model.geom_conaffinity[a]
         # Geoms that collide with nothing stand for a link that has no others.
-        silent = any(not (whole.geom_contype[geom] | whole.geom_conaffinity[geom]) for geom in (a, b))
+        silent = any(not (model.geom_contype[geom] | model.geom_conaffinity[geom]) for geom in (a, b))
         if bits or silent or frozenset((a, b)) in explicit:
             return True
     return False
-
-
-def _distant_pairs(parsed: Parsed) -> Iterator[tuple[int, int]]:
-    """Return the pairs of bodies with geoms whose links are neither the same nor consecutive."""
-    for first, second in itertools.combinations(parsed.geoms, 2):
-        if abs(parsed.links[first] - parsed.links[second]) > 1:
-            yield first, second
-
-
-def _compared_pairs(parsed: Parsed, exclude: Mapping[frozenset[str], str]) -> list[tuple[int, int]]:
-    """Return the distant pairs of bodies that are not excluded by name."""
-    return [pair for pair in _distant_pairs(parsed) if _names(parsed, pair) not in exclude]
-
-
-def _names(parsed: Parsed, pair: tuple[int, int]) -> frozenset[str]:
-    """Return the names of a pair of bodies."""
-    return frozenset(_body_name(parsed, body) for body in pair)
 
 
 def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> list[frozenset[str]]:
     """Return the names of pairs of bodies that the file does not let collide, or an SRDF file."""
     silent = {frozenset(pair) for pair in never_touch}
     found = []
-    for pair in _distant_pairs(parsed):
-        if not _collide_in_file(parsed, *pair) or _names(parsed, pair) in silent:
-            found.append(_names(parsed, pair))
+    for pair in parsed.compared({}):
+        if not _collide_in_file(parsed, *pair) or parsed.pair(pair) in silent:
+            found.append(parsed.pair(pair))
     return found
 
 
@@ -691,14 +584,15 @@ def _fitted(
     Raises:
         ValueError: Bodies are too close for that.
     """
-    fits: dict[int, list[Fit]] = {}
+    model = parsed.model
+    fits: dict[int, list[FittedCapsule]] = {}
     for body, geoms in parsed.geoms.items():
         fits[body] = []
         for geom in geoms:
-            size = 2.0 * float(parsed.model.geom_rbound[geom])
-            large = not parsed.links[body] and tolerances[body] > FINE
-            allowed = max(tolerances[body], BASE_SHARE * size) if large else tolerances[body]
-            fits[body] += [Fit(geom, capsule) for capsule in cover_geom(parsed.model, geom, allowed)]
+            allowed = tolerances[body]
+            if not parsed.links[body] and allowed > FINE:
+                allowed = max(allowed, BASE_SHARE * 2.0 * float(model.geom_rbound[geom]))
+            fits[body] += cover_geom(model, geom, allowed)
     while True:
         xml = _write(parsed, ranges, origin, fits)
         near = _near_capsules(parsed, xml, home, distances)
@@ -706,41 +600,35 @@ def _fitted(
             break
         coarse: set[tuple[int, int]] = set()
         for (first, i), (second, j) in near:
-            excess = [fits[first][i].capsule.excess, fits[second][j].capsule.excess]
-            if max(excess) < LEAST_EXCESS:
-                names = f"{_body_name(parsed, first)!r} and {_body_name(parsed, second)!r}"
+            one, other = fits[first][i].excess, fits[second][j].excess
+            if max(one, other) < LEAST_EXCESS:
                 raise ValueError(
-                    f"the bodies {names} are {1e3 * distances[first, second]:.2g} mm apart at home, too close for the "
-                    "capsules around them: give another home, or exclude their contact in the file"
+                    f"the bodies {parsed.names[first]!r} and {parsed.names[second]!r} are "
+                    f"{1e3 * distances[first, second]:.2g} mm apart at home, too close for the capsules around them: "
+                    "give another home, or exclude their contact in the file"
                 )
-            coarse.add((first, i) if excess[0] >= excess[1] else (second, j))
+            coarse.add((first, i) if one >= other else (second, j))
         for body, index in sorted(coarse, reverse=True):
-            geom, capsule = fits[body].pop(index)
-            fits[body] += [Fit(geom, half) for half in split(parsed.model, geom, capsule)]
-    return xml, max(fit.capsule.excess for some in fits.values() for fit in some)
+            fits[body] += split(model, fits[body].pop(index))
+    return xml, max(capsule.excess for some in fits.values() for capsule in some)
 
 
 def _apart(parsed: Parsed, pairs: Iterable[tuple[int, int]], configurations: Float) -> list[tuple[int, int]]:
     """Return the pairs of bodies that are in contact in none of some configurations, shape (N, J)."""
     pairs = list(pairs)
-    data = mujoco.MjData(parsed.model)
     for joints in configurations:
-        _move(data, parsed.joints, joints)
-        away = _distances(parsed, data, pairs)
-        pairs = [pair for pair in pairs if away[pair] > 0.0]
+        pairs = list(itertools.compress(pairs, _distances(parsed, joints, pairs) > 0.0))
     return pairs
 
 
-def _distances(
-    parsed: Parsed, data: mujoco.MjData, pairs: Sequence[tuple[int, int]]
-) -> dict[tuple[int, int], float]:
-    """Return the distances of pairs of bodies, [m]; at most 0.1."""
-    found = {}
-    for first, second in pairs:
-        geoms = itertools.product(parsed.geoms[first], parsed.geoms[second])
-        found[first, second] = min(
-            mujoco.mj_geomDistance(parsed.model, data, a, b, 0.1, None) for a, b in geoms
-        )
+def _distances(parsed: Parsed, joints: Float, pairs: Sequence[tuple[int, int]]) -> Float:
+    """Return the distances of P pairs of bodies in a configuration, shape (P,), [m]; at most 0.1."""
+    _move(parsed.moved, parsed.joints, joints)
+    found = np.full(len(pairs), 0.1)
+    for i, (first, second) in enumerate(pairs):
+        for one, other in itertools.product(parsed.geoms[first], parsed.geoms[second]):
+            away = mujoco.mj_geomDistance(parsed.model, parsed.moved, one, other, 0.1, None)
+            found[i] = min(found[i], away)
     return found
 
 
@@ -749,24 +637,17 @@ def _near_capsules(
 ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """Return pairs of capsules, as body and index, that are much nearer to one another at home than the bodies."""
     model = mujoco.MjModel.from_xml_string(xml)
-    data = _at(model, parsed.joints, home)
-    first_geom = {body: int(model.body(_body_name(parsed, body)).geomadr[0]) for body in parsed.geoms}
-    number = {body: int(model.body(_body_name(parsed, body)).geomnum[0]) for body in parsed.geoms}
+    data = mujoco.MjData(model)
+    _move(data, parsed.joints, home)
     found = []
     for (first, second), distance in distances.items():
         least = min(LEFT_SHARE * distance, LEFT_MOST)
-        for i, j in itertools.product(range(number[first]), range(number[second])):
-            one, other = first_geom[first] + i, first_geom[second] + j
-            if mujoco.mj_geomDistance(model, data, one, other, 0.01, None) < least:
+        one, other = model.body(parsed.names[first]), model.body(parsed.names[second])
+        for i, j in itertools.product(range(int(one.geomnum[0])), range(int(other.geomnum[0]))):
+            geoms = int(one.geomadr[0]) + i, int(other.geomadr[0]) + j
+            if mujoco.mj_geomDistance(model, data, *geoms, 0.01, None) < least:
                 found.append(((first, i), (second, j)))
     return found
-
-
-def _at(model: mujoco.MjModel, joints: tuple[str, ...], positions: Float) -> mujoco.MjData:
-    """Return the places of all parts of a model at positions of its joints."""
-    data = mujoco.MjData(model)
-    _move(data, joints, positions)
-    return data
 
 
 def _move(data: mujoco.MjData, joints: tuple[str, ...], positions: Float) -> None:
@@ -775,32 +656,38 @@ def _move(data: mujoco.MjData, joints: tuple[str, ...], positions: Float) -> Non
     mujoco.mj_kinematics(data.model, data)
 
 
-def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[Fit]]) -> str:
+def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[FittedCapsule]]) -> str:
     """Return the text of the arm's model: its bodies on the stage, with capsules as geoms."""
     model, rest = parsed.model, parsed.rest
     spec = mujoco.MjSpec.from_string(asset("stage.xml"))
     spec.option.gravity = model.opt.gravity
-    carriers = {int(model.joint(name).bodyid[0]): index for index, name in enumerate(parsed.joints)}
+    carriers = [int(model.joint(name).bodyid[0]) for name in parsed.joints]
     written: dict[int, Any] = {}
     for body, link in parsed.links.items():
-        turn, place = rest.xmat[body].reshape(3, 3), rest.xpos[body]
         parent, axes, start = spec.worldbody, np.eye(3), origin
-        # A body that is welded to another one hangs on the body with the joint, which comes before it in the file.
-        before = list(carriers)[link - 2] if body in carriers and link > 1 else int(model.body_weldid[body])
-        if link and before in written:
+        # A body hangs on the body with the joint that moves it, which comes before it in the file.
+        above = link - 1 if body in carriers else link
+        if above:
+            before = carriers[above - 1]
             parent, axes, start = written[before], rest.xmat[before].reshape(3, 3), rest.xpos[before]
         written[body] = parent.add_body(
-            name=_body_name(parsed, body), pos=axes.T @ (place - start), quat=_quaternion(axes.T @ turn)
+            name=parsed.names[body],
+            pos=axes.T @ (rest.xpos[body] - start),
+            quat=_quaternion(axes.T @ rest.xmat[body].reshape(3, 3)),
         )
         if link:
             _add_inertia(written[body], model, body)
         if body in carriers:
-            _add_joint(written[body], parsed, carriers[body], ranges)
-        for geom, capsule in fits.get(body, []):
-            _add_capsule(written[body], model, geom, capsule)
-    site = model.site(TOOL)
-    written[int(site.bodyid[0])].add_site(
-        name="hand", pos=site.pos, quat=site.quat, size=(0.004, 0.0, 0.0), rgba=(0.0, 0.0, 0.0, 0.0)
+            _add_joint(written[body], parsed, link - 1, ranges)
+        for capsule in fits.get(body, []):
+            _add_capsule(written[body], model, capsule)
+    tool = parsed.tool
+    written[tool.body].add_site(
+        name="hand",
+        pos=tool.position,
+        quat=tool.quaternion,
+        size=(0.004, 0.0, 0.0),
+        rgba=(0.0, 0.0, 0.0, 0.0),
     )
     spec.compile()
     return str(spec.to_xml())
@@ -840,11 +727,11 @@ def _add_joint(written: Any, parsed: Parsed, index: int, ranges: Float) -> None:
     added.damping[0] = model.dof_damping[dof].flat[0]
 
 
-def _add_capsule(written: Any, model: mujoco.MjModel, geom: int, capsule: FittedCapsule) -> None:
+def _add_capsule(written: Any, model: mujoco.MjModel, capsule: FittedCapsule) -> None:
     """Add a capsule that covers a geom, or a part of it, to the body."""
     turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-    first, second = model.geom_pos[geom] + capsule.ends @ turn.reshape(3, 3).T
+    mujoco.mju_quat2Mat(turn, model.geom_quat[capsule.geom])
+    first, second = model.geom_pos[capsule.geom] + capsule.ends @ turn.reshape(3, 3).T
     size = (capsule.radius, 0.0, 0.0)
     if np.array_equal(capsule.ends[0], capsule.ends[1]):
         written.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=first, size=size)

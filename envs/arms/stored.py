@@ -1,21 +1,37 @@
-"""Copies of arms: one MJCF file that holds all that was chosen when an arm was loaded."""
+"""Copies of arms: one MJCF file that holds all that was chosen when an arm was loaded.
+
+Copies are kept in folders of runs and models, and in a cache folder, because covering a file's geoms takes seconds.
+That folder is `viapoint/arms` in XDG_CACHE_HOME, or in `~/.cache`. It may be deleted at any time.
+"""
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import json
+import os
+import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
-from viapoint.envs.arms.arm import Arm, arm_from_xml
+import mujoco
+import numpy as np
+
+from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
 from viapoint.envs.arms.spheres import LeftOut
 
 MARK = "viapoint_arm"
 """Name of the text element with the choices."""
 COPY = "arm.xml"
 """Name of a copy in the folder of a run or a model."""
+UNREADABLE = (OSError, KeyError, TypeError, ValueError, ET.ParseError)
+"""Errors of files that are missing or broken."""
 
 
 def keep_arm(folder: Path, arm: Arm) -> None:
@@ -50,10 +66,13 @@ def write_arm(path: Path, arm: Arm) -> None:
         "continuous": arm.continuous,
         "notes": arm.notes,
     }
-    root = ET.fromstring(arm.xml)
-    custom = ET.SubElement(root, "custom")
-    ET.SubElement(custom, "text", name=MARK, data=json.dumps(choices))
-    path.write_text(ET.tostring(root, encoding="unicode"), encoding="utf-8")
+    model, _, _ = arm.xml.rpartition("</mujoco>")
+    path.write_text(f"{model}{_element(json.dumps(choices))}</mujoco>\n", encoding="utf-8")
+
+
+def _element(choices: str) -> str:
+    """Return the element of a copy that holds the choices."""
+    return f"<custom><text name={quoteattr(MARK)} data={quoteattr(choices)}/></custom>"
 
 
 def read_arm(path: Path) -> Arm | None:
@@ -64,11 +83,12 @@ def read_arm(path: Path) -> Arm | None:
     mark = ET.fromstring(text).find(f"custom/text[@name='{MARK}']")
     if mark is None:
         return None
-    choices: dict[str, Any] = json.loads(mark.attrib["data"])
+    data = mark.attrib["data"]
+    choices: dict[str, Any] = json.loads(data)
     left_out = tuple(LeftOut(*each) for each in choices["left_out"])
     arm = arm_from_xml(
         choices["name"],
-        text,
+        text.replace(_element(data), ""),
         joints=choices["joints"],
         tool="hand",
         home=choices["home"],
@@ -84,3 +104,47 @@ def read_arm(path: Path) -> Arm | None:
         continuous=tuple(choices["continuous"]),
         notes=tuple(choices["notes"]),
     )
+
+
+def cached_path(model: mujoco.MjModel, arguments: dict[str, Any]) -> Path:
+    """Return the place of a copy in the cache folder: it tells models, arguments and versions of the program apart."""
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    digest = hashlib.blake2b(content.tobytes(), digest_size=16)
+    digest.update(_program().encode())
+    digest.update(json.dumps(arguments, sort_keys=True, default=_plain).encode())
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return folder / "viapoint" / "arms" / f"{digest.hexdigest()}.xml"
+
+
+@functools.cache
+def _program() -> str:
+    """Return the versions of what makes arms of files: of MuJoCo, and the code beside this file."""
+    code = hashlib.blake2b(digest_size=16)
+    for path in sorted(files(__package__).iterdir(), key=lambda path: path.name):
+        if path.name.endswith(".py"):
+            code.update(path.read_bytes())
+    code.update(asset("stage.xml").encode())
+    return f"{mujoco.__version__} {code.hexdigest()}"
+
+
+def _plain(value: Any) -> Any:
+    """Return an argument of another type as numbers or text."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+
+
+def read_cached(path: Path) -> Arm | None:
+    """Return the arm of a copy in the cache folder; None if there is none, or if it is broken."""
+    with suppress(*UNREADABLE):
+        return read_arm(path)
+    return None
+
+
+def write_cached(path: Path, arm: Arm) -> None:
+    """Write a copy into the cache folder; nothing happens where the folder cannot be written."""
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # A file of its own, which is renamed at the end: other processes never see half of it.
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
+            write_arm(Path(file.name), arm)
+        os.replace(file.name, path)

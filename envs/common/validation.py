@@ -98,13 +98,6 @@ def number_of_at_least(name: str, value: Any, least: float, below: float = np.in
     return float(value)
 
 
-def reset_options(options: Any) -> dict[str, Any]:
-    """Return a copy of the options of `reset`."""
-    if options is not None and not isinstance(options, Mapping):
-        raise ValueError(f"options must be a mapping from names to values, or None, got {options!r}")
-    return dict(options or {})
-
-
 def masked_rows(mask: Any, num_envs: int, running: bool) -> Int:
     """Return the indices of the environments in a reset mask; without a mask, of all."""
     if mask is None:
@@ -127,12 +120,6 @@ def as_real_array(values: Any) -> NDArray[Any] | None:
         # Rows of different lengths, or tensors that require a gradient.
         return None
     return array if array.dtype.kind in "fiu" else None
-
-
-def checked_actions(actions: Any, num_envs: int, names: Sequence[str]) -> Float:
-    """Return finite actions of shape (num_envs, m), clipped to [-1, 1]; `names` are those of the m components."""
-    array = finite_array(f"actions of all environments ({', '.join(names)})", actions, (num_envs, len(names)))
-    return np.clip(array, -1.0, 1.0)
 
 
 def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:

@@ -18,7 +18,6 @@ from viapoint.envs.geometry.shapes import (
     CAPSULE,
     CYLINDER,
     HALF_SPACE,
-    IN_TABLES,
     KINDS,
     MESH,
     POINT_CLOUD,
@@ -33,7 +32,7 @@ from viapoint.envs.geometry.shapes import (
 
 __all__ = [
     "ABSENT", "BOX", "CAPSULE", "CYLINDER", "HALF_SPACE", "KINDS", "MESH", "POINT_CLOUD", "POSE_SIZE", "SPHERE",
-    "Geoms", "Obstacles", "add_to_model", "check_simulated", "geoms_of", "no_obstacles", "observation_rows",
+    "Obstacles", "add_to_model", "geom_fields", "geom_meshes", "no_obstacles", "observation_rows",
     "obstacles_from_rows", "pack", "unpack",
 ]  # fmt: skip
 
@@ -84,11 +83,6 @@ class Obstacles(NamedTuple):
     def present(self) -> Bool:
         """True for rows that hold an obstacle, shape (N, n)."""
         return np.asarray(self.kind != ABSENT)
-
-    def at(self, time: Any) -> Obstacles:
-        """Return the obstacles at their places at a time, or one time for each scene, shape (N,), [s]."""
-        way = self.velocity * np.reshape(time, (-1, 1, 1))
-        return self._replace(centre=self.centre + way)
 
     def take(self, scenes: Any) -> Obstacles:
         """Return some of the scenes, by indices, mask or slice."""
@@ -255,14 +249,13 @@ def mesh_names(meshes: Meshes) -> list[str]:
     """Return the registered names of packed meshes, empty for others."""
     names = []
     for mesh in split_meshes(meshes):
-        same = [name for name, each in REGISTERED_MESHES.items() if _same(each.mesh, mesh)]
-        names.append(same[0] if same else "")
+        same = ""
+        for name, known in REGISTERED_MESHES.items():
+            if known.mesh is not None and np.array_equal(known.mesh.corners, mesh.corners):
+                same = name
+                break
+        names.append(same)
     return names
-
-
-def _same(first: Meshes | None, second: Meshes) -> bool:
-    """Return True for meshes with the same triangles."""
-    return first is not None and np.array_equal(first.corners, second.corners)
 
 
 def bounding_boxes(obstacles: Obstacles) -> tuple[Float, Float]:
@@ -385,69 +378,44 @@ def obstacles_from_rows(rows: Float, kinds: Sequence[str]) -> Obstacles:
     return found
 
 
-class Geoms(NamedTuple):
-    """MuJoCo geoms of obstacles in their own frames; absent obstacles are small spheres.
-
-    Geoms of meshes are incomplete: MuJoCo turns a mesh into a frame of its own.
-    """
-
-    type: Int
-    """Types of :class:`mujoco.mjtGeom`, shape (N, n)."""
-    size: Float
-    """Sizes, shape (N, n, 3), [m]."""
-    bound: Float
-    """Radii of the bounding spheres, shape (N, n), [m]."""
-    box: Float
-    """Centres and half lengths of the bounding boxes, shape (N, n, 6), [m]."""
-    position: Float
-    """Shape (N, n, 3), [m]."""
-    quaternion: Float
-    """Shape (N, n, 4)."""
-    mesh: Any
-    """Registered names of meshes, empty for other shapes, shape (N, n)."""
-
-
-def check_simulated(obstacles: Obstacles) -> None:
-    """Check that obstacles can be simulated; plans need no simulation.
+def geom_meshes(obstacles: Obstacles) -> Any:
+    """Return the registered names of meshes, empty for other shapes, shape (N, n), after a check of all obstacles.
 
     Raises:
         ValueError: An obstacle is a point cloud, which has many geoms, or a mesh without a name.
     """
-    if np.isin(obstacles.kind, IN_TABLES).any():
-        geoms_of(obstacles)
-
-
-def geoms_of(obstacles: Obstacles) -> Geoms:
-    """Return the MuJoCo geoms of obstacles.
-
-    Raises:
-        ValueError: An obstacle cannot be simulated, see :func:`check_simulated`.
-    """
     kind = obstacles.kind
-    present, meshes = obstacles.present, kind == MESH
     if (kind == POINT_CLOUD).any():
         raise ValueError(
             "a point cloud is no single geom; use a sphere for each point of PointCloud.covering"
         )
+    meshes = kind == MESH
     names = np.array([*mesh_names(obstacles.meshes), ""])
-    mesh = names[np.where(meshes, obstacles.size[..., 0], -1).astype(np.int64)]
-    if (meshes & (mesh == "")).any():
+    found = names[np.where(meshes, obstacles.size[..., 0], -1).astype(np.int64)]
+    if (meshes & (found == "")).any():
         raise ValueError("meshes must have a name; register_mesh gives them one")
+    return found
+
+
+def geom_fields(obstacles: Obstacles) -> dict[str, Any]:
+    """Return the values of MuJoCo's fields of geoms, shape (N, n, ...); absent obstacles are small spheres.
+
+    Those of meshes are incomplete: MuJoCo turns a mesh into a frame of its own.
+    """
+    kind, present = obstacles.kind, obstacles.present
+    meshes = kind == MESH
     size = np.where((present & ~meshes)[..., None], obstacles.size, (0.01, 0.0, 0.0))
     # MuJoCo's bounding spheres: planes have none, and the sizes of other shapes are legs of a right angle.
     bound = np.where(kind == CAPSULE, size.sum(axis=-1), np.linalg.norm(size, axis=-1))
-    _, half = bounding_boxes(obstacles)
     bound = np.where(meshes, obstacles.size[..., 1], bound)
+    _, half = bounding_boxes(obstacles)
     half = np.where(present[..., None], half, size[..., :1])
-    return Geoms(
-        np.where(present, GEOMS[kind], mujoco.mjtGeom.mjGEOM_SPHERE).astype(np.int64),
-        np.where((kind == HALF_SPACE)[..., None], (0.0, 0.0, 0.01), size),
-        np.where(kind == HALF_SPACE, 0.0, bound),
-        np.concatenate((np.zeros_like(half), half), axis=-1),
-        obstacles.centre,
-        quaternions_of(obstacles.rotation),
-        mesh,
-    )
+    return {
+        "geom_type": np.where(present, GEOMS[kind], mujoco.mjtGeom.mjGEOM_SPHERE).astype(np.int64),
+        "geom_size": np.where((kind == HALF_SPACE)[..., None], (0.0, 0.0, 0.01), size),
+        "geom_rbound": np.where(kind == HALF_SPACE, 0.0, bound),
+        "geom_aabb": np.concatenate((np.zeros_like(half), half), axis=-1),
+    }
 
 
 def add_to_model(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.arms.chain import Chain, Spheres
-from viapoint.envs.arms.inverse_kinematics import solve_planar, solve_pose, solve_position
+from viapoint.envs.arms.inverse_kinematics import descend, solve_planar
 from viapoint.envs.arms.kinematics import tool_position, transform
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, self_clearance
@@ -328,12 +328,13 @@ def _reach(draft: Draft, scene: int, there: Float, numbers: Float, joints: Float
     if mover.plane:
         return bool(solve_planar(chain, limits, position[0], position[1], joints))
     _seed(mover, position, joints)
+    rotation, origin = placed.rotation, placed.origin
     if len(joints) < 6:
-        return bool(solve_position(chain, limits, position, joints, placed.rotation, placed.origin))
+        return bool(descend(chain, limits, position, axes, False, joints, rotation, origin) == 0.0)
     _tool_axes(there[3:6], there[11], numbers[3:7], axes)
     if draft.attempts.keep[scene] == 0 and not _is_hand_clear(draft, scene, position, axes):
         return False
-    return bool(solve_pose(chain, limits, position, axes, joints, placed.rotation, placed.origin))
+    return bool(descend(chain, limits, position, axes, True, joints, rotation, origin) == 0.0)
 
 
 @compiled

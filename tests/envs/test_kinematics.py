@@ -15,7 +15,13 @@ from viapoint.envs.arms.inverse_kinematics import (
     planar_motion,
     solve_planar,
 )
-from viapoint.envs.arms.kinematics import forward, jacobians, link_poses, sphere_centres, torques
+from viapoint.envs.arms.kinematics import (
+    forward,
+    link_poses,
+    sphere_centres,
+    tool_jacobian,
+    torques,
+)
 from viapoint.envs.arms.registry import arm_of
 
 GANTRY = """
@@ -69,8 +75,8 @@ def test_places_jacobians_and_torques_are_those_of_mujoco(arm):
     position, velocity, acceleration = states(arm)
     places, axes = forward(arm.chain, position)
     rotation, origin = link_poses(arm.chain, position)
-    found, needed = jacobians(arm.chain, position), torques(arm.chain, position, velocity, acceleration)
-    jacobian = np.empty((6, len(arm.joint_names)))
+    needed = torques(arm.chain, position, velocity, acceleration)
+    jacobian, found = np.empty((2, 6, len(arm.joint_names)))
     anchors = [model.joint(name).id for name in arm.joint_names]
     for i in range(len(position)):
         data.qpos[:], data.qvel[:], data.qacc[:] = position[i], velocity[i], acceleration[i]
@@ -81,7 +87,8 @@ def test_places_jacobians_and_torques_are_those_of_mujoco(arm):
         np.testing.assert_allclose(rotation[i, 1:, :, 2], data.xaxis[anchors], atol=1e-9)
         slides = arm.chain.sliding
         np.testing.assert_allclose(origin[i, 1:][~slides], data.xanchor[anchors][~slides], atol=1e-9)
-        np.testing.assert_allclose(found[i], jacobian, atol=1e-9)
+        tool_jacobian(arm.chain, rotation[i], origin[i], places[i], found)
+        np.testing.assert_allclose(found, jacobian, atol=1e-9)
         contact = data.qfrc_constraint  # of joints at their limits
         np.testing.assert_allclose(needed[i], data.qfrc_inverse + contact, atol=1e-9 * 1e2)
 

@@ -440,7 +440,7 @@ def test_a_cache_that_cannot_be_used_is_ignored(fault, tmp_path, monkeypatch):
     if fault == "broken":
         stored.write_bytes(stored.read_bytes()[:1000])
     elif fault == "shape":
-        np.savez(stored, text=np.array('{"left_out": []}'))
+        stored.write_text("<mujoco><custom><text name='viapoint_arm' data='{}'/></custom></mujoco>")
     else:
         (tmp_path / "file").write_text("")
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))

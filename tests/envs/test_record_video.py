@@ -1,21 +1,12 @@
 """Videos of movements."""
 
-import gymnasium as gym
 import pytest
-from episodes import AROUND, JUMP, OBSTACLES, moved, play
+from episodes import JUMP, OBSTACLES, play
 
-from viapoint.envs.record_video import RecordMovements
+from viapoint.envs.env import RecordMovements
 
 pytest.importorskip("moviepy")
 pytestmark = pytest.mark.usefixtures("quick_pictures")
-
-
-def test_gymnasium_records_two_frames_of_a_movement_and_a_warning_says_so(make, tmp_path):
-    env = gym.wrappers.RecordVideo(make(side=64), str(tmp_path / "videos"), episode_trigger=lambda _: True)
-    with pytest.warns(UserWarning, match="RecordMovements"):
-        moved(env, AROUND)
-    env.close()
-    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == 2
 
 
 @pytest.mark.parametrize("env_id", [OBSTACLES, JUMP])

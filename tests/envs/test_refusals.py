@@ -6,8 +6,8 @@ import pytest
 from episodes import JUMP, MOVING, OBSTACLES, PANDA, STEP
 
 from viapoint.envs import ReachVectorEnv, Task
+from viapoint.envs.env import RecordMovements
 from viapoint.envs.plans import ActionLayout, Plan
-from viapoint.envs.record_video import RecordMovements
 from viapoint.envs.rewards import RewardWeights
 
 KINDS = (OBSTACLES, STEP, MOVING, PANDA)
