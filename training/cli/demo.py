@@ -39,10 +39,8 @@ FILES = {
     "movements.mp4": "movements",
 }
 """Files besides those of the run, and what they show."""
-PICTURES = 12
-"""Number of movements in the gallery."""
-MOVEMENTS = 4
-"""Number of movements in the video."""
+PICTURES = 12  # Number of movements in the gallery
+MOVEMENTS = 4  # Number of movements in the video
 
 
 def run(config: DemoConfig) -> None:

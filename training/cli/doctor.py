@@ -9,8 +9,7 @@ import subprocess
 import sys
 from typing import Any, NamedTuple
 
-PATIENCE = 180.0
-"""Time limit of a check, [s]; the first one on a machine compiles machine code."""
+PATIENCE = 180.0  # Time limit of a check, [s]; the first one on a machine compiles machine code
 EXTRAS = {"minari": "minari", "mjviser": "live", "optuna": "study", "ray": "study", "viser": "live"}
 """Extras of packages that a command imports when it needs them; others belong to `training`."""
 VERSIONS = """import importlib.metadata, platform

@@ -13,14 +13,10 @@ from viapoint.training.config.configs import FitConfig
 from viapoint.training.io.files import BadFileError, check_ours, read_bytes, write_bytes
 from viapoint.training.plotting.fitted import Measured, fitted_movements
 
-REQUIRED = ("time", "x", "y")
-"""Columns that a file of movements must have."""
-COORDINATES = ("x", "y", "z")
-"""Names of the coordinates; z may be left out."""
-TABLE, FIGURE = "fit.csv", "fit.png"
-"""Files that are written."""
-DRAWN = 6
-"""Greatest number of movements in the figure."""
+REQUIRED = ("time", "x", "y")  # Columns that a file of movements must have
+COORDINATES = ("x", "y", "z")  # Names of the coordinates; z may be left out
+TABLE, FIGURE = "fit.csv", "fit.png"  # Files that are written
+DRAWN = 6  # Greatest number of movements in the figure
 
 
 def run(config: FitConfig) -> None:

@@ -92,16 +92,12 @@ def env_of_arm(arm: Arm | str | None, env: str | None) -> tuple[str | None, dict
     return env or "viapoint/Obstacles-v0", {"arm": found if isinstance(arm, Arm) else found.file or arm}
 
 
-Format = Literal["table", "md", "csv", "json"]
-"""Form of a table."""
-BENCHMARK = "motionbenchmaker"
-"""Name of the scene set that measures planners."""
-MOTION_FILES = (".csv", ".yaml", ".yml")
-"""Suffixes of files of movements."""
+Format = Literal["table", "md", "csv", "json"]  # Form of a table
+BENCHMARK = "motionbenchmaker"  # Name of the scene set that measures planners
+MOTION_FILES = (".csv", ".yaml", ".yml")  # Suffixes of files of movements
 UNNAMED = "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
 NOTHING_TO_CHECK = "checks and refine concern an agent, and none is given"
-USUAL_BASELINES = ("straight", "random", "search512")
-"""Baselines of an evaluation."""
+USUAL_BASELINES = ("straight", "random", "search512")  # Baselines of an evaluation
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,16 +17,11 @@ Algorithm = Literal["viaq", "viarank", "sac", "td3", "ppo", "tqc"]
 class Preset:
     """Default settings of an algorithm."""
 
-    policy: str
-    """Name of the policy."""
-    n_envs: int = 64
-    """Environments that are stepped together."""
-    n_timesteps: int
-    """Decisions in total."""
-    eval_every: int = 1_000
-    """Decisions between two evaluations on the validation scenes."""
-    checkpoint_every: int = 5_000
-    """Decisions between two checkpoints."""
+    policy: str  # Name of the policy
+    n_envs: int = 64  # Environments that are stepped together
+    n_timesteps: int  # Decisions in total
+    eval_every: int = 1_000  # Decisions between two evaluations on the validation scenes
+    checkpoint_every: int = 5_000  # Decisions between two checkpoints
     hyperparameters: Mapping[str, Any]
     """Hyperparameters; schedules and noise as :mod:`viapoint.training.agents.model_io` writes them."""
 

@@ -41,12 +41,9 @@ from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes, s
 Progress = Callable[[str, int, int], None]
 """Function of the method's name, the number of finished scenes and the number of all scenes."""
 
-TIMED_DECISIONS = 200
-"""Number of single decisions after which no further scene is timed."""
-TIMING_BUDGET = 3.0
-"""Wall time after which no further decision is timed, [s]."""
-SLOW_DECISION = 0.1
-"""Decision time above which a method is timed in batches, [s]."""
+TIMED_DECISIONS = 200  # Number of single decisions after which no further scene is timed
+TIMING_BUDGET = 3.0  # Wall time after which no further decision is timed, [s]
+SLOW_DECISION = 0.1  # Decision time above which a method is timed in batches, [s]
 
 
 @dataclass(frozen=True, kw_only=True)

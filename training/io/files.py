@@ -23,16 +23,13 @@ from safetensors.numpy import save as save_arrays
 
 Arrays = dict[str, NDArray[Any]]
 
-LARGEST_JSON = 64 << 20
-"""Greatest size of a JSON file, [bytes]."""
-LARGEST_YAML = 1 << 20
-"""Greatest size of a YAML file, [bytes]."""
+LARGEST_JSON = 64 << 20  # Greatest size of a JSON file, [bytes]
+LARGEST_YAML = 1 << 20  # Greatest size of a YAML file, [bytes]
 _NUMBER = re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+")
 """Numbers such as 1e-3, which YAML 1.1 reads as words because they lack a point or a sign."""
 MARK = b"written by viapoint"
 """Text that every file of this package contains where a user names its place, apart from JSON."""
-JSON_MARK = b'"viapoint":'
-"""Name of the version in JSON files of this package."""
+JSON_MARK = b'"viapoint":'  # Name of the version in JSON files of this package
 UNFINISHED = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{32}\.(?P<kind>part|old)")
 """Temporary names of :func:`write_bytes` and :func:`write_folder`, which a crash leaves behind."""
 PACKAGES = ("viapoint", "gymnasium", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")

@@ -40,12 +40,10 @@ from viapoint.training.scene_sets.scene_set import load, shipped_set
 MOTION, AGENT, SEARCH = "motion planner", "agent", "geometry search"
 STRAIGHT, OMPL, HAND = "straight movement", "OMPL", "by hand"
 """Names of the methods; the motion planner is :func:`~viapoint.training.plan_motion`."""
-MOST_OBSTACLES = 24
-"""Greatest number of obstacles of a scene."""
+MOST_OBSTACLES = 24  # Greatest number of obstacles of a scene
 SIMULATED = ("sphere", "capsule", "cylinder", "box", "half_space")
 """Shapes that every scene may have."""
-BOX_SIZES = ("half-depth", "half-width", "half-height")
-"""Names of the half lengths of a box."""
+BOX_SIZES = ("half-depth", "half-width", "half-height")  # Names of the half lengths of a box
 SIZES = {"radius": (0.01, 0.1), "half-length": (0.005, 0.3), **dict.fromkeys(BOX_SIZES, (0.005, 0.5))}
 """Bounds of the sliders of obstacles, [m]."""
 

@@ -27,12 +27,9 @@ from viapoint.training.planning.search import GeometrySearch, merits
 
 TIME_LIMIT, SECOND_LIMIT = 0.03, 0.3
 """Time limits of the motion planner after a change, and in a pause where that found no free movement, [s]."""
-N_PROPOSALS = 5
-"""Proposals that are shown."""
-N_CANDIDATES = 256
-"""Best candidates among which distinct proposals are looked for."""
-APART = 0.03
-"""Distance by which the paths of two proposals differ somewhere, [m]."""
+N_PROPOSALS = 5  # Proposals that are shown
+N_CANDIDATES = 256  # Best candidates among which distinct proposals are looked for
+APART = 0.03  # Distance by which the paths of two proposals differ somewhere, [m]
 N_CHECKS, REFINEMENTS = 512, 3
 """Candidates of the geometry search, and rounds of refinement around the best of them."""
 NEXT_START = 0.02

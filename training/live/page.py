@@ -35,12 +35,9 @@ from viapoint.training.live.drawing import ArmDrawing, View
 from viapoint.training.live.panels import RESET, Panels
 from viapoint.training.live.state import Scene, State
 
-LOOPBACK = "127.0.0.1"
-"""Address that only this machine reaches."""
-PAUSE = 0.12
-"""Time without other changes after which proposals and comparisons are computed, [s]."""
-TICK = 0.03
-"""Time between two pictures of a movement, [s]."""
+LOOPBACK = "127.0.0.1"  # Address that only this machine reaches
+PAUSE = 0.12  # Time without other changes after which proposals and comparisons are computed, [s]
+TICK = 0.03  # Time between two pictures of a movement, [s]
 
 
 class Tab:

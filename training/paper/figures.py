@@ -25,10 +25,8 @@ from viapoint.training.paper.rows.one_via import ENDS
 from viapoint.training.paper.rows.straight import DIAGONALS, DURATION, diagonals
 from viapoint.training.plotting.top_view import footprint
 
-WIDTH = 8.5
-"""Width of a column, [cm]."""
-STYLE = Path(__file__).with_name("paper.mplstyle")
-"""Matplotlib's style of all figures."""
+WIDTH = 8.5  # Width of a column, [cm]
+STYLE = Path(__file__).with_name("paper.mplstyle")  # Matplotlib's style of all figures
 MODEL: dict[str, Any] = {"color": PALETTE.plan, "linewidth": 2.2, "solid_capstyle": "round"}
 """Style of the model: a wide light line that stays visible beside the arm."""
 ARM: dict[str, Any] = {"color": PALETTE.executed, "linewidth": 0.9, "linestyle": (0, (4, 1.5))}
@@ -380,12 +378,10 @@ def limits() -> Figure:
     return figure
 
 
-SUM: dict[str, Any] = {"color": PALETTE.contact, "linewidth": 1.1}
-"""Style of the superposition."""
+SUM: dict[str, Any] = {"color": PALETTE.contact, "linewidth": 1.1}  # Style of the superposition
 PART: dict[str, Any] = {"color": PALETTE.contact, "linewidth": 0.6, "linestyle": ":"}
 """Style of its two parts."""
-NOW: dict[str, Any] = {"color": THIRD, "linewidth": 0.8}
-"""Style of the moment of revision."""
+NOW: dict[str, Any] = {"color": THIRD, "linewidth": 0.8}  # Style of the moment of revision
 
 
 def paths_and_speeds() -> Figure:

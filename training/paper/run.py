@@ -84,8 +84,7 @@ AROUND_LIGHTS = (obstacles.obstacle_claims, figures.around_lights, figures.isoch
 """Functions of them that take the movements around obstacles."""
 
 
-Pictures = list[tuple[Path, str]]
-"""Figures (PNG) and their captions."""
+Pictures = list[tuple[Path, str]]  # Figures (PNG) and their captions
 
 
 def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], Pictures]:
@@ -107,8 +106,7 @@ def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], Pictures]:
 
 
 TITLE = "Flash & Hogan 1985, reproduced with viapoint"
-PAGES = ("table.md", "table.json", "index.html")
-"""Files besides the figures."""
+PAGES = ("table.md", "table.json", "index.html")  # Files besides the figures
 HEADINGS = (
     "row", "claim", "paper's figure", "paper", "model", "expected", "simulated arm", "expected", "hand off plan [mm]",
     "verdict",

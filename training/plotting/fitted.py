@@ -33,10 +33,8 @@ class Measured(NamedTuple):
     """Measured movement."""
 
     name: str
-    time: Float
-    """Times of the samples, shape (N,), [s]."""
-    position: Float
-    """Positions, shape (N, D), [m]."""
+    time: Float  # Times of the samples, shape (N,), [s]
+    position: Float  # Positions, shape (N, D), [m]
 
 
 def fitted_movements(path: Path, movements: Sequence[Measured], fits: Sequence[ViaPointFit]) -> None:

@@ -17,14 +17,10 @@ from viapoint.training.io.files import MARK
 from viapoint.training.plotting.video import describe_outcome, play
 from viapoint.training.rollouts.rollout import Decide
 
-TILE = 2.6
-"""Width of one picture, [inch]."""
-RESOLUTION = 110
-"""Resolution, [dots per inch]."""
-COLUMNS = 4
-"""Greatest number of pictures in a row."""
-LINE = 28
-"""Greatest number of characters of the heading above one picture."""
+TILE = 2.6  # Width of one picture, [inch]
+RESOLUTION = 110  # Resolution, [dots per inch]
+COLUMNS = 4  # Greatest number of pictures in a row
+LINE = 28  # Greatest number of characters of the heading above one picture
 
 
 def gallery(

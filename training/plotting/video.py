@@ -23,16 +23,12 @@ from viapoint.training.io.files import MARK
 from viapoint.training.planning.motion_plan import MotionPlan, executed
 from viapoint.training.rollouts.rollout import Decide
 
-CAPTION = 48
-"""Height of the caption below the picture, [pixels]."""
-BLOCK = 16
-"""Encoders need sides that are multiples of this, [pixels]."""
-SPEED = 0.5
-"""Speed of videos relative to real time."""
+CAPTION = 48  # Height of the caption below the picture, [pixels]
+BLOCK = 16  # Encoders need sides that are multiples of this, [pixels]
+SPEED = 0.5  # Speed of videos relative to real time
 PLAN_SIZE, PLAN_FPS = (640, 480), 50
 """Size of the pictures of a plan, [pixels], and pictures per second of its movement."""
-PAUSE = 0.8
-"""Time for which each result stays, [s]."""
+PAUSE = 0.8  # Time for which each result stays, [s]
 
 
 def record_video(

@@ -46,8 +46,7 @@ PATIENCE = 10.0
 
 MAY_CHANGE = ("n_timesteps", "out", "resume", "progress")
 """Fields that may differ when a run is resumed."""
-UNSET = object()
-"""Value of a setting that is not there."""
+UNSET = object()  # Value of a setting that is not there
 
 
 class Run:

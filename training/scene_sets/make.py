@@ -54,14 +54,10 @@ NUMBERS = {"validation": 500, "test": 1000, "hard": 300, "uniform": 500}
 """Number of scenes of each set."""
 FEWER = {"validation": 200, "test": 250}
 """Number of scenes of each set of tasks without obstacles at rest, which have no other sets."""
-MOST_DRAWN = 40
-"""Greatest number of drawn scenes for each one that is wanted."""
-TOGETHER = 250
-"""Scenes that are drawn together."""
-RANDOM_ACTIONS = 512
-"""Number of random actions for the solution share."""
-HARD_SHARE = 0.01
-"""Solution share below which scenes are hard."""
+MOST_DRAWN = 40  # Greatest number of drawn scenes for each one that is wanted
+TOGETHER = 250  # Scenes that are drawn together
+RANDOM_ACTIONS = 512  # Number of random actions for the solution share
+HARD_SHARE = 0.01  # Solution share below which scenes are hard
 
 
 def _ids() -> tuple[str, ...]:

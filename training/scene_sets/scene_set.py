@@ -21,17 +21,13 @@ from viapoint.envs.geometry.obstacles import KINDS, MESH, no_obstacles
 from viapoint.envs.scenes.scene import Scenes, resting
 from viapoint.envs.task import Task
 
-SETS = ("validation", "test", "hard", "uniform")
-"""Names of the sets; a task need not have all."""
-BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")
-"""Bands of the solution share, from easy to hard."""
+SETS = ("validation", "test", "hard", "uniform")  # Names of the sets; a task need not have all
+BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")  # Bands of the solution share, from easy to hard
 BAND_EDGES = (0.2, 0.05, 0.01)
-DRAWN = ""
-"""Family of the scenes that are drawn as in training."""
+DRAWN = ""  # Family of the scenes that are drawn as in training
 SEEDS = {"validation": 1_000_003, "test": 2_000_003}
 """Seeds of the sets that can be drawn, far from training seeds and from each other."""
-NUMBERS = {"validation": 500, "test": 1_000}
-"""Number of scenes of such a set."""
+NUMBERS = {"validation": 500, "test": 1_000}  # Number of scenes of such a set
 LARGEST = 1 << 30
 """Limit of the memory of a file's arrays, [bytes]: a small archive can claim any size."""
 OWN = ("start", "goal", "jumps", "turn_time", "turn_velocity")
@@ -53,12 +49,9 @@ def bands(share: Float) -> NDArray[np.int64]:
 class FrozenScenes:
     """Set of N scenes."""
 
-    name: str
-    """Name of the set, or path of its file."""
-    task: Mapping[str, Any]
-    """Task of the scenes, see :meth:`~viapoint.envs.task.Task.as_dict`."""
-    scenes: Scenes
-    """N scenes, without meshes and point clouds."""
+    name: str  # Name of the set, or path of its file
+    task: Mapping[str, Any]  # Task of the scenes, see :meth:`~viapoint.envs.task.Task.as_dict`
+    scenes: Scenes  # N scenes, without meshes and point clouds
     share: Float
     """Solution share: the fraction of uniformly random actions whose plan is clear, shape (N,); NaN if unknown."""
     family: Any = DRAWN

@@ -43,18 +43,12 @@ MEASURED = ("test", "hard", "uniform")
 class Trial:
     """One row of the results for one seed: what a worker trains and measures."""
 
-    environment: str
-    """Name of the environment in folders and tables."""
-    env_id: str
-    """Id of the registered environment."""
-    env_kwargs: Values = field(default_factory=dict)
-    """Arguments of the environment."""
-    scenes: tuple[str, ...] = ()
-    """Names of the measured sets, or files of scenes."""
-    n_scenes: int | None = None
-    """Number of scenes of each set, evenly spread over it; None for all."""
-    row: str
-    """Name of the row, which is also that of its folder."""
+    environment: str  # Name of the environment in folders and tables
+    env_id: str  # Id of the registered environment
+    env_kwargs: Values = field(default_factory=dict)  # Arguments of the environment
+    scenes: tuple[str, ...] = ()  # Names of the measured sets, or files of scenes
+    n_scenes: int | None = None  # Number of scenes of each set, evenly spread over it; None for all
+    row: str  # Name of the row, which is also that of its folder
     seed: int = 0
     training: Values = field(default_factory=dict)
     """Fields of :class:`TrainConfig`; empty for a baseline."""
@@ -62,10 +56,8 @@ class Trial:
     """Numbers of proposals that the agent checks with exact geometry, one measurement each."""
     refine: tuple[int, ...] = ()
     """Numbers of proposals that the planner refines, one further measurement each."""
-    untrained: bool = False
-    """True to measure the network before training, too."""
-    method: str = ""
-    """Name of a baseline; empty for an agent."""
+    untrained: bool = False  # True to measure the network before training, too
+    method: str = ""  # Name of a baseline; empty for an agent
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the trial."""
@@ -91,10 +83,8 @@ class Search(Trial):
 
     parameters: Values
     """Range or list of values by the path of a field, such as `hyperparameters.learning_rate`."""
-    trials: int = 20
-    """Number of trials."""
-    first: tuple[Values, ...] = ()
-    """Parameters of the first trials."""
+    trials: int = 20  # Number of trials
+    first: tuple[Values, ...] = ()  # Parameters of the first trials
 
     def with_parameters(self, values: Values, folder: Path) -> TrainConfig:
         """Return the configuration of a training with these parameters."""
@@ -130,8 +120,7 @@ class Study:
     """
 
     name: str
-    out: Path
-    """Folder of all runs and results."""
+    out: Path  # Folder of all runs and results
     trials: tuple[Trial, ...]
     searches: tuple[Search, ...] = ()
 

@@ -27,12 +27,9 @@ from viapoint.primitives import Trajectory, minimum_jerk_coefficients, point_to_
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, instants, straight, track
 
-STEP_DURATION = 0.7
-"""Duration of the first movement and of the second one, [s]."""
-MOMENTS = (0.05, 0.1, 0.2, 0.3)
-"""Moments of revision, [s]."""
-NAMES = ("T1", "T4", "T5")
-"""Start, first and second target."""
+STEP_DURATION = 0.7  # Duration of the first movement and of the second one, [s]
+MOMENTS = (0.05, 0.1, 0.2, 0.3)  # Moments of revision, [s]
+NAMES = ("T1", "T4", "T5")  # Start, first and second target
 SWITCH, WHOLE_DURATION = 0.3, 0.8
 """Moment of revision and duration of the first movement in row 11, [s]."""
 
@@ -41,12 +38,9 @@ class DoubleStep(NamedTuple):
     """Movement to a target that jumps, as a sum and as a revised plan."""
 
     first: Trajectory
-    second: Trajectory
-    """Movement that is added at the revision, on its own clock."""
-    replanned: Trajectory
-    """Plan from the revision on, on its own clock."""
-    moment: float
-    """Moment of revision, [s]."""
+    second: Trajectory  # Movement that is added at the revision, on its own clock
+    replanned: Trajectory  # Plan from the revision on, on its own clock
+    moment: float  # Moment of revision, [s]
 
     @property
     def arrival(self) -> float:
