@@ -50,8 +50,8 @@ RECORDED = tyro.conf.arg(
 )
 PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent: {_listed(SHIPPED_IDS)}.")
 ARM = tyro.conf.arg(metavar="ARM", help="Arm: panda, planar, or an MJCF or URDF file.")
+# Environments of the built-in arms; that of other arms is viapoint/Obstacles-v0
 ARM_ENVS = {"planar": DEFAULT_ENV, "panda": "viapoint/PandaObstacles-v0"}
-"""Environments of the built-in arms; that of other arms is viapoint/Obstacles-v0."""
 
 
 def _plain(name: str, value: Any) -> Any:
@@ -284,22 +284,8 @@ class TrainConfig(Config):
         return Path(self.out) if self.out else usual
 
     def as_json(self) -> dict[str, Any]:
-        """Return the configuration as plain values; :meth:`from_json` is the inverse."""
-        values = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
-        return {**values, "out": None if self.out is None else str(self.out)}
-
-    @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> TrainConfig:
-        """Return the configuration that plain values describe.
-
-        Raises:
-            ValueError: A name is unknown or a value is not allowed.
-        """
-        names = [each.name for each in dataclasses.fields(cls)]
-        for name in record:
-            if name not in names:
-                raise ValueError(unknown_name("fields of a training", name, names))
-        return cls(**record)
+        """Return the configuration as plain values, which are arguments of an equal one."""
+        return {**dataclasses.asdict(self), "out": None if self.out is None else str(self.out)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -590,15 +576,8 @@ class DemoConfig(Config):
     def _check(self) -> None:
         check_registered(self.env)
         if not registered_task(self.env).whole_movement:
-            raise ValueError(
-                f"env must have whole movements as actions, {DEFAULT_ENV} for one, got {self.env!r}"
-            )
+            raise ValueError(f"env must have whole movements as actions, as {DEFAULT_ENV}, got {self.env!r}")
         check_folder("out", self.out)
-
-    @property
-    def total_timesteps(self) -> int:
-        """Decisions of a new training."""
-        return self.n_timesteps or TrainConfig(env=self.env).total_timesteps // 4
 
 
 @dataclass(frozen=True, kw_only=True)

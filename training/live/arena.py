@@ -38,14 +38,12 @@ from viapoint.training.paper.movements import TARGETS, rows_of_lights
 from viapoint.training.scene_sets.scene_set import load, shipped_set
 
 MOTION, AGENT, SEARCH = "motion planner", "agent", "geometry search"
-STRAIGHT, OMPL, HAND = "straight movement", "OMPL", "by hand"
-"""Names of the methods; the motion planner is :func:`~viapoint.training.plan_motion`."""
+STRAIGHT, OMPL, HAND = "straight movement", "OMPL", "by hand"  # Names of methods
 MOST_OBSTACLES = 24  # Greatest number of obstacles of a scene
-SIMULATED = ("sphere", "capsule", "cylinder", "box", "half_space")
-"""Shapes that every scene may have."""
+SIMULATED = ("sphere", "capsule", "cylinder", "box", "half_space")  # In every scene
 BOX_SIZES = ("half-depth", "half-width", "half-height")  # Names of the half lengths of a box
+# Bounds of the sliders of obstacles, [m]
 SIZES = {"radius": (0.01, 0.1), "half-length": (0.005, 0.3), **dict.fromkeys(BOX_SIZES, (0.005, 0.5))}
-"""Bounds of the sliders of obstacles, [m]."""
 
 _agent_lock = threading.Lock()  # tabs share an agent
 

@@ -25,18 +25,15 @@ from viapoint.training.planning.plan_motion import SEEDS, checked_motion, plan_m
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import GeometrySearch, merits
 
+# Time limits of the motion planner after a change, and in a pause where that found no free movement, [s]
 TIME_LIMIT, SECOND_LIMIT = 0.03, 0.3
-"""Time limits of the motion planner after a change, and in a pause where that found no free movement, [s]."""
 N_PROPOSALS = 5  # Proposals that are shown
 N_CANDIDATES = 256  # Best candidates among which distinct proposals are looked for
 APART = 0.03  # Distance by which the paths of two proposals differ somewhere, [m]
-N_CHECKS, REFINEMENTS = 512, 3
-"""Candidates of the geometry search, and rounds of refinement around the best of them."""
-NEXT_START = 0.02
-"""Least difference of a coordinate between the present position and a goal that begins a new movement."""
+N_CHECKS, REFINEMENTS = 512, 3  # Candidates of the geometry search, and rounds around the best
+NEXT_START = 0.02  # Least way to a goal that begins a new movement, in a coordinate
 
-Decide = Callable[[Observation], Float]
-"""Function that returns the action, shape (1, m), for an observation."""
+Decide = Callable[[Observation], Float]  # Action, shape (1, m), for an observation
 
 
 def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Proposal:

@@ -26,22 +26,19 @@ if TYPE_CHECKING:
     import viser
 
 SIDES = 8  # Sides of a tube
-PLAN, PROPOSAL, DONE = 0.0050, 0.0028, 0.0032
-"""Radii of the plan, of other proposals, and of the executed path, [m]."""
+PLAN, PROPOSAL, DONE = 0.0050, 0.0028, 0.0032  # Radii of plan, proposals, executed path, [m]
 SHRUNK = 0.05
 """Factor of the vertices of proposals, which their nodes undo. The client outlines what the pointer is over; it merges
 the vertices of meshes with radii above 0.1 in cubes of 0.01, which leaves gaps in the outline of a thin tube."""
+# Shifts of proposals and of the executed path, so that the plan stays visible, [m]
 BELOW, ABOVE = np.array([0.0, 0.0, -0.002]), np.array([0.0, 0.0, 0.004])
-"""Shifts of proposals and of the executed path, so that the plan stays visible, [m]."""
 RADII = {"start": 0.018, "goal": 0.018, "via": 0.013}  # Radii of the handles, [m]
 PLANE = (-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), 33.0
+# First views: position of the camera, point that it looks at, [m], direction up, and field of view, [degrees]
 SPACE = (2.6, -2.0, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), 38.0
-"""First views: position of the camera, point that it looks at, [m], direction up, and field of view, [degrees]."""
-OPACITY, GHOST, PALE = 0.45, 0.16, 0.25
-"""Opacities: of a planar arm and of large obstacles, which hide others; of the arm at the goal; of an old plan."""
+OPACITY, GHOST, PALE = 0.45, 0.16, 0.25  # Of what hides others, the arm at the goal, an old plan
 LARGE = 0.16  # Greatest size of obstacles in space that are not large, [m]
-LOW, TALL = 0.030, 0.060
-"""Height of obstacles in the plane, [m]: below links that pass above them, and where links collide."""
+LOW, TALL = 0.030, 0.060  # Height of obstacles in the plane, [m]: below links, and as tall as links
 FARTHEST = 1.2  # Greatest coordinate to which something can be dragged, [m]
 
 

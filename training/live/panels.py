@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
 WIDTH = 330  # Width of a panel, [pixels]
 RESET = "Reset"  # Name of the button that undoes all changes of a scene
-CHECKS = {"none": 0, "16": 16, "64": 64}
-"""Numbers of proposals that the agent checks with computed geometry."""
+CHECKS = {"none": 0, "16": 16, "64": 64}  # Proposals that are checked with computed geometry
 NOTE = '<div style="padding:0.2em 0.9em;font-size:0.8em;color:#6b7078">{}</div>'
 MESSAGE = '<div id="viapoint-message" style="padding:0.2em 0.9em;font-size:0.9em;color:{}">{}</div>'
 CODE = (

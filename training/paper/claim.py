@@ -39,8 +39,7 @@ def at_least(value: float) -> Range:
     return Range(low=value)
 
 
-Number: TypeAlias = tuple[Any, Range]
-"""Computed number, a float of Python or NumPy, and its expected range."""
+Number: TypeAlias = tuple[Any, Range]  # Computed number and its expected range
 
 
 @dataclass(frozen=True)
@@ -52,8 +51,7 @@ class Claim:
     figure: str = "-"  # Figure of the paper
     paper: str = "-"  # Statement or measurement of the paper
     model: Number | None = None  # Number on the model; None where it needs an arm
-    arm: Number | None = None
-    """Number on the simulated arm; None for statements about the mathematics alone."""
+    arm: Number | None = None  # Number on the simulated arm; None for mathematics alone
     deviation: float | None = None  # Greatest distance of the simulated hand from the plan, [mm]
     unit: str = ""  # Unit of the numbers
 

@@ -140,8 +140,7 @@ class SimulatedMovements(NamedTuple):
     planned: Float  # Hand position of the plan, shape (N, T, 2), [m]
     hand: Float  # Shape (N, T, 2), [m]
     joints: Float  # Shoulder and elbow angles, shape (N, T, 2), [rad]
-    torque: Float
-    """Torque of the actuators in the step that begins at each instant, shape (N, T - 1, 2), [N m]."""
+    torque: Float  # Torque of the step after each instant, shape (N, T - 1, 2), [N m]
 
     @property
     def deviation(self) -> Float:

@@ -80,8 +80,8 @@ DRAWINGS: dict[str, tuple[str, Callable[..., Figure]]] = {
         figures.comparison),
 }  # fmt: skip
 """Captions and functions of the figures by their file names, in the order of the paper."""
+# Functions of them that take the movements around obstacles
 AROUND_LIGHTS = (obstacles.obstacle_claims, figures.around_lights, figures.isochrony)
-"""Functions of them that take the movements around obstacles."""
 
 
 Pictures = list[tuple[Path, str]]  # Figures (PNG) and their captions

@@ -16,12 +16,10 @@ from viapoint.envs.common.types import Float
 from viapoint.primitives import ViaPointFit
 from viapoint.training.io.files import MARK
 
-STYLE = files("viapoint.training") / "paper" / "paper.mplstyle"
-"""Matplotlib's style of the figures of movements."""
-WIDTH, HEIGHT, LEGEND = 17.0, 5.4, 0.7
-"""Width of the figure, height of each movement, and that of the legend, [cm]."""
+STYLE = files("viapoint.training") / "paper" / "paper.mplstyle"  # Style of figures
+WIDTH, HEIGHT, LEGEND = 17.0, 5.4, 0.7  # Of the figure, each movement, the legend, [cm]
+# Style of the fit: a wide light line below the samples
 FITTED: dict[str, Any] = {"color": PALETTE.plan, "linewidth": 2.2, "label": "fitted"}
-"""Style of the fit: a wide light line below the samples."""
 POINT: dict[str, Any] = {"linestyle": "none", "markeredgecolor": "white", "markeredgewidth": 0.6}
 SAMPLES: dict[str, Any] = {"color": PALETTE.executed, "linestyle": "none", "marker": ".", "markersize": 1.8}
 VIA: dict[str, Any] = {**POINT, "color": PALETTE.via, "marker": "o", "markersize": 6.0, "label": "via-points"}

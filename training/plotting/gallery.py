@@ -53,30 +53,22 @@ def gallery(
     figure.set_layout_engine("constrained", w_pad=0.03, h_pad=0.03)
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat:
-        axes.set_axis_off()
+        axes.set(xticks=[], yticks=[], frame_on=False)
     for row, (axes, title) in enumerate(zip(grid.flat, titles, strict=False)):
         outcome, colour = describe_outcome(play(env, scenes.take([row]), decide))
         axes.imshow(env.unwrapped.render())
         axes.set_title(outcome, fontsize=8.5, color=colour, fontweight="bold", pad=3)
-        axes.text(
-            0.5,
-            -0.02,
-            title,
-            fontsize=8,
-            color=PALETTE.joint,
-            ha="center",
-            va="top",
-            transform=axes.transAxes,
-        )
+        axes.set_xlabel(title, fontsize=8, color=PALETTE.joint)
     marks = {
-        "planned": PALETTE.plan,
-        "executed": PALETTE.executed,
-        "via-point": PALETTE.via,
-        "goal": PALETTE.goal,
+        "planned": "plan",
+        "executed": "executed",
+        "via-point": "via",
+        "goal": "goal",
+        "contact": "contact",
     }
-    handles = [Line2D([], [], color=colour, linewidth=4) for colour in (*marks.values(), PALETTE.contact)]
+    handles = [Line2D([], [], color=getattr(PALETTE, name), linewidth=4) for name in marks.values()]
     places: Any = {"loc": "outside lower center", "ncols": 5 if columns > 1 else 2}
-    figure.legend(handles, [*marks, "contact"], **places, fontsize=8, frameon=False)
+    figure.legend(handles, list(marks), **places, fontsize=8, frameon=False)
     if lines:
         figure.suptitle("\n".join(lines), fontsize=11, color=PALETTE.executed)
     figure.savefig(path, metadata={"Software": MARK.decode()})

@@ -15,8 +15,7 @@ import numpy as np
 from viapoint.envs.env import ReachEnv
 from viapoint.training.planning.baselines import Method, OpenLoopBaseline, PlannerMethod
 
-DATASET_ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")
-"""Names that Minari allows: groups, a name, and a version."""
+DATASET_ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")  # As Minari allows: groups, name, version
 
 
 def dataset_folder(dataset_id: str) -> Path:

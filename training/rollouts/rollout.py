@@ -18,8 +18,8 @@ from viapoint.training.planning.search import registered_task
 if TYPE_CHECKING:
     from viapoint.envs.vector_env import ReachVectorEnv
 
+# Function of observations and scenes that returns actions, shape (N, m)
 Decide = Callable[[Observation, Scenes], Float]
-"""Function of observations and scenes that returns actions, shape (N, m)."""
 
 
 class SimulationResults(NamedTuple):

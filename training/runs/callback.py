@@ -22,10 +22,9 @@ from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets.scene_set import FrozenScenes, scenes_for
 
 LOG_EVERY = 1_000  # Decisions between two entries of the log
-RATES = ("collision", "reachable")
-"""Metrics of an episode that are true or false; Stable-Baselines3 logs the success itself."""
+RATES = ("collision", "reachable")  # Metrics that are true or false
+# Metrics of a validation in the log and in the learning curve; medians in [m] and [s]
 VALIDATED = ("success", "collision", "min_clearance", "goal_error", "jerk_ratio", "duration")
-"""Metrics of a validation in the log and in the learning curve; medians in [m] and [s]."""
 
 
 class TrainingStoppedError(Exception):

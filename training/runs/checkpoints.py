@@ -36,10 +36,9 @@ COUNTERS = (
 """Counters of Stable-Baselines3's algorithms."""
 ARRAYS = ("_last_obs", "_last_episode_starts")
 DEQUES = ("ep_info_buffer", "ep_success_buffer")
+# Errors of content that is none of a checkpoint, or that does not fit the model
 UNFIT = (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OSError, EOFError)
-"""Errors of content that is none of a checkpoint, or that does not fit the model."""
-MAY_DIFFER = ("num_timesteps", "viapoint")
-"""Entries of a model's description that say nothing about which model it is."""
+MAY_DIFFER = ("num_timesteps", "viapoint")  # Entries that do not tell models apart
 
 
 def write_checkpoint(model: BaseAlgorithm, path: Path, extra: Mapping[str, Any]) -> None:

@@ -25,19 +25,15 @@ SETS = ("validation", "test", "hard", "uniform")  # Names of the sets; a task ne
 BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")  # Bands of the solution share, from easy to hard
 BAND_EDGES = (0.2, 0.05, 0.01)
 DRAWN = ""  # Family of the scenes that are drawn as in training
-SEEDS = {"validation": 1_000_003, "test": 2_000_003}
-"""Seeds of the sets that can be drawn, far from training seeds and from each other."""
+SEEDS = {"validation": 1_000_003, "test": 2_000_003}  # Far from training seeds
 NUMBERS = {"validation": 500, "test": 1_000}  # Number of scenes of such a set
-LARGEST = 1 << 30
-"""Limit of the memory of a file's arrays, [bytes]: a small archive can claim any size."""
-OWN = ("start", "goal", "jumps", "turn_time", "turn_velocity")
-"""Arrays of :class:`Scenes` in a file."""
-MOVING = ("centre", "rotation", "size", "velocity")
-"""Arrays of :class:`Obstacles` in a file, besides their kind."""
+LARGEST = 1 << 30  # Limit of a file's arrays, [bytes]: small archives can claim any size
+OWN = ("start", "goal", "jumps", "turn_time", "turn_velocity")  # Arrays of `Scenes`
+MOVING = ("centre", "rotation", "size", "velocity")  # Arrays of `Obstacles` beside kind
+# Arrays of a file, with one entry for each scene
 CONTENT = ("start", "goal", "kind", *MOVING, "jumps", "turn_time", "turn_velocity", "share", "family")
-"""Arrays of a file, with one entry for each scene."""
+# Fields of a task that say which scenes are scenes of it, besides kinds and families of obstacles
 SCENE_FIELDS = ("arm", "n_obstacles", "whole_arm", "moving_obstacles", "n_jumps")
-"""Fields of a task that say which scenes are scenes of it, besides kinds and families of obstacles."""
 
 
 def bands(share: Float) -> NDArray[np.int64]:
@@ -52,10 +48,8 @@ class FrozenScenes:
     name: str  # Name of the set, or path of its file
     task: Mapping[str, Any]  # Task of the scenes, see :meth:`~viapoint.envs.task.Task.as_dict`
     scenes: Scenes  # N scenes, without meshes and point clouds
-    share: Float
-    """Solution share: the fraction of uniformly random actions whose plan is clear, shape (N,); NaN if unknown."""
-    family: Any = DRAWN
-    """Name of each scene's family, shape (N,), or one for all; DRAWN for the families of training."""
+    share: Float  # Share of random actions whose plan is clear, shape (N,); NaN if unknown
+    family: Any = DRAWN  # Name of each scene's family, shape (N,), or one for all
 
     def __post_init__(self) -> None:
         """Expand the names of families to all scenes."""

@@ -25,10 +25,9 @@ from viapoint.training.study.config import Study, Trial
 
 Record = dict[str, Any]
 KEYS = ["environment", "set", "method"]
+# Columns that are medians over seeds; `decisions` are those of a training
 MEDIANS = ["collision", "jerk_ratio", "movement_s", "decision_ms", "decisions"]
-"""Columns that are medians over seeds; `decisions` are those of a training."""
-COLUMNS = [*KEYS, "seeds", "scenes", "success", "low", "high", *MEDIANS]
-"""Columns of `results.csv`; success is a share with its 95 % interval."""
+COLUMNS = [*KEYS, "seeds", "scenes", "success", "low", "high", *MEDIANS]  # Of `results.csv`
 NOTE = (
     "Success with 95 % intervals. Jerk of successes, relative to the straight movement's. Median time of a decision on "
     "the cores of one trial. Written by `viapoint study`."

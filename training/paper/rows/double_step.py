@@ -30,8 +30,7 @@ from viapoint.training.paper.movements import TARGETS, SimulatedMovements, insta
 STEP_DURATION = 0.7  # Duration of the first movement and of the second one, [s]
 MOMENTS = (0.05, 0.1, 0.2, 0.3)  # Moments of revision, [s]
 NAMES = ("T1", "T4", "T5")  # Start, first and second target
-SWITCH, WHOLE_DURATION = 0.3, 0.8
-"""Moment of revision and duration of the first movement in row 11, [s]."""
+SWITCH, WHOLE_DURATION = 0.3, 0.8  # Revision and duration of the first movement in row 11, [s]
 
 
 class DoubleStep(NamedTuple):

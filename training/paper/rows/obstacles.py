@@ -25,8 +25,7 @@ from viapoint.training.rollouts.rollout import SceneSimulation
 
 LENGTHS = (0.15, 0.2, 0.25)  # Lengths of the rows of lights, [m]; the paper's were up to 25 cm
 RADII = (0.008, 0.02)  # Half widths of the rows of lights, [m]
-SHIFTS = ((0.0, 0.0), (-0.05, 0.02), (0.05, -0.02))
-"""Offsets of a row's middle from the middle of the line between the targets, along and across it, [m]."""
+SHIFTS = ((0.0, 0.0), (-0.05, 0.02), (0.05, -0.02))  # Shifts along and across the line, [m]
 
 
 class ObstacleMovements(NamedTuple):

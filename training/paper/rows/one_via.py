@@ -64,11 +64,9 @@ def closed_form(waypoints: Float, share: float, time: Float) -> Float:
 
 
 ENDS = ("T1", "T4")  # Targets of the family of curved movements; Fig. 1B shows one of them.
-EXAMPLE = (0.35, -0.4)
-"""d1 / (d1 + d2) and d3 / (d1 + d2) of the movement of Fig. 1B, towards the body."""
+EXAMPLE = (0.35, -0.4)  # d1 / (d1 + d2) and d3 / (d1 + d2) of Fig. 1B, towards the body
 ALONGS = np.array([0.25, 0.35, 0.45, 0.55, 0.65, 0.75])  # d1 / (d1 + d2) of the family
-HEIGHTS = np.array([-0.42, -0.45, -0.48, -0.51, -0.54])
-"""d3 / (d1 + d2) of the family: high enough for two speed peaks everywhere, and within the reach."""
+HEIGHTS = np.array([-0.42, -0.45, -0.48, -0.51, -0.54])  # d3 / (d1 + d2), all with two peaks
 N_VIAS = 300  # Number of random via-points in row 4
 
 
