@@ -5,8 +5,7 @@ import pytest
 from PIL import Image
 
 from viapoint.training import GeometrySearch
-from viapoint.training.plotting.gallery import gallery
-from viapoint.training.plotting.video import record_video
+from viapoint.training.plotting.video import gallery, record_video
 
 TASKS = tuple(
     f"viapoint/{task}-v0" for task in ("PlanarObstacles", "PandaObstacles", "PlanarMovingObstacles")

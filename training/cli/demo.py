@@ -21,8 +21,7 @@ from viapoint.training.io.progress import scene_progress
 from viapoint.training.planning.baselines import Method, agent_method, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plotting import plots
-from viapoint.training.plotting.gallery import gallery
-from viapoint.training.plotting.video import record_video
+from viapoint.training.plotting.video import gallery, record_video
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, scenes_for

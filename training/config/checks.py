@@ -106,13 +106,6 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
     """Check values against the type hints of a function or class, and numbers against their ranges.
 
     The algorithms accept any number, and many a wrong one shows only as a training that does not learn.
-
-    Args:
-        function: Function, or class whose constructor names the types.
-        values: Arguments by name.
-
-    Raises:
-        ValueError: A value has another type, or a number is out of range.
     """
     # The hints of Stable-Baselines3 name VecEnv, which its modules import for type checkers only.
     hinted: Any = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009

@@ -55,11 +55,7 @@ ARM_ENVS = {"planar": DEFAULT_ENV, "panda": "viapoint/PandaObstacles-v0"}
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Return a value as JSON has it: NumPy's numbers and arrays as Python's, registered arms by name.
-
-    Raises:
-        ValueError: JSON has no form of it.
-    """
+    """Return a value as JSON has it: NumPy's numbers and arrays as Python's, arms by name or file."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if isinstance(value, Arm) and value.file:
@@ -210,11 +206,7 @@ class TrainConfig(Config):
 
     @functools.cached_property
     def task(self) -> Task:
-        """Task of the environment.
-
-        Raises:
-            ValueError: An argument of the environment is unknown or has a value that is not allowed.
-        """
+        """Task of the environment; an unknown or wrong argument of it raises ValueError."""
         try:
             return registered_task(self.env, **self.env_kwargs)
         except TypeError as error:

@@ -249,11 +249,7 @@ def evaluate(
 def _environment_of(
     agent: BaseAlgorithm | Method | None, env: str | None, env_kwargs: Mapping[str, Any] | None
 ) -> tuple[str, dict[str, Any]]:
-    """Return id and arguments of the environment whose scenes are evaluated, in which an action is a whole movement.
-
-    Raises:
-        ValueError: The agent is for another environment, or none is given.
-    """
+    """Return id and arguments of the environment of an evaluation, in which an action is a whole movement."""
     if not isinstance(agent, BaseAlgorithm):
         if env is None:
             raise ValueError("env must be the id of an environment where no trained agent is given")

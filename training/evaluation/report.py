@@ -89,14 +89,10 @@ def text(record: Record) -> str:
     parts = [title(record)]
     for first in range(0, cells.shape[1], fitting):
         part = cells.iloc[:, first : first + fitting]
-        names = [
-            name if len(name) <= COLUMN - 4 else name.replace(", ", ",\n").replace(" (", "\n(")
-            for name in part
-        ]
+        names = [name.replace(", ", ",\n").replace(" (", "\n(") for name in part]
         align = ["left", *["right"] * len(names)]
-        parts.append(
-            part.to_markdown(headers=["", *names], tablefmt="simple", colalign=align, disable_numparse=True)
-        )
+        settings: Any = {"tablefmt": "simple", "colalign": align, "disable_numparse": True}
+        parts.append(part.to_markdown(headers=["", *names], **settings))
     return "\n\n".join(parts)
 
 

@@ -56,11 +56,7 @@ class BadFileError(ValueError):
 
 
 def check_ours(path: Path) -> None:
-    """Check that a file may be written: there is none yet, or one that this package wrote.
-
-    Raises:
-        BadFileError: There is something else.
-    """
+    """Check that a file may be written: there is none yet, or one that this package wrote."""
     if not (path.is_symlink() or path.exists()):
         return
     if not path.is_file():
@@ -142,11 +138,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
-    """Read a JSON object of finite numbers.
-
-    Raises:
-        BadFileError: It is missing, larger than `largest` bytes, not JSON, or not an object.
-    """
+    """Read a JSON object of finite numbers; what is missing, too large [bytes] or no object raises BadFileError."""
     content = read_bytes(path, largest)
     try:
         value = json.loads(content, parse_constant=_finite, parse_float=_finite)
@@ -158,11 +150,7 @@ def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
 
 
 def read_bytes(path: Path, largest: int | None = None) -> bytes:
-    """Return the content of a regular file.
-
-    Raises:
-        BadFileError: It is missing, no regular file, larger than `largest` bytes, or cannot be read.
-    """
+    """Return the content of a regular file; what is missing, too large [bytes] or unreadable raises BadFileError."""
     try:
         if not path.exists():
             raise BadFileError(path, "is missing")
@@ -194,11 +182,7 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.01234
 
 
 def parse_yaml(text: str | bytes) -> Any:
-    """Return the plain values that a YAML text holds.
-
-    Raises:
-        ValueError: The text is no YAML, or a name is there twice.
-    """
+    """Return the plain values of a YAML text; other texts, and names that are there twice, raise ValueError."""
     try:
         return yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -206,11 +190,7 @@ def parse_yaml(text: str | bytes) -> Any:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML file that holds values by name.
-
-    Raises:
-        BadFileError: It is missing, too large, no YAML, or holds something else.
-    """
+    """Read a YAML file of values by name; what is missing, too large or something else raises BadFileError."""
     content = read_bytes(path, LARGEST_YAML)
     try:
         value = parse_yaml(content)
@@ -227,11 +207,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def read_arrays(path: Path, largest: int | None = None) -> Arrays:
-    """Read named arrays.
-
-    Raises:
-        BadFileError: It is missing, larger than `largest` bytes, truncated or no safetensors file.
-    """
+    """Read named arrays; a file that is missing, too large [bytes] or torn raises BadFileError."""
     content = read_bytes(path, largest)
     try:
         return load_arrays(content)

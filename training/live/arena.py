@@ -49,14 +49,7 @@ _agent_lock = threading.Lock()  # tabs share an agent
 
 
 class Arena:
-    """Arm, task, agent and environments of one tab.
-
-    Args:
-        env_id: Id of the environment.
-        agent: Agent; None for none.
-        seed: Seed of the random scenes.
-        env_kwargs: Arguments of the environment.
-    """
+    """Arm, task, agent (or None) and environments of one tab."""
 
     def __init__(
         self, env_id: str, agent: Agent | None, seed: int | None, env_kwargs: Mapping[str, Any]
@@ -88,11 +81,10 @@ class Arena:
         """Names of the methods that can be chosen; the first one is the default."""
 
     def env(self, name: str) -> ReachVectorEnv:
-        """Return a batch of one environment, which is made once.
+        """Return a batch of one environment, which is made once, by its name.
 
-        Args:
-            name: `own`: with obstacles as the agent knows them; `any`: with obstacles of any number and shape;
-                `whole`: the same where a plan is never revised; `steps`: as the id says.
+        Names are `own`: with obstacles as the agent knows them; `any`: with others, too; `whole`: the same, with a plan that is
+        never revised; `steps`: as the id says.
         """
         if name not in self._envs:
             arguments = self.arguments["own" if name in ("own", "steps") else "any"]
@@ -169,11 +161,7 @@ class Arena:
         return Scene(obstacles=tuple(options["obstacles"]), **arrays)
 
     def read(self, content: str | bytes) -> Scene:
-        """Return the scene of a JSON file; parts that it lacks are drawn.
-
-        Raises:
-            ValueError: The file holds no scene, or an impossible one.
-        """
+        """Return the scene of a JSON file; missing parts are drawn, and an impossible one raises ValueError."""
         options, env = scene_from_json(content), self.env("any")
         try:
             env.reset(options=options)
@@ -216,13 +204,7 @@ class Arena:
         return quaternion
 
     def clearances(self, coordinates: Float, obstacles: Obstacles, times: Float | None = None) -> Float:
-        """Return clearances from the obstacles of one scene and of the arm from itself, shape (T, 2), [m].
-
-        Args:
-            coordinates: Shape (T, D).
-            obstacles: Obstacles at time 0.
-            times: Shape (T,), [s]; 0 by default.
-        """
+        """Return clearances from obstacles at T times [s] and of the arm from itself, shape (T, 2), [m]."""
         arm, number = self.task.arm, len(coordinates)
         joints, rows = self.task.space.joints(coordinates), obstacles.take(np.zeros(number, np.int64))
         when = np.zeros(number) if times is None else times
@@ -231,14 +213,8 @@ class Arena:
     def moved(self, coordinates: Float, place: Float, scene: Scene | None, turn: Any = None) -> Float:
         """Return coordinates with the tool at another place, in joint space the nearest ones that are free.
 
-        Args:
-            coordinates: Present coordinates, shape (D,).
-            place: New place of the tool, shape (3,), [m].
-            scene: Scene whose obstacles are avoided; None for none.
-            turn: New orientation of the tool, a quaternion; the present one by default.
-
-        Raises:
-            ValueError: The arm cannot reach the place.
+        `scene` has the obstacles that are avoided, if any; `turn` is a new orientation of the tool. A place out of
+        reach raises ValueError.
         """
         if self.task.space.of_hand:
             return np.array(place[:2])

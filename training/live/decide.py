@@ -37,13 +37,7 @@ Decide = Callable[[Observation], Float]  # Action, shape (1, m), for an observat
 
 
 def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Proposal:
-    """Return the plan of the method, or by hand; where the scene is impossible, the motion planner says why.
-
-    Args:
-        arena: Arm, agent and environments.
-        state: Scene, method and its settings.
-        time_limit: Time limit of the motion planner, [s].
-    """
+    """Return the plan of the method, or by hand; where the scene is impossible, the motion planner says why."""
     if state.by_hand is not None:
         assert state.plan is not None
         return _by_hand(arena, state, state.by_hand, state.duration or state.plan.duration)
@@ -181,16 +175,10 @@ def play(
     plan: Plan | None = None,
     goal_of: Callable[[], Float] | None = None,
 ) -> Iterator[Movement]:
-    """Play an episode, and yield the movement so far after each decision.
+    """Play an episode in a batch of one, and yield the movement so far after each decision.
 
-    When the arm has reached a goal that has been dragged away meanwhile, a new episode begins there.
-
-    Args:
-        env: Batch of one environment.
-        scene: Scene.
-        decide: Function of observations.
-        plan: First plan; None for that of a decision.
-        goal_of: Function that returns the present goal, shape (D,); None for one that stays.
+    `plan` replaces the first decision; `goal_of` returns the present goal, shape (D,). When the arm has reached a goal
+    that has been dragged away meanwhile, a new episode begins there.
     """
     observation, _ = env.reset(options=scene.options())
     decision = env.execute_actions(decide(observation)) if plan is None else env.execute_plan(_in_batch(plan))

@@ -70,11 +70,9 @@ def tube(points: Float, radius: float) -> Any:
 
 
 def obstacle_mesh(shape: Shape, levels: tuple[float, float] | None = None) -> Any:
-    """Return the mesh of an obstacle around its position, turned as it is in the world.
+    """Return the mesh of an obstacle around its position, turned as it is in the world; a plate is a half-space.
 
-    Args:
-        shape: Obstacle; a plate stands for a half-space.
-        levels: Least and greatest height of an obstacle in the plane, which is cut off there, [m]; None for space.
+    `levels` are the heights between which an obstacle in the plane is cut off, [m].
     """
     place = np.array(shape.position)
     if isinstance(shape, HalfSpace):
@@ -92,13 +90,8 @@ def obstacle_mesh(shape: Shape, levels: tuple[float, float] | None = None) -> An
 class ArmDrawing:
     """Meshes of an arm, and their poses.
 
-    Args:
-        arm: Arm that moves.
-        model: MuJoCo model of the environment.
-        model_file: MJCF file that the arm was loaded from; its visible geoms replace the capsules.
-
-    Raises:
-        ValueError: The file cannot be read.
+    They are those of a MuJoCo model, or of the visible geoms of the file that the arm was loaded from. A file that
+    cannot be read raises ValueError.
     """
 
     def __init__(self, arm: Arm, model: mujoco.MjModel, model_file: str | Path | None = None) -> None:
@@ -145,14 +138,7 @@ def _first_anchor(model: mujoco.MjModel, arm: Arm) -> Float:
 
 
 class View:
-    """View of one tab, drawn from its state.
-
-    Args:
-        client: Tab.
-        arena: Arm and task.
-        arm: Drawing of the arm.
-        act: Function that is called with the name of what a user does and its values.
-    """
+    """View of one tab, drawn from its state; `act` is called with the name of what a user does and its values."""
 
     def __init__(
         self, client: viser.ClientHandle, arena: Arena, arm: ArmDrawing, act: Callable[..., None]

@@ -41,13 +41,7 @@ TICK = 0.03  # Time between two pictures of a movement, [s]
 
 
 class Tab:
-    """One tab: its state, and the thread in which all that a user does changes it.
-
-    Args:
-        client: Tab of the browser.
-        make: Function that returns arm, task and agent, and the drawing of the arm.
-        on_end: Function that is called when the thread has ended.
-    """
+    """One tab: its state, and the thread in which all that a user does changes it."""
 
     state: State
 

@@ -37,14 +37,7 @@ LINES: Any = (
 
 
 class Panels:
-    """Panels of one tab, drawn from its state.
-
-    Args:
-        client: Tab.
-        arena: Arm, task and agent.
-        scene_kinds: Names of the buttons that draw scenes.
-        act: Function that is called with the name of what a user does and its values.
-    """
+    """Panels of one tab, drawn from its state; `act` is called with the name of what a user does and its values."""
 
     def __init__(
         self, client: viser.ClientHandle, arena: Arena, scene_kinds: Iterable[str], act: Callable[..., None]

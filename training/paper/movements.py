@@ -44,16 +44,10 @@ def left_of(line: Float) -> Float:
 
 
 def via_waypoints(start: Any, goal: Any, along: ArrayLike, height: ArrayLike) -> Float:
-    """Return start, via-point and goal by the construction of Fig. 1B.
+    """Return start, via-point and goal by the construction of Fig. 1B, shape (..., 3, 2), [m].
 
-    Args:
-        start: Shape (2,), [m].
-        goal: Shape (2,), [m].
-        along: d1 / (d1 + d2), shape (...,): where the perpendicular through the via-point meets the line.
-        height: d3 / (d1 + d2), shape (...,); positive is to the left of the movement.
-
-    Returns:
-        Shape (..., 3, 2), [m].
+    The perpendicular through the via-point meets the line at `along` = d1 / (d1 + d2), shape (...,); `height` is
+    d3 / (d1 + d2), positive to the left of the movement.
     """
     line = np.subtract(goal, start)
     along, height = np.broadcast_arrays(along, height)

@@ -1,10 +1,11 @@
-"""Videos of several movements with captions of their outcomes."""
+"""Videos and galleries of several movements with captions of their outcomes."""
 
 from __future__ import annotations
 
 import os
+import textwrap
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ import gymnasium as gym
 import imageio_ffmpeg
 import numpy as np
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont
+from matplotlib.lines import Line2D
 from PIL import Image, ImageDraw, ImageFont
 
 from viapoint.envs.common.palette import PALETTE, Colour
@@ -29,6 +32,10 @@ BLOCK = 16  # Encoders need sides that are multiples of this, [pixels]
 SPEED = 0.5  # Speed of videos relative to real time
 PLAN_SIZE, PLAN_FPS = (640, 480), 50  # Pictures of a plan, [pixels], [1/s]
 PAUSE = 0.8  # Time for which each result stays, [s]
+TILE = 2.6  # Width of one picture, [inch]
+RESOLUTION = 110  # Resolution, [dots per inch]
+COLUMNS = 4  # Greatest number of pictures in a row
+LINE = 28  # Greatest number of characters of the heading above one picture
 
 
 def record_video(
@@ -167,3 +174,54 @@ def _stacked(frame: Frame, caption: Frame) -> Frame:
     whole = np.concatenate((frame, caption))
     height, width = (side - side % BLOCK if side >= BLOCK else side for side in whole.shape[:2])
     return whole[whole.shape[0] - height :, :width]
+
+
+def gallery(
+    path: Path,
+    env: gym.Env[Any, Any],
+    scenes: Scenes,
+    decide: Decide,
+    titles: Sequence[str],
+    *,
+    heading: str = "",
+) -> None:
+    """Play an episode in each scene, and save a page of their last pictures as a PNG file in an existing folder.
+
+    Args:
+        path: PNG file.
+        env: Environment made with `render_mode="rgb_array"`.
+        scenes: Scenes, at least one, with as many rows for obstacles as the environment has.
+        decide: Function from observation and scene, of one row each, to actions, shape (1, m).
+        titles: Text below each picture, such as the difficulty of the scene.
+        heading: Heading of the page.
+
+    Raises:
+        GLUnavailableError: There is no OpenGL library.
+    """
+    columns = min(COLUMNS, len(titles))
+    rows = -(-len(titles) // columns)
+    lines = textwrap.wrap(heading, LINE * columns)
+    margin = 0.45 + 0.3 * bool(lines) + 0.2 * len(lines[1:]) + 0.3 * (columns == 1)
+    figure = Figure(figsize=(TILE * columns, (TILE + 0.5) * rows + margin), dpi=RESOLUTION)
+    figure.set_layout_engine("constrained", w_pad=0.03, h_pad=0.03)
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid.flat:
+        axes.set(xticks=[], yticks=[], frame_on=False)
+    for row, (axes, title) in enumerate(zip(grid.flat, titles, strict=False)):
+        outcome, colour = describe_outcome(play(env, scenes.take([row]), decide))
+        axes.imshow(env.unwrapped.render())
+        axes.set_title(outcome, fontsize=8.5, color=colour, fontweight="bold", pad=3)
+        axes.set_xlabel(title, fontsize=8, color=PALETTE.joint)
+    marks = {
+        "planned": "plan",
+        "executed": "executed",
+        "via-point": "via",
+        "goal": "goal",
+        "contact": "contact",
+    }
+    handles = [Line2D([], [], color=getattr(PALETTE, name), linewidth=4) for name in marks.values()]
+    places: Any = {"loc": "outside lower center", "ncols": 5 if columns > 1 else 2}
+    figure.legend(handles, list(marks), **places, fontsize=8, frameon=False)
+    if lines:
+        figure.suptitle("\n".join(lines), fontsize=11, color=PALETTE.executed)
+    figure.savefig(path, metadata={"Software": MARK.decode()})

@@ -19,11 +19,7 @@ DATASET_ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")  # As Minari allows: groups, n
 
 
 def dataset_folder(dataset_id: str) -> Path:
-    """Return the folder of a dataset, in MINARI_DATASETS_PATH or, by default, in ~/.minari/datasets.
-
-    Raises:
-        ValueError: Minari allows no such name.
-    """
+    """Return the folder of a dataset, in MINARI_DATASETS_PATH or, by default, in ~/.minari/datasets."""
     if not DATASET_ID.fullmatch(dataset_id):
         raise ValueError(f"dataset must be named like group/name-v0, got {dataset_id!r}")
     root = os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets"

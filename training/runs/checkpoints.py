@@ -66,10 +66,7 @@ def write_checkpoint(model: BaseAlgorithm, path: Path, extra: Mapping[str, Any])
 
 
 def read_checkpoint(model: BaseAlgorithm, path: Path) -> dict[str, Any]:
-    """Set a newly built model of the same kind and its environment to the state of a checkpoint.
-
-    Returns:
-        Content of `extra`.
+    """Set a newly built model of the same kind and its environment to the state of a checkpoint, and return `extra`.
 
     Raises:
         BadFileError: The checkpoint is torn, foreign, or of another model.
@@ -90,11 +87,7 @@ def read_checkpoint(model: BaseAlgorithm, path: Path) -> dict[str, Any]:
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Return the content of a checkpoint after checking the sums of its parts.
-
-    Raises:
-        BadFileError: It is no checkpoint, or a damaged one.
-    """
+    """Return the content of a checkpoint after checking the sums of its parts; a bad one raises BadFileError."""
     content = io.BytesIO(read_bytes(path))
     try:
         with zipfile.ZipFile(content) as archive:

@@ -226,12 +226,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def check_free(folder: Path) -> None:
-    """Check that a folder can hold a new run.
-
-    Raises:
-        BadFileError: The folder holds other files, or is a file.
-        ValueError: The folder cannot be written to.
-    """
+    """Check that a folder can be written to and holds nothing but what an attempt to create a run left there."""
     if (folder / "config.json").exists():
         raise BadFileError(folder, "holds a run already; continue it with --resume or name another folder")
     check_folder("run folder", folder)
@@ -248,15 +243,9 @@ def write_config(folder: Path, config: TrainConfig) -> None:
 
 
 def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = None) -> None:
-    """Check that a run goes on with its own settings.
+    """Check that a run goes on with its own settings; others raise BadFileError.
 
-    Args:
-        run: Run.
-        config: Settings that are asked for.
-        usual: Settings of a call that names none; where it is given, equal settings of the call are left to the run.
-
-    Raises:
-        BadFileError: Settings differ; the message names them.
+    Where `usual` settings are given, those asked for that equal them are left to the run.
     """
     begun, asked = _settings(run.config), _settings(config)
     names = asked.keys() | begun.keys()

@@ -98,11 +98,7 @@ class FrozenScenes:
         return {name: np.asarray(parts[name]) for name in CONTENT}
 
     def save(self, path: Path) -> None:
-        """Write the set with its hash; numbers that single precision represents take half the place.
-
-        Raises:
-            ValueError: A scene has a mesh or a point cloud.
-        """
+        """Write the set with its hash; numbers that single precision represents take half the place."""
         if (self.scenes.obstacles.kind >= MESH).any():
             raise ValueError(f"frozen scenes must have obstacles of the kinds {', '.join(KINDS[:MESH])} only")
         arrays = {name: _smallest(array) for name, array in self.arrays().items()}
@@ -165,11 +161,7 @@ def _scene_key(task: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def load(path: Path, name: str = "") -> FrozenScenes:
-    """Load a set of scenes and check its hash.
-
-    Raises:
-        ValueError: The file is not one of scenes, or is damaged.
-    """
+    """Load a set of scenes and check its hash; a file of something else, or a damaged one, raises ValueError."""
     if not path.is_file():
         raise ValueError(f"there is no file of scenes {path}")
     content: dict[str, Any] = _read(path)

@@ -155,11 +155,7 @@ class Study:
 
 
 def _made(where: str, make: Callable[..., Any], fields: Any, *args: Any) -> Any:
-    """Return the result of a function for fields of a file, which are its keyword arguments.
-
-    Raises:
-        ValueError: A field is unknown, or the function refuses it; the message begins with the place in the file.
-    """
+    """Return the result of a function of fields of a file; an error begins with the place in the file."""
     if not isinstance(fields, Mapping):
         raise ValueError(f"{where} must be values by name, got {fields!r}")
     parameters = inspect.signature(make).parameters

@@ -35,17 +35,7 @@ NOTE = (
 
 
 def run_trial(trial: Trial, out: Path) -> Record:
-    """Train if needed, measure, and return the record of a trial.
-
-    A training that is complete is not repeated, and one that was interrupted goes on from its last checkpoint.
-
-    Args:
-        trial: Trial of a study.
-        out: Folder of the study.
-
-    Raises:
-        ValueError: The folder holds a training with other settings, or the training cannot be made.
-    """
+    """Train if needed, or go on with an interrupted training, measure, and return the record of a trial."""
     record: Record = {"viapoint": "study", "asked": _asked(trial)}
     env_kwargs, decisions = dict(trial.env_kwargs), None
     methods: dict[str, Method] = {}

@@ -75,13 +75,9 @@ class DoubleStep(NamedTuple):
 def double_step(
     moment: float, *, goal: Any = None, duration: float = STEP_DURATION, remaining: float = STEP_DURATION
 ) -> DoubleStep:
-    """Return a movement from T1 towards T4 whose target jumps to T5.
+    """Return a movement from T1 towards T4 whose target jumps to T5, or to another goal, shape (2,), [m].
 
-    Args:
-        moment: Moment of revision, [s].
-        goal: Second target instead of T5, shape (2,), [m].
-        duration: Duration of the first movement, [s].
-        remaining: Duration of the second movement, which ends at moment + remaining >= duration, [s].
+    The first movement takes `duration`, the second one `remaining`, not less than is left of the first, [s].
     """
     start, corner, last = NAMES
     goal = TARGETS[last] if goal is None else goal

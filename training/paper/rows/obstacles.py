@@ -40,11 +40,7 @@ class ObstacleMovements(NamedTuple):
 
 
 def light_scenes(n_rows: int) -> Scenes:
-    """Return 252 scenes with rows of lights of several lengths, widths and places between each two targets.
-
-    Args:
-        n_rows: Rows for obstacles, of which the first is used.
-    """
+    """Return 252 scenes with rows of lights of several lengths, widths and places, and room for obstacles."""
     ends, lights = [], []
     for length, radius, shift in itertools.product(LENGTHS, RADII, SHIFTS):
         for first, last, row in movements.rows_of_lights(length, radius, shift):

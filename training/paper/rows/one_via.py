@@ -38,15 +38,9 @@ def roots_of(polynomial: Poly) -> list[float]:
 
 
 def closed_form(waypoints: Float, share: float, time: Float) -> Float:
-    """Return the hand position by the paper's Eqs. 4, 5 and C13 to C15 with their misprints corrected.
+    """Return the hand position, shape (T, 2), [m], by the paper's Eqs. 4, 5 and C13 to C15 without their misprints.
 
-    Args:
-        waypoints: Start, via-point and goal, shape (3, 2), [m].
-        share: tau1 = t1 / tf.
-        time: tau = t / tf, shape (T,).
-
-    Returns:
-        Shape (T, 2), [m].
+    `waypoints` has shape (3, 2), [m]; `share` is tau1 = t1 / tf and `time` is tau = t / tf, shape (T,).
     """
     x0, x1, xf = waypoints
     t, s = time[:, None], share
@@ -272,11 +266,7 @@ def scaling_claims() -> list[Claim]:
 
 
 def slow_and_fast(movement: Trajectory, count: int) -> tuple[float, float, list[SimulatedMovements]]:
-    """Carry movements out in the durations of Fig. 11.
-
-    Returns:
-        Greatest distances of both paths at `count` instants of the model and of the arm, [mm]; the simulations.
-    """
+    """Carry movements out in the durations of Fig. 11; return distances of model and arm paths, [mm], and motions."""
     plans = [movement.stretched(duration) for duration in (SLOW, FAST)]
     motions = [simulate(plan) for plan in plans]
     paths = [plan.sample(count, 0)[0] for plan in plans]

@@ -91,11 +91,7 @@ def _invariance(generator: np.random.Generator, count: int, vias: int) -> float:
 
 
 def _placed_shapes() -> tuple[Float, float]:
-    """Simulate one shape in five places, directions, sizes and durations.
-
-    Returns:
-        Paths in the frame of their ends, shape (5, 201, 2), and the greatest deviation from the plan, [mm].
-    """
+    """Simulate one shape in five places; return paths in the frame of their ends, (5, 201, 2), and deviation, [mm]."""
     pairs = (("T1", "T4"), ("T4", "T1"), ("T2", "T5"), ("T6", "T3"), ("T3", "T4"))
     waypoints = [movements.via_waypoints(TARGETS[a], TARGETS[b], 0.35, 0.2) for a, b in pairs]
     motion = simulate(minimum_jerk_through(np.stack(waypoints), np.array([0.8, 0.7, 1.0, 1.2, 0.6])))
