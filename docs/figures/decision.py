@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch
+from footprint import footprint
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -25,7 +26,6 @@ from viapoint.envs.task import Task
 from viapoint.training import load_agent
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import plan_clearances
-from viapoint.training.plotting.top_view import footprint
 from viapoint.training.scene_sets.scene_set import scenes_for
 
 ENV_ID, SCENE = "viapoint/PlanarObstacles-v0", 19

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from footprint import footprint
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -19,7 +20,6 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training import load_agent
-from viapoint.training.plotting.top_view import footprint
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets.scene_set import scenes_for
 

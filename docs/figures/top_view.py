@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from footprint import footprint, outline
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
@@ -22,7 +23,6 @@ from viapoint.envs.plans import Plan
 from viapoint.envs.rendering.renderer import picture_of
 from viapoint.envs.rendering.scene_view import FADED, Picture
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.plotting.top_view import footprint, outline
 from viapoint.training.rollouts.rollout import Decide
 
 View = tuple[tuple[float, float], tuple[float, float]]

@@ -39,7 +39,7 @@ EXAMPLES = [
 @pytest.mark.parametrize("config", EXAMPLES, ids=lambda config: type(config).__name__)
 def test_configurations_are_frozen_and_that_of_a_training_survives_json(config):
     if isinstance(config, TrainConfig):
-        assert TrainConfig.from_json(json.loads(json.dumps(config.as_json()))) == config
+        assert TrainConfig(**json.loads(json.dumps(config.as_json()))) == config
     with pytest.raises(dataclasses.FrozenInstanceError):
         config.env = "other"
 

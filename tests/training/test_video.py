@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from viapoint.envs import Box, Capsule, ConvexMesh, Cylinder, PointCloud, Sphere
 from viapoint.training import GeometrySearch
-from viapoint.training.plotting.gallery import gallery
-from viapoint.training.plotting.top_view import footprint
-from viapoint.training.plotting.video import record_video
+from viapoint.training.plotting.video import gallery, record_video
 
 TASKS = tuple(
     f"viapoint/{task}-v0" for task in ("PlanarObstacles", "PandaObstacles", "PlanarMovingObstacles")
@@ -75,25 +72,3 @@ def test_a_gallery_is_a_page_of_movements(tmp_path):
     path = tmp_path / "gallery.png"
     gallery(path, env, scenes_of(env, 5), search(env), titles, heading="test scenes")
     assert np.asarray(Image.open(path).convert("RGB")).std() > 5.0
-
-
-POSE = {"position": (0.3, -0.2, 0.1), "quaternion": (0.7, 0.1, -0.5, 0.5)}
-SHAPES = (
-    Sphere(0.1, **POSE),
-    Capsule(0.05, 0.12, **POSE),
-    Cylinder(0.08, 0.1, **POSE),
-    Box((0.05, 0.1, 0.2), **POSE),
-    ConvexMesh.hull([(0, 0, 0), (0.2, 0, 0), (0, 0.2, 0), (0, 0, 0.2)], **POSE),
-    PointCloud([(0.0, 0.0, 0.0), (0.0, 0.0, 0.2)], radius=0.02, **POSE),
-)
-
-
-@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.kind)
-@pytest.mark.parametrize("rim", [0.0, 0.03])
-def test_a_footprint_is_the_shadow_of_the_shape(shape, rim):
-    """A vertical line through the outline touches the shape, up to the corners of drawn circles."""
-    heights = np.linspace(-0.3, 0.5, 4001)
-    for polygon in footprint(shape, rim):
-        for x, y in polygon[::5]:
-            line = np.column_stack((np.full_like(heights, x), np.full_like(heights, y), heights))
-            assert shape.distance(line).min() == pytest.approx(rim, abs=1e-3)

@@ -75,7 +75,9 @@ def evaluate(config: EvaluateConfig) -> None:
         record["weights_sha256"] = read_json(run.best / "model.json").get("weights_sha256")
         partial = ".partial" if result.partial else ""
         name = f"{Path(config.scenes).stem}-{result.sha256[:8]}{partial}"  # the hash is that of the scenes
-        print(f"kept as {run.write_evaluation(name, record)}", file=_notes(config))
+        kept = run.folder / "evaluations" / f"{name}.json"
+        write_json(kept, record)
+        print(f"kept as {kept}", file=_notes(config))
     if config.json is not None:
         write_json(config.json, record)
         print(f"results, scene by scene: {config.json}", file=_notes(config))

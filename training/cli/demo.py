@@ -21,14 +21,12 @@ from viapoint.training.io.progress import scene_progress
 from viapoint.training.planning.baselines import Method, agent_method, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plotting import plots
-from viapoint.training.plotting.gallery import gallery
-from viapoint.training.plotting.video import record_video
+from viapoint.training.plotting.video import gallery, record_video
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
 from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, scenes_for
 
-CHECKS = 16
-"""Number of proposals that the agent checks with exact geometry in its second row of the table."""
+CHECKS = 16  # Proposals that the agent checks in the second row of the table
 BASELINES = ("search16", "search512", "straight", "random")
 FILES = {
     "table.md": "the table",
@@ -39,10 +37,8 @@ FILES = {
     "movements.mp4": "movements",
 }
 """Files besides those of the run, and what they show."""
-PICTURES = 12
-"""Number of movements in the gallery."""
-MOVEMENTS = 4
-"""Number of movements in the video."""
+PICTURES = 12  # Number of movements in the gallery
+MOVEMENTS = 4  # Number of movements in the video
 
 
 def run(config: DemoConfig) -> None:
@@ -79,12 +75,12 @@ def run(config: DemoConfig) -> None:
 
 def _trained(config: DemoConfig) -> Run:
     """Return the completed run in the folder, trained now if necessary."""
-    number = config.total_timesteps
     if (config.out / "config.json").is_file():
         found = Run(config.out)
         number = config.n_timesteps or found.config.total_timesteps
         print(f"{config.out} holds a training of {found.decisions} decisions: starting from it")
     else:
+        number = config.n_timesteps or TrainConfig(env=config.env).total_timesteps // 4
         print(f"training for {number} decisions; Ctrl-C saves, and the same command goes on")
     return train_or_resume(TrainConfig(env=config.env, n_timesteps=number, out=config.out))
 

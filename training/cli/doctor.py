@@ -9,10 +9,9 @@ import subprocess
 import sys
 from typing import Any, NamedTuple
 
-PATIENCE = 180.0
-"""Time limit of a check, [s]; the first one on a machine compiles machine code."""
+PATIENCE = 180.0  # Time limit of a check, [s]; the first one on a machine compiles machine code
+# Extras of packages that a command imports when it needs them; others belong to `training`
 EXTRAS = {"minari": "minari", "mjviser": "live", "optuna": "study", "ray": "study", "viser": "live"}
-"""Extras of packages that a command imports when it needs them; others belong to `training`."""
 VERSIONS = """import importlib.metadata, platform
 names = "viapoint", "numpy", "gymnasium", "mujoco", "numba"
 print("Python", platform.python_version(), *(f"{name} {importlib.metadata.version(name)}" for name in names))"""

@@ -90,11 +90,7 @@ def run_command(config: Any) -> None:
 
 
 def parse(words: Sequence[str], usual: Any = None) -> Any:
-    """Return the configuration that a command line stands for.
-
-    Args:
-        words: Words of the command line, without the program's name.
-        usual: Configuration with defaults for everything that the words do not name; that of the command if not given.
+    """Return the configuration that a command line stands for, with defaults of `usual` where it is given.
 
     Raises:
         SystemExit: Help was asked for; code 0.

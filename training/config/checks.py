@@ -19,10 +19,9 @@ from viapoint.envs.common.validation import is_number, whole_number
 from viapoint.training.io.files import check_ours
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
-SHIPPED = Path(str(files("viapoint.training") / "pretrained"))
-"""Folder of the agents that come with the package."""
+SHIPPED = Path(str(files("viapoint.training") / "pretrained"))  # Agents of the package
+# Ids of environments with a shipped agent
 SHIPPED_IDS = tuple(f"viapoint/{path.parent.name}" for path in sorted(SHIPPED.glob("*/model.json")))
-"""Ids of environments with a shipped agent."""
 
 ELSEWHERE = {
     "num_envs": "--n-envs says how many environments are stepped together",
@@ -35,8 +34,8 @@ ELSEWHERE = {
     "wrappers": "the environments are trained on as they are",
 }
 """Arguments that a training's environment does not take, and what to use instead."""
+# Greatest values: seeds of NumPy's legacy generator, environments in memory, days of training, and ports
 GREATEST = {"seed": 2**32 - 1, "n_envs": 1 << 16, "n_timesteps": 10**9, "port": 65535}
-"""Greatest values: seeds of NumPy's legacy generator, environments in memory, days of training, and ports."""
 
 
 def unknown_name(what: str, value: object, allowed: Collection[str]) -> str:
@@ -88,51 +87,25 @@ def _check_place(name: str, path: Path, folder: Path) -> None:
         raise ValueError(f"{name} {path} cannot be written: nothing may be written in {there}") from None
 
 
+# Hyperparameters that must be greater than zero
 POSITIVE = frozenset({"learning_rate", "temperature", "clip_range", "max_grad_norm"})
-"""Hyperparameters that must be greater than zero."""
-SHARES = frozenset({"gamma", "gae_lambda", "tau", "explore_uniformly"})
-"""Hyperparameters that must be from 0 to 1."""
+SHARES = frozenset({"gamma", "gae_lambda", "tau", "explore_uniformly"})  # From 0 to 1
+# Least values of hyperparameters; -1 gradient steps are as many as there were steps of the environment
 LEAST: dict[str, float] = {
-    "buffer_size": 1,
-    "batch_size": 1,
-    "learning_starts": 0,
-    "train_freq": 1,
-    "gradient_steps": -1,  # as many as there were steps
-    "n_steps": 1,
-    "n_epochs": 1,
-    "policy_delay": 1,
-    "target_update_interval": 1,
-    "target_policy_noise": 0.0,
-    "target_noise_clip": 0.0,
-    "ent_coef": 0.0,
-    "vf_coef": 0.0,
-    "top_quantiles_to_drop_per_net": 0,
-    "explore_candidates": 2,
-    "next_candidates": 1,
-    "labels": 2,
-    "nearest": 1,
-    "width": 1,
-    "instants": 2,
-    "candidates": 1,
-    "refinements": 0,
-    "per_refinement": 1,
-    "checks": 0,
-    "refine": 0,
+    "gradient_steps": -1,
+    **dict.fromkeys(("learning_starts", "target_policy_noise", "target_noise_clip", "ent_coef"), 0),
+    **dict.fromkeys(("vf_coef", "top_quantiles_to_drop_per_net", "refinements", "checks", "refine"), 0),
+    **dict.fromkeys(("buffer_size", "batch_size", "train_freq", "n_steps", "n_epochs"), 1),
+    **dict.fromkeys(("policy_delay", "target_update_interval", "next_candidates", "nearest"), 1),
+    **dict.fromkeys(("width", "candidates", "per_refinement"), 1),
+    **dict.fromkeys(("explore_candidates", "labels", "instants"), 2),
 }
-"""Least values of hyperparameters."""
 
 
 def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> None:
     """Check values against the type hints of a function or class, and numbers against their ranges.
 
     The algorithms accept any number, and many a wrong one shows only as a training that does not learn.
-
-    Args:
-        function: Function, or class whose constructor names the types.
-        values: Arguments by name.
-
-    Raises:
-        ValueError: A value has another type, or a number is out of range.
     """
     # The hints of Stable-Baselines3 name VecEnv, which its modules import for type checkers only.
     hinted: Any = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009

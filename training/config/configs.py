@@ -50,16 +50,12 @@ RECORDED = tyro.conf.arg(
 )
 PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent: {_listed(SHIPPED_IDS)}.")
 ARM = tyro.conf.arg(metavar="ARM", help="Arm: panda, planar, or an MJCF or URDF file.")
+# Environments of the built-in arms; that of other arms is viapoint/Obstacles-v0
 ARM_ENVS = {"planar": DEFAULT_ENV, "panda": "viapoint/PandaObstacles-v0"}
-"""Environments of the built-in arms; that of other arms is viapoint/Obstacles-v0."""
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Return a value as JSON has it: NumPy's numbers and arrays as Python's, registered arms by name.
-
-    Raises:
-        ValueError: JSON has no form of it.
-    """
+    """Return a value as JSON has it: NumPy's numbers and arrays as Python's, arms by name or file."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if isinstance(value, Arm) and value.file:
@@ -92,16 +88,12 @@ def env_of_arm(arm: Arm | str | None, env: str | None) -> tuple[str | None, dict
     return env or "viapoint/Obstacles-v0", {"arm": found if isinstance(arm, Arm) else found.file or arm}
 
 
-Format = Literal["table", "md", "csv", "json"]
-"""Form of a table."""
-BENCHMARK = "motionbenchmaker"
-"""Name of the scene set that measures planners."""
-MOTION_FILES = (".csv", ".yaml", ".yml")
-"""Suffixes of files of movements."""
+Format = Literal["table", "md", "csv", "json"]  # Form of a table
+BENCHMARK = "motionbenchmaker"  # Name of the scene set that measures planners
+MOTION_FILES = (".csv", ".yaml", ".yml")  # Suffixes of files of movements
 UNNAMED = "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
 NOTHING_TO_CHECK = "checks and refine concern an agent, and none is given"
-USUAL_BASELINES = ("straight", "random", "search512")
-"""Baselines of an evaluation."""
+USUAL_BASELINES = ("straight", "random", "search512")  # Baselines of an evaluation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,11 +206,7 @@ class TrainConfig(Config):
 
     @functools.cached_property
     def task(self) -> Task:
-        """Task of the environment.
-
-        Raises:
-            ValueError: An argument of the environment is unknown or has a value that is not allowed.
-        """
+        """Task of the environment; an unknown or wrong argument of it raises ValueError."""
         try:
             return registered_task(self.env, **self.env_kwargs)
         except TypeError as error:
@@ -288,22 +276,8 @@ class TrainConfig(Config):
         return Path(self.out) if self.out else usual
 
     def as_json(self) -> dict[str, Any]:
-        """Return the configuration as plain values; :meth:`from_json` is the inverse."""
-        values = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
-        return {**values, "out": None if self.out is None else str(self.out)}
-
-    @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> TrainConfig:
-        """Return the configuration that plain values describe.
-
-        Raises:
-            ValueError: A name is unknown or a value is not allowed.
-        """
-        names = [each.name for each in dataclasses.fields(cls)]
-        for name in record:
-            if name not in names:
-                raise ValueError(unknown_name("fields of a training", name, names))
-        return cls(**record)
+        """Return the configuration as plain values, which are arguments of an equal one."""
+        return {**dataclasses.asdict(self), "out": None if self.out is None else str(self.out)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -594,15 +568,8 @@ class DemoConfig(Config):
     def _check(self) -> None:
         check_registered(self.env)
         if not registered_task(self.env).whole_movement:
-            raise ValueError(
-                f"env must have whole movements as actions, {DEFAULT_ENV} for one, got {self.env!r}"
-            )
+            raise ValueError(f"env must have whole movements as actions, as {DEFAULT_ENV}, got {self.env!r}")
         check_folder("out", self.out)
-
-    @property
-    def total_timesteps(self) -> int:
-        """Decisions of a new training."""
-        return self.n_timesteps or TrainConfig(env=self.env).total_timesteps // 4
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,18 +17,12 @@ Algorithm = Literal["viaq", "viarank", "sac", "td3", "ppo", "tqc"]
 class Preset:
     """Default settings of an algorithm."""
 
-    policy: str
-    """Name of the policy."""
-    n_envs: int = 64
-    """Environments that are stepped together."""
-    n_timesteps: int
-    """Decisions in total."""
-    eval_every: int = 1_000
-    """Decisions between two evaluations on the validation scenes."""
-    checkpoint_every: int = 5_000
-    """Decisions between two checkpoints."""
-    hyperparameters: Mapping[str, Any]
-    """Hyperparameters; schedules and noise as :mod:`viapoint.training.agents.model_io` writes them."""
+    policy: str  # Name of the policy
+    n_envs: int = 64  # Environments that are stepped together
+    n_timesteps: int  # Decisions in total
+    eval_every: int = 1_000  # Decisions between two evaluations on the validation scenes
+    checkpoint_every: int = 5_000  # Decisions between two checkpoints
+    hyperparameters: Mapping[str, Any]  # As :mod:`~.agents.model_io` writes them
 
     def arguments(self) -> dict[str, Any]:
         """Return the hyperparameters as a new dictionary."""
@@ -55,8 +49,7 @@ _OFF_POLICY: dict[str, Any] = {
     "gradient_steps": 16,
     "policy_kwargs": _NETWORK,
 }
-_LITTLE_ENTROPY = "auto_0.02"
-"""Initial entropy coefficient; rewards are of order one, so the usual 1 outweighs them for 10,000 decisions."""
+_LITTLE_ENTROPY = "auto_0.02"  # rewards are of order one, and the usual 1 outweighs them
 _STEP_WISE: dict[str, Any] = {**_OFF_POLICY, "learning_starts": 4096, "gamma": 0.98}
 _SELDOM: dict[str, Any] = {"eval_every": 10_000, "checkpoint_every": 50_000}
 
@@ -111,8 +104,8 @@ STEP_PRESETS: dict[str, Preset] = {
 }
 """Presets of tasks in which an action lasts one control step, which counts as a decision."""
 
+# Presets of tasks without obstacles, which need fewer decisions
 REACH_PRESETS: dict[str, Preset] = {"viaq": dataclasses.replace(PRESETS["viaq"], n_timesteps=8_000)}
-"""Presets of tasks without obstacles, which need fewer decisions."""
 
 REPLANNING_PRESETS: dict[str, Preset] = {
     "viaq": dataclasses.replace(
@@ -122,8 +115,7 @@ REPLANNING_PRESETS: dict[str, Preset] = {
     )
 }
 """Presets of replanning tasks."""
-JOINT_DECISIONS = 16_000
-"""Greatest default number of decisions in joint space, where one costs several times as much."""
+JOINT_DECISIONS = 16_000  # decisions in joint space, where one costs several times as much
 
 
 JOINT_SIGHT: dict[str, Any] = {

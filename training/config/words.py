@@ -12,8 +12,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from viapoint.training.io.files import parse_yaml
 
-REGISTRY = ConstructorRegistry()
-"""Ways in which the command line reads numbers and paths."""
+REGISTRY = ConstructorRegistry()  # Ways in which the command line reads numbers and paths
 KINDS = {
     int: ("INT", "a whole number"),
     float: ("FLOAT", "a number"),

@@ -19,7 +19,6 @@ from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import NEVER, Scenes
-from viapoint.envs.task import Task
 from viapoint.training.agents.agent import load_agent
 from viapoint.training.agents.model_io import untrained
 from viapoint.training.config.checks import check_whole
@@ -38,15 +37,11 @@ from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResult
 from viapoint.training.rollouts.vec_env import env_arguments
 from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes, scenes_for
 
-Progress = Callable[[str, int, int], None]
-"""Function of the method's name, the number of finished scenes and the number of all scenes."""
+Progress = Callable[[str, int, int], None]  # Method's name, scenes done, all scenes
 
-TIMED_DECISIONS = 200
-"""Number of single decisions after which no further scene is timed."""
-TIMING_BUDGET = 3.0
-"""Wall time after which no further decision is timed, [s]."""
-SLOW_DECISION = 0.1
-"""Decision time above which a method is timed in batches, [s]."""
+TIMED_DECISIONS = 200  # Number of single decisions after which no further scene is timed
+TIMING_BUDGET = 3.0  # Wall time after which no further decision is timed, [s]
+SLOW_DECISION = 0.1  # Decision time above which a method is timed in batches, [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,31 +73,28 @@ class MethodResult:
 
     def summary(self) -> dict[str, Any]:
         """Return the metrics by name; those of successes are None without successes."""
-        success, outcomes = self.success, self.outcomes
-        times, paths = self.decision_times, outcomes["path_length"]
-        known = len(success) > 0 and np.isfinite(self.distance).all()
-        return {
-            "scenes": len(success),
-            "partial": self.partial,
-            "success": _rate(success),
-            "success_by_band": {
-                name: _rate(success[self.band == i]) for i, name in enumerate(BANDS) if (self.band == i).any()
-            },
-            "success_by_family": {
-                str(name): _rate(success[self.family == name])
-                for name in dict.fromkeys(self.family.tolist())
-                if name != DRAWN
-            },
-            "collision": _rate(np.asarray(outcomes["collision"], dtype=bool)),
-            "unreachable": _rate(~np.asarray(outcomes["reachable"], dtype=bool)),
-            **{name: _quantile(outcomes[name]) for name in ("min_clearance", "goal_error", "tracking_error")},
-            **{
-                name: _quantile(outcomes[name][success]) for name in ("jerk_ratio", "duration", "path_length")
-            },
-            "spl": success_weighted_path_length(success, self.distance, paths) if known else None,
-            "decision_time": _quantile(times),
-            "decision_time_98": None if len(times) < 2 else _quantile(times, 0.98),
-        }
+        success, outcomes, times = self.success, self.outcomes, self.decision_times
+        summary: dict[str, Any] = {"scenes": len(success), "partial": self.partial, "success": _rate(success)}
+        by_band = summary["success_by_band"] = {}
+        for i, name in enumerate(BANDS):
+            if (self.band == i).any():
+                by_band[name] = _rate(success[self.band == i])
+        by_family = summary["success_by_family"] = {}
+        for name in dict.fromkeys(self.family.tolist()):
+            if name != DRAWN:
+                by_family[name] = _rate(success[self.family == name])
+        summary["collision"] = _rate(np.asarray(outcomes["collision"], dtype=bool))
+        summary["unreachable"] = _rate(~np.asarray(outcomes["reachable"], dtype=bool))
+        for name in ("min_clearance", "goal_error", "tracking_error"):
+            summary[name] = _quantile(outcomes[name])
+        for name in ("jerk_ratio", "duration", "path_length"):
+            summary[name] = _quantile(outcomes[name][success])
+        summary["spl"] = None
+        if len(success) and np.isfinite(self.distance).all():
+            summary["spl"] = success_weighted_path_length(success, self.distance, outcomes["path_length"])
+        summary["decision_time"] = _quantile(times)
+        summary["decision_time_98"] = None if len(times) < 2 else _quantile(times, 0.98)
+        return summary
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,6 +147,11 @@ class EvaluationResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return metrics, comparisons with the first method, and every outcome, as JSON can represent them."""
+        first = self.results[0]
+        outcomes = {}
+        for result in self.results:
+            arrays = {"action": result.actions, **result.outcomes}
+            outcomes[result.name] = {name: _rounded(values) for name, values in arrays.items()}
         return {
             "viapoint": versions()["viapoint"],
             "env": self.env_id,
@@ -162,14 +159,8 @@ class EvaluationResult:
             "sha256": self.sha256,
             "partial": self.partial,
             "methods": {result.name: result.summary() for result in self.results},
-            "compared_with_first": {each.name: _compare(self.results[0], each) for each in self.results[1:]},
-            "outcomes": {
-                result.name: {
-                    "action": _rounded(result.actions),
-                    **{name: _rounded(values) for name, values in result.outcomes.items()},
-                }
-                for result in self.results
-            },
+            "compared_with_first": {each.name: _compare(first, each) for each in self.results[1:]},
+            "outcomes": outcomes,
         }
 
 
@@ -241,25 +232,24 @@ def evaluate(
         print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
     methods = _rows_of(agent, settings)
     for each in baselines:
-        methods += _baseline(each, agent, settings, env_id, kwargs)
+        if not isinstance(each, str):
+            methods.append(each)
+        elif each == "untrained" and isinstance(agent, BaseAlgorithm):
+            methods += _rows_of(untrained(agent), settings, each)
+        elif each == "unrevised" and isinstance(agent, BaseAlgorithm):
+            first = agent_method("agent", agent, checks=0 if settings[0] else None)
+            methods.append(OpenLoopBaseline(first, SceneSimulation(env_id, 250, **kwargs)))
+        else:
+            methods.append(make_method(each, env_id, **kwargs))
     return evaluate_methods(
-        methods,
-        chosen,
-        env_id,
-        env_kwargs=kwargs,
-        time_decisions=time_decisions,
-        progress=progress,
+        methods, chosen, env_id, env_kwargs=kwargs, time_decisions=time_decisions, progress=progress
     )
 
 
 def _environment_of(
     agent: BaseAlgorithm | Method | None, env: str | None, env_kwargs: Mapping[str, Any] | None
 ) -> tuple[str, dict[str, Any]]:
-    """Return id and arguments of the environment whose scenes are evaluated, in which an action is a whole movement.
-
-    Raises:
-        ValueError: The agent is for another environment, or none is given.
-    """
+    """Return id and arguments of the environment of an evaluation, in which an action is a whole movement."""
     if not isinstance(agent, BaseAlgorithm):
         if env is None:
             raise ValueError("env must be the id of an environment where no trained agent is given")
@@ -275,30 +265,9 @@ def _rows_of(
     agent: BaseAlgorithm | Method | None, settings: Sequence[Mapping[str, int]], name: str = "agent"
 ) -> list[Method]:
     """Return one method for each number of checks, and of refined proposals."""
-    if agent is None:
-        return []
-    if not isinstance(agent, BaseAlgorithm):
-        return [agent]
-    return [agent_method(name, agent, **each) for each in settings]
-
-
-def _baseline(
-    baseline: str | Method,
-    agent: BaseAlgorithm | Method | None,
-    settings: Sequence[Mapping[str, int]],
-    env_id: str,
-    env_kwargs: Mapping[str, Any],
-) -> list[Method]:
-    """Return the methods that a baseline stands for."""
-    if not isinstance(baseline, str):
-        return [baseline]
     if isinstance(agent, BaseAlgorithm):
-        if baseline == "untrained":
-            return _rows_of(untrained(agent), settings, baseline)
-        if baseline == "unrevised":
-            first = agent_method("agent", agent, checks=0 if settings[0] else None)
-            return [OpenLoopBaseline(first, SceneSimulation(env_id, 250, **env_kwargs))]
-    return [make_method(baseline, env_id, **env_kwargs)]
+        return [agent_method(name, agent, **each) for each in settings]
+    return [] if agent is None else [agent]
 
 
 def evaluate_methods(
@@ -361,6 +330,9 @@ def _evaluate_one(
     else:
         outcomes = {name: np.zeros(0) for name in (*Outcome._fields, "action")}
     done = len(outcomes["is_success"])
+    arm, scenes = simulation.task.arm, frozen.scenes
+    away = np.linalg.norm(arm.hand(scenes.goal) - arm.hand(scenes.start), axis=-1)
+    away[(scenes.jump_times < NEVER).any(axis=-1)] = np.nan  # the shortest path is unknown
     return MethodResult(
         name=method.name,
         actions=outcomes.pop("action"),
@@ -368,16 +340,10 @@ def _evaluate_one(
         decision_times=times,
         band=frozen.band[:done],
         family=frozen.family[:done],
-        distance=_distances(frozen.scenes, simulation.task)[:done],
+        distance=away[:done],
         interrupted=interrupted,
         partial=done < number,
     )
-
-
-def _distances(scenes: Scenes, task: Task) -> Float:
-    """Return the hand's distances from start to goal, shape (N,), [m]; NaN if the target jumps."""
-    away = np.linalg.norm(task.arm.hand(scenes.goal) - task.arm.hand(scenes.start), axis=-1)
-    return np.where((scenes.jump_times < NEVER).any(axis=-1), np.nan, away)
 
 
 def _decision_times(method: Method, scenes: Scenes, simulation: SceneSimulation, in_batch: float) -> Float:

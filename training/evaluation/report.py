@@ -14,8 +14,7 @@ from viapoint.training.config.configs import Format
 from viapoint.training.io.files import MARK, write_bytes, write_json
 from viapoint.training.scene_sets.scene_set import BANDS
 
-Record = Mapping[str, Any]
-"""Result of :meth:`viapoint.training.evaluation.evaluator.EvaluationResult.to_dict`, or the content of its file."""
+Record = Mapping[str, Any]  # Result of `EvaluationResult.to_dict`, or the content of its file
 
 NUMBERS = {
     "clearance [mm]": ("min_clearance", 1e3, 1),
@@ -35,8 +34,7 @@ NOTES = (
     "by straight distance over path length. Decision: median wall time of single decisions, and their 98th "
     "percentile; where that is missing, the mean in a batch."
 )
-HEADINGS, COLUMN = 18, 14
-"""Width of the column of headings, and of that of a method with the space before it, [characters]."""
+HEADINGS, COLUMN = 18, 14  # Widths in a terminal, [characters]
 
 
 def table(record: Record) -> pd.DataFrame:
@@ -91,14 +89,10 @@ def text(record: Record) -> str:
     parts = [title(record)]
     for first in range(0, cells.shape[1], fitting):
         part = cells.iloc[:, first : first + fitting]
-        names = [
-            name if len(name) <= COLUMN - 4 else name.replace(", ", ",\n").replace(" (", "\n(")
-            for name in part
-        ]
+        names = [name.replace(", ", ",\n").replace(" (", "\n(") for name in part]
         align = ["left", *["right"] * len(names)]
-        parts.append(
-            part.to_markdown(headers=["", *names], tablefmt="simple", colalign=align, disable_numparse=True)
-        )
+        settings: Any = {"tablefmt": "simple", "colalign": align, "disable_numparse": True}
+        parts.append(part.to_markdown(headers=["", *names], **settings))
     return "\n\n".join(parts)
 
 

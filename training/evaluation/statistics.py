@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-CONFIDENCE = 0.95
-"""Confidence of all intervals."""
+CONFIDENCE = 0.95  # Confidence of all intervals
 
 
 class Interval(NamedTuple):
@@ -24,14 +23,10 @@ class Interval(NamedTuple):
 class Comparison(NamedTuple):
     """Comparison of two methods on the same scenes."""
 
-    difference: float
-    """Success rate of the first minus that of the second."""
-    only_first: int
-    """Scenes in which the second alone failed."""
-    only_second: int
-    """Scenes in which the first alone failed."""
-    p_value: float
-    """Two-sided p-value of the exact McNemar test."""
+    difference: float  # Success rate of the first minus that of the second
+    only_first: int  # Scenes in which the second alone failed
+    only_second: int  # Scenes in which the first alone failed
+    p_value: float  # Two-sided p-value of the exact McNemar test
 
 
 def wilson(successes: int, trials: int) -> Interval:

@@ -23,20 +23,16 @@ from safetensors.numpy import save as save_arrays
 
 Arrays = dict[str, NDArray[Any]]
 
-LARGEST_JSON = 64 << 20
-"""Greatest size of a JSON file, [bytes]."""
-LARGEST_YAML = 1 << 20
-"""Greatest size of a YAML file, [bytes]."""
+LARGEST_JSON = 64 << 20  # Greatest size of a JSON file, [bytes]
+LARGEST_YAML = 1 << 20  # Greatest size of a YAML file, [bytes]
+# Numbers such as 1e-3, which YAML 1.1 reads as words because they lack a point or a sign
 _NUMBER = re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+")
-"""Numbers such as 1e-3, which YAML 1.1 reads as words because they lack a point or a sign."""
-MARK = b"written by viapoint"
-"""Text that every file of this package contains where a user names its place, apart from JSON."""
-JSON_MARK = b'"viapoint":'
-"""Name of the version in JSON files of this package."""
+MARK = b"written by viapoint"  # In every file that a user names, but JSON
+JSON_MARK = b'"viapoint":'  # Name of the version in JSON files of this package
+# Temporary names of :func:`write_bytes` and :func:`write_folder`, which a crash leaves behind
 UNFINISHED = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{32}\.(?P<kind>part|old)")
-"""Temporary names of :func:`write_bytes` and :func:`write_folder`, which a crash leaves behind."""
+# Packages that results depend on
 PACKAGES = ("viapoint", "gymnasium", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
-"""Packages that results depend on."""
 
 
 def versions() -> dict[str, str]:
@@ -51,28 +47,23 @@ class BadFileError(ValueError):
     """Error of a file or folder; the message names it and the reason."""
 
     def __init__(self, path: Path, reason: str) -> None:
-        super().__init__(f"{path}: {reason}")
-        self.path, self.reason = path, reason
+        super().__init__(path, reason)  # both, so that the error can be pickled by workers of a study
+        self.path = path
+        self.reason = reason
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Return what makes the error again, in another process of a study."""
-        return type(self), (self.path, self.reason)
+    def __str__(self) -> str:
+        return f"{self.path}: {self.reason}"
 
 
 def check_ours(path: Path) -> None:
-    """Check that a file may be written: there is none yet, or one that this package wrote.
-
-    Raises:
-        BadFileError: There is something else.
-    """
-    if path.is_symlink() or path.exists():
-        if not path.is_file():
-            raise BadFileError(path, "exists and is no file; name another one")
-        content = path.read_bytes()
-        if MARK not in content and JSON_MARK not in content:
-            raise BadFileError(
-                path, "exists and was not written by viapoint; name another file, or move it away"
-            )
+    """Check that a file may be written: there is none yet, or one that this package wrote."""
+    if not (path.is_symlink() or path.exists()):
+        return
+    if not path.is_file():
+        raise BadFileError(path, "exists and is no file; name another one")
+    content = path.read_bytes()
+    if MARK not in content and JSON_MARK not in content:
+        raise BadFileError(path, "exists and was not written by viapoint; name another file, or move it away")
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -134,15 +125,11 @@ def _check_replaceable(path: Path, names: set[str]) -> None:
     there = sorted(path.iterdir())
     for each in there:
         if each.name not in names or not each.is_file():
-            raise BadFileError(
-                path, f"holds {each.name}, which is not part of what is written; name a new folder"
-            )
+            raise BadFileError(path, f"holds {each.name}, which is not written here; name a new folder")
         if each.suffix == ".json":
             check_ours(each)
     if there and not any(each.suffix == ".json" for each in there):
-        raise BadFileError(
-            path, f"holds {there[0].name}, not written by viapoint; name a new or empty folder"
-        )
+        raise BadFileError(path, f"holds {there[0].name}, not written by viapoint; name a new folder")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -151,14 +138,10 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
-    """Read a JSON object of finite numbers.
-
-    Raises:
-        BadFileError: It is missing, larger than `largest` bytes, not JSON, or not an object.
-    """
+    """Read a JSON object of finite numbers; what is missing, too large [bytes] or no object raises BadFileError."""
     content = read_bytes(path, largest)
     try:
-        value = json.loads(content, parse_constant=refuse_constant, parse_float=_finite)
+        value = json.loads(content, parse_constant=_finite, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise BadFileError(path, f"cannot be read as JSON ({error})") from None
     if not isinstance(value, dict):
@@ -167,11 +150,7 @@ def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
 
 
 def read_bytes(path: Path, largest: int | None = None) -> bytes:
-    """Return the content of a regular file.
-
-    Raises:
-        BadFileError: It is missing, no regular file, larger than `largest` bytes, or cannot be read.
-    """
+    """Return the content of a regular file; what is missing, too large [bytes] or unreadable raises BadFileError."""
     try:
         if not path.exists():
             raise BadFileError(path, "is missing")
@@ -203,11 +182,7 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.01234
 
 
 def parse_yaml(text: str | bytes) -> Any:
-    """Return the plain values that a YAML text holds.
-
-    Raises:
-        ValueError: The text is no YAML, or a name is there twice.
-    """
+    """Return the plain values of a YAML text; other texts, and names that are there twice, raise ValueError."""
     try:
         return yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -215,15 +190,10 @@ def parse_yaml(text: str | bytes) -> Any:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML file that holds values by name.
-
-    Raises:
-        BadFileError: It is missing, too large, no YAML, or holds something else.
-    """
+    """Read a YAML file of values by name; what is missing, too large or something else raises BadFileError."""
+    content = read_bytes(path, LARGEST_YAML)
     try:
-        value = parse_yaml(read_bytes(path, LARGEST_YAML))
-    except BadFileError:
-        raise
+        value = parse_yaml(content)
     except ValueError as error:
         raise BadFileError(path, str(error)) from None
     if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
@@ -237,11 +207,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def read_arrays(path: Path, largest: int | None = None) -> Arrays:
-    """Read named arrays.
-
-    Raises:
-        BadFileError: It is missing, larger than `largest` bytes, truncated or no safetensors file.
-    """
+    """Read named arrays; a file that is missing, too large [bytes] or torn raises BadFileError."""
     content = read_bytes(path, largest)
     try:
         return load_arrays(content)
@@ -249,15 +215,11 @@ def read_arrays(path: Path, largest: int | None = None) -> Arrays:
         raise BadFileError(path, f"is no whole safetensors file ({error})") from None
 
 
-def refuse_constant(constant: str) -> Any:
-    """Raise ValueError for NaN or Infinity, which Python's JSON allows."""
-    raise ValueError(f"{constant} is no JSON number")
-
-
-def _finite(digits: str) -> float:
-    number = float(digits)
+def _finite(text: str) -> float:
+    """Return a number of JSON; Python's reader would also take NaN, Infinity and 1e999."""
+    number = float(text)
     if not math.isfinite(number):
-        raise ValueError(f"{digits[:40]} is too large a number")
+        raise ValueError(f"{text[:40]} is no finite number")
     return number
 
 

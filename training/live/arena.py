@@ -35,76 +35,67 @@ from viapoint.envs.geometry.obstacles import KINDS, pack
 from viapoint.training.agents.agent import Agent
 from viapoint.training.live.state import Scene, State
 from viapoint.training.paper.movements import TARGETS, rows_of_lights
+from viapoint.training.planning.search import registered_task
 from viapoint.training.scene_sets.scene_set import load, shipped_set
 
 MOTION, AGENT, SEARCH = "motion planner", "agent", "geometry search"
-STRAIGHT, OMPL, HAND = "straight movement", "OMPL", "by hand"
-"""Names of the methods; the motion planner is :func:`~viapoint.training.plan_motion`."""
-MOST_OBSTACLES = 24
-"""Greatest number of obstacles of a scene."""
-SIMULATED = ("sphere", "capsule", "cylinder", "box", "half_space")
-"""Shapes that every scene may have."""
-BOX_SIZES = ("half-depth", "half-width", "half-height")
-"""Names of the half lengths of a box."""
+STRAIGHT, OMPL, HAND = "straight movement", "OMPL", "by hand"  # Names of methods
+MOST_OBSTACLES = 24  # Greatest number of obstacles of a scene
+SIMULATED = ("sphere", "capsule", "cylinder", "box", "half_space")  # In every scene
+BOX_SIZES = ("half-depth", "half-width", "half-height")  # Names of the half lengths of a box
+# Bounds of the sliders of obstacles, [m]
 SIZES = {"radius": (0.01, 0.1), "half-length": (0.005, 0.3), **dict.fromkeys(BOX_SIZES, (0.005, 0.5))}
-"""Bounds of the sliders of obstacles, [m]."""
 
 _agent_lock = threading.Lock()  # tabs share an agent
 
 
 class Arena:
-    """Arm, task, agent and environments of one tab.
-
-    Args:
-        env_id: Id of the environment.
-        agent: Agent; None for none.
-        seed: Seed of the random scenes.
-        env_kwargs: Arguments of the environment.
-    """
+    """Arm, task, agent (or None) and environments of one tab."""
 
     def __init__(
         self, env_id: str, agent: Agent | None, seed: int | None, env_kwargs: Mapping[str, Any]
     ) -> None:
-        self.env_id, self.agent, self._seed = env_id, agent, seed
-        self.arguments = {"own": dict(env_kwargs)}
-        """Arguments of environments with obstacles as the agent knows them, and with any others."""
-        self._envs: dict[str, ReachVectorEnv] = {}
-        task = self.env("steps").task
-        self.stepwise = task.stepwise
-        """True if the agent acts in every control step; the page plans whole movements instead."""
-        shapes = (*SIMULATED, *(name for name in task.shapes if name not in SIMULATED))
-        self.arguments["any"] = {**env_kwargs, "shapes": shapes, "n_obstacles": (0, MOST_OBSTACLES)}
-        self._changes: dict[str, Any] = {}
+        self.env_id = env_id
+        self.agent = agent
+        self._seed = seed
+        task = registered_task(env_id, **env_kwargs)
+        self.stepwise = task.stepwise  # True if the agent acts in every control step
+        any_shape = tuple(dict.fromkeys((*SIMULATED, *task.shapes)))
+        own = dict(env_kwargs)
+        others = {**own, "shapes": any_shape, "n_obstacles": (0, MOST_OBSTACLES)}
+        self.arguments = {"own": own, "any": others}  # as a user writes them
+
+        # The page plans whole movements, or revises them; a movement soon follows a goal that is dragged.
+        changes: dict[str, Any] = {}
+        never: dict[str, Any] = {}
         if self.stepwise:
             task = task.of_movements()
-            self._changes = {"decide_at": task.decide_at, "reward_weights": task.weights}
-        if task.replanning:  # a movement soon follows a goal that is dragged
-            self._changes["horizon"] = min(task.horizon, 0.1)
+            changes = {"decide_at": task.decide_at, "reward_weights": task.weights}
+        if task.replanning:
+            changes["horizon"] = min(task.horizon, 0.1)
+            never = {"decide_at": (), "horizon": 1e3}
+        self._arguments = {
+            "steps": own,  # as the id says
+            "own": {**own, **changes},  # with obstacles as the agent knows them
+            "any": {**others, **changes},  # with obstacles of any number and shape
+            "whole": {**others, **changes, **never},  # the same, with a plan that is never revised
+        }
+        self._envs: dict[str, ReachVectorEnv] = {}
         self.task = self.env("own").task
-        """Task whose actions are whole movements or revisions of them."""
-        self.planar = task.arm.space == "hand"
-        """True if the arm moves in a horizontal plane."""
+        self.planar = task.arm.space == "hand"  # True if the arm moves in a horizontal plane
         self._sampler = self.task.sampler()
-        methods = [MOTION] * (not task.replanning) + [AGENT] * (agent is not None) + [SEARCH, STRAIGHT]
-        if not task.replanning and importlib.util.find_spec("ompl") is not None:
-            methods.append(OMPL)
-        self.methods = tuple(methods)
-        """Names of the methods that can be chosen; the first one is the default."""
+        methods = [SEARCH, STRAIGHT]
+        if agent is not None:
+            methods = [AGENT, *methods]
+        if not task.replanning:
+            methods = [MOTION, *methods]
+            methods += [OMPL] if importlib.util.find_spec("ompl") else []
+        self.methods = tuple(methods)  # those that can be chosen; the first one is the default
 
     def env(self, name: str) -> ReachVectorEnv:
-        """Return a batch of one environment, which is made once.
-
-        Args:
-            name: `own`: with obstacles as the agent knows them; `any`: with obstacles of any number and shape;
-                `whole`: the same where a plan is never revised; `steps`: as the id says.
-        """
+        """Return a batch of one environment, `own`, `any`, `whole` or `steps`, which is made once."""
         if name not in self._envs:
-            arguments = self.arguments["own" if name in ("own", "steps") else "any"]
-            if name != "steps":
-                arguments = {**arguments, **self._changes}
-            if name == "whole" and self.task.replanning:
-                arguments = {**arguments, "decide_at": (), "horizon": 1e3}
-            env: Any = gym.make_vec(self.env_id, num_envs=1, **arguments)
+            env: Any = gym.make_vec(self.env_id, num_envs=1, **self._arguments[name])
             self._envs[name] = env.unwrapped
         return self._envs[name]
 
@@ -144,9 +135,11 @@ class Arena:
 
     def scenes(self) -> dict[str, Iterator[tuple[Scene, str]]]:
         """Return endless scenes and sentences on them, by the names of their buttons."""
-        task, kinds = self.task, {"Random": self._random()}
+        task = self.task
+        kinds = {"Random": self._random()}
         for name in ("test", "hard"):
-            if (path := shipped_set(name, task)) is not None:
+            path = shipped_set(name, task)
+            if path is not None:
                 kinds[name.capitalize()] = self._shipped(name, load(path).scenes)
         if task.space.of_hand and task.n_obstacles[1] and not (task.whole_arm or task.replanning):
             kinds["Lights 1985"] = self._lights()
@@ -173,12 +166,9 @@ class Arena:
         return Scene(obstacles=tuple(options["obstacles"]), **arrays)
 
     def read(self, content: str | bytes) -> Scene:
-        """Return the scene of a JSON file; parts that it lacks are drawn.
-
-        Raises:
-            ValueError: The file holds no scene, or an impossible one.
-        """
-        options, env = scene_from_json(content), self.env("any")
+        """Return the scene of a JSON file; missing parts are drawn, and an impossible one raises ValueError."""
+        options = scene_from_json(content)
+        env = self.env("any")
         try:
             env.reset(options=options)
         except ValueError as error:
@@ -220,29 +210,18 @@ class Arena:
         return quaternion
 
     def clearances(self, coordinates: Float, obstacles: Obstacles, times: Float | None = None) -> Float:
-        """Return clearances from the obstacles of one scene and of the arm from itself, shape (T, 2), [m].
-
-        Args:
-            coordinates: Shape (T, D).
-            obstacles: Obstacles at time 0.
-            times: Shape (T,), [s]; 0 by default.
-        """
-        arm, number = self.task.arm, len(coordinates)
-        joints, rows = self.task.space.joints(coordinates), obstacles.take(np.zeros(number, np.int64))
-        when = np.zeros(number) if times is None else times
+        """Return clearances from obstacles at T times [s] and of the arm from itself, shape (T, 2), [m]."""
+        arm = self.task.arm
+        joints = self.task.space.joints(coordinates)
+        rows = obstacles.take(np.zeros(len(joints), np.int64))
+        when = np.zeros(len(joints)) if times is None else times
         return np.asarray(configuration_clearances(arm.chain, arm.spheres, joints, rows, when))
 
     def moved(self, coordinates: Float, place: Float, scene: Scene | None, turn: Any = None) -> Float:
         """Return coordinates with the tool at another place, in joint space the nearest ones that are free.
 
-        Args:
-            coordinates: Present coordinates, shape (D,).
-            place: New place of the tool, shape (3,), [m].
-            scene: Scene whose obstacles are avoided; None for none.
-            turn: New orientation of the tool, a quaternion; the present one by default.
-
-        Raises:
-            ValueError: The arm cannot reach the place.
+        `scene` has the obstacles that are avoided, if any; `turn` is a new orientation of the tool. A place out of
+        reach raises ValueError.
         """
         if self.task.space.of_hand:
             return np.array(place[:2])
@@ -258,16 +237,14 @@ class Arena:
 
     def new_shapes(self) -> dict[str, Shape]:
         """Return the obstacles that can be added, by name."""
-        shapes: dict[str, Shape] = {
-            "sphere": Sphere(0.06),
-            "capsule": Capsule(0.035, 0.1),
-            "box": Box((0.05, 0.05, 0.05)),
-            "cylinder": Cylinder(0.04, 0.08),
-        }
+        height = self._sampler.room.height
+        shapes: dict[str, Shape]
         if self.planar:
-            height = self._sampler.room.height
-            bar, box = Box((0.09, 0.015, height)), Box((0.03, 0.03, height))
-            shapes = {"post": Cylinder(0.025, height), "bar": bar, "box": box}
+            shapes = {"post": Cylinder(0.025, height), "bar": Box((0.09, 0.015, height))}
+            shapes["box"] = Box((0.03, 0.03, height))
+        else:
+            shapes = {"sphere": Sphere(0.06), "capsule": Capsule(0.035, 0.1)}
+            shapes |= {"box": Box((0.05, 0.05, 0.05)), "cylinder": Cylinder(0.04, 0.08)}
         return {**shapes, "wall": HalfSpace()}
 
     def new_obstacle(self, scene: Scene, name: str) -> Shape:

@@ -25,31 +25,19 @@ from viapoint.training.planning.plan_motion import SEEDS, checked_motion, plan_m
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import GeometrySearch, merits
 
+# Time limits of the motion planner after a change, and in a pause where that found no free movement, [s]
 TIME_LIMIT, SECOND_LIMIT = 0.03, 0.3
-"""Time limits of the motion planner after a change, and in a pause where that found no free movement, [s]."""
-N_PROPOSALS = 5
-"""Proposals that are shown."""
-N_CANDIDATES = 256
-"""Best candidates among which distinct proposals are looked for."""
-APART = 0.03
-"""Distance by which the paths of two proposals differ somewhere, [m]."""
-N_CHECKS, REFINEMENTS = 512, 3
-"""Candidates of the geometry search, and rounds of refinement around the best of them."""
-NEXT_START = 0.02
-"""Least difference of a coordinate between the present position and a goal that begins a new movement."""
+N_PROPOSALS = 5  # Proposals that are shown
+N_CANDIDATES = 256  # Best candidates among which distinct proposals are looked for
+APART = 0.03  # Distance by which the paths of two proposals differ somewhere, [m]
+N_CHECKS, REFINEMENTS = 512, 3  # Candidates of the geometry search, and rounds around the best
+NEXT_START = 0.02  # Least way to a goal that begins a new movement, in a coordinate
 
-Decide = Callable[[Observation], Float]
-"""Function that returns the action, shape (1, m), for an observation."""
+Decide = Callable[[Observation], Float]  # Action, shape (1, m), for an observation
 
 
 def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Proposal:
-    """Return the plan of the method, or by hand; where the scene is impossible, the motion planner says why.
-
-    Args:
-        arena: Arm, agent and environments.
-        state: Scene, method and its settings.
-        time_limit: Time limit of the motion planner, [s].
-    """
+    """Return the plan of the method, or by hand; where the scene is impossible, the motion planner says why."""
     if state.by_hand is not None:
         assert state.plan is not None
         return _by_hand(arena, state, state.by_hand, state.duration or state.plan.duration)
@@ -187,16 +175,10 @@ def play(
     plan: Plan | None = None,
     goal_of: Callable[[], Float] | None = None,
 ) -> Iterator[Movement]:
-    """Play an episode, and yield the movement so far after each decision.
+    """Play an episode in a batch of one, and yield the movement so far after each decision.
 
-    When the arm has reached a goal that has been dragged away meanwhile, a new episode begins there.
-
-    Args:
-        env: Batch of one environment.
-        scene: Scene.
-        decide: Function of observations.
-        plan: First plan; None for that of a decision.
-        goal_of: Function that returns the present goal, shape (D,); None for one that stays.
+    `plan` replaces the first decision; `goal_of` returns the present goal, shape (D,). When the arm has reached a goal
+    that has been dragged away meanwhile, a new episode begins there.
     """
     observation, _ = env.reset(options=scene.options())
     decision = env.execute_actions(decide(observation)) if plan is None else env.execute_plan(_in_batch(plan))

@@ -25,28 +25,21 @@ from viapoint.training.planning.motion_plan import MotionPlan
 if TYPE_CHECKING:
     import viser
 
-SIDES = 8
-"""Sides of a tube."""
-PLAN, PROPOSAL, DONE = 0.0050, 0.0028, 0.0032
-"""Radii of the plan, of other proposals, and of the executed path, [m]."""
+SIDES = 8  # Sides of a tube
+PLAN, PROPOSAL, DONE = 0.0050, 0.0028, 0.0032  # Radii of plan, proposals, executed path, [m]
 SHRUNK = 0.05
 """Factor of the vertices of proposals, which their nodes undo. The client outlines what the pointer is over; it merges
 the vertices of meshes with radii above 0.1 in cubes of 0.01, which leaves gaps in the outline of a thin tube."""
+# Shifts of proposals and of the executed path, so that the plan stays visible, [m]
 BELOW, ABOVE = np.array([0.0, 0.0, -0.002]), np.array([0.0, 0.0, 0.004])
-"""Shifts of proposals and of the executed path, so that the plan stays visible, [m]."""
-RADII = {"start": 0.018, "goal": 0.018, "via": 0.013}
-"""Radii of the handles, [m]."""
+RADII = {"start": 0.018, "goal": 0.018, "via": 0.013}  # Radii of the handles, [m]
 PLANE = (-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), 33.0
+# First views: position of the camera, point that it looks at, [m], direction up, and field of view, [degrees]
 SPACE = (2.6, -2.0, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), 38.0
-"""First views: position of the camera, point that it looks at, [m], direction up, and field of view, [degrees]."""
-OPACITY, GHOST, PALE = 0.45, 0.16, 0.25
-"""Opacities: of a planar arm and of large obstacles, which hide others; of the arm at the goal; of an old plan."""
-LARGE = 0.16
-"""Greatest size of obstacles in space that are not large, [m]."""
-LOW, TALL = 0.030, 0.060
-"""Height of obstacles in the plane, [m]: below links that pass above them, and where links collide."""
-FARTHEST = 1.2
-"""Greatest coordinate to which something can be dragged, [m]."""
+OPACITY, GHOST, PALE = 0.45, 0.16, 0.25  # Of what hides others, the arm at the goal, an old plan
+LARGE = 0.16  # Greatest size of obstacles in space that are not large, [m]
+LOW, TALL = 0.030, 0.060  # Height of obstacles in the plane, [m]: below links, and as tall as links
+FARTHEST = 1.2  # Greatest coordinate to which something can be dragged, [m]
 
 
 def tube(points: Float, radius: float) -> Any:
@@ -77,11 +70,9 @@ def tube(points: Float, radius: float) -> Any:
 
 
 def obstacle_mesh(shape: Shape, levels: tuple[float, float] | None = None) -> Any:
-    """Return the mesh of an obstacle around its position, turned as it is in the world.
+    """Return the mesh of an obstacle around its position, turned as it is in the world; a plate is a half-space.
 
-    Args:
-        shape: Obstacle; a plate stands for a half-space.
-        levels: Least and greatest height of an obstacle in the plane, which is cut off there, [m]; None for space.
+    `levels` are the heights between which an obstacle in the plane is cut off, [m].
     """
     place = np.array(shape.position)
     if isinstance(shape, HalfSpace):
@@ -99,13 +90,8 @@ def obstacle_mesh(shape: Shape, levels: tuple[float, float] | None = None) -> An
 class ArmDrawing:
     """Meshes of an arm, and their poses.
 
-    Args:
-        arm: Arm that moves.
-        model: MuJoCo model of the environment.
-        model_file: MJCF file that the arm was loaded from; its visible geoms replace the capsules.
-
-    Raises:
-        ValueError: The file cannot be read.
+    They are those of a MuJoCo model, or of the visible geoms of the file that the arm was loaded from. A file that
+    cannot be read raises ValueError.
     """
 
     def __init__(self, arm: Arm, model: mujoco.MjModel, model_file: str | Path | None = None) -> None:
@@ -152,14 +138,7 @@ def _first_anchor(model: mujoco.MjModel, arm: Arm) -> Float:
 
 
 class View:
-    """View of one tab, drawn from its state.
-
-    Args:
-        client: Tab.
-        arena: Arm and task.
-        arm: Drawing of the arm.
-        act: Function that is called with the name of what a user does and its values.
-    """
+    """View of one tab, drawn from its state; `act` is called with the name of what a user does and its values."""
 
     def __init__(
         self, client: viser.ClientHandle, arena: Arena, arm: ArmDrawing, act: Callable[..., None]

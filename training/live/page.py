@@ -35,22 +35,13 @@ from viapoint.training.live.drawing import ArmDrawing, View
 from viapoint.training.live.panels import RESET, Panels
 from viapoint.training.live.state import Scene, State
 
-LOOPBACK = "127.0.0.1"
-"""Address that only this machine reaches."""
-PAUSE = 0.12
-"""Time without other changes after which proposals and comparisons are computed, [s]."""
-TICK = 0.03
-"""Time between two pictures of a movement, [s]."""
+LOOPBACK = "127.0.0.1"  # Address that only this machine reaches
+PAUSE = 0.12  # Time without other changes after which proposals and comparisons are computed, [s]
+TICK = 0.03  # Time between two pictures of a movement, [s]
 
 
 class Tab:
-    """One tab: its state, and the thread in which all that a user does changes it.
-
-    Args:
-        client: Tab of the browser.
-        make: Function that returns arm, task and agent, and the drawing of the arm.
-        on_end: Function that is called when the thread has ended.
-    """
+    """One tab: its state, and the thread in which all that a user does changes it."""
 
     state: State
 

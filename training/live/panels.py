@@ -18,12 +18,9 @@ from viapoint.training.live.state import State
 if TYPE_CHECKING:
     import viser
 
-WIDTH = 330
-"""Width of a panel, [pixels]."""
-RESET = "Reset"
-"""Name of the button that undoes all changes of a scene."""
-CHECKS = {"none": 0, "16": 16, "64": 64}
-"""Numbers of proposals that the agent checks with computed geometry."""
+WIDTH = 330  # Width of a panel, [pixels]
+RESET = "Reset"  # Name of the button that undoes all changes of a scene
+CHECKS = {"none": 0, "16": 16, "64": 64}  # Proposals that are checked with computed geometry
 NOTE = '<div style="padding:0.2em 0.9em;font-size:0.8em;color:#6b7078">{}</div>'
 MESSAGE = '<div id="viapoint-message" style="padding:0.2em 0.9em;font-size:0.9em;color:{}">{}</div>'
 CODE = (
@@ -40,14 +37,7 @@ LINES: Any = (
 
 
 class Panels:
-    """Panels of one tab, drawn from its state.
-
-    Args:
-        client: Tab.
-        arena: Arm, task and agent.
-        scene_kinds: Names of the buttons that draw scenes.
-        act: Function that is called with the name of what a user does and its values.
-    """
+    """Panels of one tab, drawn from its state; `act` is called with the name of what a user does and its values."""
 
     def __init__(
         self, client: viser.ClientHandle, arena: Arena, scene_kinds: Iterable[str], act: Callable[..., None]

@@ -20,16 +20,11 @@ from viapoint.training.planning.motion_plan import MotionPlan
 class Scene(NamedTuple):
     """One scene in coordinates of the task's space: the options of `reset`."""
 
-    start: Float
-    """Shape (D,)."""
-    goal: Float
-    """Shape (D,)."""
-    obstacles: tuple[Shape, ...]
-    """Obstacles at time 0, with their velocities."""
-    jumps: Any = ()
-    """Jumps of the target: rows (time [s], target D)."""
-    turns: Any = ()
-    """Changes of course: rows (time [s], velocity 3 [m/s]) for each obstacle, zero for none."""
+    start: Float  # Shape (D,)
+    goal: Float  # Shape (D,)
+    obstacles: tuple[Shape, ...]  # Obstacles at time 0, with their velocities
+    jumps: Any = ()  # Jumps of the target: rows (time [s], target D)
+    turns: Any = ()  # Changes of course: rows (time [s], velocity 3 [m/s]) by obstacle
 
     def options(self) -> dict[str, Any]:
         """Return the options of `reset`; what does not change is left out."""
@@ -75,79 +70,49 @@ class Scene(NamedTuple):
 class Proposal(NamedTuple):
     """One plan that was considered."""
 
-    motion: MotionPlan
-    """Plan, with what is known of it."""
-    maker: str
-    """Method that made it."""
-    seconds: float = 0.0
-    """Time that the decision took, [s]."""
-    value: float | None = None
-    """Value by which the agent ranks the plan; None where it does not decide."""
-    reward: float | None = None
-    """Reward of the simulated movement; None for one that fails, and until it is simulated."""
+    motion: MotionPlan  # Plan, with what is known of it
+    maker: str  # Method that made it
+    seconds: float = 0.0  # Time that the decision took, [s]
+    value: float | None = None  # Value by which the agent ranks the plan
+    reward: float | None = None  # Simulated reward; None for a plan that fails, or not yet
 
 
 class Movement(NamedTuple):
     """Simulated movement up to the next decision, or to its end."""
 
-    rollout: Rollout
-    """The movement from its beginning, at every physics step."""
-    scenes: Scenes
-    """Its scene, which has the places of obstacles over time."""
-    plan: Plan | None
-    """Plan that is followed; None where the arm is steered."""
-    info: Mapping[str, Any]
-    """Metrics so far, of a batch of one."""
-    reward: float
-    """Reward so far."""
+    rollout: Rollout  # The movement from its beginning, at every physics step
+    scenes: Scenes  # Its scene, which has the places of obstacles over time
+    plan: Plan | None  # Plan that is followed; None where the arm is steered
+    info: Mapping[str, Any]  # Metrics so far, of a batch of one
+    reward: float  # Reward so far
 
 
 @dataclass(kw_only=True)
 class State:
     """Everything that a tab shows; arrays and records in it are replaced, never changed."""
 
-    scene: Scene
-    """Present scene."""
-    drawn: Scene
-    """Scene before the user changed it."""
-    origin: str = ""
-    """Sentence on where the scene comes from."""
-    method: str
-    """Name of the method that decides."""
-    n_via: int | None = None
-    """Number of via-points that the user wants; None for that of the method."""
-    checks: int = 0
-    """Proposals that the agent checks with computed geometry."""
-    duration: float | None = None
-    """Duration that the user wants, [s]; None for that of the method."""
-    by_hand: Float | None = None
-    """Via-points that the user has chosen, shape (K, D)."""
-    selected: int | None = None
-    """Row of the selected obstacle."""
-    turning: bool = False
-    """True if rings are shown that turn the tool at the goal."""
-    proposals: tuple[Proposal, ...] = ()
-    """Plans; the one of the method, or by hand, is first."""
-    picked: int = 0
-    """Index of the proposal that is the plan."""
-    before: MotionPlan | None = None
-    """Plan before the last change, whose via-points are tried first; it stays pale until a pause."""
-    profile: Mapping[str, Float] | None = None
-    """Time, speed, jerk and clearance of the plan; None until a pause."""
-    movement: Movement | None = None
-    """Executed movement so far."""
-    instant: int = 0
-    """Row of its rollout that is shown."""
-    playing: bool = False
-    """True while the movement is played."""
+    scene: Scene  # Present scene
+    drawn: Scene  # Scene before the user changed it
+    origin: str = ""  # Sentence on where the scene comes from
+    method: str  # Name of the method that decides
+    n_via: int | None = None  # Number of via-points; None for that of the method
+    checks: int = 0  # Proposals that the agent checks with computed geometry
+    duration: float | None = None  # Duration that the user wants, [s]; None for that of the method
+    by_hand: Float | None = None  # Via-points that the user has chosen, shape (K, D)
+    selected: int | None = None  # Row of the selected obstacle
+    turning: bool = False  # True if rings are shown that turn the tool at the goal
+    proposals: tuple[Proposal, ...] = ()  # Plans; the one of the method, or by hand, is first
+    picked: int = 0  # Index of the proposal that is the plan
+    before: MotionPlan | None = None  # Plan before the last change; pale until a pause
+    profile: Mapping[str, Float] | None = None  # Curves of the plan; None until a pause
+    movement: Movement | None = None  # Executed movement so far
+    instant: int = 0  # Row of its rollout that is shown
+    playing: bool = False  # True while the movement is played
+    # Compared methods: name, time of the first decision, [s], and simulated movement
     results: tuple[tuple[str, float, Movement], ...] = ()
-    """Compared methods: name, time of the first decision, [s], and simulated movement."""
-    comparing: str = ""
-    """Name of the method whose result is to come."""
-    message: str = "Getting ready."
-    """Sentence on the plan or the movement."""
-    good: bool = True
-    """False for bad news."""
+    comparing: str = ""  # Name of the method whose result is to come
+    message: str = "Getting ready."  # Sentence on the plan or the movement
+    good: bool = True  # False for bad news
 
     @property
     def plan(self) -> MotionPlan | None:

@@ -39,30 +39,21 @@ def at_least(value: float) -> Range:
     return Range(low=value)
 
 
-Number: TypeAlias = tuple[Any, Range]
-"""Computed number, a float of Python or NumPy, and its expected range."""
+Number: TypeAlias = tuple[Any, Range]  # Computed number and its expected range
 
 
 @dataclass(frozen=True)
 class Claim:
     """Statement with its number on the model and, where it can be simulated, on the arm."""
 
-    row: int
-    """Number of its subject."""
-    claim: str
-    """Text of the statement; it says where the statement is only approximate."""
-    figure: str = "-"
-    """Figure of the paper."""
-    paper: str = "-"
-    """Statement or measurement of the paper."""
-    model: Number | None = None
-    """Number on the model; None where it needs an arm."""
-    arm: Number | None = None
-    """Number on the simulated arm; None for statements about the mathematics alone."""
-    deviation: float | None = None
-    """Greatest distance of the simulated hand from the plan, [mm]."""
-    unit: str = ""
-    """Unit of the numbers."""
+    row: int  # Number of its subject
+    claim: str  # Text of the statement; it says where the statement is only approximate
+    figure: str = "-"  # Figure of the paper
+    paper: str = "-"  # Statement or measurement of the paper
+    model: Number | None = None  # Number on the model; None where it needs an arm
+    arm: Number | None = None  # Number on the simulated arm; None for mathematics alone
+    deviation: float | None = None  # Greatest distance of the simulated hand from the plan, [mm]
+    unit: str = ""  # Unit of the numbers
 
     @property
     def holds(self) -> bool:

@@ -23,16 +23,13 @@ from viapoint.training.paper.rows import alternatives, double_step, one_via
 from viapoint.training.paper.rows.obstacles import ObstacleMovements, features
 from viapoint.training.paper.rows.one_via import ENDS
 from viapoint.training.paper.rows.straight import DIAGONALS, DURATION, diagonals
-from viapoint.training.plotting.top_view import footprint
 
-WIDTH = 8.5
-"""Width of a column, [cm]."""
-STYLE = Path(__file__).with_name("paper.mplstyle")
-"""Matplotlib's style of all figures."""
+WIDTH = 8.5  # Width of a column, [cm]
+STYLE = Path(__file__).with_name("paper.mplstyle")  # Matplotlib's style of all figures
+# Style of the model: a wide light line that stays visible beside the arm
 MODEL: dict[str, Any] = {"color": PALETTE.plan, "linewidth": 2.2, "solid_capstyle": "round"}
-"""Style of the model: a wide light line that stays visible beside the arm."""
+# Style of the simulated arm
 ARM: dict[str, Any] = {"color": PALETTE.executed, "linewidth": 0.9, "linestyle": (0, (4, 1.5))}
-"""Style of the simulated arm."""
 SECOND = PALETTE.goal
 THIRD = PALETTE.via
 GREY = PALETTE.start
@@ -248,7 +245,9 @@ def around_lights(avoidance: ObstacleMovements) -> Figure:
         plane(ax[0])
         paths(ax[0], model.position, profile.position)
         (lights,) = unpack(avoidance.scenes.obstacles, row)
-        ax[0].fill(*(100.0 * footprint(lights)[0].T), color=PALETTE.obstacle)
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * lights.packed_size[:2]
+        outline = corners @ lights.rotation[:2, :2].T + lights.position[:2]
+        ax[0].fill(*(100.0 * outline.T), color=PALETTE.obstacle)
         dot(ax[0], via)
         profiles(ax[1:], model, profile, 1.0, ("model through $\\bullet$", avoidance.name))
         ax[2].set_xlabel("$t/t_f$")
@@ -282,8 +281,7 @@ DOTS: dict[str, Any] = {
 FAINT: dict[str, Any] = {
     "linestyle": "none", "marker": "s", "markersize": 1.8, "color": GREY, "alpha": 0.6, "markeredgewidth": 0.0,
 }  # fmt: skip
-SUBJECTS = ((-0.004, 0.02), (-0.0006, 0.017))
-"""Mean and standard deviation of the residuals in the paper's Figs. 10B and 10D."""
+SUBJECTS = ((-0.004, 0.02), (-0.0006, 0.017))  # Mean and s.d. of residuals in Figs. 10B and 10D
 
 
 def isochrony(avoidance: ObstacleMovements) -> Figure:
@@ -380,12 +378,10 @@ def limits() -> Figure:
     return figure
 
 
-SUM: dict[str, Any] = {"color": PALETTE.contact, "linewidth": 1.1}
-"""Style of the superposition."""
+SUM: dict[str, Any] = {"color": PALETTE.contact, "linewidth": 1.1}  # Style of the superposition
+# Style of its two parts
 PART: dict[str, Any] = {"color": PALETTE.contact, "linewidth": 0.6, "linestyle": ":"}
-"""Style of its two parts."""
-NOW: dict[str, Any] = {"color": THIRD, "linewidth": 0.8}
-"""Style of the moment of revision."""
+NOW: dict[str, Any] = {"color": THIRD, "linewidth": 0.8}  # Style of the moment of revision
 
 
 def paths_and_speeds() -> Figure:

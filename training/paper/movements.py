@@ -29,10 +29,8 @@ TARGETS = {
 The figure gives no coordinates. Its movements T1-T4, T2-T5 and T3-T6 (Figs. 1, 3 and 4) are the three diagonals of a
 hexagon here, 40, 36 and 36 cm long, in front of the right shoulder and within the reach of the arm.
 """
-ADULT = Task.of().arm
-"""Arm of an adult."""
-PLANE = Task.of().space
-"""Plane of its hand."""
+ADULT = Task.of().arm  # Arm of an adult
+PLANE = Task.of().space  # Plane of its hand
 
 
 def straight(first: str, last: str, duration: float = 0.8, *, order: int = 3) -> Trajectory:
@@ -46,16 +44,10 @@ def left_of(line: Float) -> Float:
 
 
 def via_waypoints(start: Any, goal: Any, along: ArrayLike, height: ArrayLike) -> Float:
-    """Return start, via-point and goal by the construction of Fig. 1B.
+    """Return start, via-point and goal by the construction of Fig. 1B, shape (..., 3, 2), [m].
 
-    Args:
-        start: Shape (2,), [m].
-        goal: Shape (2,), [m].
-        along: d1 / (d1 + d2), shape (...,): where the perpendicular through the via-point meets the line.
-        height: d3 / (d1 + d2), shape (...,); positive is to the left of the movement.
-
-    Returns:
-        Shape (..., 3, 2), [m].
+    The perpendicular through the via-point meets the line at `along` = d1 / (d1 + d2), shape (...,); `height` is
+    d3 / (d1 + d2), positive to the left of the movement.
     """
     line = np.subtract(goal, start)
     along, height = np.broadcast_arrays(along, height)
@@ -87,8 +79,7 @@ def passage_share(movement: Trajectory) -> Float:
     return np.asarray(movement.knots[..., 1] / movement.knots[..., 2])
 
 
-LEAST_APART = 0.3
-"""Least distance of the targets of a movement, [m]."""
+LEAST_APART = 0.3  # Least distance of the targets of a movement, [m]
 
 
 def rows_of_lights(
@@ -132,25 +123,18 @@ def rows_of_lights(
     return found
 
 
-SETTLING = 0.1
-"""Time after the end of a movement that is simulated, too, [s]."""
+SETTLING = 0.1  # Time after the end of a movement that is simulated, too, [s]
 
 
 class SimulatedMovements(NamedTuple):
     """Simulated movements at T instants; after its end a movement settles."""
 
-    time: Float
-    """Shape (T,), [s]; every physics step from the start on."""
-    duration: Float
-    """Planned durations, shape (N,), [s]."""
-    planned: Float
-    """Hand position of the plan, shape (N, T, 2), [m]."""
-    hand: Float
-    """Shape (N, T, 2), [m]."""
-    joints: Float
-    """Shoulder and elbow angles, shape (N, T, 2), [rad]."""
-    torque: Float
-    """Torque of the actuators in the step that begins at each instant, shape (N, T - 1, 2), [N m]."""
+    time: Float  # Shape (T,), [s]; every physics step from the start on
+    duration: Float  # Planned durations, shape (N,), [s]
+    planned: Float  # Hand position of the plan, shape (N, T, 2), [m]
+    hand: Float  # Shape (N, T, 2), [m]
+    joints: Float  # Shoulder and elbow angles, shape (N, T, 2), [rad]
+    torque: Float  # Torque of the step after each instant, shape (N, T - 1, 2), [N m]
 
     @property
     def deviation(self) -> Float:
@@ -238,14 +222,10 @@ SAMPLES = 2001
 class Profile(NamedTuple):
     """States of the hand in one movement at T instants."""
 
-    time: Float
-    """Instants as fractions of the duration, shape (T,)."""
-    position: Float
-    """Shape (T, 2), [m]."""
-    velocity: Float
-    """Shape (T, 2), [m/s]."""
-    acceleration: Float
-    """Shape (T, 2), [m/s^2]."""
+    time: Float  # Instants as fractions of the duration, shape (T,)
+    position: Float  # Shape (T, 2), [m]
+    velocity: Float  # Shape (T, 2), [m/s]
+    acceleration: Float  # Shape (T, 2), [m/s^2]
 
     @property
     def speed(self) -> Float:

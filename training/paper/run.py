@@ -80,12 +80,11 @@ DRAWINGS: dict[str, tuple[str, Callable[..., Figure]]] = {
         figures.comparison),
 }  # fmt: skip
 """Captions and functions of the figures by their file names, in the order of the paper."""
+# Functions of them that take the movements around obstacles
 AROUND_LIGHTS = (obstacles.obstacle_claims, figures.around_lights, figures.isochrony)
-"""Functions of them that take the movements around obstacles."""
 
 
-Pictures = list[tuple[Path, str]]
-"""Figures (PNG) and their captions."""
+Pictures = list[tuple[Path, str]]  # Figures (PNG) and their captions
 
 
 def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], Pictures]:
@@ -107,8 +106,7 @@ def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], Pictures]:
 
 
 TITLE = "Flash & Hogan 1985, reproduced with viapoint"
-PAGES = ("table.md", "table.json", "index.html")
-"""Files besides the figures."""
+PAGES = ("table.md", "table.json", "index.html")  # Files besides the figures
 HEADINGS = (
     "row", "claim", "paper's figure", "paper", "model", "expected", "simulated arm", "expected", "hand off plan [mm]",
     "verdict",

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from viapoint.envs.common.types import Float
 from viapoint.training.io.files import MARK
 from viapoint.training.scene_sets.scene_set import BANDS
 
@@ -17,17 +18,11 @@ DOTS_PER_INCH = 130
 
 
 def learning_curve(path: Path, curve: Sequence[Mapping[str, Any]]) -> Path:
-    """Draw success on the validation scenes against decisions, with its Wilson band and the time of training.
-
-    Raises:
-        ValueError: There is no record.
-    """
+    """Draw success on the validation scenes against decisions, with its Wilson band and the time of training."""
     if not curve:
         raise ValueError("there is no learning curve to draw: the run was never evaluated")
-    rate, low, high = (
-        100.0 * np.array([record["success"][part] for record in curve]) for part in ("rate", "low", "high")
-    )
-    decisions = np.array([record["decisions"] for record in curve])
+    rate, low, high = _percent([record["success"] for record in curve])
+    decisions = [record["decisions"] for record in curve]
     figure = Figure(figsize=(6.0, 3.6), layout="constrained")
     ax = figure.subplots()
     ax.plot(decisions, rate, marker="o", markersize=3.5, color=BLUE)
@@ -50,9 +45,7 @@ def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
         bands = summary["success_by_band"]
         shown = [(j, bands[band]) for j, band in enumerate(BANDS) if band in bands]
         x = np.array([j + (i - (len(summaries) - 1) / 2.0) * width for j, _ in shown])
-        rate, low, high = (
-            100.0 * np.array([each[part] for _, each in shown]) for part in ("rate", "low", "high")
-        )
+        rate, low, high = _percent([each for _, each in shown])
         ax.bar(x, rate, width=0.9 * width, label=name)
         ax.errorbar(x, rate, yerr=(rate - low, high - rate), fmt="none", ecolor="0.25", elinewidth=1.0)
     ax.set_xticks(range(len(BANDS)), BANDS)
@@ -69,10 +62,8 @@ def success_of_rows(
 ) -> Path:
     """Draw success with intervals of each row of a study, and success during the trainings.
 
-    Args:
-        path: PNG file.
-        table: Lines of one environment with `method`, `set`, `success`, `low` and `high`, a pandas table.
-        curves: Pairs of decisions and success in validation, for each run of each row.
+    `table` has lines of one environment with `method`, `set`, `success`, `low` and `high`; `curves` has pairs of
+    decisions and success in validation, for each run of each row.
     """
     methods = list(dict.fromkeys(table["method"]))
     figure = Figure(figsize=(11.0, 1.6 + 0.32 * len(methods)), layout="constrained")
@@ -105,6 +96,12 @@ def style_axes(ax: Any) -> None:
     ax.spines[["top", "right"]].set_visible(False)
     ax.grid(axis="y", color="0.9")
     ax.set_axisbelow(True)
+
+
+def _percent(rates: Sequence[Mapping[str, float]]) -> tuple[Float, Float, Float]:
+    """Return rates and the ends of their intervals, [%]."""
+    rate, low, high = (100.0 * np.array([each[part] for each in rates]) for part in ("rate", "low", "high"))
+    return rate, low, high
 
 
 def _save(figure: Figure, path: Path) -> Path:

@@ -1,17 +1,21 @@
-"""Videos of several movements with captions of their outcomes."""
+"""Videos and galleries of several movements with captions of their outcomes."""
 
 from __future__ import annotations
 
 import os
+import textwrap
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import imageio_ffmpeg
 import numpy as np
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont
+from matplotlib.lines import Line2D
 from PIL import Image, ImageDraw, ImageFont
 
 from viapoint.envs.common.palette import PALETTE, Colour
@@ -23,16 +27,15 @@ from viapoint.training.io.files import MARK
 from viapoint.training.planning.motion_plan import MotionPlan, executed
 from viapoint.training.rollouts.rollout import Decide
 
-CAPTION = 48
-"""Height of the caption below the picture, [pixels]."""
-BLOCK = 16
-"""Encoders need sides that are multiples of this, [pixels]."""
-SPEED = 0.5
-"""Speed of videos relative to real time."""
-PLAN_SIZE, PLAN_FPS = (640, 480), 50
-"""Size of the pictures of a plan, [pixels], and pictures per second of its movement."""
-PAUSE = 0.8
-"""Time for which each result stays, [s]."""
+CAPTION = 48  # Height of the caption below the picture, [pixels]
+BLOCK = 16  # Encoders need sides that are multiples of this, [pixels]
+SPEED = 0.5  # Speed of videos relative to real time
+PLAN_SIZE, PLAN_FPS = (640, 480), 50  # Pictures of a plan, [pixels], [1/s]
+PAUSE = 0.8  # Time for which each result stays, [s]
+TILE = 2.6  # Width of one picture, [inch]
+RESOLUTION = 110  # Resolution, [dots per inch]
+COLUMNS = 4  # Greatest number of pictures in a row
+LINE = 28  # Greatest number of characters of the heading above one picture
 
 
 def record_video(
@@ -59,13 +62,7 @@ def record_video(
     if not len(scenes.start):
         raise ValueError("scenes must hold at least one scene")
     fps = float(env.metadata["render_fps"])
-    part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part.mp4")
-    try:
-        count = _write_mp4(part, _scenes(env, scenes, decide, name, fps), fps * SPEED)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
-    return count
+    return _write_mp4(path, _scenes(env, scenes, decide, name, fps), fps)
 
 
 def record_plan(path: str | Path, plan: MotionPlan) -> int:
@@ -85,10 +82,8 @@ def record_plan(path: str | Path, plan: MotionPlan) -> int:
     info = {name: value[0] for name, value in outcome._asdict().items()}
     film = EpisodeRenderer(episodes, 0, "rgb_array_list", *PLAN_SIZE, PLAN_FPS)
     left = f"{plan.source}   {plan.duration:.2f} s   planned in {plan.milliseconds:.0f} ms"
-    hold = round(PAUSE * SPEED * PLAN_FPS)
     try:
-        frames = _with_captions(iter(film.render()), left, *describe_outcome(info), hold=hold)
-        return _write_mp4(path, frames, PLAN_FPS * SPEED)
+        return _write_mp4(path, _with_captions(film.render(), left, info, PLAN_FPS), PLAN_FPS)
     finally:
         film.close()
 
@@ -99,30 +94,32 @@ def _scenes(env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, name: str, f
     for i in range(number):
         info = play(env, scenes.take([i]), decide)
         left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
-        frames: Any = env.unwrapped.render()
-        yield from _with_captions(
-            iter(frames), left, *describe_outcome(info), hold=round(PAUSE * SPEED * fps)
-        )
+        yield from _with_captions(env.unwrapped.render(), left, info, fps)
 
 
 def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
-    """Encode frames of equal size, with even numbers of pixels, as an MP4 file (H.264), and return their number."""
+    """Encode frames of equal size, at least one, as a slow MP4 file (H.264), and return their number."""
+    part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part.mp4")
     count, writer = 0, None
     try:
         for frame in frames:
             if writer is None:
                 height, width = frame.shape[:2]
                 writer = imageio_ffmpeg.write_frames(
-                    str(path), (width, height), fps=fps, codec="libx264", quality=None, bitrate=None,
+                    str(part), (width, height), fps=SPEED * fps, codec="libx264", quality=None, bitrate=None,
                     output_params=["-crf", "20", "-movflags", "+faststart", "-metadata", f"comment={MARK.decode()}"],
                     macro_block_size=1, ffmpeg_log_level="error",
                 )  # fmt: skip
                 writer.send(None)
             writer.send(np.ascontiguousarray(frame))
             count += 1
+        if writer is not None:
+            writer.close()  # the file is complete now
+        os.replace(part, path)
     finally:
         if writer is not None:
             writer.close()
+        part.unlink(missing_ok=True)
     return count
 
 
@@ -148,18 +145,16 @@ def play(env: gym.Env[Any, Any], scene: Scenes, decide: Decide) -> dict[str, Any
             return {name: value[0] for name, value in decision.info.items()}
 
 
-def _with_captions(
-    frames: Iterator[Frame], left: str, right: str, colour: Colour, *, hold: int
-) -> Iterator[Frame]:
-    """Yield frames with a caption, which shows the result after the movement, and hold the last one."""
-    before = after = frame = None
+def _with_captions(frames: Any, left: str, info: dict[str, Any], fps: float) -> Iterator[Frame]:
+    """Yield frames with a caption, and the last one for a pause with the outcome in it."""
+    outcome, colour = describe_outcome(info)
+    frames = list(frames)
+    plain = _caption(frames[0].shape[1], left, "", colour)
+    final = _caption(frames[0].shape[1], left, outcome, colour)
     for frame in frames:
-        before = _caption(frame.shape[1], left, "", colour) if before is None else before
-        yield _stacked(frame, before)
-    if frame is not None:
-        after = _caption(frame.shape[1], left, right, colour)
-        for _ in range(max(hold, 1)):
-            yield _stacked(frame, after)
+        yield _stacked(frame, plain)
+    for _ in range(round(PAUSE * SPEED * fps)):
+        yield _stacked(frames[-1], final)
 
 
 def _caption(width: int, left: str, right: str, colour: Colour) -> Frame:
@@ -169,8 +164,8 @@ def _caption(width: int, left: str, right: str, colour: Colour) -> Frame:
     size = max(10, min(16, width // 30))
     plain = ImageFont.truetype(findfont("DejaVu Sans"), size)
     bold = ImageFont.truetype(findfont("DejaVu Sans:bold"), size)
-    pen.text((14, CAPTION // 2), left, font=plain, fill=_bytes(PALETTE.executed), anchor="lm")
-    pen.text((width - 14, CAPTION // 2), right, font=bold, fill=_bytes(colour), anchor="rm")
+    pen.text((14, CAPTION // 2), left, font=plain, fill=to_hex(PALETTE.executed), anchor="lm")
+    pen.text((width - 14, CAPTION // 2), right, font=bold, fill=to_hex(colour), anchor="rm")
     return np.asarray(image)
 
 
@@ -181,6 +176,52 @@ def _stacked(frame: Frame, caption: Frame) -> Frame:
     return whole[whole.shape[0] - height :, :width]
 
 
-def _bytes(colour: Colour) -> tuple[int, int, int]:
-    red, green, blue = (round(255 * c) for c in colour)
-    return red, green, blue
+def gallery(
+    path: Path,
+    env: gym.Env[Any, Any],
+    scenes: Scenes,
+    decide: Decide,
+    titles: Sequence[str],
+    *,
+    heading: str = "",
+) -> None:
+    """Play an episode in each scene, and save a page of their last pictures as a PNG file in an existing folder.
+
+    Args:
+        path: PNG file.
+        env: Environment made with `render_mode="rgb_array"`.
+        scenes: Scenes, at least one, with as many rows for obstacles as the environment has.
+        decide: Function from observation and scene, of one row each, to actions, shape (1, m).
+        titles: Text below each picture, such as the difficulty of the scene.
+        heading: Heading of the page.
+
+    Raises:
+        GLUnavailableError: There is no OpenGL library.
+    """
+    columns = min(COLUMNS, len(titles))
+    rows = -(-len(titles) // columns)
+    lines = textwrap.wrap(heading, LINE * columns)
+    margin = 0.45 + 0.3 * bool(lines) + 0.2 * len(lines[1:]) + 0.3 * (columns == 1)
+    figure = Figure(figsize=(TILE * columns, (TILE + 0.5) * rows + margin), dpi=RESOLUTION)
+    figure.set_layout_engine("constrained", w_pad=0.03, h_pad=0.03)
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid.flat:
+        axes.set(xticks=[], yticks=[], frame_on=False)
+    for row, (axes, title) in enumerate(zip(grid.flat, titles, strict=False)):
+        outcome, colour = describe_outcome(play(env, scenes.take([row]), decide))
+        axes.imshow(env.unwrapped.render())
+        axes.set_title(outcome, fontsize=8.5, color=colour, fontweight="bold", pad=3)
+        axes.set_xlabel(title, fontsize=8, color=PALETTE.joint)
+    marks = {
+        "planned": "plan",
+        "executed": "executed",
+        "via-point": "via",
+        "goal": "goal",
+        "contact": "contact",
+    }
+    handles = [Line2D([], [], color=getattr(PALETTE, name), linewidth=4) for name in marks.values()]
+    places: Any = {"loc": "outside lower center", "ncols": 5 if columns > 1 else 2}
+    figure.legend(handles, list(marks), **places, fontsize=8, frameon=False)
+    if lines:
+        figure.suptitle("\n".join(lines), fontsize=11, color=PALETTE.executed)
+    figure.savefig(path, metadata={"Software": MARK.decode()})

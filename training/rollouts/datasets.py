@@ -15,16 +15,11 @@ import numpy as np
 from viapoint.envs.env import ReachEnv
 from viapoint.training.planning.baselines import Method, OpenLoopBaseline, PlannerMethod
 
-DATASET_ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")
-"""Names that Minari allows: groups, a name, and a version."""
+DATASET_ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")  # As Minari allows: groups, name, version
 
 
 def dataset_folder(dataset_id: str) -> Path:
-    """Return the folder of a dataset, in MINARI_DATASETS_PATH or, by default, in ~/.minari/datasets.
-
-    Raises:
-        ValueError: Minari allows no such name.
-    """
+    """Return the folder of a dataset, in MINARI_DATASETS_PATH or, by default, in ~/.minari/datasets."""
     if not DATASET_ID.fullmatch(dataset_id):
         raise ValueError(f"dataset must be named like group/name-v0, got {dataset_id!r}")
     root = os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets"

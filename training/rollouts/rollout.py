@@ -18,8 +18,8 @@ from viapoint.training.planning.search import registered_task
 if TYPE_CHECKING:
     from viapoint.envs.vector_env import ReachVectorEnv
 
+# Function of observations and scenes that returns actions, shape (N, m)
 Decide = Callable[[Observation, Scenes], Float]
-"""Function of observations and scenes that returns actions, shape (N, m)."""
 
 
 class SimulationResults(NamedTuple):
@@ -76,10 +76,7 @@ class SceneSimulation:
         return self.episodes(scenes, actions, None)
 
     def play(self, method: Any, scenes: Scenes, decisions: Float) -> SimulationResults:
-        """Simulate episodes that begin with the decisions of a method; it makes every later decision, too.
-
-        A method with `execute(scenes, decisions)` simulates them itself.
-        """
+        """Simulate episodes that begin with decisions of a method; it makes all others or has its own `execute`."""
         if hasattr(method, "execute"):
             results: SimulationResults = method.execute(scenes, decisions)
             return results
@@ -88,14 +85,7 @@ class SceneSimulation:
     def episodes(
         self, scenes: Scenes, actions: Float, decide: Decide | None, *, single_decision: bool = False
     ) -> SimulationResults:
-        """Simulate one episode in each of N scenes, N at least 1.
-
-        Args:
-            scenes: Scenes.
-            actions: First actions, shape (N, m).
-            decide: Function that makes the later decisions; None for zero actions.
-            single_decision: True to end after the first decision.
-        """
+        """Simulate one episode in each of N scenes, from first actions (N, m); later ones are decided, or zero."""
         pieces = []
         for rows, env in self._groups(len(scenes.start)):
             self._begin(env, scenes, rows)

@@ -21,12 +21,10 @@ assert viapoint.envs.TASKS, "importing it registers the environments"
 
 Observation = dict[str, NDArray[np.float32]] | NDArray[Any]
 
-ELAPSED = "elapsed"
-"""Name of the duration of a decision in infos, [s]."""
+ELAPSED = "elapsed"  # Name of the duration of a decision in infos, [s]
+# Metrics of an episode that `episode` in the infos holds too, as with `info_keywords` of SB3's `Monitor`
 LOGGED = ("collision", "reachable", "min_clearance", "jerk_ratio", "duration")
-"""Metrics of an episode that `episode` in the infos holds too, as with `info_keywords` of SB3's `Monitor`."""
-TERMS = tuple(f"reward_{name}" for name in RewardTerms._fields)
-"""Terms of a decision's reward, which the info dictionaries report."""
+TERMS = tuple(f"reward_{name}" for name in RewardTerms._fields)  # Terms of the reward in infos
 
 
 def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:

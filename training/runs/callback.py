@@ -21,19 +21,16 @@ from viapoint.training.rollouts.vec_env import LOGGED, ViaVecEnv
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets.scene_set import FrozenScenes, scenes_for
 
-LOG_EVERY = 1_000
-"""Decisions between two entries of the log."""
-RATES = ("collision", "reachable")
-"""Metrics of an episode that are true or false; Stable-Baselines3 logs the success itself."""
+LOG_EVERY = 1_000  # Decisions between two entries of the log
+RATES = ("collision", "reachable")  # Metrics that are true or false
+# Metrics of a validation in the log and in the learning curve; medians in [m] and [s]
 VALIDATED = ("success", "collision", "min_clearance", "goal_error", "jerk_ratio", "duration")
-"""Metrics of a validation in the log and in the learning curve; medians in [m] and [s]."""
 
 
 class TrainingStoppedError(Exception):
     """Training was stopped by Ctrl-C after its state was saved."""
 
-    exit_code = 130
-    """Exit code of shells for Ctrl-C."""
+    exit_code = 130  # Exit code of shells for Ctrl-C
 
 
 class TrainingStalledError(Exception):

@@ -36,10 +36,9 @@ COUNTERS = (
 """Counters of Stable-Baselines3's algorithms."""
 ARRAYS = ("_last_obs", "_last_episode_starts")
 DEQUES = ("ep_info_buffer", "ep_success_buffer")
+# Errors of content that is none of a checkpoint, or that does not fit the model
 UNFIT = (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OSError, EOFError)
-"""Errors of content that is none of a checkpoint, or that does not fit the model."""
-MAY_DIFFER = ("num_timesteps", "viapoint")
-"""Entries of a model's description that say nothing about which model it is."""
+MAY_DIFFER = ("num_timesteps", "viapoint")  # Entries that do not tell models apart
 
 
 def write_checkpoint(model: BaseAlgorithm, path: Path, extra: Mapping[str, Any]) -> None:
@@ -67,10 +66,7 @@ def write_checkpoint(model: BaseAlgorithm, path: Path, extra: Mapping[str, Any])
 
 
 def read_checkpoint(model: BaseAlgorithm, path: Path) -> dict[str, Any]:
-    """Set a newly built model of the same kind and its environment to the state of a checkpoint.
-
-    Returns:
-        Content of `extra`.
+    """Set a newly built model of the same kind and its environment to the state of a checkpoint, and return `extra`.
 
     Raises:
         BadFileError: The checkpoint is torn, foreign, or of another model.
@@ -91,11 +87,7 @@ def read_checkpoint(model: BaseAlgorithm, path: Path) -> dict[str, Any]:
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Return the content of a checkpoint after checking the sums of its parts.
-
-    Raises:
-        BadFileError: It is no checkpoint, or a damaged one.
-    """
+    """Return the content of a checkpoint after checking the sums of its parts; a bad one raises BadFileError."""
     content = io.BytesIO(read_bytes(path))
     try:
         with zipfile.ZipFile(content) as archive:

@@ -12,7 +12,6 @@ tensorboard/                      logs
 from __future__ import annotations
 
 import json
-import re
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -41,13 +40,10 @@ from viapoint.training.io.files import (
 from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
 
 KEPT_CHECKPOINTS = 2
-PATIENCE = 10.0
-"""Time to wait for a folder in use, [s]: workers of a study that was killed end within seconds."""
+PATIENCE = 10.0  # [s]; workers of a study that was killed end within seconds
 
-MAY_CHANGE = ("n_timesteps", "out", "resume", "progress")
-"""Fields that may differ when a run is resumed."""
-UNSET = object()
-"""Value of a setting that is not there."""
+MAY_CHANGE = ("n_timesteps", "out", "resume", "progress")  # When a run is resumed
+UNSET = object()  # Value of a setting that is not there
 
 
 class Run:
@@ -77,18 +73,14 @@ class Run:
         if not (folder / "config.json").is_file():
             raise BadFileError(folder, "is no run folder: it holds no config.json")
         self.folder = folder
+        record = read_json(folder / "config.json")
         try:
-            record = read_json(folder / "config.json")
             if isinstance(record.get("env_kwargs"), dict):
                 record["env_kwargs"] = with_kept_arm(record["env_kwargs"], folder)
-            self.config: TrainConfig = TrainConfig.from_json(record)
-        except BadFileError:
-            raise
+            self.config: TrainConfig = TrainConfig(**record)
         except (TypeError, ValueError) as error:
-            writer, mine = self.versions.get("viapoint", "of an unknown version"), versions()["viapoint"]
-            reason = (
-                f"was written by viapoint {writer}, and is no configuration of a training by {mine} ({error})"
-            )
+            writer = self.versions.get("viapoint", "of an unknown version")
+            reason = f"was written by viapoint {writer}, and is no configuration of a training here ({error})"
             raise BadFileError(folder / "config.json", reason) from None
 
     def __repr__(self) -> str:
@@ -129,7 +121,8 @@ class Run:
     def curve(self) -> list[dict[str, Any]]:
         """Learning curve: one record for each evaluation."""
         path = self.folder / "learning_curve.jsonl"
-        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        lines = path.read_text().splitlines() if path.exists() else []
+        return [json.loads(line) for line in lines]
 
     def write_curve(self, records: list[dict[str, Any]]) -> None:
         """Replace the learning curve."""
@@ -162,14 +155,14 @@ class Run:
 
     def checkpoint(self, model: BaseAlgorithm, extra: Mapping[str, Any]) -> None:
         """Write a checkpoint and remove outdated ones."""
-        write_checkpoint(model, self._checkpoints / f"{model.num_timesteps:010d}.pt", extra)
+        write_checkpoint(model, self.folder / "checkpoints" / f"{model.num_timesteps:010d}.pt", extra)
         for outdated in self.checkpoints()[:-KEPT_CHECKPOINTS]:
             outdated.unlink()
 
     def checkpoints(self) -> list[Path]:
         """Files of the checkpoints, oldest first."""
-        found = self._checkpoints.glob("[0-9]*.pt")
-        return sorted(path for path in found if re.fullmatch(r"\d{10}", path.stem) and path.is_file())
+        found = (self.folder / "checkpoints").glob(10 * "[0-9]" + ".pt")
+        return sorted(path for path in found if path.is_file())
 
     def restore(self, model: BaseAlgorithm) -> dict[str, Any] | None:
         """Set a model to the state of the newest intact checkpoint, and print why newer ones were skipped.
@@ -208,12 +201,6 @@ class Run:
         enough = self.stalled or self.decisions >= self.config.total_timesteps
         return enough and (self.final / "model.json").is_file()
 
-    def write_evaluation(self, name: str, record: Mapping[str, Any]) -> Path:
-        """Write the result of an evaluation under a name."""
-        path = self.folder / "evaluations" / f"{name}.json"
-        write_json(path, record)
-        return path
-
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Lock the folder for this process; the operating system unlocks it when the process ends.
@@ -222,13 +209,9 @@ class Run:
             BadFileError: Another process trains in the folder.
         """
         with _locked(self.folder):
-            for folder in (self.folder, self._checkpoints, self.folder / "evaluations"):
-                tidy(folder)
+            for name in (".", "checkpoints", "evaluations"):
+                tidy(self.folder / name)
             yield
-
-    @property
-    def _checkpoints(self) -> Path:
-        return self.folder / "checkpoints"
 
 
 @contextmanager
@@ -243,12 +226,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def check_free(folder: Path) -> None:
-    """Check that a folder can hold a new run.
-
-    Raises:
-        BadFileError: The folder holds other files, or is a file.
-        ValueError: The folder cannot be written to.
-    """
+    """Check that a folder can be written to and holds nothing but what an attempt to create a run left there."""
     if (folder / "config.json").exists():
         raise BadFileError(folder, "holds a run already; continue it with --resume or name another folder")
     check_folder("run folder", folder)
@@ -265,15 +243,9 @@ def write_config(folder: Path, config: TrainConfig) -> None:
 
 
 def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = None) -> None:
-    """Check that a run goes on with its own settings.
+    """Check that a run goes on with its own settings; others raise BadFileError.
 
-    Args:
-        run: Run.
-        config: Settings that are asked for.
-        usual: Settings of a call that names none; where it is given, equal settings of the call are left to the run.
-
-    Raises:
-        BadFileError: Settings differ; the message names them.
+    Where `usual` settings are given, those asked for that equal them are left to the run.
     """
     begun, asked = _settings(run.config), _settings(config)
     names = asked.keys() | begun.keys()

@@ -152,18 +152,35 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
 def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> None:
     """Train from the last checkpoint of the run to its end."""
     folder = str(run.folder / "tensorboard")
+    given = [callback] if isinstance(callback, BaseCallback) else list(callback or ())
     try:
         with (
             closing(Logger(folder, [TensorBoardOutputFormat(folder)])) as logger,
             RunCallback(run) as monitor,
         ):
             model.set_logger(logger)
-            _learn(model, run, monitor, callback)
+            restored = run.restore(model)
+            if restored is not None:
+                monitor.restore(float(restored["seconds"]), model.num_timesteps)
+            run.write_curve(monitor.curve)  # without validations after the checkpoint
+            remaining = run.config.total_timesteps - model.num_timesteps
+            if remaining > 0 and not run.stalled:
+                _learn(model, remaining, [monitor, *given], fresh=restored is None)
+            run.save("final", model)
     except OSError as error:
         raise TrainingFailedError(
             f"training cannot go on: {error}; all up to decision {run.decisions} is saved; go on with: "
             f"{resume_command(run)}"
         ) from error
+
+
+def _learn(model: BaseAlgorithm, steps: int, callbacks: list[BaseCallback], *, fresh: bool) -> None:
+    """Learn; a training that stalls ends like any other."""
+    try:
+        model.learn(steps, callbacks, None, reset_num_timesteps=fresh)  # type: ignore[arg-type]
+    except TrainingStalledError:
+        for each in callbacks[1:]:
+            each.on_training_end()
 
 
 def _restore_settings(run: Run, config: TrainConfig) -> None:
@@ -185,20 +202,3 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
     ]
     if others:
         print(f"the run began with {', '.join(others)}: it may end otherwise", file=sys.stderr)
-
-
-def _learn(model: BaseAlgorithm, run: Run, monitor: RunCallback, callback: Callbacks) -> None:
-    restored = run.restore(model)
-    if restored is not None:
-        monitor.restore(float(restored["seconds"]), model.num_timesteps)
-    run.write_curve(monitor.curve)
-    remaining = run.config.total_timesteps - model.num_timesteps
-    if remaining > 0 and not run.stalled:
-        given = [callback] if isinstance(callback, BaseCallback) else list(callback or ())
-        callbacks = [monitor, *given]
-        try:
-            model.learn(remaining, callbacks, None, reset_num_timesteps=restored is None)  # type: ignore[arg-type]
-        except TrainingStalledError:
-            for each in given:
-                each.on_training_end()
-    run.save("final", model)

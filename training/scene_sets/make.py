@@ -46,22 +46,14 @@ from viapoint.training.scene_sets.scene_set import (
     together,
 )
 
-SEEDS = {"validation": 11, "test": 12, "hard": 13, "uniform": 14}
-"""First part of the seeds of scenes; the second is the number of the scene."""
-SENSED = 100
-"""Number that is added to the first part for tasks with a sensor, so that their scenes are those of no other task."""
-NUMBERS = {"validation": 500, "test": 1000, "hard": 300, "uniform": 500}
-"""Number of scenes of each set."""
-FEWER = {"validation": 200, "test": 250}
-"""Number of scenes of each set of tasks without obstacles at rest, which have no other sets."""
-MOST_DRAWN = 40
-"""Greatest number of drawn scenes for each one that is wanted."""
-TOGETHER = 250
-"""Scenes that are drawn together."""
-RANDOM_ACTIONS = 512
-"""Number of random actions for the solution share."""
-HARD_SHARE = 0.01
-"""Solution share below which scenes are hard."""
+SEEDS = {"validation": 11, "test": 12, "hard": 13, "uniform": 14}  # First part of seeds
+SENSED = 100  # Added for tasks with a sensor, whose scenes are those of no other task
+NUMBERS = {"validation": 500, "test": 1000, "hard": 300, "uniform": 500}  # Scenes of a set
+FEWER = {"validation": 200, "test": 250}  # Of tasks without obstacles at rest
+MOST_DRAWN = 40  # Greatest number of drawn scenes for each one that is wanted
+TOGETHER = 250  # Scenes that are drawn together
+RANDOM_ACTIONS = 512  # Number of random actions for the solution share
+HARD_SHARE = 0.01  # Solution share below which scenes are hard
 
 
 def _ids() -> tuple[str, ...]:

@@ -21,27 +21,19 @@ from viapoint.envs.geometry.obstacles import KINDS, MESH, no_obstacles
 from viapoint.envs.scenes.scene import Scenes, resting
 from viapoint.envs.task import Task
 
-SETS = ("validation", "test", "hard", "uniform")
-"""Names of the sets; a task need not have all."""
-BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")
-"""Bands of the solution share, from easy to hard."""
+SETS = ("validation", "test", "hard", "uniform")  # Names of the sets; a task need not have all
+BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")  # Bands of the solution share, from easy to hard
 BAND_EDGES = (0.2, 0.05, 0.01)
-DRAWN = ""
-"""Family of the scenes that are drawn as in training."""
-SEEDS = {"validation": 1_000_003, "test": 2_000_003}
-"""Seeds of the sets that can be drawn, far from training seeds and from each other."""
-NUMBERS = {"validation": 500, "test": 1_000}
-"""Number of scenes of such a set."""
-LARGEST = 1 << 30
-"""Limit of the memory of a file's arrays, [bytes]: a small archive can claim any size."""
-OWN = ("start", "goal", "jumps", "turn_time", "turn_velocity")
-"""Arrays of :class:`Scenes` in a file."""
-MOVING = ("centre", "rotation", "size", "velocity")
-"""Arrays of :class:`Obstacles` in a file, besides their kind."""
+DRAWN = ""  # Family of the scenes that are drawn as in training
+SEEDS = {"validation": 1_000_003, "test": 2_000_003}  # Far from training seeds
+NUMBERS = {"validation": 500, "test": 1_000}  # Number of scenes of such a set
+LARGEST = 1 << 30  # Limit of a file's arrays, [bytes]: small archives can claim any size
+OWN = ("start", "goal", "jumps", "turn_time", "turn_velocity")  # Arrays of `Scenes`
+MOVING = ("centre", "rotation", "size", "velocity")  # Arrays of `Obstacles` beside kind
+# Arrays of a file, with one entry for each scene
 CONTENT = ("start", "goal", "kind", *MOVING, "jumps", "turn_time", "turn_velocity", "share", "family")
-"""Arrays of a file, with one entry for each scene."""
+# Fields of a task that say which scenes are scenes of it, besides kinds and families of obstacles
 SCENE_FIELDS = ("arm", "n_obstacles", "whole_arm", "moving_obstacles", "n_jumps")
-"""Fields of a task that say which scenes are scenes of it, besides kinds and families of obstacles."""
 
 
 def bands(share: Float) -> NDArray[np.int64]:
@@ -53,16 +45,11 @@ def bands(share: Float) -> NDArray[np.int64]:
 class FrozenScenes:
     """Set of N scenes."""
 
-    name: str
-    """Name of the set, or path of its file."""
-    task: Mapping[str, Any]
-    """Task of the scenes, see :meth:`~viapoint.envs.task.Task.as_dict`."""
-    scenes: Scenes
-    """N scenes, without meshes and point clouds."""
-    share: Float
-    """Solution share: the fraction of uniformly random actions whose plan is clear, shape (N,); NaN if unknown."""
-    family: Any = DRAWN
-    """Name of each scene's family, shape (N,), or one for all; DRAWN for the families of training."""
+    name: str  # Name of the set, or path of its file
+    task: Mapping[str, Any]  # Task of the scenes, see :meth:`~viapoint.envs.task.Task.as_dict`
+    scenes: Scenes  # N scenes, without meshes and point clouds
+    share: Float  # Share of random actions whose plan is clear, shape (N,); NaN if unknown
+    family: Any = DRAWN  # Name of each scene's family, shape (N,), or one for all
 
     def __post_init__(self) -> None:
         """Expand the names of families to all scenes."""
@@ -111,11 +98,7 @@ class FrozenScenes:
         return {name: np.asarray(parts[name]) for name in CONTENT}
 
     def save(self, path: Path) -> None:
-        """Write the set with its hash; numbers that single precision represents take half the place.
-
-        Raises:
-            ValueError: A scene has a mesh or a point cloud.
-        """
+        """Write the set with its hash; numbers that single precision represents take half the place."""
         if (self.scenes.obstacles.kind >= MESH).any():
             raise ValueError(f"frozen scenes must have obstacles of the kinds {', '.join(KINDS[:MESH])} only")
         arrays = {name: _smallest(array) for name, array in self.arrays().items()}
@@ -178,11 +161,7 @@ def _scene_key(task: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def load(path: Path, name: str = "") -> FrozenScenes:
-    """Load a set of scenes and check its hash.
-
-    Raises:
-        ValueError: The file is not one of scenes, or is damaged.
-    """
+    """Load a set of scenes and check its hash; a file of something else, or a damaged one, raises ValueError."""
     if not path.is_file():
         raise ValueError(f"there is no file of scenes {path}")
     content: dict[str, Any] = _read(path)

@@ -14,7 +14,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from viapoint.envs.common.validation import is_number
 from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
@@ -28,44 +28,35 @@ from viapoint.training.planning.search import registered_task
 from viapoint.training.scene_sets.scene_set import SEEDS, SETS, shipped_set
 
 Values = Mapping[str, Any]
-Made = TypeVar("Made")
 TRAINING_FIELDS = tuple(
     each.name
     for each in dataclasses.fields(TrainConfig)
     if each.name not in ("env", "seed", "out", "resume", "progress")
 )
 """Fields of a training that an agent may set."""
+# Sets that are measured by default; models are selected on `validation`
 MEASURED = ("test", "hard", "uniform")
-"""Sets that are measured by default; models are selected on `validation`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
     """One row of the results for one seed: what a worker trains and measures."""
 
-    environment: str
-    """Name of the environment in folders and tables."""
-    env_id: str
-    """Id of the registered environment."""
-    env_kwargs: Values = field(default_factory=dict)
-    """Arguments of the environment."""
-    scenes: tuple[str, ...] = ()
-    """Names of the measured sets, or files of scenes."""
-    n_scenes: int | None = None
-    """Number of scenes of each set, evenly spread over it; None for all."""
-    row: str
-    """Name of the row, which is also that of its folder."""
+    environment: str  # Name of the environment in folders and tables
+    env_id: str  # Id of the registered environment
+    env_kwargs: Values = field(default_factory=dict)  # Arguments of the environment
+    scenes: tuple[str, ...] = ()  # Names of the measured sets, or files of scenes
+    n_scenes: int | None = None  # Number of scenes of each set, evenly spread over it; None for all
+    row: str  # Name of the row, which is also that of its folder
     seed: int = 0
+    # Fields of :class:`TrainConfig`; empty for a baseline
     training: Values = field(default_factory=dict)
-    """Fields of :class:`TrainConfig`; empty for a baseline."""
+    # Numbers of proposals that the agent checks with exact geometry, one measurement each
     checks: tuple[int, ...] = (0,)
-    """Numbers of proposals that the agent checks with exact geometry, one measurement each."""
+    # Numbers of proposals that the planner refines, one further measurement each
     refine: tuple[int, ...] = ()
-    """Numbers of proposals that the planner refines, one further measurement each."""
-    untrained: bool = False
-    """True to measure the network before training, too."""
-    method: str = ""
-    """Name of a baseline; empty for an agent."""
+    untrained: bool = False  # True to measure the network before training, too
+    method: str = ""  # Name of a baseline; empty for an agent
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the trial."""
@@ -89,12 +80,11 @@ class Trial:
 class Search(Trial):
     """Search for hyperparameters of one algorithm in one environment; the fields of the trial are what all share."""
 
-    parameters: Values
-    """Range or list of values by the path of a field, such as `hyperparameters.learning_rate`."""
+    parameters: (
+        Values  # range or list of values by the path of a field, such as `hyperparameters.learning_rate`
+    )
     trials: int = 20
-    """Number of trials."""
-    first: tuple[Values, ...] = ()
-    """Parameters of the first trials."""
+    first: tuple[Values, ...] = ()  # parameters of the first trials
 
     def with_parameters(self, values: Values, folder: Path) -> TrainConfig:
         """Return the configuration of a training with these parameters."""
@@ -112,7 +102,7 @@ class Search(Trial):
         return super().folder(out).parent
 
     def is_finished(self, out: Path) -> bool:
-        """Return whether the best parameters of this very search are there."""
+        """Return True if the best parameters of this very search are there."""
         path = self.folder(out) / "best.json"
         return path.is_file() and read_json(path).get("key") == self.key
 
@@ -130,8 +120,7 @@ class Study:
     """
 
     name: str
-    out: Path
-    """Folder of all runs and results."""
+    out: Path  # Folder of all runs and results
     trials: tuple[Trial, ...]
     searches: tuple[Search, ...] = ()
 
@@ -161,15 +150,12 @@ class Study:
         Raises:
             ValueError: Something is not allowed; the message says what is.
         """
-        return _made("the study", _study, given, name, Path(folder))
+        study: Study = _made("the study", _study, given, name, Path(folder))
+        return study
 
 
-def _made(where: str, make: Callable[..., Made], fields: Any, *args: Any) -> Made:
-    """Return the result of a function for fields of a file, which are its keyword arguments.
-
-    Raises:
-        ValueError: A field is unknown, or the function refuses it; the message begins with the place in the file.
-    """
+def _made(where: str, make: Callable[..., Any], fields: Any, *args: Any) -> Any:
+    """Return the result of a function of fields of a file; an error begins with the place in the file."""
     if not isinstance(fields, Mapping):
         raise ValueError(f"{where} must be values by name, got {fields!r}")
     parameters = inspect.signature(make).parameters
@@ -187,7 +173,7 @@ def _made(where: str, make: Callable[..., Made], fields: Any, *args: Any) -> Mad
 
 
 def _study(
-    default: str,
+    name: str,
     folder: Path,
     *,
     environments: Any,
@@ -200,28 +186,31 @@ def _study(
     n_scenes: int | None = None,
 ) -> Study:
     """Return a study; the fields are those of the file."""
-    known: dict[str, Values] = {}
-    for name, fields in _entries(environments):
+    known = {}
+    for env, fields in _entries(environments):
         fields = {"scenes": scenes, "n_scenes": n_scenes, **fields}
-        known[name] = _made(f"environments.{name}", _environment, fields, name, folder)
+        known[env] = _made(f"environments.{env}", _environment, fields, env, folder)
     found: list[Trial] = []
     rows: set[str] = set()
     for make, given in ((_agent, agents), (_baseline, baselines), (_search, searches)):
-        for name, fields in _entries(given or {}):
-            if name in rows:
-                raise ValueError(f"rows must have different names, {name} is there twice")
-            rows.add(name)
+        for row, fields in _entries(given or {}):
+            if row in rows:
+                raise ValueError(f"rows must have different names, {row} is there twice")
+            rows.add(row)
             for env in fields.pop("environments", list(known)):
                 if env not in known:
-                    raise ValueError(unknown_name(f"{name}: environments", env, known))
+                    raise ValueError(unknown_name(f"{row}: environments", env, known))
                 shared = {} if make is _baseline else {"seeds": seeds or [0]}
-                found += _made(name, make, {**shared, **fields}, known[env], name)
+                found += _made(row, make, {**shared, **fields}, known[env], row)
     if not found:
         raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
-    searches = tuple(each for each in found if isinstance(each, Search))
-    trials = sorted((each for each in found if not isinstance(each, Search)), key=lambda trial: trial.seed)
-    place = Path(out or f"runs/{default}").expanduser()
-    return Study(name=default, out=place, trials=tuple(trials), searches=searches)
+    trials = [each for each in found if not isinstance(each, Search)]
+    return Study(
+        name=name,
+        out=Path(out or f"runs/{name}").expanduser(),
+        trials=tuple(sorted(trials, key=lambda trial: trial.seed)),
+        searches=tuple(each for each in found if isinstance(each, Search)),
+    )
 
 
 def _entries(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -267,8 +256,7 @@ def _environment(
     kwargs = env_kwargs or {}
     check_env_kwargs(kwargs)
     task = registered_task(env_id, **kwargs)
-    if n_scenes is not None:
-        check_whole("n_scenes", n_scenes, 1)
+    check_whole("n_scenes", 1 if n_scenes is None else n_scenes, 1)
     places = []
     for each in MEASURED if scenes is None else scenes:
         if each in SETS:
@@ -303,18 +291,19 @@ def _agent(
     numbers = tuple(check_whole("checks", number, 0) for number in checks or [0])
     refined = tuple(check_whole("refine", number, 1) for number in refine or [])
     if (any(numbers) or refined) and training.get("algo", "viaq") != "viaq":
-        raise ValueError(
-            f"checks and refine are those of viaq; {training['algo']} has no proposals to check or refine"
-        )
+        raise ValueError(f"checks and refine are for the proposals of viaq, got algo {training['algo']}")
     if refined and registered_task(env["env_id"], **env["env_kwargs"]).replanning:
         raise ValueError(f"refine is for tasks with one decision for a movement, {env['env_id']} has several")
     if not seeds or len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must hold at least one number and none twice, got {seeds}")
-    own: dict[str, Any] = {"training": training, "checks": numbers, "refine": refined, "untrained": untrained}
-    trials = [Trial(**env, row=row, seed=seed, **own) for seed in seeds]
-    for trial in trials:
+    trials = []
+    for seed in seeds:
+        trial = Trial(
+            **env, row=row, seed=seed, training=training, checks=numbers, refine=refined, untrained=untrained
+        )
         config = trial.config(Path())
         check_hyperparameters(config.algorithm, config.hyperparameters)
+        trials.append(trial)
     return trials
 
 
@@ -340,23 +329,25 @@ def _search(
         raise ValueError("parameters must hold at least one list or range")
     if not trial.config(Path()).evaluation_interval:
         raise ValueError("eval_every must be 1 or more in a search, which compares success in validation")
-    for path in {path for values in first or [] for path in values}:
+    for path in itertools.chain(*(first or [])):
         if path not in parameters:
             raise ValueError(unknown_name("first", path, parameters))
-    for path, given in parameters.items():
-        for value in _ends(path, given):  # an impossible value is an error now, and not in the last trial
+    for path, values in parameters.items():
+        for value in _ends(path, values):  # an impossible value is an error now, and not in the last trial
             _made("parameters", _agent, {"seeds": [0], **_with(training, {path: value})}, env, row)
-    own: dict[str, Any] = {"parameters": parameters, "trials": check_whole("trials", trials, 1)}
-    return [Search(**env, row=row, seed=trial.seed, training=training, first=tuple(first or ()), **own)]
+    check_whole("trials", trials, 1)
+    given = {"parameters": parameters, "trials": trials, "first": tuple(first or ())}
+    return [Search(**env, row=row, seed=trial.seed, training=training, **given)]
 
 
 def _ends(path: str, given: Any) -> list[Any]:
     """Return all values of a list, or the lowest and the highest of a range."""
     if isinstance(given, list) and given:
         return given
-    low: Any = given.get("low") if isinstance(given, Mapping) else None
-    high: Any = given.get("high") if isinstance(given, Mapping) else None
-    if not (is_number(low) and is_number(high) and low < high) or (given.get("log") and low <= 0):
+    ends = given if isinstance(given, Mapping) else {}
+    low: Any = ends.get("low")
+    high: Any = ends.get("high")
+    if not (is_number(low) and is_number(high) and low < high) or (ends.get("log") and low <= 0):
         raise ValueError(
             f"{path} must be a list, or a range such as {{low: 1e-4, high: 1e-2, log: true}}, got {given!r}"
         )

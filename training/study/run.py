@@ -23,8 +23,7 @@ from viapoint.training.runs.trainer import train_or_resume
 from viapoint.training.study.config import Search, Study, Trial, Values
 from viapoint.training.study.trials import finished_record, markdown, run_trial, tables, write_results
 
-RETRIES = 2
-"""Number of times that a trial whose worker died is begun again."""
+RETRIES = 2  # Number of times that a trial whose worker died is begun again
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",  # Ray sends nothing to its authors
     "RAY_AIR_NEW_OUTPUT": "0",  # Ray Tune's own tables

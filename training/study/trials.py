@@ -25,10 +25,9 @@ from viapoint.training.study.config import Study, Trial
 
 Record = dict[str, Any]
 KEYS = ["environment", "set", "method"]
+# Columns that are medians over seeds; `decisions` are those of a training
 MEDIANS = ["collision", "jerk_ratio", "movement_s", "decision_ms", "decisions"]
-"""Columns that are medians over seeds; `decisions` are those of a training."""
-COLUMNS = [*KEYS, "seeds", "scenes", "success", "low", "high", *MEDIANS]
-"""Columns of `results.csv`; success is a share with its 95 % interval."""
+COLUMNS = [*KEYS, "seeds", "scenes", "success", "low", "high", *MEDIANS]  # Of `results.csv`
 NOTE = (
     "Success with 95 % intervals. Jerk of successes, relative to the straight movement's. Median time of a decision on "
     "the cores of one trial. Written by `viapoint study`."
@@ -36,17 +35,7 @@ NOTE = (
 
 
 def run_trial(trial: Trial, out: Path) -> Record:
-    """Train if needed, measure, and return the record of a trial.
-
-    A training that is complete is not repeated, and one that was interrupted goes on from its last checkpoint.
-
-    Args:
-        trial: Trial of a study.
-        out: Folder of the study.
-
-    Raises:
-        ValueError: The folder holds a training with other settings, or the training cannot be made.
-    """
+    """Train if needed, or go on with an interrupted training, measure, and return the record of a trial."""
     record: Record = {"viapoint": "study", "asked": _asked(trial)}
     env_kwargs, decisions = dict(trial.env_kwargs), None
     methods: dict[str, Method] = {}

@@ -13,12 +13,11 @@ from viapoint.training.paper.movements import ADULT, PLANE, TARGETS, SimulatedMo
 from viapoint.training.paper.rows import straight
 from viapoint.training.paper.rows.straight import DIAGONALS, DURATION, LENGTHS, bow, diagonals
 
+# Minimised quantity and peak speed in units of A / t_f, by the order of the derivative
 PEAKS = {2: ("acceleration", 1.5), 3: ("jerk", 1.875), 4: ("snap", 2.1875)}
-"""Minimised quantity and peak speed in units of A / t_f, by the order of the derivative."""
+# Acceleration at the onset: statement of the paper, and ranges for model and arm, by the order
 ONSETS = {2: ("not zero", near(6.0, 1e-9), near(6.0, 1.0)), 3: ("zero", at_most(1e-9), at_most(2.0))}
-"""Acceleration at the onset: statement of the paper, and ranges for model and arm, by the order."""
-ONSET = 0.02
-"""Time in which the simulated arm builds up a jump of the acceleration, [s]."""
+ONSET = 0.02  # Time in which the simulated arm builds up a jump of the acceleration, [s]
 
 
 def joint_space(ends: Float) -> SimulatedMovements:
@@ -74,16 +73,11 @@ def _joint_space_claims() -> list[Claim]:
     ]  # fmt: skip
 
 
-TOUR = ("T3", "T4", "T5", "T6", "T1")
-"""Start, three via-points and goal."""
-SWINGS = 8
-"""Half cycles of the repetitive movement on the arm."""
-SWING = 0.5
-"""Duration of each, [s]."""
-SPEED_LIMIT = 0.8
-"""[m/s]"""
-HURRY = 0.7
-"""Fraction of the shortest duration, which needs more torque than the limit."""
+TOUR = ("T3", "T4", "T5", "T6", "T1")  # Start, three via-points and goal
+SWINGS = 8  # Half cycles of the repetitive movement on the arm
+SWING = 0.5  # Duration of each, [s]
+SPEED_LIMIT = 0.8  # [m/s]
+HURRY = 0.7  # Fraction of the shortest duration, which needs more torque than the limit
 
 
 def limit_claims() -> list[Claim]:

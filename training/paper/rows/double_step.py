@@ -27,26 +27,19 @@ from viapoint.primitives import Trajectory, minimum_jerk_coefficients, point_to_
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, instants, straight, track
 
-STEP_DURATION = 0.7
-"""Duration of the first movement and of the second one, [s]."""
-MOMENTS = (0.05, 0.1, 0.2, 0.3)
-"""Moments of revision, [s]."""
-NAMES = ("T1", "T4", "T5")
-"""Start, first and second target."""
-SWITCH, WHOLE_DURATION = 0.3, 0.8
-"""Moment of revision and duration of the first movement in row 11, [s]."""
+STEP_DURATION = 0.7  # Duration of the first movement and of the second one, [s]
+MOMENTS = (0.05, 0.1, 0.2, 0.3)  # Moments of revision, [s]
+NAMES = ("T1", "T4", "T5")  # Start, first and second target
+SWITCH, WHOLE_DURATION = 0.3, 0.8  # Revision and duration of the first movement in row 11, [s]
 
 
 class DoubleStep(NamedTuple):
     """Movement to a target that jumps, as a sum and as a revised plan."""
 
     first: Trajectory
-    second: Trajectory
-    """Movement that is added at the revision, on its own clock."""
-    replanned: Trajectory
-    """Plan from the revision on, on its own clock."""
-    moment: float
-    """Moment of revision, [s]."""
+    second: Trajectory  # Movement that is added at the revision, on its own clock
+    replanned: Trajectory  # Plan from the revision on, on its own clock
+    moment: float  # Moment of revision, [s]
 
     @property
     def arrival(self) -> float:
@@ -82,13 +75,9 @@ class DoubleStep(NamedTuple):
 def double_step(
     moment: float, *, goal: Any = None, duration: float = STEP_DURATION, remaining: float = STEP_DURATION
 ) -> DoubleStep:
-    """Return a movement from T1 towards T4 whose target jumps to T5.
+    """Return a movement from T1 towards T4 whose target jumps to T5, or to another goal, shape (2,), [m].
 
-    Args:
-        moment: Moment of revision, [s].
-        goal: Second target instead of T5, shape (2,), [m].
-        duration: Duration of the first movement, [s].
-        remaining: Duration of the second movement, which ends at moment + remaining >= duration, [s].
+    The first movement takes `duration`, the second one `remaining`, not less than is left of the first, [s].
     """
     start, corner, last = NAMES
     goal = TARGETS[last] if goal is None else goal

@@ -23,34 +23,24 @@ from viapoint.training.paper.rows.one_via import slow_and_fast
 from viapoint.training.planning.baselines import Method, agent_method
 from viapoint.training.rollouts.rollout import SceneSimulation
 
-LENGTHS = (0.15, 0.2, 0.25)
-"""Lengths of the rows of lights, [m]; the paper's were up to 25 cm."""
-RADII = (0.008, 0.02)
-"""Half widths of the rows of lights, [m]."""
-SHIFTS = ((0.0, 0.0), (-0.05, 0.02), (0.05, -0.02))
-"""Offsets of a row's middle from the middle of the line between the targets, along and across it, [m]."""
+LENGTHS = (0.15, 0.2, 0.25)  # Lengths of the rows of lights, [m]; the paper's were up to 25 cm
+RADII = (0.008, 0.02)  # Half widths of the rows of lights, [m]
+SHIFTS = ((0.0, 0.0), (-0.05, 0.02), (0.05, -0.02))  # Shifts along and across the line, [m]
 
 
 class ObstacleMovements(NamedTuple):
     """Successful movements of a method around rows of lights."""
 
     name: str
-    scenes: Scenes
-    """Scenes of the successful movements."""
+    scenes: Scenes  # Scenes of the successful movements
     plan: Plan
     motion: SimulatedMovements
-    n_scenes: int
-    """Number of all scenes."""
-    profiles: list[Profile]
-    """Profiles on the simulated arm."""
+    n_scenes: int  # Number of all scenes
+    profiles: list[Profile]  # Profiles on the simulated arm
 
 
 def light_scenes(n_rows: int) -> Scenes:
-    """Return 252 scenes with rows of lights of several lengths, widths and places between each two targets.
-
-    Args:
-        n_rows: Rows for obstacles, of which the first is used.
-    """
+    """Return 252 scenes with rows of lights of several lengths, widths and places, and room for obstacles."""
     ends, lights = [], []
     for length, radius, shift in itertools.product(LENGTHS, RADII, SHIFTS):
         for first, last, row in movements.rows_of_lights(length, radius, shift):

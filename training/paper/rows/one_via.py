@@ -38,15 +38,9 @@ def roots_of(polynomial: Poly) -> list[float]:
 
 
 def closed_form(waypoints: Float, share: float, time: Float) -> Float:
-    """Return the hand position by the paper's Eqs. 4, 5 and C13 to C15 with their misprints corrected.
+    """Return the hand position, shape (T, 2), [m], by the paper's Eqs. 4, 5 and C13 to C15 without their misprints.
 
-    Args:
-        waypoints: Start, via-point and goal, shape (3, 2), [m].
-        share: tau1 = t1 / tf.
-        time: tau = t / tf, shape (T,).
-
-    Returns:
-        Shape (T, 2), [m].
+    `waypoints` has shape (3, 2), [m]; `share` is tau1 = t1 / tf and `time` is tau = t / tf, shape (T,).
     """
     x0, x1, xf = waypoints
     t, s = time[:, None], share
@@ -63,16 +57,11 @@ def closed_form(waypoints: Float, share: float, time: Float) -> Float:
     return np.asarray(before + pi * np.maximum(t - s, 0.0) ** 5 / 120)  # Eq. 5
 
 
-ENDS = ("T1", "T4")
-"""Targets of the family of curved movements; Fig. 1B shows one of them."""
-EXAMPLE = (0.35, -0.4)
-"""d1 / (d1 + d2) and d3 / (d1 + d2) of the movement of Fig. 1B, towards the body."""
-ALONGS = np.array([0.25, 0.35, 0.45, 0.55, 0.65, 0.75])
-"""d1 / (d1 + d2) of the family."""
-HEIGHTS = np.array([-0.42, -0.45, -0.48, -0.51, -0.54])
-"""d3 / (d1 + d2) of the family: high enough for two speed peaks everywhere, and within the reach."""
-N_VIAS = 300
-"""Number of random via-points in row 4."""
+ENDS = ("T1", "T4")  # Targets of the family of curved movements; Fig. 1B shows one of them.
+EXAMPLE = (0.35, -0.4)  # d1 / (d1 + d2) and d3 / (d1 + d2) of Fig. 1B, towards the body
+ALONGS = np.array([0.25, 0.35, 0.45, 0.55, 0.65, 0.75])  # d1 / (d1 + d2) of the family
+HEIGHTS = np.array([-0.42, -0.45, -0.48, -0.51, -0.54])  # d3 / (d1 + d2), all with two peaks
+N_VIAS = 300  # Number of random via-points in row 4
 
 
 def passage_claims() -> list[Claim]:
@@ -221,18 +210,12 @@ def place_claims() -> list[Claim]:
     ]  # fmt: skip
 
 
-SHARES = np.linspace(0.1, 0.9, 17)
-"""d1 / (d1 + d2) on the abscissa of Fig. 10A."""
-HEIGHT = -0.45
-"""d3 / (d1 + d2) there, towards the body."""
-LENGTHS = np.linspace(0.3, 0.55, 6)
-"""d3 / (d1 + d2) on the abscissa of Fig. 10C."""
-TYPICAL = 0.45
-"""d1 / (d1 + d2) there: about the paper's typical t1/(t1+t2) of .49."""
-SLOW, FAST = 1.1, 0.85
-"""Durations of Fig. 11, [s]."""
-THREE_POINTS = (0.4, -0.45)
-"""Via-point of Fig. 11, as parts of d1 + d2."""
+SHARES = np.linspace(0.1, 0.9, 17)  # d1 / (d1 + d2) on the abscissa of Fig. 10A.
+HEIGHT = -0.45  # d3 / (d1 + d2) there, towards the body
+LENGTHS = np.linspace(0.3, 0.55, 6)  # d3 / (d1 + d2) on the abscissa of Fig. 10C.
+TYPICAL = 0.45  # d1 / (d1 + d2) there: about the paper's typical t1/(t1+t2) of .49
+SLOW, FAST = 1.1, 0.85  # Durations of Fig. 11, [s].
+THREE_POINTS = (0.4, -0.45)  # Via-point of Fig. 11, as parts of d1 + d2.
 
 
 def arm_shares(along: ArrayLike, height: ArrayLike) -> tuple[Float, float]:
@@ -283,11 +266,7 @@ def scaling_claims() -> list[Claim]:
 
 
 def slow_and_fast(movement: Trajectory, count: int) -> tuple[float, float, list[SimulatedMovements]]:
-    """Carry movements out in the durations of Fig. 11.
-
-    Returns:
-        Greatest distances of both paths at `count` instants of the model and of the arm, [mm]; the simulations.
-    """
+    """Carry movements out in the durations of Fig. 11; return distances of model and arm paths, [mm], and motions."""
     plans = [movement.stretched(duration) for duration in (SLOW, FAST)]
     motions = [simulate(plan) for plan in plans]
     paths = [plan.sample(count, 0)[0] for plan in plans]

@@ -18,10 +18,8 @@ DIAGONALS = np.array(
     [[TARGETS["T3"], TARGETS["T6"]], [TARGETS["T1"], TARGETS["T4"]], [TARGETS["T2"], TARGETS["T5"]]]
 )
 """Ends of the straight movements of Figs. 3 and 4, shape (3, 2, 2), [m]."""
-LENGTHS = np.linalg.norm(DIAGONALS[:, 1] - DIAGONALS[:, 0], axis=-1)
-"""Their lengths, shape (3,), [m]."""
-DURATION = 0.8
-"""Their duration, within the paper's 0.5 to 1 s, [s]."""
+LENGTHS = np.linalg.norm(DIAGONALS[:, 1] - DIAGONALS[:, 0], axis=-1)  # Shape (3,), [m]
+DURATION = 0.8  # Their duration, within the paper's 0.5 to 1 s, [s]
 
 
 def diagonals(order: int = 3) -> Trajectory:
@@ -93,11 +91,7 @@ def _invariance(generator: np.random.Generator, count: int, vias: int) -> float:
 
 
 def _placed_shapes() -> tuple[Float, float]:
-    """Simulate one shape in five places, directions, sizes and durations.
-
-    Returns:
-        Paths in the frame of their ends, shape (5, 201, 2), and the greatest deviation from the plan, [mm].
-    """
+    """Simulate one shape in five places; return paths in the frame of their ends, (5, 201, 2), and deviation, [mm]."""
     pairs = (("T1", "T4"), ("T4", "T1"), ("T2", "T5"), ("T6", "T3"), ("T3", "T4"))
     waypoints = [movements.via_waypoints(TARGETS[a], TARGETS[b], 0.35, 0.2) for a, b in pairs]
     motion = simulate(minimum_jerk_through(np.stack(waypoints), np.array([0.8, 0.7, 1.0, 1.2, 0.6])))

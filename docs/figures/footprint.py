@@ -11,8 +11,7 @@ from scipy.spatial import ConvexHull
 from viapoint.envs import Box, ConvexMesh, Cylinder, HalfSpace, PointCloud, Shape
 from viapoint.envs.common.types import Float
 
-CIRCLE = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]
-"""Angles of the points of a circle, [rad]."""
+CIRCLE = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]  # Angles of the points of a circle, [rad]
 
 
 def footprint(shape: Shape, rim: float = 0.0) -> list[Float]:
