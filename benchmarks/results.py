@@ -3,6 +3,7 @@
 python benchmarks/results.py                                  # all tasks; hours
 python benchmarks/results.py --env viapoint/PandaObstacles-v0 # others keep their numbers
 python benchmarks/results.py --only runs                      # only the trainings of benchmarks/sb3.py
+python benchmarks/results.py --only looking                   # only searches that look again on the way
 """
 
 from __future__ import annotations
@@ -37,6 +38,15 @@ SENSED_BASELINES = (
     "known:plan_motion",
 )
 """Baselines of tasks with a sensor: beliefs with more and more information. The last three need the truth."""
+LOOKING: dict[str, Any] = {
+    "one look": "end",
+    "a look each 0.3 s": ["horizon"],
+    "looks at what is new": ["sight"],
+    "looks at what is new or near": ["sight", "clearance"],
+}
+"""Decisions of PlanarSensed with rays around the hand, in which points that were seen are remembered."""
+LOOKS = "PlanarSensed, hand_rays"
+"""Name of this variant in the file and on the page."""
 PAGE = Path("docs/results.md")
 FIELDS = ("env", "scenes", "method", "success", "low", "high", "count", "jerk_ratio", "milliseconds")
 
@@ -51,8 +61,8 @@ class Config:
     """Ids of environments with a shipped agent."""
     n_scenes: int | None = None
     """Number of scenes of each set; default: all of them."""
-    only: Literal["everything", "runs"] = "everything"
-    """What is measured; "runs" keeps the other numbers."""
+    only: Literal["everything", "runs", "looking"] = "everything"
+    """What is measured: the trainings in `runs`, or searches that look again; other numbers stay."""
     runs: Path = Path("runs/sb3")
     """Folder of trainings of algorithms of Stable-Baselines3 by benchmarks/sb3.py, which get a row each."""
 
@@ -70,6 +80,14 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
     if config.only == "everything":
         for row in evaluate(load_agent(env_id), **common, **settings).rows:
             yield _numbers(env_id, name, row["method"], row)
+    if config.only != "runs" and task.sensor is not None and task.space.of_hand:
+        for when, decide_at in LOOKING.items():
+            kwargs = {"sensor": "hand_rays", "decide_at": decide_at}
+            searches = ["thick:search512", "known:search512"]
+            for row in evaluate(**common, env_kwargs=kwargs, baselines=searches).rows:
+                yield _numbers(LOOKS, name, f"{row['method']}, {when}", row)
+    if config.only == "looking":
+        return
     short = env_id.removeprefix("viapoint/").removesuffix("-v0")
     for folder in sorted(config.runs.glob(f"{short}-*")):
         run = Run(folder)
@@ -124,6 +142,7 @@ def write_page(rows: list[dict[str, Any]]) -> None:
         if not found:
             continue  # tasks without obstacles are not on the page
         mine = [row for row in rows if row["env"] == env_id]
+        mine = [row for row in mine if not row["method"].startswith("untrained, ")]  # in the file only
         _, _, rest = after.partition("\n\n")  # after the old table
         text = f"{before}{heading}{table(mine)}\n\n{rest}"
     PAGE.write_text(text, encoding="utf-8")
@@ -143,12 +162,12 @@ def main() -> None:
         for name in SETS:
             if name != "validation" and shipped_set(name, task) is not None:
                 found += list(rows_of(config, env_id, name))
-        measured = {row["method"] for row in found}
-        rows = [row for row in every if row["env"] != env_id]
-        if config.only == "runs":
-            rows = [row for row in every if row["env"] != env_id or row["method"] not in measured]
-        rows += found
-        every = sorted(rows, key=lambda row: SHIPPED_IDS.index(row["env"]))
+        measured = {(row["env"], row["method"]) for row in found}
+        kept = [row for row in every if (row["env"], row["method"]) not in measured]
+        if config.only == "everything":
+            kept = [row for row in kept if row["env"] != env_id]
+        order = [*SHIPPED_IDS, LOOKS]
+        every = sorted(kept + found, key=lambda row: order.index(row["env"]))
         with config.out.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, FIELDS)
             writer.writeheader()

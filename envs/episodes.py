@@ -18,6 +18,7 @@ from viapoint.envs.plans import Motion, Movements, Plan, checked_plan, jerk_cost
 from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed
 from viapoint.envs.rewards import reward_terms
 from viapoint.envs.scenes.scene import Scenes, resting
+from viapoint.envs.sensors import Looks
 from viapoint.envs.simulator import Simulator
 from viapoint.envs.task import Task
 
@@ -91,6 +92,8 @@ class Episodes:
         self._motion = Motion.at_rest(self._start)
         self.last_plan: Plan | None = None
         """Plans of the last decisions; None before the first, and where the arm is steered."""
+        self.looks = None if task.sensor is None else Looks.none(task.sensor, number)
+        """Looks of the sensor in the running episodes; None without a sensor."""
 
     @property
     def time(self) -> Float:
@@ -125,6 +128,16 @@ class Episodes:
         put(self._motion, rows, Motion.at_rest(start))
         for row in rows:
             self.history[row] = []
+        if self.looks is not None and self.task.sensor is not None:
+            put(self.looks, rows, Looks.none(self.task.sensor, len(rows)))
+            self._look(rows)
+
+    def _look(self, rows: Int) -> None:
+        """Look with the sensor at the present scenes of some episodes."""
+        if self.looks is not None and self.task.sensor is not None:
+            obstacles = self.scenes.take(rows).obstacles_at(self.time[rows])
+            joints = self.executor.state.joints[rows]
+            self.looks.add(rows, self.task.sensor, self.task.arm, joints, obstacles)
 
     def goals(self, time: Float) -> Float:
         """Return the goals at one time for each episode, in coordinates of the space, shape (n, D)."""
@@ -155,6 +168,7 @@ class Episodes:
             command,
             time,
             nominal,
+            self.looks,
         )
 
     def decide(self, actions: Float, active: Bool) -> Decision:
@@ -222,7 +236,7 @@ class Episodes:
         first = ~self.begun
         before, begin = self._outcome(np.zeros(len(first), bool)), state.steps.copy()
         self._adopt(plan, np.flatnonzero(revised))
-        ends = self._events(self.plan, self._began, begin, scenes, self.goals)
+        ends = self._events(self.plan, self._began, begin, scenes, self.goals, self.looks)
         last = np.where(state.reachable & active, ends.step, begin)
         self._run_until(last)
         return self._decision(before, begin, first, ends.final, ends.event)
@@ -365,6 +379,7 @@ class Episodes:
         )
         elapsed = (state.steps - begin) * self.simulator.timestep
         times = {"elapsed": elapsed, "time": self.time, "event": event}
+        self._look(np.arange(len(event)))
         info = {**after._asdict(), **terms.as_info(), **times}
         return Decision(self.observe(), terms.total(), ended & ~truncated, truncated, info)
 
@@ -426,6 +441,7 @@ class Episodes:
             "begun": self.begun.copy(),
             "physics": self.simulator.batch.state.copy(),
             "physics_steps": self.simulator.physics_steps,
+            "looks": [part.copy() for part in self.looks or ()],
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -438,3 +454,5 @@ class Episodes:
         self._began[:], self.begun[:] = state["began"], state["begun"]
         self.simulator.batch.state[:] = state["physics"]
         self.simulator.physics_steps = int(state["physics_steps"])
+        if self.looks is not None:
+            self.looks = Looks(*(np.array(part) for part in state["looks"]))

@@ -20,12 +20,17 @@ from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import MAX_START_OFFSET, Plan
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.sensors import Looks
 from viapoint.envs.task import Task
 
 FORESIGHT = 0.4
 """Horizon of the predicted clearance, [s]."""
 LOOK = 0.032
 """Time from one prediction to the next, [s]."""
+GLANCE = 0.064
+"""Time from one glance of the sensor to the next, [s]."""
+NEW_POINTS, NEW_DISTANCE = 4, 0.04
+"""Something new is seen where this number of points is farther than this from all that are remembered, [m]."""
 NEVER = np.iinfo(np.int64).max // 4
 """Physics step of an event that does not happen."""
 
@@ -41,19 +46,29 @@ class Event(IntEnum):
     """An obstacle has changed its course."""
     CLEARANCE = 3
     """The predicted clearance has fallen below the margin."""
-    ARRIVAL = 4
+    SIGHT = 4
+    """The sensor sees something new."""
+    ARRIVAL = 5
     """The arm has arrived and settled."""
-    CONTACT = 5
+    CONTACT = 6
     """The arm was in contact."""
-    TIME_LIMIT = 6
+    TIME_LIMIT = 7
     """The time is up."""
-    REACH = 7
+    REACH = 8
     """The plan leaves the arm's reach; the arm does not start on it."""
-    UNSTABLE = 8
+    UNSTABLE = 9
     """The physics broke down."""
 
 
-_RANK = (Event.TIME_LIMIT, Event.TARGET, Event.COURSE, Event.CLEARANCE, Event.ARRIVAL, Event.HORIZON)
+_RANK = (
+    Event.TIME_LIMIT,
+    Event.TARGET,
+    Event.COURSE,
+    Event.CLEARANCE,
+    Event.SIGHT,
+    Event.ARRIVAL,
+    Event.HORIZON,
+)
 """Rank of simultaneous events, highest first."""
 
 
@@ -72,7 +87,7 @@ class EventPredictor:
     """Predictor of the ends of decisions of a task."""
 
     def __init__(self, task: Task) -> None:
-        self.arm, self.space, self.margin = task.arm, task.space, task.margin
+        self.arm, self.space, self.margin, self.sensor = task.arm, task.space, task.margin, task.sensor
         self.timestep = task.arm.timestep
         self.triggers = frozenset(() if isinstance(task.decide_at, str) else task.decide_at)
         self.horizon = int(self.steps(min(task.horizon, task.time_limit)))
@@ -87,7 +102,13 @@ class EventPredictor:
         return np.where(time < 1e8, number, NEVER)
 
     def __call__(
-        self, plan: Plan, began: Int, now: Int, scenes: Scenes, goal: Callable[[Float], Float]
+        self,
+        plan: Plan,
+        began: Int,
+        now: Int,
+        scenes: Scenes,
+        goal: Callable[[Float], Float],
+        looks: Looks | None,
     ) -> Ends:
         """Return the ends of decisions that begin at physics step `now` under plans that began at step `began`.
 
@@ -97,6 +118,7 @@ class EventPredictor:
             now: Present steps, shape (N,).
             scenes: Scenes.
             goal: Goals at the time of arrival in coordinates of the space, as a function of times (N,) -> (N, D).
+            looks: Looks of the sensor so far.
         """
         jump, turn = self.steps(scenes.jump_times), self.steps(scenes.turn_time)
         moving_until = began + self.steps(plan.duration)
@@ -119,6 +141,7 @@ class EventPredictor:
         ends[Event.ARRIVAL] = np.where(waits, NEVER, arrival)
         latest = np.minimum.reduce([*ends.values()])
         ends[Event.CLEARANCE] = self._clearance(plan, began, now, scenes, latest)
+        ends[Event.SIGHT] = self._sight(plan, began, now, scenes, latest, looks)
         steps = np.stack([ends[event] for event in _RANK])
         event = np.array([int(each) for each in _RANK])[steps.argmin(axis=0)]
         return Ends(steps.min(axis=0), event, there & (event == Event.ARRIVAL))
@@ -150,6 +173,61 @@ class EventPredictor:
         low = _low_clearances(chain, spheres, path, obstacles, looks + ahead, interval, self.margin)
         _first_falls(low, rows, steps, looks, ahead, now, latest, found)
         return found
+
+    def _sight(
+        self, plan: Plan, began: Int, now: Int, scenes: Scenes, latest: Int, looks: Looks | None
+    ) -> Int:
+        """Return the step at which the sensor sees something new, NEVER if not before `latest`.
+
+        The sensor glances along the planned movement. The arm follows it within a millimetre.
+        """
+        found = np.full(len(now), NEVER)
+        if "sight" not in self.triggers or self.sensor is None or looks is None:
+            return found
+        number, nothing = len(now), self.sensor.range
+        known = looks.points.reshape(number, -1, 3)
+        known_hit = looks.ranges.reshape(number, -1) < nothing
+        every = max(round(GLANCE / self.timestep), 1)
+        step = now + every
+        rows = np.flatnonzero(step < latest)
+        while rows.size:
+            since = self.timestep * (step - began)[rows]
+            joints = self.space.joints(plan.take(rows).trajectory()(since[:, None]))[:, 0]
+            obstacles = scenes.take(rows).obstacles_at(self.timestep * step[rows])
+            glance = self.sensor.read(self.arm, joints, obstacles)
+            hit = glance.ranges < nothing
+            new = _count_new(glance.points, hit, known[rows], known_hit[rows]) >= NEW_POINTS
+            found[rows[new]] = step[rows[new]]
+            step = step + every
+            rows = rows[~new & (step < latest)[rows]]
+        return found
+
+
+@compiled
+def _count_new(points: Float, hit: Bool, known: Float, known_hit: Bool) -> Int:
+    """Return how many points of each scene are NEW_DISTANCE or more from all known ones, at most NEW_POINTS.
+
+    Args:
+        points: Shape (N, R, 3), [m].
+        hit: True for those that count, shape (N, R).
+        known: Shape (N, M, 3), [m].
+        known_hit: True for those that count, shape (N, M).
+    """
+    found = np.zeros(len(points), np.int64)
+    for scene in range(len(points)):
+        for i in range(points.shape[1]):
+            if not hit[scene, i] or found[scene] >= NEW_POINTS:
+                continue
+            x, y, z = points[scene, i]
+            new = True
+            for k in range(known.shape[1]):
+                if known_hit[scene, k]:
+                    a, b, c = known[scene, k]
+                    if (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2 < NEW_DISTANCE**2:
+                        new = False
+                        break
+            found[scene] += new
+    return found
 
 
 @compiled

@@ -14,7 +14,7 @@ from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.obstacles import POSE_SIZE, Obstacles, observation_rows
 from viapoint.envs.plans import Motion
 from viapoint.envs.replanning import NominalPlan
-from viapoint.envs.sensors import Sensor
+from viapoint.envs.sensors import Looks, Sensor
 
 FARTHEST = 2.0
 """Bound of every coordinate and length, [m]."""
@@ -30,7 +30,8 @@ class ObservationLayout:
 
     `joints` [rad], `hand` and `goal` [m]; in joint space `goal_joints` [rad]; where obstacles may be, `obstacles`:
     n rows (kind one-hot, centre [m], first two axes of the frame, half lengths of the bounding box [m], velocity [m/s],
-    present), flattened. With a sensor, `ranges` and `points` of its rays [m], flattened, in place of `obstacles`. While
+    present), flattened. With a sensor, `ranges` and `points` of its rays [m], flattened, in place of `obstacles`, for
+    all looks that are remembered; where there are several, also `eyes`, the places of these looks [m]. While
     a movement is under way also the reference that the arm follows, `command`, `velocity` and `acceleration`, and
     `time_left` [s]; in tasks with replanning `via` and `remaining` [s], the plan of a zero action. What exceeds its
     bounds is clipped.
@@ -71,8 +72,11 @@ class ObservationLayout:
             found["goal_joints"] = joints
         if self.sensor is not None:
             farthest = self.sensor.range + FARTHEST + float(np.abs(self.sensor.position).max())
-            found["ranges"] = np.zeros(self.sensor.n_rays), np.full(self.sensor.n_rays, self.sensor.range)
-            found["points"] = _box(farthest, 3 * self.sensor.n_rays)
+            number = self.sensor.looks * self.sensor.n_rays
+            found["ranges"] = np.zeros(number), np.full(number, self.sensor.range)
+            found["points"] = _box(farthest, 3 * number)
+            if self.sensor.looks > 1:
+                found["eyes"] = _box(FARTHEST, 3 * self.sensor.looks)
         elif self.n_rows:
             kinds, pose = np.zeros(len(self.kinds)), [FARTHEST] * 3 + [1.0] * 6
             sizes = [FARTHEST] * 3
@@ -109,6 +113,7 @@ class ObservationLayout:
         command: Motion | None = None,
         time: Float | None = None,
         nominal: NominalPlan | None = None,
+        looks: Looks | None = None,
     ) -> Observation:
         """Return observations of N environments in fresh arrays.
 
@@ -120,6 +125,7 @@ class ObservationLayout:
             command: References that the arms follow, in tasks in which decisions are made during a movement.
             time: Time since the start of each episode, shape (N,), [s].
             nominal: Plans of a zero action, in tasks with replanning.
+            looks: Looks of the sensor so far; by default a first look is made.
         """
         parts: dict[str, Any] = {
             "joints": joints,
@@ -128,9 +134,11 @@ class ObservationLayout:
             "goal_joints": goal[0],
         }
         if self.sensor is not None:
-            readings = self.sensor.read(self.arm, joints, obstacles)
-            parts["ranges"] = readings.ranges
-            parts["points"] = readings.points.reshape(len(joints), -1)
+            if looks is None:
+                looks = Looks.none(self.sensor, len(joints))
+                looks.add(np.arange(len(joints)), self.sensor, self.arm, joints, obstacles)
+            for name, part in looks._asdict().items():
+                parts[name] = part.reshape(len(joints), -1)
         else:
             parts["obstacles"] = observation_rows(obstacles, self.kinds).reshape(len(joints), -1)
         if command is not None and time is not None:

@@ -30,6 +30,8 @@ MOUNTS = ("world", "hand")
 """Frames in which the pose of a sensor may be given."""
 MOST_RAYS = 65_536
 """Greatest number of rays of a sensor."""
+MOST_LOOKS = 64
+"""Greatest number of looks that are remembered."""
 WIDEST_IMAGE = 2.9
 """Greatest field of view of an image, [rad]: its rays meet a plane."""
 TOUCH = 1e-5
@@ -47,6 +49,39 @@ class Readings(NamedTuple):
     """Ends of the rays in the world, shape (N, R, 3), [m]."""
     seen: Int
     """Row of the obstacle that a ray meets, -1 for none, shape (N, R); not part of the observation."""
+
+
+class Looks(NamedTuple):
+    """Readings of the last L looks of a sensor in N scenes, the newest first; looks not yet made have met nothing."""
+
+    eyes: Float
+    """Places of the sensor, shape (N, L, 3), [m]."""
+    ranges: Float
+    """Distances along the rays, shape (N, L, R), [m]."""
+    points: Float
+    """Ends of the rays in the world, shape (N, L, R, 3), [m]."""
+
+    @classmethod
+    def none(cls, sensor: Sensor, number: int) -> Looks:
+        """Return the memory of a sensor that has not looked yet in a number of scenes."""
+        shape = number, sensor.looks, sensor.n_rays
+        return cls(np.zeros((*shape[:2], 3)), np.full(shape, sensor.range), np.zeros((*shape, 3)))
+
+    def add(self, rows: Int, sensor: Sensor, arm: Arm, joints: Float, obstacles: Obstacles) -> None:
+        """Look once more in some scenes, and forget the oldest look.
+
+        Args:
+            rows: Indices of the scenes, shape (n,).
+            sensor: Sensor.
+            arm: Arm.
+            joints: Its joint positions, shape (n, J).
+            obstacles: Obstacles of these scenes at their present places.
+        """
+        for part in self:
+            part[rows, 1:] = part[rows, :-1]
+        readings = sensor.read(arm, joints, obstacles)
+        self.eyes[rows, 0] = sensor.pose(arm, joints)[1]
+        self.ranges[rows, 0], self.points[rows, 0] = readings.ranges, readings.points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +122,9 @@ class Sensor:
     """Standard deviation of the distances, [m]."""
     dropped: float = 0.0
     """Share of rays that return the greatest range whatever they meet."""
+    looks: int = 1
+    """Number of looks that an observation holds, the newest first: the start of an episode and the end of each decision
+    are looks. With more than one, the points that were seen on the way are remembered."""
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -114,6 +152,7 @@ class Sensor:
             "range": number_of_at_least("range of the sensor", self.range, 1e-3, 100.0),
             "noise": number_of_at_least("noise of the sensor", self.noise, 0.0, 1.0),
             "dropped": number_of_at_least("dropped of the sensor", self.dropped, 0.0, 1.0),
+            "looks": whole_number("looks of the sensor", self.looks, 1, MOST_LOOKS),
         }
         for name, value in checked.items():
             object.__setattr__(self, name, value)
@@ -237,7 +276,7 @@ class Sensor:
         return np.where((seen < 0) | (third < self.dropped), self.range, noisy)
 
 
-NAMED = ("rays", "camera", "hand_camera")
+NAMED = ("rays", "camera", "hand_rays", "hand_camera")
 """Names of usual sensors, see :func:`named_sensor`."""
 
 
@@ -246,7 +285,8 @@ def named_sensor(name: str, arm: Arm, foot: tuple[float, float, float], scale: f
 
     Args:
         name: `rays`, a fan of 192 rays from the first joint at the height of the hand; `camera`, a depth image from
-            above and behind the base; `hand_camera`, one from the tool along its approach axis, its z axis.
+            above and behind the base; `hand_rays`, a short fan of 192 rays all around the hand; `hand_camera`, a depth
+            image from the tool along its approach axis, its z axis. Those of the hand remember eight looks.
         arm: Arm.
         foot: Place of its foot, [m].
         scale: Size of the arm relative to the reference arm.
@@ -267,10 +307,12 @@ def named_sensor(name: str, arm: Arm, foot: tuple[float, float, float], scale: f
         return Sensor(
             position=place, quaternion=turn, columns=48, rows=36, field_of_view=1.3, range=2.5 * scale
         )
+    if name == "hand_rays":
+        return Sensor(mount="hand", field_of_view=2.0 * math.pi, range=0.4 * scale, looks=8)
     if name == "hand_camera":
         turn = math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0
         return Sensor(
-            mount="hand", quaternion=turn, columns=32, rows=24, field_of_view=1.5, range=1.0 * scale
+            mount="hand", quaternion=turn, columns=32, rows=24, field_of_view=1.5, range=1.0 * scale, looks=8
         )
     raise ValueError(f"sensor must be one of {', '.join(NAMED)}, got {name!r}")
 

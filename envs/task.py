@@ -30,7 +30,7 @@ from viapoint.envs.sensors import Sensor, named_sensor
 from viapoint.envs.spaces import Space, space_of
 from viapoint.envs.steering import Steering
 
-Trigger = Literal["horizon", "target", "course", "clearance"]
+Trigger = Literal["horizon", "target", "course", "clearance", "sight"]
 TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)
 """Events that may end a decision before the goal."""
 END, STEPS = "end", "steps"
@@ -132,6 +132,8 @@ class Task:
         if isinstance(sensor, str):
             room = room_of(arm, kinds, most, tall=False)
             sensor = named_sensor(sensor, arm, room.foot, room.scale)
+            if decide_at == END:  # one look is all
+                sensor = dataclasses.replace(sensor, looks=1)
         sensor = Sensor.of(sensor)
         if sensor is not None and not most[1]:
             raise ValueError("sensor needs n_obstacles of 1 or more: there is nothing to see")
@@ -154,6 +156,10 @@ class Task:
             weights=RewardWeights.of(reward_weights),
             sensor=sensor,
         )
+        if "sight" in task.decide_at and sensor is None:
+            raise ValueError("decide_at with 'sight' needs a sensor")
+        if task.whole_movement and sensor is not None and sensor.looks > 1:
+            raise ValueError(f"looks of the sensor must be 1 with one decision, got {sensor.looks}")
         if not task.whole_movement and timing != "optimal":
             raise ValueError(f"timing must be optimal where plans are revised or steered, got {timing!r}")
         if task.whole_movement and (task.moving_obstacles or task.n_jumps[1]):

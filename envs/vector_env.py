@@ -61,13 +61,13 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         moving_obstacles: True if the obstacles move.
         n_jumps: Number of jumps of the target, or the fewest and the most.
         decide_at: `end`, one decision for a movement; `steps`, a velocity in every control step; or events that end a
-            decision before the goal, some of `horizon`, `target`, `course`, `clearance`.
+            decision before the goal, some of `horizon`, `target`, `course`, `clearance`, `sight`.
         horizon: Time after which a decision ends, [s].
         margin: Predicted clearance below which a decision ends, [m].
         control_step: Time for which an action holds with `decide_at="steps"`, [s].
         reward_weights: Some or all of the weights of :class:`~viapoint.envs.rewards.RewardWeights`.
-        sensor: Sensor whose readings are observed in place of the obstacles: `rays`, `camera`, `hand_camera`, a
-            :class:`~viapoint.envs.sensors.Sensor` or a mapping of its fields.
+        sensor: Sensor whose readings are observed in place of the obstacles: `rays`, `camera`, `hand_rays`,
+            `hand_camera`, a :class:`~viapoint.envs.sensors.Sensor` or a mapping of its fields.
         autoreset_mode: `SameStep`, `NextStep` or `Disabled`.
         render_mode: `human`, `rgb_array` or `rgb_array_list`.
         width: Width of a rendered frame, [pixels].

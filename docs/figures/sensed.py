@@ -77,7 +77,7 @@ def draw_calibration(axes: Axes, env_id: str, agent: Any) -> None:
     task: Task = agent.policy.task
     scenes = scenes_for("validation", task).scenes
     simulation = SceneSimulation(env_id)
-    actions, predicted = agent.policy.decide(simulation.observe(scenes))
+    actions, predicted = agent.policy.assess(simulation.observe(scenes))
     success = simulation(scenes, actions).success
     order = np.argsort(predicted)
     bins = np.array_split(order, BINS)

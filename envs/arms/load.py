@@ -223,7 +223,7 @@ def _load(
     exclude = dict.fromkeys(_excluded(parsed, urdf.never_touch), "excluded in the file")
     never = f"in contact in none of {NEAR_LOOKED_AT:,} configurations, though always near"
     pairs = parsed.compared(exclude)
-    drawn = np.random.default_rng(0).uniform(*ranges.T, (NEAR_LOOKED_AT, len(names)))
+    drawn = np.random.default_rng(0).uniform(ranges[:, 0], ranges[:, 1], (NEAR_LOOKED_AT, len(names)))
     looked_at = np.array([_distances(parsed, each, pairs) for each in drawn[:LOOKED_AT]])
     near = list(itertools.compress(pairs, np.median(looked_at, axis=0) < NEAR))
     apart = _apart(parsed, near, drawn)

@@ -17,7 +17,9 @@ from viapoint.envs import (
     arm_of,
     signed_distances,
 )
+from viapoint.envs.events import NEW_DISTANCE, NEW_POINTS, Event
 from viapoint.envs.geometry.obstacles import add_to_model, pack, unpack
+from viapoint.training import evaluate
 from viapoint.training.planning.beliefs import Sight, fitted_boxes, thick_points
 from viapoint.training.planning.search import registered_task
 
@@ -128,6 +130,76 @@ def test_beliefs_hold_what_is_seen_and_leave_the_ends_free(env_id, belief) -> No
             assert (free > 0.009).all()
 
 
+LOOKING = {"sensor": "hand_rays", "decide_at": ("sight",), "n_via": 1}
+
+
+def looks_of(observation):
+    """Return places, ranges and points of the looks that are remembered."""
+    number = len(observation["eyes"])
+    points = observation["points"].reshape(number, 8, 192, 3)
+    return observation["eyes"].reshape(number, 8, 3), observation["ranges"].reshape(number, 8, 192), points
+
+
+def test_looks_are_remembered_and_new_points_end_decisions() -> None:
+    envs = gym.make_vec("viapoint/PlanarObstacles-v0", num_envs=24, **LOOKING)
+    envs.action_space.seed(0)
+    before, _ = envs.reset(seed=3)
+    seen = 0
+    for _ in range(3):
+        actions = envs.action_space.sample()
+        after, _, ended, _, info = envs.step(actions)
+        eyes, ranges, points = looks_of(after)
+        _, ranges_before, points_before = looks_of(before)
+        for i in np.flatnonzero(~ended):
+            # The newest look is made from the hand; those before move up by one.
+            assert eyes[i, 0] == pytest.approx(after["hand"][i], abs=1e-6)
+            assert np.array_equal(points[i, 1:], points_before[i, :-1])
+            assert np.array_equal(ranges[i, 1:], ranges_before[i, :-1])
+            # What is new is far from all that was remembered; the arm is within a millimetre of its plan.
+            assert info["event"][i] == Event.SIGHT
+            new = points[i, 0][ranges[i, 0] < 0.39]
+            known = points_before[i][ranges_before[i] < 0.39]
+            apart = np.linalg.norm(new[:, None] - known, axis=-1).min(axis=1, initial=1.0)
+            assert (apart > NEW_DISTANCE - 0.005).sum() >= NEW_POINTS - 2
+            seen += 1
+        before = after
+    assert seen > 10
+
+
+def test_looks_do_not_depend_on_the_batch_and_are_restored() -> None:
+    many = gym.make_vec("viapoint/PlanarObstacles-v0", num_envs=3, **LOOKING)
+    alone = gym.make_vec("viapoint/PlanarObstacles-v0", num_envs=1, **LOOKING)
+    many.reset(seed=[5, 6, 7])
+    alone.reset(seed=[6])
+    action = np.full((3, many.single_action_space.shape[0]), 0.3, np.float32)
+    first, *_ = many.step(action)
+    second, *_ = alone.step(action[:1])
+    assert all(np.array_equal(first[name][1], second[name][0]) for name in first)
+    state = many.unwrapped.state()
+    once = many.step(-action)[0]
+    many.unwrapped.restore(state)
+    again = many.step(-action)[0]
+    assert all(np.array_equal(once[name], again[name]) for name in once)
+
+
+def test_looking_again_helps_a_search() -> None:
+    solved = {}
+    for when, kwargs in {
+        "once": {"sensor": "hand_rays"},
+        "again": {"sensor": "hand_rays", "decide_at": ("sight", "clearance")},
+    }.items():
+        result = evaluate(
+            env="viapoint/PlanarSensed-v0",
+            env_kwargs=kwargs,
+            scenes="validation",
+            n_scenes=60,
+            baselines=["thick:search128"],
+            time_decisions=False,
+        )
+        solved[when] = result.success_rate
+    assert solved["again"] > solved["once"] + 0.08
+
+
 @pytest.mark.parametrize(
     ("sensor", "error"),
     [
@@ -145,6 +217,8 @@ def test_beliefs_hold_what_is_seen_and_leave_the_ends_free(env_id, belief) -> No
         ({"position": (0.0, np.nan, 0.0)}, ValueError),
         ({"quaternion": (1.0, 1.0, 0.0, 0.0)}, ValueError),
         ({"mount": "foot"}, ValueError),
+        ({"looks": 0}, ValueError),
+        ({"looks": 2}, ValueError),  # an episode of one decision has one look
     ],
 )
 def test_impossible_sensors_are_refused(sensor, error) -> None:
@@ -155,6 +229,8 @@ def test_impossible_sensors_are_refused(sensor, error) -> None:
 def test_sensors_that_see_nothing_are_refused() -> None:
     with pytest.raises(ValueError, match="nothing to see"):
         Task.of(sensor="rays", n_obstacles=0)
+    with pytest.raises(ValueError, match="sensor"):
+        Task.of(decide_at=["sight"])
     env = gym.make("viapoint/PlanarSensed-v0")
     with pytest.raises(ValueError, match="sensor"):
         env.reset(options={"obstacles": [Cylinder(0.05, 0.04, position=(0.03, 0.0, 0.0))]})

@@ -33,7 +33,7 @@ def test_predicted_success_is_calibrated(agent) -> None:
     problem = Problem.of_scenes(scenes, task)
     hand, goals = task.arm.hand(scenes.start), (scenes.goal, task.arm.hand(scenes.goal))
     seen = task.observation.observe(scenes.start, hand, goals, scenes.obstacles)
-    actions, predicted = agent.policy.decide(seen)
+    actions, predicted = agent.policy.assess(seen)
     clear = plan_clearances(task, problem, actions[:, None], 0.0, 0.0, exact=True)[:, 0] >= 0.0
     assert abs(predicted.mean() - clear.mean()) < 0.08
 

@@ -308,7 +308,8 @@ def parameter_budget(arrays: Mapping[str, Any]) -> Iterator[None]:
 
 def argument_names(kind: type[BaseAlgorithm]) -> set[str]:
     """Return the names of an algorithm's hyperparameters."""
-    return set(inspect.signature(kind.__init__).parameters) - NOT_STORED
+    every = inspect.signature(kind.__init__).parameters.values()
+    return {each.name for each in every if each.kind is not each.VAR_KEYWORD} - NOT_STORED
 
 
 def _encode(value: Any) -> Any:

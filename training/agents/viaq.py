@@ -12,21 +12,19 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import check_for_correct_spaces, polyak_update
+from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 from torch.nn import functional
 
 from viapoint.envs.task import Task
-from viapoint.training.agents.agent import Agent
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.outcome_buffer import OutcomeReplayBuffer, Outcomes, OutcomeSamples
+from viapoint.training.agents.plan_agent import PlanAlgorithm
 from viapoint.training.agents.viaq_critic import Values
 from viapoint.training.agents.viaq_policy import KEEP, ViaQPolicy
-from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.problem import Problem
 
@@ -42,7 +40,7 @@ CONTACT_WEIGHT = 0.1
 """Weight of the contact loss; the clearance loss carries finer information on the same event."""
 
 
-class ViaQ(Agent, OffPolicyAlgorithm):
+class ViaQ(PlanAlgorithm):
     """Off-policy algorithm that chooses via-points by ranking candidate plans.
 
     Args:
@@ -61,11 +59,9 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         train_freq: Steps of all environments between two rounds of updates.
         tau: Rate at which the target critic follows, in tasks with replanning.
         policy_kwargs: Arguments of :class:`ViaQPolicy`; `env` provides the task.
-        stats_window_size: Episodes over which the logged success is averaged.
-        tensorboard_log: Folder of a TensorBoard log.
-        verbose: 0 for no output, 1 for information, 2 for more of it.
-        seed: Seed of all random numbers.
-        device: Device of the networks.
+        _init_setup_model: False to set up the networks later.
+        **kwargs: Arguments that all algorithms of Stable-Baselines3 have, such as `seed`, `device`, `verbose` and
+            `tensorboard_log`.
 
     Raises:
         ValueError: A hyperparameter is out of range, or the environment has no task of this package.
@@ -100,59 +96,28 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         train_freq: int | tuple[int, str] = 1,
         tau: float = 0.005,
         policy_kwargs: dict[str, Any] | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: torch.device | str = "auto",
         _init_setup_model: bool = True,
+        **kwargs: Any,
     ) -> None:
         self.explore_uniformly, self.temperature = explore_uniformly, temperature
         self.explore_candidates, self.next_candidates = explore_candidates, next_candidates
-        own = ("explore_uniformly", "temperature", "explore_candidates", "next_candidates")
-        check_arguments(ViaQ, {name: getattr(self, name) for name in own})
         super().__init__(
             policy,
             env,
             learning_rate,
+            own=("explore_uniformly", "temperature", "explore_candidates", "next_candidates"),
             buffer_size=buffer_size,
             learning_starts=learning_starts,
             batch_size=batch_size,
             gamma=gamma,
             gradient_steps=gradient_steps,
             replay_buffer_class=OutcomeReplayBuffer,
-            policy_kwargs=dict(policy_kwargs or {}),
+            policy_kwargs=policy_kwargs,
             train_freq=train_freq,
             tau=tau,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            seed=seed,
-            device=device,
-            support_multi_env=True,
-            sde_support=False,
+            _init_setup_model=_init_setup_model,
+            **kwargs,
         )
-        if self.env is not None:
-            self.policy_kwargs.setdefault("task", task_of(self.env).as_dict())
-        if _init_setup_model:
-            self._setup_model()
-
-    def _setup_model(self) -> None:
-        if self.env is not None:
-            self._check_env(self.env)
-        super()._setup_model()
-        self.actor = self.policy
-
-    def set_env(self, env: Any, force_reset: bool = True) -> None:
-        """Set the training environment.
-
-        Raises:
-            ValueError: Spaces, arm, action or kind of clearance differ from those of the agent.
-        """
-        wrapped = self._wrap_env(env, self.verbose)
-        check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
-        self._check_env(wrapped)
-        super().set_env(wrapped, force_reset)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         before = self._last_obs
@@ -161,14 +126,20 @@ class ViaQ(Agent, OffPolicyAlgorithm):
             self.replay_buffer.begin()
         return prepared
 
-    def _check_env(self, env: VecEnv) -> None:
-        mine, theirs = Task.from_dict(self.policy_kwargs["task"]).as_dict(), task_of(env).as_dict()
-        others = [name for name in FIXED_PARTS if mine[name] != theirs[name]]
+    def _task_of(self, env: VecEnv) -> Task:
+        return task_of(env)
+
+    def _check_task(self, mine: Task, theirs: Task) -> None:
+        before, after = mine.as_dict(), theirs.as_dict()
+        others = [name for name in FIXED_PARTS if before[name] != after[name]]
         if others:
             raise ValueError(
                 f"the environment must have the same {', '.join(others)} as the agent: "
-                f"{ {name: mine[name] for name in others} }, got { {name: theirs[name] for name in others} }"
+                f"{ {name: before[name] for name in others} }, got { {name: after[name] for name in others} }"
             )
+
+    def _check_env(self, env: VecEnv) -> None:
+        super()._check_env(env)
         normalized = unwrap_vec_normalize(env)
         if normalized is not None and normalized.norm_obs:
             raise ValueError("ViaQ computes with metres: VecNormalize must be made with norm_obs=False")
@@ -293,12 +264,6 @@ class ViaQ(Agent, OffPolicyAlgorithm):
         explore = np.random.uniform(size=(n_envs, 1)) < self.explore_uniformly  # noqa: NPY002
         actions = np.where(explore, uniform, chosen).astype(np.float32)
         return actions, actions
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor"]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "policy.optimizer"], []
 
 
 def task_of(env: VecEnv) -> Task:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.utils import is_vectorized_observation
 from torch import Tensor
 
 from viapoint.envs.common.arrays import norm
@@ -20,15 +18,12 @@ from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import turned
 from viapoint.envs.task import Task
 from viapoint.training.agents.pairs import pairs_of
+from viapoint.training.agents.plan_agent import Numbers, Observation, PlanPolicy
 from viapoint.training.agents.viaq_critic import PlanInputs, ViaQCritic
-from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.candidates import candidate_actions, normal_steps
 from viapoint.training.planning.movements import FINE_INSTANTS, INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import INFEASIBLE, VERIFIED, best_of, merits, refined_actions
-
-Observation = Mapping[str, NDArray[Any]]
-Numbers = NDArray[np.floating[Any]]
 
 KEEP = 0.1
 """Minimum gain of Q for which a running plan is revised."""
@@ -46,7 +41,7 @@ MOTION_SCALES = (1.0, 0.1)
 """Scales of velocity and acceleration at the input of the critic."""
 
 
-class ViaQPolicy(BasePolicy):
+class ViaQPolicy(PlanPolicy):
     """Policy that ranks candidates with a critic and can check the best ones with exact geometry.
 
     Args:
@@ -63,6 +58,14 @@ class ViaQPolicy(BasePolicy):
         refine: Number of best candidates that the planner refines by the gradient of clearance, of which the best one
             is taken after an exact check; 0 for none. Only for tasks whose actions are whole movements.
     """
+
+    width: int
+    instants: int
+    candidates: int
+    refinements: int
+    per_refinement: int
+    checks: int
+    refine: int
 
     def __init__(
         self,
@@ -82,57 +85,35 @@ class ViaQPolicy(BasePolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        own = {
-            "width": width,
-            "instants": instants,
-            "candidates": candidates,
-            "refinements": refinements,
-            "per_refinement": per_refinement,
-            "checks": checks,
-            "refine": refine,
-        }
-        check_arguments(ViaQPolicy, own)
         super().__init__(
             observation_space,
             action_space,
+            task=task,
+            own={
+                "width": width,
+                "instants": instants,
+                "candidates": candidates,
+                "refinements": refinements,
+                "per_refinement": per_refinement,
+                "checks": checks,
+                "refine": refine,
+            },
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
             **kwargs,
         )
-        self.task = Task.from_dict(task)
         self.replanning = self.task.replanning
-        self.candidates, self.refinements, self.per_refinement = candidates, refinements, per_refinement
-        self.checks, self.refine = checks, refine
         self._check_refine()
-        self.width, self.instants = width, instants
         self.critic = self.make_critic()
         self.critic_target = self.make_critic() if self.replanning else None
         if self.critic_target is not None:
             self.critic_target.load_state_dict(self.critic.state_dict())
             self.critic_target.requires_grad_(False)
-        self.optimizer = self.optimizer_class(
-            self.critic.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
+        self._make_optimizer(self.critic, lr_schedule)
 
     def make_critic(self) -> ViaQCritic:
         """Return a new critic for the task."""
         return ViaQCritic(self.task, width=self.width)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {
-            **super()._get_constructor_parameters(),
-            "width": self.width,
-            "task": self.task.as_dict(),
-            "lr_schedule": self._dummy_schedule,
-            "instants": self.instants,
-            "candidates": self.candidates,
-            "refinements": self.refinements,
-            "per_refinement": self.per_refinement,
-            "checks": self.checks,
-            "refine": self.refine,
-        }
 
     @property
     def can_refine(self) -> bool:
@@ -273,47 +254,6 @@ class ViaQPolicy(BasePolicy):
         first = np.argsort(-values[:, : self.candidates], axis=1, kind="stable")[:, :spread]
         last = np.argsort(-values[:, self.candidates :], axis=1, kind="stable")[:, :refined]
         return np.concatenate((first, last + self.candidates), axis=1)
-
-    def forward(self, observation: Any, deterministic: bool = True) -> Tensor:
-        """Return the chosen actions, shape (B, m)."""
-        return self._predict(observation, deterministic)
-
-    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
-        arrays = {name: each.cpu().numpy() for name, each in observation.items()}
-        return torch.as_tensor(self.decide(arrays), dtype=torch.float32, device=self.device)
-
-    def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """Return actions for one observation or a batch, and no state, as policies of Stable-Baselines3 do.
-
-        Raises:
-            ValueError: The observation is not a dict with the parts of the observation space, is not finite, or the
-                hand is at the goal already.
-        """
-        if isinstance(observation, tuple):
-            return super().predict(cast(Any, observation), state, *args, **kwargs)  # it explains the mistake
-        self._check_parts(observation)
-        parts: Any = self.observation_space
-        several = is_vectorized_observation(observation, parts)
-        batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
-        actions = np.clip(np.asarray(self.decide(batch), np.float32), -1.0, 1.0)
-        return (actions if several else actions[0]), state
-
-    def _check_parts(self, observation: Any) -> None:
-        space: Any = self.observation_space
-        wanted = ", ".join(space.spaces)
-        if not isinstance(observation, dict):
-            raise ValueError(f"observation must be a dict of {wanted}; got {type(observation).__name__}")
-        if observation.keys() != space.spaces.keys():
-            raise ValueError(
-                f"observation must have the parts {wanted}; got {', '.join(map(str, observation))}"
-            )
-        for name, each in observation.items():
-            if not np.isfinite(np.asarray(each)).all():
-                raise ValueError(f"observation must be finite; {name} is {np.asarray(each)}")
-        here, there = ("joints", "goal_joints") if "goal_joints" in observation else ("hand", "goal")
-        apart = np.asarray(observation[here]) != np.asarray(observation[there])
-        if not self.replanning and not apart.any(axis=-1).all():
-            raise ValueError("start and goal must differ: no movement leads from a point to itself")
 
 
 def seen_ends(task: Task, problem: Problem) -> Float:

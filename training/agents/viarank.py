@@ -20,20 +20,17 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit, logit
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import is_vectorized_observation
-from torch import Tensor
+from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional
 
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.task import Task
-from viapoint.training.agents.agent import Agent
 from viapoint.training.agents.model_io import ALGORITHMS
+from viapoint.training.agents.plan_agent import Observation, PlanAlgorithm, PlanPolicy
 from viapoint.training.agents.sight_network import SightInputs, SightNetwork, sight_inputs
-from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.problem import Numbers, Problem
@@ -53,7 +50,7 @@ BLOCK = 16
 """Scenes that are decided together."""
 
 
-class ViaRankPolicy(BasePolicy):
+class ViaRankPolicy(PlanPolicy):
     """Policy that ranks candidates by the probability of success that a network predicts from a sensor's readings.
 
     Args:
@@ -67,6 +64,12 @@ class ViaRankPolicy(BasePolicy):
         candidates: Number of Sobol points in the action space.
         refine: Number of best candidates that the planner refines around what is seen; they are ranked, too.
     """
+
+    width: int
+    instants: int
+    nearest: int
+    candidates: int
+    refine: int
 
     def __init__(
         self,
@@ -84,38 +87,27 @@ class ViaRankPolicy(BasePolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        self._own = {
-            "width": width,
-            "instants": instants,
-            "nearest": nearest,
-            "candidates": candidates,
-            "refine": refine,
-        }
-        check_arguments(ViaRankPolicy, self._own)
         super().__init__(
             observation_space,
             action_space,
+            task=task,
+            own={
+                "width": width,
+                "instants": instants,
+                "nearest": nearest,
+                "candidates": candidates,
+                "refine": refine,
+            },
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
             **kwargs,
         )
-        self.task = Task.from_dict(task)
         if self.task.sensor is None or not self.task.whole_movement:
             raise ValueError(
                 "viarank needs a task with a sensor whose actions are whole movements, such as viapoint/PlanarSensed-v0"
             )
-        self.width, self.instants, self.nearest = width, instants, nearest
-        self.candidates, self.refine = candidates, refine
         self.network = SightNetwork(self.task.sensor, width=width)
-        self.optimizer = self.optimizer_class(
-            self.network.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        own = {"task": self.task.as_dict(), "lr_schedule": self._dummy_schedule}
-        return {**super()._get_constructor_parameters(), **self._own, **own}
+        self._make_optimizer(self.network, lr_schedule)
 
     @property
     def can_refine(self) -> bool:
@@ -136,7 +128,11 @@ class ViaRankPolicy(BasePolicy):
         success = torch.sigmoid(self.network(inputs.to(self.device))).cpu().numpy()
         return success + EFFORT_WEIGHT * worth, success
 
-    def decide(self, observation: Mapping[str, NDArray[Any]]) -> tuple[Float, Float]:
+    def decide(self, observation: Observation) -> Numbers:
+        """Return the best actions, shape (B, m), for parts of B observations."""
+        return self.assess(observation)[0]
+
+    def assess(self, observation: Observation) -> tuple[Float, Float]:
         """Return the best actions of B observations, shape (B, m), and their predicted success, shape (B,).
 
         Args:
@@ -170,42 +166,10 @@ class ViaRankPolicy(BasePolicy):
             success.append(likely[best])
         return np.concatenate(chosen).astype(np.float64), np.concatenate(success).astype(np.float64)
 
-    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
-        arrays = {name: each.cpu().numpy() for name, each in observation.items()}
-        return torch.as_tensor(self.decide(arrays)[0], dtype=torch.float32, device=self.device)
-
-    def forward(self, observation: Any, deterministic: bool = True) -> Tensor:
-        """Return the chosen actions, shape (B, m)."""
-        return self._predict(observation, deterministic)
-
-    def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """Return actions for one observation or a batch, and no state, as policies of Stable-Baselines3 do.
-
-        Raises:
-            ValueError: The observation has other parts than the task's, another number of rays, or is not finite.
-        """
-        parts: Any = self.observation_space
-        if not isinstance(observation, Mapping) or set(observation) != set(parts.spaces):
-            names = ", ".join(observation) if isinstance(observation, Mapping) else type(observation).__name__
-            raise ValueError(f"observation must have the parts {', '.join(parts.spaces)}; got {names}")
-        for name, each in observation.items():
-            size = np.shape(each)[-1:]
-            if size != parts[name].shape:
-                raise ValueError(
-                    f"{name} must have {parts[name].shape[0]} values, as with the sensor of the training; got {size[0]}"
-                )
-            if not np.isfinite(np.asarray(each)).all():
-                raise ValueError(f"observation must be finite; {name} is not")
-        given: Any = dict(observation)
-        several = is_vectorized_observation(given, parts)
-        batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
-        self._check_rays(Sight.of(batch, self.task))
-        actions = np.clip(self.decide(batch)[0], -1.0, 1.0).astype(np.float32)
-        return (actions if several else actions[0]), state
-
-    def _check_rays(self, sight: Sight) -> None:
-        """Check that points lie on the rays of the sensor that the agent was trained with."""
-        sensor = self.task.sensor
+    def _check_observation(self, batch: Observation) -> None:
+        """Check that start and goal differ, and that points lie on the rays of the sensor of the training."""
+        super()._check_observation(batch)
+        sensor, sight = self.task.sensor, Sight.of(batch, self.task)
         assert sensor is not None
         rays = np.einsum("nij,rj->nri", sight.rotation, sensor.directions)
         apart = np.abs(sight.origin[:, None] + sight.ranges[..., None] * rays - sight.points).max(initial=0.0)
@@ -228,7 +192,7 @@ class NoBuffer(ReplayBuffer):
         """Forget a transition."""
 
 
-class ViaRank(Agent, OffPolicyAlgorithm):
+class ViaRank(PlanAlgorithm):
     """Algorithm that learns from labelled plans which movements are clear of obstacles that are seen only in part.
 
     Args:
@@ -242,11 +206,9 @@ class ViaRank(Agent, OffPolicyAlgorithm):
         labels: Plans of each scene that are learned from: the better half are the best candidates, the others random.
         train_freq: Steps of all environments between two rounds of updates.
         policy_kwargs: Arguments of :class:`ViaRankPolicy`; `env` provides the task.
-        stats_window_size: Episodes over which the logged success is averaged.
-        tensorboard_log: Folder of a TensorBoard log.
-        verbose: 0 for no output, 1 for information, 2 for more of it.
-        seed: Seed of all random numbers.
-        device: Device of the networks.
+        _init_setup_model: False to set up the network later.
+        **kwargs: Arguments that all algorithms of Stable-Baselines3 have, such as `seed`, `device`, `verbose` and
+            `tensorboard_log`.
 
     Raises:
         ValueError: A hyperparameter is out of range, or the environment has no sensor.
@@ -275,75 +237,43 @@ class ViaRank(Agent, OffPolicyAlgorithm):
         labels: int = 24,
         train_freq: int | tuple[int, str] = 1,
         policy_kwargs: dict[str, Any] | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: torch.device | str = "auto",
         _init_setup_model: bool = True,
+        **kwargs: Any,
     ) -> None:
         self.explore_candidates, self.labels = explore_candidates, labels
-        check_arguments(ViaRank, {"explore_candidates": explore_candidates, "labels": labels})
         if labels > explore_candidates:
             raise ValueError(f"labels must be at most explore_candidates, {explore_candidates}, got {labels}")
         super().__init__(
             policy,
             env,
             learning_rate,
+            own=("explore_candidates", "labels"),
             buffer_size=1,
             learning_starts=learning_starts,
             batch_size=batch_size,
             gamma=1.0,
             gradient_steps=gradient_steps,
             replay_buffer_class=NoBuffer,
-            policy_kwargs=dict(policy_kwargs or {}),
+            policy_kwargs=policy_kwargs,
             train_freq=train_freq,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            seed=seed,
-            device=device,
-            support_multi_env=True,
-            sde_support=False,
+            _init_setup_model=_init_setup_model,
+            **kwargs,
         )
-        if self.env is not None:
-            self.policy_kwargs.setdefault("task", self._task().as_dict())
-        if _init_setup_model:
-            self._setup_model()
 
-    def _task(self) -> Task:
-        """Return the task of the environment."""
-        assert self.env is not None
-        task = self.env.get_attr("task", indices=0)[0]
+    def _task_of(self, env: VecEnv) -> Task:
+        task: Task = env.get_attr("task", indices=0)[0]
         if task.sensor is None or not task.whole_movement:
             raise ValueError(
                 "viarank needs an environment with a sensor in which an action is a whole movement, such as "
                 f"viapoint/PlanarSensed-v0; this one has sensor={task.sensor}, decide_at={task.decide_at!r}"
             )
-        found: Task = task
-        return found
+        return task
 
-    def _setup_model(self) -> None:
-        task = Task.from_dict(self.policy_kwargs["task"])
-        if self.env is not None and self._task().sensor != task.sensor:
+    def _check_task(self, mine: Task, theirs: Task) -> None:
+        if mine.sensor != theirs.sensor:
             raise ValueError(
-                f"the environment must have the sensor of the agent, {task.sensor}, got {self._task().sensor}"
+                f"the environment must have the sensor of the agent, {mine.sensor}, got {theirs.sensor}"
             )
-        super()._setup_model()
-        self.actor = self.policy
-
-    def set_env(self, env: Any, force_reset: bool = True) -> None:
-        """Set the training environment.
-
-        Raises:
-            ValueError: Its spaces or its sensor differ from those of the agent.
-        """
-        before = self.env
-        super().set_env(env, force_reset)
-        mine, theirs = self.policy.task.sensor, self._task().sensor
-        if mine != theirs:
-            self.env = before
-            raise ValueError(f"the environment must have the sensor of the agent, {mine}, got {theirs}")
 
     def _candidates(self, number: int) -> NDArray[np.float32]:
         """Return random candidates of some scenes, shape (number, H, m)."""
@@ -444,10 +374,7 @@ class ViaRank(Agent, OffPolicyAlgorithm):
         return self.policy.task.sampler()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "_sampler"]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "policy.optimizer"], []
+        return [*super()._excluded_save_params(), "_sampler"]
 
 
 ALGORITHMS["viarank"] = ViaRank

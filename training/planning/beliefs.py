@@ -46,13 +46,15 @@ class Sight(NamedTuple):
     """Readings of a sensor in B scenes, as an observation tells them."""
 
     origin: Float
-    """Places of the sensor, shape (B, 3), [m]."""
+    """Present places of the sensor, shape (B, 3), [m]."""
     rotation: Float
-    """Axes of the sensor as columns, shape (B, 3, 3)."""
+    """Present axes of the sensor as columns, shape (B, 3, 3)."""
     ranges: Float
-    """Shape (B, R), [m]."""
+    """Those of R rays, or of all rays of the looks that are remembered, shape (B, R), [m]."""
     points: Float
-    """Shape (B, R, 3), [m]."""
+    """Ends of the rays, shape (B, R, 3), [m]."""
+    eyes: Float
+    """Places from which they were seen, shape (B, R, 3), [m]."""
     hit: Bool
     """True for rays that met something, shape (B, R)."""
     free: Float
@@ -78,7 +80,9 @@ class Sight(NamedTuple):
             ends = [joints, parts["goal_joints"]]
         rotation, origin = task.sensor.pose(task.arm, joints)
         hit = ranges < task.sensor.range - ROUNDING
-        return cls(origin, rotation, ranges, points, hit, *_spheres_of(task, ends))
+        eyes = parts["eyes"].reshape(len(origin), -1, 3) if "eyes" in parts else origin[:, None]
+        eyes = np.repeat(eyes, task.sensor.n_rays, axis=1)
+        return cls(origin, rotation, ranges, points, eyes, hit, *_spheres_of(task, ends))
 
     @classmethod
     def of_scenes(cls, scenes: Scenes, task: Task) -> Sight:
@@ -91,7 +95,8 @@ class Sight(NamedTuple):
         if task.space_name == "hand":
             ends = [task.arm.hand(joints) for joints in ends]
         hit = found.ranges < sensor.range - ROUNDING
-        return cls(origin, rotation, found.ranges, found.points, hit, *_spheres_of(task, ends))
+        eyes = np.repeat(origin[:, None], sensor.n_rays, axis=1)
+        return cls(origin, rotation, found.ranges, found.points, eyes, hit, *_spheres_of(task, ends))
 
 
 def _spheres_of(task: Task, ends: list[Float]) -> tuple[Float, Float]:
@@ -117,8 +122,8 @@ def thick_points(task: Task, sight: Sight, depth: float | None = None) -> Obstac
     """Return clouds of the points that were seen and of the space behind each, THICKNESS or another depth, [m]."""
     steps = np.arange(0.0, (THICKNESS[task.space_name] if depth is None else depth) + 1e-9, SPACING)
     found = []
-    for origin, points, hit in zip(sight.origin, sight.points, sight.hit, strict=True):
-        away = points[hit] - origin
+    for eyes, points, hit in zip(sight.eyes, sight.points, sight.hit, strict=True):
+        away = points[hit] - eyes[hit]
         away /= np.linalg.norm(away, axis=-1, keepdims=True)
         found.append((points[hit][:, None] + steps[:, None] * away[:, None]).reshape(-1, 3))
     return _clouds(sight, found)

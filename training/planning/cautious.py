@@ -15,6 +15,7 @@ from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training.planning.beliefs import Sight, fitted_boxes, points_alone, thick_points
 from viapoint.training.planning.candidates import candidate_actions
@@ -48,9 +49,22 @@ def known(task: Task, sight: Sight, truth: Obstacles) -> Obstacles:
 
 def seen(task: Task, sight: Sight, truth: Obstacles) -> Obstacles:
     """Return those of the true obstacles that at least one ray meets."""
-    assert task.sensor is not None
-    hidden = task.sensor.hidden(sight.rotation, sight.origin, truth)
+    sensor = one_look(task, "seen")
+    hidden = sensor.hidden(sight.rotation, sight.origin, truth)
     return truth._replace(kind=np.where(hidden, ABSENT, truth.kind))
+
+
+def one_look(task: Task, name: str) -> Sensor:
+    """Return the sensor of a task for a method that needs its present look alone.
+
+    Raises:
+        ValueError: Other looks are remembered.
+    """
+    sensor = task.sensor
+    assert sensor is not None
+    if sensor.looks > 1:
+        raise ValueError(f"{name} needs a sensor with looks=1, got {sensor.looks}")
+    return sensor
 
 
 BELIEFS: dict[str, Callable[[Task, Sight, Obstacles], Obstacles]] = {
@@ -99,6 +113,7 @@ class CautiousSearch:
     """
 
     def __init__(self, task: Task, n_checks: int) -> None:
+        one_look(task, f"cautious{n_checks}")
         self.task, self.n_checks = task, n_checks
         self.name = f"cautious{n_checks}"
 

@@ -1,0 +1,202 @@
+"""Parts that viaq and viarank share: policies that rank candidate plans, and the algorithms that train them."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import check_for_correct_spaces, is_vectorized_observation
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
+
+from viapoint.envs.task import Task
+from viapoint.training.agents.agent import Agent
+from viapoint.training.config.checks import check_arguments
+
+Observation = Mapping[str, NDArray[Any]]
+Numbers = NDArray[np.floating[Any]]
+
+
+class PlanPolicy(BasePolicy):
+    """Policy without an actor: :meth:`decide` ranks candidate plans.
+
+    Args:
+        observation_space: Observation space of the environment.
+        action_space: Action space of the environment.
+        task: Task of the environment as plain values, see :meth:`viapoint.envs.task.Task.as_dict`.
+        own: Further arguments of the subclass, which become attributes.
+        optimizer_class: Optimizer of the network.
+        optimizer_kwargs: Its arguments.
+        **kwargs: Arguments of the base class.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        *,
+        task: Mapping[str, Any],
+        own: Mapping[str, Any],
+        optimizer_class: type[torch.optim.Optimizer],
+        optimizer_kwargs: dict[str, Any] | None,
+        **kwargs: Any,
+    ) -> None:
+        check_arguments(type(self), own)
+        super().__init__(
+            observation_space,
+            action_space,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            **kwargs,
+        )
+        self.task = Task.from_dict(task)
+        self._own = tuple(own)
+        for name, value in own.items():
+            setattr(self, name, value)
+
+    def _make_optimizer(self, network: torch.nn.Module, lr_schedule: Any) -> None:
+        """Create the optimizer of the network."""
+        self.optimizer = self.optimizer_class(
+            network.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {name: getattr(self, name) for name in self._own}
+        always = {"task": self.task.as_dict(), "lr_schedule": self._dummy_schedule}
+        return {**super()._get_constructor_parameters(), **own, **always}
+
+    @abstractmethod
+    def decide(self, observation: Observation) -> Numbers:
+        """Return the chosen actions, shape (B, m), for parts of B observations."""
+
+    def forward(self, observation: Any, deterministic: bool = True) -> Tensor:
+        """Return the chosen actions, shape (B, m)."""
+        return self._predict(observation, deterministic)
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
+        arrays = {name: each.cpu().numpy() for name, each in observation.items()}
+        return torch.as_tensor(self.decide(arrays), dtype=torch.float32, device=self.device)
+
+    def predict(self, observation: Any, state: Any = None, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """Return actions for one observation or a batch, and no state, as policies of Stable-Baselines3 do.
+
+        Raises:
+            ValueError: The observation has other parts or sizes than the observation space, or is not finite; in tasks
+                with whole movements, start and goal are the same; with a sensor, points are not on its rays.
+        """
+        if isinstance(observation, tuple):  # the base class explains the mistake
+            return super().predict(cast(Any, observation), state, *args, **kwargs)
+        parts: Any = self.observation_space
+        wanted = ", ".join(parts.spaces)
+        if not isinstance(observation, Mapping):
+            raise ValueError(f"observation must be a dict of {wanted}; got {type(observation).__name__}")
+        if observation.keys() != parts.spaces.keys():
+            got = ", ".join(map(str, observation))
+            raise ValueError(f"observation must have the parts {wanted}; got {got}")
+        for name, each in observation.items():
+            size = np.shape(each)[-1:]
+            if size != parts[name].shape:
+                raise ValueError(
+                    f"{name} must have {parts[name].shape[0]} values, as in training; got {size}"
+                )
+            if not np.isfinite(np.asarray(each)).all():
+                raise ValueError(f"observation must be finite; {name} is {np.asarray(each)}")
+        several = is_vectorized_observation(cast(Any, dict(observation)), parts)
+        batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
+        self._check_observation(batch)
+        actions = np.clip(self.decide(batch), -1.0, 1.0).astype(np.float32)
+        return (actions if several else actions[0]), state
+
+    def _check_observation(self, batch: Observation) -> None:
+        """Check what the values of a batch of observations mean.
+
+        Raises:
+            ValueError: Start and goal are the same.
+        """
+        here, there = ("joints", "goal_joints") if "goal_joints" in batch else ("hand", "goal")
+        apart = batch[here] != batch[there]
+        if self.task.whole_movement and not apart.any(axis=-1).all():
+            raise ValueError("start and goal must differ: no movement leads from a point to itself")
+
+
+class PlanAlgorithm(Agent, OffPolicyAlgorithm):
+    """Off-policy algorithm that trains a policy that ranks plans.
+
+    Args:
+        policy: Name or class of the policy.
+        env: Environment or vector environment of this package.
+        learning_rate: Learning rate, or a function of the remaining progress.
+        own: Names of attributes of the subclass that are hyperparameters.
+        policy_kwargs: Arguments of the policy; `env` provides the task.
+        _init_setup_model: False to set up the model later.
+        **kwargs: Arguments of the base class.
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        env: Any,
+        learning_rate: Any,
+        *,
+        own: tuple[str, ...],
+        policy_kwargs: dict[str, Any] | None,
+        _init_setup_model: bool,
+        **kwargs: Any,
+    ) -> None:
+        check_arguments(type(self), {name: getattr(self, name) for name in own})
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            policy_kwargs=dict(policy_kwargs or {}),
+            support_multi_env=True,
+            sde_support=False,
+            **kwargs,
+        )
+        if self.env is not None:
+            self.policy_kwargs.setdefault("task", self._task_of(self.env).as_dict())
+        if _init_setup_model:
+            self._setup_model()
+
+    @abstractmethod
+    def _task_of(self, env: VecEnv) -> Task:
+        """Return the task of an environment, if the algorithm is made for it; ValueError otherwise."""
+
+    @abstractmethod
+    def _check_task(self, mine: Task, theirs: Task) -> None:
+        """Check that the policy, which was made for one task, can decide in another; ValueError if not."""
+
+    def _check_env(self, env: VecEnv) -> None:
+        self._check_task(Task.from_dict(self.policy_kwargs["task"]), self._task_of(env))
+
+    def _setup_model(self) -> None:
+        if self.env is not None:
+            self._check_env(self.env)
+        super()._setup_model()
+        self.actor = self.policy
+
+    def set_env(self, env: Any, force_reset: bool = True) -> None:
+        """Set the training environment.
+
+        Raises:
+            ValueError: Spaces, or parts of the task that the policy needs, differ from those of the agent.
+        """
+        wrapped = self._wrap_env(env, self.verbose)
+        check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
+        self._check_env(wrapped)
+        super().set_env(wrapped, force_reset)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []
