@@ -13,8 +13,7 @@ from viapoint.envs.arms.chain import Chain
 from viapoint.envs.arms.kinematics import link_frames, tool_jacobian, transform
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, whole_number
-from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.kernels import kernel
+from viapoint.envs.geometry.compiled import compiled, kernel
 
 ITERATIONS = 80
 """Greatest number of iterations from one seed."""

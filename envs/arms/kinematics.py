@@ -13,8 +13,7 @@ import numpy as np
 from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.kernels import inlined, kernel
+from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 
 Vector = tuple[float, float, float]
 """Three components."""

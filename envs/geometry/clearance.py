@@ -15,9 +15,8 @@ import numpy as np
 from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.arms.kinematics import link_frames
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 from viapoint.envs.geometry.distance import point_distance
-from viapoint.envs.geometry.kernels import inlined, kernel
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 
 FAR = 1.0

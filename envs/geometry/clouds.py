@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.common.types import Float, Int
-from viapoint.envs.geometry.kernels import kernel
+from viapoint.envs.geometry.compiled import kernel
 
 LEAF = 16
 """Greatest number of points of a leaf of the tree."""

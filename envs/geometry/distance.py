@@ -9,8 +9,7 @@ import numpy as np
 
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.kernels import inlined
+from viapoint.envs.geometry.compiled import compiled, inlined
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.envs.geometry.shapes import Distance, Shape, as_obstacles, local_distance
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.common.types import Float, Int
-from viapoint.envs.geometry.kernels import kernel
+from viapoint.envs.geometry.compiled import kernel
 
 TINY = 1e-12
 """Length below which a vector has no direction, [m]."""

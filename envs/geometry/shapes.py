@@ -26,7 +26,7 @@ from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least
 from viapoint.envs.geometry.clouds import Clouds, build_cloud, cloud_distance, join_clouds
-from viapoint.envs.geometry.kernels import inlined, kernel
+from viapoint.envs.geometry.compiled import inlined, kernel
 from viapoint.envs.geometry.meshes import (
     Meshes,
     build_mesh,
