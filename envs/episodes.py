@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from viapoint.envs.arms.kinematics import slowdowns
 from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float, Int, Observation
 from viapoint.envs.events import NEVER, Event, EventPredictor
 from viapoint.envs.executor import Executor, Pieces
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
-from viapoint.envs.limits import slowdowns
 from viapoint.envs.outcome import SETTLING, Outcome, Rollout, straight_jerk_cost
 from viapoint.envs.plans import Motion, Movements, Plan, checked_plan, jerk_cost_between
 from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed

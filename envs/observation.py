@@ -117,7 +117,7 @@ class ObservationLayout:
             hand: Hand positions, shape (N, 3), [m].
             goal: Goals as joint positions, shape (N, J), [rad], and as hand positions, shape (N, 3), [m].
             obstacles: Obstacles at their present places.
-            command: References that the arms follow, in tasks in which decisions are made during a movement.
+            command: References that the arms follow, where decisions are made during a movement.
             time: Time since the start of each episode, shape (N,), [s].
             nominal: Plans of a zero action, in tasks with replanning.
         """

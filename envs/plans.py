@@ -331,12 +331,7 @@ class ActionLayout:
         return np.concatenate(parts, axis=-1)
 
     def shortest(self, waypoints: Float, shares: Float) -> Float:
-        """Return the shortest durations that keep the velocity limits of the joints, shape (...), [s].
-
-        Args:
-            waypoints: Shape (..., K + 2, D), [rad].
-            shares: Shares of the duration of the segments, shape (..., K + 1).
-        """
+        """Return the shortest durations that keep the velocity limits, (...), [s], for shares (..., K + 1)."""
         trajectory = primitives.through(waypoints, shares)
         velocity = trajectory(np.linspace(0.0, 1.0, PEAK_INSTANTS + 1)[1:-1], 1)
         relative = np.abs(velocity) / np.array(self.rate_limit)

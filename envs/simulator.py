@@ -128,13 +128,9 @@ class Simulator:
         return joints, contact, unstable
 
     def touches_between(self, sim: int, joints: Float, centres: Float, number: int) -> bool:
-        """Return True if there is a contact between two physics steps, at `number` states on a straight line.
+        """Return True if there is a contact at `number` states on a straight line between two physics steps.
 
-        Args:
-            sim: Index of the simulation.
-            joints: Joint positions at both steps, shape (2, J), [rad].
-            centres: Centres of the obstacles at both steps, shape (2, rows, 3), [m].
-            number: Number of states between the steps that are looked at.
+        Joint positions at both steps have the shape (2, J), and centres of the obstacles (2, rows, 3), [m].
         """
         if self._probe is None:
             model = copy.copy(self.model)

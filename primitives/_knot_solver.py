@@ -52,14 +52,7 @@ _SHORT, _LONG = 1e-3, 1e3
 
 
 def _solve_states(order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States) -> States:
-    """Return the states with every FREE derivative computed.
-
-    Args:
-        order: m.
-        durations: per segment, shapes that broadcast against the steps [s].
-        steps: per segment, the difference of its two points [m].
-        states: per knot, its m - 1 derivatives (see States).
-    """
+    """Return the states with every FREE derivative computed, from durations and steps of the segments."""
     nodes: Nodes = {}
     for k, state in enumerate(states):
         for i, value in enumerate(state):

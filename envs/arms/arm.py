@@ -110,12 +110,7 @@ class Arm:
         return forward(self.chain, joints)[0]
 
     def compile(self, n_obstacles: int, meshes: Sequence[str] = ()) -> mujoco.MjModel:
-        """Return the MuJoCo model of the arm with movable obstacles `obstacle_0`, `obstacle_1`, ...
-
-        Args:
-            n_obstacles: Number of obstacles.
-            meshes: Names of registered meshes that obstacles may be.
-        """
+        """Return the MuJoCo model of the arm with movable obstacles `obstacle_0`, ..., also registered meshes."""
         spec = mujoco.MjSpec.from_string(self.xml)
         _set_contacts(spec, self)
         _add_actuators(spec, self)
@@ -138,16 +133,11 @@ class Arm:
         return spec.compile()
 
     def controls(self, position: Float, velocity: Float, acceleration: Float, stride: int = 1) -> Float:
-        """Return controls of the actuators that track motions of the joints, shape (N, T, J).
+        """Return controls of the actuators that track motions of the joints at T physics steps, shape (N, T, J).
 
-        The torque of an actuator is control - stiffness * position - damping * velocity. So its control is the
-        torque of the motion, plus stiffness and damping times the references.
-
-        Args:
-            position: References of the joints at T physics steps, shape (N, T, J).
-            velocity: Their rates.
-            acceleration: Their accelerations.
-            stride: Steps between two computed torques; those in between are interpolated linearly.
+        The torque of an actuator is control - stiffness * position - damping * velocity. So its control is the torque
+        of the motion, plus stiffness and damping times the references. Torques are computed every `stride` steps; those
+        in between are interpolated linearly.
         """
         out = np.empty(position.shape)
         _controls(

@@ -68,17 +68,8 @@ def descend(
     """Move joints towards a target by damped least squares, and return the remaining error, 0 if it is reached.
 
     The step is J^T (J J^T + d^2 I)^-1 e for the error e of place and orientation, cut off at the limits of the joints
-    (Y. Nakamura and H. Hanafusa, Inverse kinematic solutions with singularity robustness, 1986).
-
-    Args:
-        chain: Chain of the arm.
-        joint_range: Ranges of the joints, shape (J, 2).
-        position: Target place of the tool, shape (3,), [m].
-        axes: Target axes of the tool as columns, shape (3, 3).
-        oriented: True if the axes matter.
-        joints: Joint positions, which are changed.
-        rotation: Memory for the axes of the links.
-        origin: Memory for the origins of the links.
+    (Y. Nakamura and H. Hanafusa, Inverse kinematic solutions with singularity robustness, 1986). Axes, shape (3, 3),
+    matter only if `oriented`; rotation and origin are memory for the frames of the links.
     """
     last = len(chain.mass)
     rows = 6 if oriented else 3

@@ -66,13 +66,7 @@ def cover(
 ) -> Cover:
     """Return spheres that contain all capsules, and the pairs of bodies that must not touch one another.
 
-    Args:
-        chain: Chain of the arm.
-        capsules: Collision geoms.
-        links: Link that each body moves with.
-        home: Joint positions at home, shape (J,).
-        touching: Pairs of bodies whose geoms are in contact at home.
-        exclude: Pairs that may pass through one another, with the reason.
+    Pairs that are in contact at home, `touching`, or named in `exclude` with the reason, may pass through one another.
 
     Raises:
         ValueError: Spheres of bodies that are apart at home overlap there, however small they are.

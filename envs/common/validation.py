@@ -69,14 +69,7 @@ def as_given(arguments: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def fewest_and_most(name: str, number: Any, most: int, most_drawn: int) -> tuple[int, int]:
-    """Return (fewest, most) from an exact number or such a pair.
-
-    Args:
-        name: Name of the argument for errors.
-        number: Number or pair.
-        most: Greatest allowed number.
-        most_drawn: Greatest allowed `fewest`.
-    """
+    """Return (fewest, most) from a number or such a pair; at most `most_drawn` and `most`."""
     try:
         fewest, greatest = (number, number) if is_whole(number) else number
     except (TypeError, ValueError):

@@ -243,10 +243,7 @@ def _are_apart(first: Float, i: int, second: Float, j: int, distance: float) -> 
 def travel(reach: Float, first: Float, second: Float) -> float:
     """Return a bound of the way of any sphere between two configurations of shape (J,), [m].
 
-    Args:
-        reach: Greatest distance of a sphere's centre from the axis of each joint, 1 for sliding joints, shape (J,).
-        first: Joint positions.
-        second: Joint positions a short time later.
+    `reach` is the greatest distance of a sphere's centre from the axis of each joint, 1 for sliding joints.
     """
     total = 0.0
     for joint in range(len(reach)):
@@ -353,15 +350,7 @@ def _move(reach: Float, first: Float, second: Float, drift: float, spheres: Sphe
 def configuration_clearances(
     chain: Chain, spheres: Spheres, configurations: Float, obstacles: Obstacles, times: Float
 ) -> Float:
-    """Return the clearance of N arms in N scenes from obstacles and from themselves, shape (N, 2), at most FAR, [m].
-
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        configurations: Joint positions, shape (N, J).
-        obstacles: Obstacles of N scenes.
-        times: Times at which the obstacles are looked at, shape (N,), [s].
-    """
+    """Return the clearance of N arms in N scenes from obstacles and from themselves, shape (N, 2), at most FAR, [m]."""
     placed = memory(chain, spheres)
     found = np.empty((len(configurations), 2))
     for scene in range(len(configurations)):

@@ -121,9 +121,7 @@ def _from_triangle(
 def build_mesh(vertices: Float, faces: Int | None) -> Meshes:
     """Return the convex mesh of vertices, shape (V, 3), [m], with the triangles of their hull.
 
-    Args:
-        vertices: Vertices.
-        faces: Triangles as indices of vertices, shape (F, 3), which must be closed and convex; None for the hull.
+    Given faces, shape (F, 3), must be closed and convex.
 
     Raises:
         ValueError: The vertices lie in a plane, or the mesh is open or not convex.
@@ -152,11 +150,9 @@ def _one_mesh(corners: Float, normals: Float) -> Meshes:
 
 
 def convex_hull(vertices: Float, coplanar: float = 0.0) -> Any:
-    """Return the :class:`scipy.spatial.ConvexHull` of vertices, as triangles.
+    """Return the :class:`scipy.spatial.ConvexHull` of vertices, shape (V, 3), as triangles.
 
-    Args:
-        vertices: Shape (V, 3), [m].
-        coplanar: Distance within which neighbouring faces have the same plane, as a share of the mesh's size.
+    Neighbouring faces within the distance `coplanar`, as a share of the size, have the same plane.
 
     Raises:
         ValueError: The vertices lie in a plane, or numbers are too large.

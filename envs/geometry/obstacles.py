@@ -123,13 +123,9 @@ class Obstacles(NamedTuple):
         return self._replace(meshes=join_meshes(meshes), clouds=join_clouds(clouds))
 
     def _merged(self, kind: int, new: Bool, before: list[Table], added: list[Table]) -> list[Table]:
-        """Return the different tables in use, and set the indices of the obstacles that refer to them.
+        """Return the different tables of a kind in use, and set the indices of the obstacles that refer to them.
 
-        Args:
-            kind: Number of the kind.
-            new: True for obstacles that refer to the added tables, shape (N, n).
-            before: Tables of the other obstacles.
-            added: Tables of the new ones.
+        Those that are `new`, shape (N, n), refer to the added tables.
         """
         rows = self.kind == kind
         number = self.size[rows][:, 0].astype(np.int64) + len(before) * new[rows]
@@ -259,12 +255,9 @@ def mesh_names(meshes: Meshes) -> list[str]:
 
 
 def bounding_boxes(obstacles: Obstacles) -> tuple[Float, Float]:
-    """Return centres in the world, and half lengths along the axes of the frames, of boxes around obstacles, [m].
+    """Return centres in the world and half lengths along the axes of boxes around obstacles, (N, n, 3) each, [m].
 
     The box of a half-space is a cube below the point of the surface that is nearest to the origin.
-
-    Returns:
-        Centres and half lengths, shape (N, n, 3) each.
     """
     kind, rotation = obstacles.kind, obstacles.rotation
     half = np.einsum("...i,...ij->...j", obstacles.size, BOXES[kind])

@@ -130,17 +130,8 @@ def local_distance(
 ) -> Distance:
     """Return the signed distance of a point in the frame of a shape, and its gradient.
 
-    Args:
-        kind: Number of the kind.
-        a: First size, see :attr:`Shape.packed_size`, [m].
-        b: Second size, [m].
-        c: Third size, [m].
-        meshes: Meshes of the scene.
-        clouds: Point clouds of the scene.
-        x: First coordinate of the point, [m].
-        y: Second coordinate, [m].
-        z: Third coordinate, [m].
-        limit: Distance beyond which any number between `limit` and the distance may be returned, [m].
+    The sizes a, b and c are those of :attr:`Shape.packed_size`. Beyond `limit`, any number between it and the distance
+    may be returned, [m].
     """
     if kind == SPHERE:
         found = sphere_distance(a, x, y, z)

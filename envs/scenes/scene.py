@@ -189,12 +189,7 @@ def row_clearances(
 ) -> tuple[Float, Float]:
     """Return the clearances of N arms from n obstacles at time 0, shape (N, n), and from themselves, shape (N,), [m].
 
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        joints: Joint positions, shape (N, J).
-        obstacles: Obstacles of N scenes.
-        most: Greatest clearance of interest, [m].
+    They are at most `most`.
     """
     placed = memory(chain, spheres)
     number, rows = obstacles.kind.shape

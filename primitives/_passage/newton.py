@@ -70,11 +70,7 @@ def fractions_by_newton(
 ) -> tuple[Floats, Any]:
     """Return fractions of the duration (N, S), from several starts if asked, and True where it converged (N,).
 
-    Args:
-        cost: of N movements.
-        guess: (S, N) durations to start from, NaN for none.
-        bound: (N,) lower bound of the cost, NaN for none.
-        several: True for several starts.
+    A guess (S, N) of the durations and a lower bound (N,) of the cost are NaN for none.
     """
     first, *others = _starts(cost, guess, several)
     best = _minimise(cost, first)
@@ -264,16 +260,9 @@ def solve_positive(matrix: Floats, right: Floats) -> Floats:
 def attach_gradient(
     fractions: Array, waypoints: Array, ends: list[Any], cost: PassageCost, xp: Namespace
 ) -> Array:
-    """Return the fractions (..., S), differentiable with respect to waypoints and boundary values.
+    """Return the fractions (..., S), differentiable with respect to waypoints and boundary values in unit time.
 
     Movements with a dropped via-point get the gradient zero.
-
-    Args:
-        fractions: in double precision.
-        waypoints: (..., S + 1, D), likewise.
-        ends: the four boundary values in unit time, (..., D) each, None or FREE.
-        cost: of the same movements.
-        xp: namespace.
     """
     segments = fractions.shape[-1]
     if segments == 1:
