@@ -11,7 +11,7 @@ import numpy as np
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.chain import Chain
 from viapoint.envs.arms.kinematics import link_frames, tool_jacobian, transform
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.compiled import compiled, kernel
 
@@ -192,10 +192,12 @@ def in_planar_reach(chain: Chain, limits: Float, x: float, y: float) -> bool:
 
 
 @compiled
-def _planar_joints(chain: Chain, joint_range: Float, places: Float, out: Float) -> None:
-    """Fill in the joints for N places."""
+def planar_solutions(chain: Chain, joint_range: Float, places: Float, joints: Float) -> Bool:
+    """Fill in the joints for places of the hand in the plane, (N, 2), [m], and return True where it gets there."""
+    found = np.empty(len(places), np.bool_)
     for i in range(len(places)):
-        solve_planar(chain, joint_range, places[i, 0], places[i, 1], out[i])
+        found[i] = solve_planar(chain, joint_range, places[i, 0], places[i, 1], joints[i])
+    return found
 
 
 @compiled
@@ -241,7 +243,7 @@ def planar_joints(arm: Arm, places: Any) -> Float:
     places = np.asarray(places, dtype=np.float64)
     flat = places.reshape(-1, 2)
     out = np.empty((len(flat), 2))
-    _planar_joints(arm.chain, arm.joint_range, flat, out)
+    planar_solutions(arm.chain, arm.joint_range, flat, out)
     return out.reshape(places.shape)
 
 

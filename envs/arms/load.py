@@ -223,7 +223,8 @@ def _load(
     exclude = dict.fromkeys(_excluded(parsed, urdf.never_touch), "excluded in the file")
     never = f"in contact in none of {NEAR_LOOKED_AT:,} configurations, though always near"
     pairs = parsed.compared(exclude)
-    drawn = np.random.default_rng(0).uniform(*ranges.T, (NEAR_LOOKED_AT, len(names)))
+    low, high = ranges.T
+    drawn = np.random.default_rng(0).uniform(low, high, (NEAR_LOOKED_AT, len(names)))
     looked_at = np.array([_distances(parsed, each, pairs) for each in drawn[:LOOKED_AT]])
     near = list(itertools.compress(pairs, np.median(looked_at, axis=0) < NEAR))
     apart = _apart(parsed, near, drawn)

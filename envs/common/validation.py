@@ -158,5 +158,7 @@ def _fits(shape: tuple[int, ...], allowed: tuple[Any, ...]) -> bool:
         shape = shape[max(len(shape) - len(allowed), 0) :]
     if len(shape) != len(allowed):
         return False
-    pairs = zip(shape, allowed, strict=True)
-    return all(size > 0 if wanted is None else size == wanted for size, wanted in pairs)
+    for size, wanted in zip(shape, allowed, strict=True):
+        if size != wanted and (wanted is not None or size == 0):
+            return False
+    return True

@@ -87,15 +87,7 @@ class Obstacles(NamedTuple):
     def take(self, scenes: Any) -> Obstacles:
         """Return some of the scenes, by indices, mask or slice."""
         scenes = np.arange(len(self.kind))[scenes]
-        return Obstacles(
-            self.kind[scenes],
-            self.centre[scenes],
-            self.rotation[scenes],
-            self.size[scenes],
-            self.velocity[scenes],
-            self.meshes,
-            self.clouds,
-        )
+        return Obstacles(*[part[scenes] for part in self[:5]], self.meshes, self.clouds)
 
     def with_rows(self, rows: int) -> Obstacles:
         """Return the obstacles with room for more of them in each scene."""

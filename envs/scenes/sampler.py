@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -224,8 +225,9 @@ class SceneSampler:
         for end in ENDS:
             if self.plane and end in given:
                 hand = (self.arm.hand(getattr(scenes, end)) - np.array(room.foot)) / room.scale
-                places = [(float(x), float(y)) for x, y, _ in hand]
-                rooms = [each._replace(**{end: place}) for each, place in zip(rooms, places, strict=True)]
+                for i, (x, y, _) in enumerate(hand.tolist()):
+                    place: dict[str, Any] = {end: (x, y)}
+                    rooms[i] = rooms[i]._replace(**place)
         return rooms
 
     def _change(

@@ -65,22 +65,14 @@ class Scenes(NamedTuple):
 
     def take(self, rows: Any) -> Scenes:
         """Return the scenes at `rows`, an index array, slice or mask."""
-        return Scenes(
-            self.start[rows],
-            self.goal[rows],
-            self.obstacles.take(rows),
-            self.jumps[rows],
-            self.turn_time[rows],
-            self.turn_velocity[rows],
-        )
+        start, goal, obstacles, *changes = self
+        return Scenes(start[rows], goal[rows], obstacles.take(rows), *[part[rows] for part in changes])
 
     def put(self, rows: Any, scenes: Scenes) -> Scenes:
         """Return the scenes after the ones at `rows` were overwritten in place; only tables of shapes are new."""
-        self.start[rows] = scenes.start
-        self.goal[rows] = scenes.goal
-        self.jumps[rows] = scenes.jumps
-        self.turn_time[rows] = scenes.turn_time
-        self.turn_velocity[rows] = scenes.turn_velocity
+        for mine, theirs in zip(self, scenes, strict=True):
+            if not isinstance(mine, Obstacles):
+                mine[rows] = theirs
         return self._replace(obstacles=self.obstacles.put(rows, scenes.obstacles))
 
     @classmethod
@@ -93,14 +85,11 @@ class Scenes(NamedTuple):
             last = first + len(part.start)
             obstacles = obstacles.put(slice(first, last), part.obstacles)
             first = last
-        return cls(
-            start=np.concatenate([part.start for part in parts]),
-            goal=np.concatenate([part.goal for part in parts]),
-            obstacles=obstacles,
-            jumps=np.concatenate([part.jumps for part in parts]),
-            turn_time=np.concatenate([part.turn_time for part in parts]),
-            turn_velocity=np.concatenate([part.turn_velocity for part in parts]),
-        )
+        arrays = {"obstacles": obstacles}
+        for name in cls._fields:
+            if name != "obstacles":
+                arrays[name] = np.concatenate([getattr(part, name) for part in parts])
+        return cls(**arrays)
 
     def as_dict(self) -> dict[str, Any]:
         """Return copies of all arrays in nested dictionaries, for :meth:`from_dict`."""
@@ -124,6 +113,8 @@ class Scenes(NamedTuple):
 
     def goals(self, time: Float) -> Float:
         """Return the targets, shape (N, J), at one time for each scene, shape (N,), [s]; a jump counts at once."""
+        if not self.jumps.any():
+            return self.goal
         number = (self.jump_times <= time[:, None] + ROUNDING).sum(axis=-1)
         targets = np.concatenate((self.goal[:, None], self.jumps[..., 1:]), axis=1)
         return np.asarray(targets[np.arange(len(targets)), number])
