@@ -12,7 +12,7 @@ import numpy as np
 
 from viapoint.envs.arms.chain import Chain, FirstTwo, Spheres
 from viapoint.envs.arms.kinematics import forward, inverse_dynamics
-from viapoint.envs.arms.spheres import Capsule, Cover, LeftOut, cover, touching_at_home
+from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, touching_at_home
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.clearance import memory, nearest_spheres, place
 from viapoint.envs.geometry.compiled import compiled
@@ -193,9 +193,16 @@ def arm_from_xml(
     mujoco.mj_comPos(model, data)
     bodies = [model.body(i).name for i in range(1, model.nbody) if model.body(i).name in links]
     touching = touching_at_home(model, data, bodies)
-    covered = cover(chain, capsules, links, home, touching, exclude or {})
+    names, spheres, left_out, excess = cover(chain, capsules, links, home, touching, exclude or {})
+    # Pairs that touch in none of many configurations are not compared, either.
     ranges = np.array([model.joint(each).range for each in joints])
-    covered = _without_distant_pairs(chain, covered, ranges)
+    low, high = ranges.T
+    drawn = np.random.default_rng(0).uniform(low, high, (COMPARED, len(ranges)))
+    touch = _touching(chain, spheres, drawn)
+    for first, second in spheres.pairs[~touch]:
+        reason = f"in contact in none of {COMPARED:,} configurations"
+        left_out.append(LeftOut(names[first], names[second], reason))
+    spheres = spheres._replace(pairs=spheres.pairs[touch])
     inertia = _greatest_inertia(model, data, tuple(joints))
     stiffness = inertia * bandwidth**2
     return Arm(
@@ -207,30 +214,16 @@ def arm_from_xml(
         torque_limit=np.array(torque_limit, dtype=np.float64),
         home=home,
         chain=chain,
-        spheres=covered.spheres,
-        group_names=covered.names,
-        left_out=covered.left_out,
-        excess=covered.excess,
-        reach=_reach(chain, covered.spheres, ranges),
+        spheres=spheres,
+        group_names=names,
+        left_out=tuple(left_out),
+        excess=excess,
+        reach=_reach(chain, spheres, ranges),
         stiffness=stiffness,
         damping=np.maximum(2.0 * inertia * bandwidth - chain.damping, 0.0),
         space=space,
         timestep=float(model.opt.timestep),
     )
-
-
-def _without_distant_pairs(chain: Chain, covered: Cover, ranges: Float) -> Cover:
-    """Return the spheres without the pairs of bodies that touch in none of many configurations."""
-    spheres, names = covered.spheres, covered.names
-    low, high = ranges.T
-    random = np.random.default_rng(0).uniform(low, high, (COMPARED, len(ranges)))
-    touching = _touching(chain, spheres, random)
-    left_out = [
-        LeftOut(names[first], names[second], f"in contact in none of {COMPARED:,} configurations")
-        for first, second in spheres.pairs[~touching]
-    ]
-    spheres = spheres._replace(pairs=spheres.pairs[touching])
-    return covered._replace(spheres=spheres, left_out=(*covered.left_out, *left_out))
 
 
 @compiled

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -141,12 +142,7 @@ def build_mesh(vertices: Float, faces: Int | None) -> Meshes:
     clockwise = (area * normals).sum(axis=1) < 0.0
     corners[clockwise] = corners[clockwise, ::-1]
     wide = np.linalg.norm(area, axis=1) > SLIVER * size**2
-    return _one_mesh(corners[wide], normals[wide])
-
-
-def _one_mesh(corners: Float, normals: Float) -> Meshes:
-    """Return packed arrays of one mesh."""
-    return Meshes(np.array([0, len(normals)]), corners, normals)
+    return Meshes(np.array([0, int(wide.sum())]), corners[wide], normals[wide])
 
 
 def convex_hull(vertices: Float, coplanar: float = 0.0) -> Any:
@@ -202,5 +198,8 @@ def join_meshes(meshes: Iterable[Meshes]) -> Meshes:
 
 def split_meshes(meshes: Meshes) -> list[Meshes]:
     """Return a record of its own for each mesh."""
-    parts = [slice(*ends) for ends in zip(meshes.first, meshes.first[1:], strict=False)]
-    return [_one_mesh(meshes.corners[part], meshes.normals[part]) for part in parts]
+    found = []
+    for first, last in itertools.pairwise(meshes.first):
+        part = slice(first, last)
+        found.append(Meshes(np.array([0, last - first]), meshes.corners[part], meshes.normals[part]))
+    return found
