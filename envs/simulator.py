@@ -87,14 +87,8 @@ class Simulator:
     ) -> tuple[Float, Bool, Bool]:
         """Run n simulations, in increasing order, each for its own number of steps, 1 to T.
 
-        All run for T steps. To `resume` later, each is set back to its state after its own steps.
-
-        Args:
-            sims: Indices of the simulations, shape (n,).
-            controls: Controls of the actuators, shape (n, T, U).
-            steps: Steps of each simulation, shape (n,).
-            centres: Centres of moving obstacles before each step, shape (n, T, rows, 3), [m]; None if all rest.
-            resume: True if the simulations go on afterwards.
+        All run for T steps with controls of shape (n, T, U), and centres of moving obstacles before each step, shape
+        (n, T, rows, 3), [m]. To `resume` later, each is set back to its state after its own steps.
 
         Returns:
             Joint positions after each step, shape (n, T, J), [rad]; True where there is a contact at the state before a

@@ -118,13 +118,8 @@ def least_cost_coefficients(
 ) -> Array:
     """Return the coefficients (..., 2m, S, D) of the least-cost trajectory through all waypoints at fixed times.
 
-    Args:
-        xp: namespace.
-        order: m.
-        waypoints: (..., S + 1, D) with the full batch shape [m].
-        durations: (..., S); may be shared by the batch. 0 is allowed between waypoints that are equal within
-            rounding; the via-points after such segments are dropped [s].
-        states: per knot, its derivatives (see States).
+    The waypoints (..., S + 1, D) have the full batch shape; durations (..., S) may be shared by the batch. They may be
+    0 between waypoints that are equal within rounding; the via-points after such segments are dropped.
     """
     segments, eps = durations.shape[-1], float(xp.finfo(durations.dtype).eps)
     if not _is_extreme(to_numpy(durations), eps).any():

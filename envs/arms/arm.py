@@ -166,19 +166,11 @@ def arm_from_xml(
     bandwidth: float = 50.0,
     exclude: Mapping[frozenset[str], str] | None = None,
 ) -> Arm:
-    """Return the arm of an MJCF text in which all collision geoms are capsules and spheres.
+    """Return the arm of an MJCF text without actuators, in which all collision geoms are capsules and spheres.
 
-    Args:
-        name: Name of the arm.
-        xml: MJCF text of the arm and its surroundings, without actuators.
-        joints: Names of its hinges and slides from the base to the tool; all other bodies move with one of them.
-        tool: Name of the site that is the tool.
-        home: Joint positions at home, shape (J,).
-        velocity_limit: Greatest velocities, shape (J,).
-        torque_limit: Greatest torques, shape (J,).
-        space: Space in which movements are planned.
-        bandwidth: Natural frequency of the critically damped joint servos, [rad/s].
-        exclude: Pairs of bodies that may pass through one another, with the reason.
+    The joints are hinges and slides from the base to the tool, which is a site; all other bodies move with one of them.
+    Pairs of bodies in `exclude` may pass through one another, with the reason. The servos of the joints are critically
+    damped; `bandwidth` is their natural frequency, [rad/s].
 
     Raises:
         ValueError: Bodies that are apart at home cannot be told apart.

@@ -99,10 +99,9 @@ def split(model: mujoco.MjModel, capsule: FittedCapsule) -> list[FittedCapsule]:
 
 
 def polytope_around(model: mujoco.MjModel, geom: int) -> tuple[Float, float]:
-    """Return the corners of a polytope that contains a geom, in the geom's frame, shape (n, 3), and its excess, [m].
+    """Return the corners, shape (n, 3), of a polytope that contains a geom, in the geom's frame, and its excess, [m].
 
-    The excess is an upper bound of the distance of the corners from the geom. It is 0 for boxes and the convex hulls of
-    meshes.
+    The excess bounds the distance of the corners from the geom. It is 0 for boxes and the convex hulls of meshes.
 
     Raises:
         ValueError: The geom is neither of these, nor a cylinder or an ellipsoid.

@@ -133,11 +133,8 @@ def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int
 def finite_array(name: str, values: Any, *shapes: tuple[Any, ...]) -> Float:
     """Return finite real numbers as an array of double precision; an array that is one already is not copied.
 
-    Args:
-        name: Name of the argument for errors.
-        values: Array or nested lists.
-        *shapes: Allowed shapes; None stands for any length but 0, and an ellipsis in front for any leading axes.
-            Without shapes, all are allowed.
+    In allowed shapes, None stands for any length but 0, and an ellipsis in front for any leading axes; without shapes,
+    all are allowed.
     """
     array = as_real_array(values)
     if array is None:

@@ -166,18 +166,10 @@ def obstacle_clearance(
     least: float,
     floor: float,
 ) -> float:
-    """Return the clearance of a placed arm from the obstacles of a scene, at most `least`, [m].
+    """Return the clearance of a placed arm from the obstacles of a scene at a time, at most `least`, [m].
 
-    The base does not count, as it may stand on an obstacle. The search stops at the first clearance below `floor`.
-
-    Args:
-        spheres: Spheres of the arm.
-        placed: Places of links and bounding balls, see :func:`place`.
-        obstacles: Obstacles of N scenes.
-        scene: Index of the scene.
-        time: Time at which the obstacles are looked at, [s].
-        least: Greatest clearance of interest, [m].
-        floor: Clearance below which the exact value does not matter, [m].
+    The base does not count, as it may stand on an obstacle. The search stops at the first clearance below `floor`: the
+    exact value below it does not matter.
     """
     for group in range(len(spheres.link)):
         if spheres.link[group] > 0:
@@ -276,19 +268,9 @@ def movement_clearance(
 ) -> tuple[float, float]:
     """Return the least clearance of T configurations from obstacles and from the arm itself, at most FAR each, [m].
 
-    The values are exact, but most configurations are skipped: after a clearance c of some spheres, none of them is
-    nearer than the least so far before they, and the obstacles, have moved by the difference.
-
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        reach: Reach of the joints, see :func:`travel`.
-        path: Configurations, shape (T, J).
-        obstacles: Obstacles of N scenes.
-        scene: Index of the scene.
-        begin: Time of the first configuration, [s].
-        step: Time between two configurations, [s].
-        placed: Memory of :func:`memory`.
+    The values are exact, but most configurations of the path, shape (T, J), are skipped: after a clearance c of some
+    spheres, none of them is nearer than the least so far before they, and the obstacles, have moved by the difference.
+    The path begins at the time `begin` and takes `step` from one configuration to the next, [s].
     """
     least, least_self = FAR, FAR
     drift = step * fastest(obstacles, scene)

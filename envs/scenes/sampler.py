@@ -68,19 +68,10 @@ ATTEMPTS, FAMILY_ATTEMPTS = 1000, 50
 class SceneSampler:
     """Sampler of scenes for an arm; a :class:`~viapoint.envs.task.Task` makes it of checked values.
 
-    Args:
-        arm: Arm.
-        space: Space in which the straight movement is straight: `hand` or `joints`.
-        n_obstacles: Fewest and most obstacles; furniture has as many as it needs.
-        kinds: Kinds that obstacles may have.
-        families: Names of families, drawn with equal chances; a repeated name is drawn more often.
-        rows: Rows for obstacles in the scenes, at least as many as are drawn.
-        tall: True if obstacles in the plane are in the way of the links, too.
-        jumps: Fewest and most jumps of the target.
-        moving: True if obstacles move.
-        durations: Shortest, centre and longest duration of a movement, [s]; in joint space relative to the shortest
-            duration of the straight movement that the velocity limits of the joints allow.
-        viewpoint: Place of a sensor, from which obstacles keep away, [m]; None for none.
+    Scenes have `rows` for obstacles, at least as many as are drawn; furniture has as many as it needs. Obstacles in the
+    plane are in the way of the links, too, if they are `tall`, and keep away from the place of a sensor, `viewpoint`,
+    [m]. The durations are the shortest, the centre and the longest of a movement, [s]; in joint space relative to the
+    shortest one of the straight movement that the velocity limits of the joints allow.
     """
 
     def __init__(

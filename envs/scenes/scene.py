@@ -198,11 +198,7 @@ def check_scenes(
 ) -> None:
     """Check that a movement can start and end in each scene, and its changes.
 
-    Args:
-        scenes: N scenes whose obstacles were made from shapes.
-        arm: Arm.
-        names: Names of the obstacles, for messages: one list for each scene.
-        ends: Ends that are looked at, `start` and `goal`; jumps are only checked together with both.
+    Names of the obstacles, a list for each scene, are for messages. Jumps are only checked together with both ends.
 
     Raises:
         ValueError: A scene is impossible; the message names the scene, the fault and what is allowed.
