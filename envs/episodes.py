@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from viapoint.envs.arms.kinematics import slowdowns
 from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float, Int, Observation
 from viapoint.envs.events import NEVER, Event, EventPredictor
 from viapoint.envs.executor import Executor, Pieces
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
-from viapoint.envs.limits import slowdowns
 from viapoint.envs.outcome import SETTLING, Outcome, Rollout, straight_jerk_cost
 from viapoint.envs.plans import Motion, Movements, Plan, checked_plan, jerk_cost_between
 from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed
@@ -98,7 +98,7 @@ class Episodes:
     @property
     def time(self) -> Float:
         """Time since the start of each episode, shape (n,), [s]."""
-        return self.executor.state.steps * self.simulator.timestep
+        return np.asarray(self.executor.state.steps * self.simulator.timestep)
 
     def start(self, rows: Int, scenes: Scenes, *, keep: bool = False) -> None:
         """Start episodes with the arms at rest at the start and the obstacles in place.
@@ -148,7 +148,7 @@ class Episodes:
         """Plans that a zero action leads to, and the present references."""
         since = (self.executor.state.steps - self._began) * self.simulator.timestep
         goal = self.goals(self.time)
-        return nominal_plan(self.task.action, self.plan, since, self.begun, self._start, goal)
+        return nominal_plan(self.task.action, self.plan, np.asarray(since), self.begun, self._start, goal)
 
     def observe(self) -> Observation:
         """Return the present observations."""
@@ -250,54 +250,60 @@ class Episodes:
         if not rows.size:
             return
         state, given = self.executor.state, plan
-        plan, stretch, within, inside = self._within_limits(plan.take(rows))
+        plan, movements, stretch, within, inside = self._within_limits(plan.take(rows))
         state.reachable[rows] &= inside
         adopted = within | ~self.begun[rows]
         rows, plan = rows[adopted], plan.take(adopted)
         state.stretch[rows] = np.maximum(state.stretch[rows], stretch[adopted])
         # Whole movements have any number of via-points.
         if given.waypoints.shape != self.plan.waypoints.shape:
-            self.plan = Plan(*(part.copy() for part in given))
+            self.plan = Plan(*[part.copy() for part in given])
+            self._movements = Movements.of(self.plan)
         put(self.plan, rows, plan)
-        self._movements = Movements.of(self.plan)
-        self.last_plan = Plan(*(part.copy() for part in self.plan))
+        put(self._movements, rows, take(movements, adopted))
+        self.last_plan = Plan(*[part.copy() for part in self.plan])
         self._began[rows] = state.steps[rows]
         self.begun[rows] = True
         for i, row in enumerate(rows):
             self.history[row].append((float(self.time[row]), plan.take([i])))
 
-    def _within_limits(self, plan: Plan) -> tuple[Plan, Float, Bool, Bool]:
+    def _within_limits(self, plan: Plan) -> tuple[Plan, Movements, Float, Bool, Bool]:
         """Return plans that are slow enough, with what they are like, shape (n,).
 
         Returns:
-            The plans; how much slower they are; True where they keep the limits; True where they stay within reach.
+            The plans; their movements; how much slower they are; True where they keep the limits; True where they stay
+            within reach.
         """
-        needed, inside = self._look_at(plan)
+        movements = Movements.of(plan)
+        needed, inside = self._look_at(movements)
         stretch = np.maximum(needed, 1.0)
         moving = ((plan.velocity != 0.0) | (plan.acceleration != 0.0)).any(axis=-1)
         stretch[moving] = np.minimum(stretch[moving], MOST_PROLONGED)
         slower = plan._replace(durations=plan.durations * stretch[:, None])
-        rows = np.flatnonzero(moving & (needed > ENOUGH))
+        movements = movements.stretched(stretch)
+        rows = changed = np.flatnonzero(moving & (needed > ENOUGH))
         for _ in range(PROLONGED):
             if not rows.size:
                 break
             state = Motion(plan.waypoints[rows, 0], plan.velocity[rows], plan.acceleration[rows])
             put(slower, rows, timed(plan.waypoints[rows], slower.duration[rows], state))
-            again, inside[rows] = self._look_at(slower.take(rows))
+            again, inside[rows] = self._look_at(Movements.of(slower.take(rows)))
             rows, again = rows[again > ENOUGH], np.minimum(again[again > ENOUGH], MOST_PROLONGED)
             stretch[rows] *= again
             slower.durations[rows] *= again[:, None]
         within = np.ones(len(stretch), bool)
         within[rows] = False
-        return slower, stretch, within, inside
+        if changed.size:
+            put(movements, changed, Movements.of(slower.take(changed)))
+        return slower, movements, stretch, within, inside
 
-    def _look_at(self, plan: Plan) -> tuple[Float, Bool]:
-        """Return how much slower plans must be to keep the arm's limits, and True within reach and joint ranges."""
+    def _look_at(self, movements: Movements) -> tuple[Float, Bool]:
+        """Return how much slower movements must be to keep the limits, and True within reach and joint ranges."""
         arm, space = self.task.arm, self.task.space
         share = np.linspace(0.0, 1.0, 2 * LIMIT_INSTANTS + 1)
-        motion = Movements.of(plan).sample(plan.duration[:, None] * share)
+        motion = movements.sample(movements.end * share)
         inside = np.asarray(space.inside(motion.position).all(axis=-1))
-        some = Motion(*(np.ascontiguousarray(part[:, ::2]) for part in motion))
+        some = Motion(*[np.ascontiguousarray(part[:, ::2]) for part in motion])
         needed = slowdowns(arm.chain, arm.velocity_limit, arm.torque_limit, *space.joint_motion(some))
         return needed, inside
 
@@ -313,21 +319,21 @@ class Episodes:
             turn = np.where(turns[rows] > now[:, None], turns[rows], NEVER).min(axis=1, initial=NEVER)
             steps = np.minimum(last[rows], turn) - now
             scenes = self.scenes.take(rows)
-            obstacles = scenes.obstacles_at(now * timestep)
-            goal = space.coordinates(scenes.goals((now + steps) * timestep))
+            obstacles = scenes.obstacles_at(np.asarray(now * timestep))
+            goal = space.coordinates(scenes.goals(np.asarray((now + steps) * timestep)))
             resume = not self.task.whole_movement
             self.executor.run(
                 rows, steps, obstacles, goal, self._references, resume=resume, moving=self._moving
             )
             movements, began = take(self._movements, rows), self._began[rows]
             done = state.steps[rows] - began
-            cost = jerk_cost_between(movements, (now - began) * timestep, done * timestep)
-            state.jerk_cost[rows] += cost
+            begin, end = np.asarray((now - began) * timestep), np.asarray(done * timestep)
+            state.jerk_cost[rows] += jerk_cost_between(movements, begin, end)
 
     def _references(self, rows: Int, number: int) -> Motion:
         """Return references of plans from now on, shape (n, T + 1, D) each."""
         since = (self.executor.state.steps - self._began)[rows]
-        times = self.simulator.timestep * (since[:, None] + np.arange(number + 1))
+        times = np.asarray(self.simulator.timestep * (since[:, None] + np.arange(number + 1)))
         return take(self._movements, rows).sample(times)
 
     # Decisions of one control step
@@ -420,8 +426,10 @@ class Episodes:
         """Return the length of the straight lines from target to target until a time for each episode, shape (n,)."""
         before = self.task.space.coordinates(self.scenes.goal)
         length = norm(before - self._start)
+        if not self.task.n_jumps[1]:
+            return length
         jumps, times = self.scenes.jumps, self.scenes.jump_times
-        for k in range(jumps.shape[1] if self.task.n_jumps[1] else 0):
+        for k in range(jumps.shape[1]):
             jumped = times[:, k] <= time + 1e-9
             target = self.task.space.coordinates(jumps[:, k, 1:])
             length = length + np.where(jumped, norm(target - before), 0.0)

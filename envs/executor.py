@@ -82,12 +82,12 @@ class Executor:
     ) -> None:
         """Execute references in n episodes and add what comes of it to their metrics.
 
-        An episode stops at its first contact.
+        An episode stops at its first contact. Obstacles keep their velocities.
 
         Args:
             rows: Episodes in increasing order, shape (n,).
             steps: Physics steps of each, 1 or more, shape (n,).
-            obstacles: Obstacles of these episodes, at their present places and with the velocities that they keep.
+            obstacles: Obstacles of these episodes at their present places.
             goal: Goals in coordinates of the space, shape (n, D).
             references: Function that returns the references.
             resume: True if the episodes may go on afterwards.
@@ -253,25 +253,10 @@ def _measure(
 ) -> Int:
     """Add executed segments to the metrics of n episodes, and return how many of their steps count, shape (n,).
 
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        reach: Reach of the joints.
-        joint_range: Ranges of the joints, shape (J, 2), [rad].
-        of_hand: True if references are of the hand, False if they are of the joints.
-        joints: Joint positions after each step, shape (n, T, J), [rad].
-        contact: True where there is a contact at the state before a step, shape (n, T).
-        planned: References before the first step and after each, shape (n, T + 1 or more, D).
-        path: Joint positions that belong to them, shape (n, T + 1 or more, J), [rad].
-        steps: Numbers of steps, shape (n,).
-        obstacles: Obstacles of n scenes.
-        timestep: Length of a step, [s].
-        goal: Goals, shape (n, D).
-        goal_tolerance: Greatest distance from the goal at rest.
-        rest_speed: Greatest speed at rest.
-        state: Metrics, which are changed.
-        rows: Indices of the episodes, shape (n,).
-        placed: Memory.
+    Joint positions after each step, (n, T, J), and contacts before it, (n, T), are those of the simulation. The
+    references, (n, T + 1 or more, D), and the joint positions that belong to them begin before the first step. Each
+    episode has its own number of steps. At rest, the arm is within the tolerance of its goal, shape (n, D), and slower
+    than `rest_speed`; the metrics in `state` are changed at `rows`.
     """
     found = np.empty_like(steps)
     for scene in range(len(rows)):

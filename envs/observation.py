@@ -117,15 +117,9 @@ class ObservationLayout:
     ) -> Observation:
         """Return observations of N environments in fresh arrays.
 
-        Args:
-            joints: Joint positions, shape (N, J), [rad].
-            hand: Hand positions, shape (N, 3), [m].
-            goal: Goals as joint positions, shape (N, J), [rad], and as hand positions, shape (N, 3), [m].
-            obstacles: Obstacles at their present places.
-            command: References that the arms follow, in tasks in which decisions are made during a movement.
-            time: Time since the start of each episode, shape (N,), [s].
-            nominal: Plans of a zero action, in tasks with replanning.
-            looks: Looks of the sensor so far; by default a first look is made.
+        Goals are joint positions, (N, J), [rad], and hand positions, (N, 3), [m]. References that the arms follow and
+        times since the starts of the episodes, (N,), [s], are needed where decisions are made during a movement, and
+        plans of a zero action in tasks with replanning. Without the looks of a sensor so far, a first look is made.
         """
         parts: dict[str, Any] = {
             "joints": joints,

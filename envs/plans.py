@@ -63,7 +63,7 @@ class Plan(NamedTuple):
 
     def take(self, rows: Any) -> Plan:
         """Return the movements at `rows`, an index, slice or mask of the batch."""
-        return Plan(*(None if part is None else part[rows] for part in self))
+        return Plan(*[part if part is None else part[rows] for part in self])
 
     def trajectory(self) -> primitives.Trajectory:
         """Return the minimum-jerk movement through the waypoints."""
@@ -107,7 +107,12 @@ class Movements(NamedTuple):
     def of(cls, plan: Plan) -> Movements:
         """Return the movements of a batch of plans."""
         found = plan.trajectory()
-        return cls(*(np.array(part) for part in (found.coefficients, found.starts, found.rates, found.end)))
+        return cls(*map(np.array, (found.coefficients, found.starts, found.rates, found.end)))
+
+    def stretched(self, factor: Float) -> Movements:
+        """Return movements that begin at rest with durations that are longer by a factor, shape (N,)."""
+        scale = factor[:, None]
+        return Movements(self.coefficients, self.starts * scale, self.rates / scale, self.end * scale)
 
     def sample(self, times: Float) -> Motion:
         """Return the states at times of shape (N, T), [s]; outside the movement, the arm rests at an end."""
@@ -331,12 +336,7 @@ class ActionLayout:
         return np.concatenate(parts, axis=-1)
 
     def shortest(self, waypoints: Float, shares: Float) -> Float:
-        """Return the shortest durations that keep the velocity limits of the joints, shape (...), [s].
-
-        Args:
-            waypoints: Shape (..., K + 2, D), [rad].
-            shares: Shares of the duration of the segments, shape (..., K + 1).
-        """
+        """Return the shortest durations that keep the velocity limits, (...), [s], for shares (..., K + 1)."""
         trajectory = primitives.through(waypoints, shares)
         velocity = trajectory(np.linspace(0.0, 1.0, PEAK_INSTANTS + 1)[1:-1], 1)
         relative = np.abs(velocity) / np.array(self.rate_limit)

@@ -109,15 +109,9 @@ def reward_terms(
     and the jerk cost J_0 and the duration T_0 of the straight movement of the zero action. With the default weights any
     success is worth more than any failure, and the duration T_0 is the best one of a straight movement.
 
-    Args:
-        before: Metrics before the decision.
-        after: Metrics after the decision.
-        first: True for the first decision of an episode, shape (N,).
-        ended: True if the episode ended, shape (N,).
-        length: Distance from start to goal, shape (N,), [m] or [rad].
-        zero_duration: Duration T_0, shape (N,), [s].
-        goal_unit: Distance u from the goal at which its term saturates, [m] or [rad].
-        weights: Weights of the terms.
+    Metrics are those before and after the decision, which is the `first` of an episode or not, and `ended` it or not.
+    The length is that from start to goal, [m] or [rad], and u, `goal_unit`, the distance at which the term of the goal
+    saturates.
     """
     later = ~first
     clearance = _bounded(after.planned_clearance) - later * _bounded(before.planned_clearance)

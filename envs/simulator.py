@@ -87,14 +87,8 @@ class Simulator:
     ) -> tuple[Float, Bool, Bool]:
         """Run n simulations, in increasing order, each for its own number of steps, 1 to T.
 
-        All run for T steps. To `resume` later, each is set back to its state after its own steps.
-
-        Args:
-            sims: Indices of the simulations, shape (n,).
-            controls: Controls of the actuators, shape (n, T, U).
-            steps: Steps of each simulation, shape (n,).
-            centres: Centres of moving obstacles before each step, shape (n, T, rows, 3), [m]; None if all rest.
-            resume: True if the simulations go on afterwards.
+        All run for T steps with controls of shape (n, T, U), and centres of moving obstacles before each step, shape
+        (n, T, rows, 3), [m]. To `resume` later, each is set back to its state after its own steps.
 
         Returns:
             Joint positions after each step, shape (n, T, J), [rad]; True where there is a contact at the state before a
@@ -128,13 +122,9 @@ class Simulator:
         return joints, contact, unstable
 
     def touches_between(self, sim: int, joints: Float, centres: Float, number: int) -> bool:
-        """Return True if there is a contact between two physics steps, at `number` states on a straight line.
+        """Return True if there is a contact at `number` states on a straight line between two physics steps.
 
-        Args:
-            sim: Index of the simulation.
-            joints: Joint positions at both steps, shape (2, J), [rad].
-            centres: Centres of the obstacles at both steps, shape (2, rows, 3), [m].
-            number: Number of states between the steps that are looked at.
+        Joint positions at both steps have the shape (2, J), and centres of the obstacles (2, rows, 3), [m].
         """
         if self._probe is None:
             model = copy.copy(self.model)

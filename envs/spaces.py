@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.chain import Chain
-from viapoint.envs.arms.inverse_kinematics import planar_joints, planar_motion, solve_planar
+from viapoint.envs.arms.inverse_kinematics import planar_joints, planar_motion, planar_solutions
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.plans import Motion, SpaceName
 
 REACH_TOLERANCE = 1e-9
@@ -74,17 +72,7 @@ class HandPlane:
         """Return True where the hand reaches the coordinates with joints within their ranges."""
         chain, limits = self.arm.chain, self.arm.joint_range + REACH_TOLERANCE * np.array([-1.0, 1.0])
         flat = np.ascontiguousarray(coordinates.reshape(-1, 2))
-        return np.asarray(_are_reached(chain, limits, flat).reshape(coordinates.shape[:-1]))
-
-
-@compiled
-def _are_reached(chain: Chain, joint_range: Float, places: Float) -> Bool:
-    """Return True for places of the hand of an arm in the plane, shape (N, 2), [m], that it reaches, shape (N,)."""
-    joints = np.empty(2)
-    found = np.empty(len(places), np.bool_)
-    for i in range(len(places)):
-        found[i] = solve_planar(chain, joint_range, places[i, 0], places[i, 1], joints)
-    return found
+        return planar_solutions(chain, limits, flat, np.empty_like(flat)).reshape(coordinates.shape[:-1])
 
 
 Space = JointSpace | HandPlane

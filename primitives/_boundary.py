@@ -56,7 +56,11 @@ def check_order(order: int, start_acceleration: Boundary, goal_acceleration: Bou
 
 def end_shapes(ends: Mapping[str, Boundary], dimension: int) -> dict[str, tuple[int, ...]]:
     """Return the leading shapes of the given boundary values; raise ValueError if a last axis is not D."""
-    return {name: leading_shape(name, value, dimension) for name, value in ends.items() if is_given(value)}
+    shapes = {}
+    for name, value in ends.items():
+        if value is not None and value is not FREE:
+            shapes[name] = leading_shape(name, value, dimension)
+    return shapes
 
 
 def waypoint_shapes(waypoints: Array, ends: Ends) -> dict[str, tuple[int, ...]]:

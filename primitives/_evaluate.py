@@ -127,14 +127,8 @@ def evaluate(
 ) -> list[Array]:
     """Return derivatives `orders` at `time`, each (..., T, D), written to `out` if that is given.
 
-    Args:
-        coefficients: (..., 2m, S, D).
-        starts: (..., S) with a batch shape that broadcasts against the coefficients' [s].
-        rates: (..., S), likewise [1/s].
-        time: (..., T), likewise.
-        orders: derivative orders, each below 2m.
-        out: buffers, one per order, of the full result shape.
-        xp: namespace.
+    All but the orders have leading shapes that broadcast: coefficients (..., 2m, S, D), starts and rates (..., S), time
+    (..., T).
     """
     powers, segments, dimension = coefficients.shape[-3:]
     weights = []

@@ -52,14 +52,7 @@ _SHORT, _LONG = 1e-3, 1e3
 
 
 def _solve_states(order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States) -> States:
-    """Return the states with every FREE derivative computed.
-
-    Args:
-        order: m.
-        durations: per segment, shapes that broadcast against the steps [s].
-        steps: per segment, the difference of its two points [m].
-        states: per knot, its m - 1 derivatives (see States).
-    """
+    """Return the states with every FREE derivative computed, from durations and steps of the segments."""
     nodes: Nodes = {}
     for k, state in enumerate(states):
         for i, value in enumerate(state):
@@ -125,13 +118,8 @@ def least_cost_coefficients(
 ) -> Array:
     """Return the coefficients (..., 2m, S, D) of the least-cost trajectory through all waypoints at fixed times.
 
-    Args:
-        xp: namespace.
-        order: m.
-        waypoints: (..., S + 1, D) with the full batch shape [m].
-        durations: (..., S); may be shared by the batch. 0 is allowed between waypoints that are equal within
-            rounding; the via-points after such segments are dropped [s].
-        states: per knot, its derivatives (see States).
+    The waypoints (..., S + 1, D) have the full batch shape; durations (..., S) may be shared by the batch. They may be
+    0 between waypoints that are equal within rounding; the via-points after such segments are dropped.
     """
     segments, eps = durations.shape[-1], float(xp.finfo(durations.dtype).eps)
     if not _is_extreme(to_numpy(durations), eps).any():

@@ -117,16 +117,8 @@ def fit_modes(
 ) -> tuple[Any, list[list[Array]]]:
     """Compute the FREE derivatives at the knots, and the modes r of each segment (Eq. 1), of N movements.
 
-    Args:
-        xp: namespace.
-        order: m.
-        lengths: (S, N) durations.
-        steps: (S, D, N) differences of neighbouring points.
-        states: per knot, its m - 1 derivatives: (D, N), None for zero, FREE.
-        slack: (N,), see Eq. 4.
-
-    Returns:
-        The states with every FREE replaced, and r_0 ... r_(m-1) per segment, (D, N) each.
+    Durations are (S, N), steps (S, D, N), derivatives at the knots (D, N), None for zero, or FREE; the slack (N,) is
+    that of Eq. 4. Returned are the states with every FREE replaced, and r_0 ... r_(m-1) per segment, (D, N) each.
     """
     origins = _origins(xp, lengths, steps, states)
     rows: list[list[_Row]] = []

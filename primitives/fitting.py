@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -130,24 +130,8 @@ class ViaPointFit:
         return self.trajectory(time - self.onset[..., None], nu)
 
 
-class _Recordings(NamedTuple):
-    """Measured movements, checked."""
-
-    movements: list[tuple[Floats, Floats]]
-    """Times (N,) [s] and positions (N, D) [m] of each movement."""
-    batch: tuple[int, ...]
-    """Leading shape of the results."""
-    kind: Array
-    """Array of the library and dtype that the results have."""
-
-
-class _Samples(NamedTuple):
-    """Samples of one movement in units of the recording."""
-
-    time: Floats
-    """Times from 0 to 1, shape (N,)."""
-    position: Floats
-    """Positions of mean 0 and size 1, shape (N, D)."""
+_Recordings: TypeAlias = tuple[list[tuple[Floats, Floats]], tuple[int, ...], Array]
+"""Times (N,) [s] and positions (N, D) [m] of each movement, leading shape of the results, an array of their kind."""
 
 
 class _Fit(NamedTuple):
@@ -204,12 +188,12 @@ def fit_via_points(
         ([[0.15, 0.2]], [0.5], 0.001)
     """
     counts = _counts(n_via)
-    recordings = _recordings(time, position, 2 * counts[-1] + 5)
+    movements, batch, kind = _recordings(time, position, 2 * counts[-1] + 5)
     fits = []
-    for times, positions in recordings.movements:
+    for times, positions in movements:
         candidates = [_fit(times, positions, count, free_ends) for count in counts]
         fits.append(min(candidates, key=lambda fit: fit.bic))
-    return _record(fits, recordings.batch, recordings.kind)
+    return _record(fits, batch, kind)
 
 
 def _counts(n_via: Any) -> range:
@@ -232,13 +216,15 @@ def _recordings(time: Any, position: Any, fewest: int) -> _Recordings:
     times = time if _is_list(time, 1) else [time] * len(position)
     if len(times) != len(position):
         raise ValueError(f"time must hold an array for each of {len(position)} movements, got {len(times)}")
-    parts = []
+    movements, kinds = [], []
     for i, (own_time, own_position) in enumerate(zip(times, position, strict=True)):
-        parts.append(_checked(f"time[{i}]", own_time, f"position[{i}]", own_position, fewest))
-    dimensions = sorted({part.kind.shape[-1] for part in parts})
+        own, _, kind = _checked(f"time[{i}]", own_time, f"position[{i}]", own_position, fewest)
+        movements += own
+        kinds.append(kind)
+    dimensions = sorted({kind.shape[-1] for kind in kinds})
     if len(dimensions) > 1:
         raise ValueError(f"position must hold movements of one dimension, got {dimensions}")
-    return _Recordings([part.movements[0] for part in parts], (len(parts),), parts[0].kind)
+    return movements, (len(kinds),), kinds[0]
 
 
 def _is_list(value: Any, axes: int = 2) -> bool:
@@ -275,7 +261,7 @@ def _checked(time_name: str, time: Any, name: str, position: Any, fewest: int) -
     require(ascending, time_name, times[:, 1:], "must ascend: sort the samples, and keep one of equal times")
     moves = np.ptp(places, axis=1).any(axis=-1)
     require(moves, name, 1.0 * moves, "must change: there is no movement in equal samples")
-    return _Recordings(list(zip(times, places, strict=True)), batch, position)
+    return list(zip(times, places, strict=True)), batch, position
 
 
 def _basis(knots: Floats, time: Floats) -> Floats:
@@ -321,31 +307,35 @@ def _theta(knots: Floats, free_ends: bool) -> Floats:
     return np.hstack([inner[:, :-1] - inner[:, -1:], outer[:, :-1] - outer[:, -1:]])
 
 
-def _residuals(knots: Floats, samples: _Samples) -> Floats:
+def _residuals(knots: Floats, time: Floats, position: Floats) -> Floats:
     """Return the residuals (M, N D) with the waypoints of least squares; large ones for knots outside the recording."""
-    basis, _ = np.linalg.qr(_basis(knots, samples.time))
-    residuals = samples.position - basis @ (basis.mT @ samples.position)
+    basis, _ = np.linalg.qr(_basis(knots, time))
+    residuals = position - basis @ (basis.mT @ position)
     # A segment without samples would leave a waypoint open.
     outside: Any = (knots[:, :-1] >= 1.0).any(axis=-1) | (knots[:, 1:] <= 0.0).any(axis=-1)
-    residuals = np.where(outside[:, None, None], 10.0 * samples.position, residuals)
+    residuals = np.where(outside[:, None, None], 10.0 * position, residuals)
     return residuals.reshape(len(knots), -1)
 
 
-def _expansion(theta: Floats, samples: _Samples, free_ends: bool) -> tuple[Floats, Floats, Floats]:
+def _expansion(
+    theta: Floats, time: Floats, position: Floats, free_ends: bool
+) -> tuple[Floats, Floats, Floats]:
     """Return half the squares (S,), their gradient (S, P) and the Gauss-Newton matrix (S, P, P) at theta (S, P)."""
     starts, count = theta.shape
     tried = theta[:, None] + _STEP * np.eye(count + 1, count, k=-1)  # the first row is theta itself
-    residuals = _residuals(_knots(tried.reshape(starts * (count + 1), count), free_ends), samples).reshape(
-        starts, count + 1, -1
-    )
+    residuals = _residuals(
+        _knots(tried.reshape(starts * (count + 1), count), free_ends), time, position
+    ).reshape(starts, count + 1, -1)
     base = residuals[:, :1]
     jacobian = (residuals[:, 1:] - base) / _STEP
     return 0.5 * (base * base).sum(axis=(1, 2)), (jacobian @ base.mT)[..., 0], jacobian @ jacobian.mT
 
 
-def _descend(theta: Floats, samples: _Samples, free_ends: bool, steps: int) -> tuple[Floats, Floats]:
+def _descend(
+    theta: Floats, time: Floats, position: Floats, free_ends: bool, steps: int
+) -> tuple[Floats, Floats]:
     """Return parameters (S, P) after steps of Levenberg and Marquardt, and half their squares (S,)."""
-    squares, gradient, matrix = _expansion(theta, samples, free_ends)
+    squares, gradient, matrix = _expansion(theta, time, position, free_ends)
     damping = np.full(len(theta), 1e-2)
     for _ in range(steps):
         size = damping * (np.trace(matrix, axis1=1, axis2=2) + _TINY)
@@ -355,7 +345,7 @@ def _descend(theta: Floats, samples: _Samples, free_ends: bool, steps: int) -> t
         if (gain <= _CONVERGED * squares + _TINY).all():
             break
         tried = theta + step
-        new = _expansion(tried, samples, free_ends)
+        new = _expansion(tried, time, position, free_ends)
         better = new[0] < squares
         theta = np.where(better[:, None], tried, theta)
         squares = np.where(better, new[0], squares)
@@ -365,10 +355,10 @@ def _descend(theta: Floats, samples: _Samples, free_ends: bool, steps: int) -> t
     return theta, squares
 
 
-def _moving_part(samples: _Samples) -> tuple[float, float]:
+def _moving_part(time: Floats, position: Floats) -> tuple[float, float]:
     """Return about where a movement begins and ends, from the speed of a smooth curve through all samples."""
-    knots = np.linspace(0.0, 1.0, min(12, len(samples.time) // 2))
-    points = np.linalg.lstsq(_basis(knots[None], samples.time)[0], samples.position)[0]
+    knots = np.linspace(0.0, 1.0, min(12, len(time) // 2))
+    points = np.linalg.lstsq(_basis(knots[None], time)[0], position)[0]
     speed = np.square(through(points, np.diff(knots)).sample(200, 1)[0]).sum(axis=-1)
     reached = np.cumsum(speed) / speed.sum()
     first, last = np.interp([_ENERGY, 1.0 - _ENERGY], reached, np.linspace(0.0, 1.0, 200))
@@ -377,15 +367,15 @@ def _moving_part(samples: _Samples) -> tuple[float, float]:
     return max(first - beyond, -most), min(last + beyond, 1.0 + most)
 
 
-def _starts(samples: _Samples, n_via: int, free_ends: bool) -> Floats:
+def _starts(time: Floats, position: Floats, n_via: int, free_ends: bool) -> Floats:
     """Return knots (S, K + 2) with passage times of a grid, those of least squares first."""
     grid = max(_GRID, n_via + 3)
     places = np.arange(1, grid + 1) / (grid + 1)
     chosen = list(combinations(places, n_via))
     inner = np.array([(0.0, *each, 1.0) for each in chosen])
-    spans = [(0.0, 1.0), _moving_part(samples)] if free_ends else [(0.0, 1.0)]
+    spans = [(0.0, 1.0), _moving_part(time, position)] if free_ends else [(0.0, 1.0)]
     knots = np.concatenate([onset + (end - onset) * inner for onset, end in spans])
-    squares = np.square(_residuals(knots, samples)).sum(axis=-1)
+    squares = np.square(_residuals(knots, time, position)).sum(axis=-1)
     return knots[np.argsort(squares, kind="stable")]
 
 
@@ -394,17 +384,17 @@ def _fit(time: Floats, position: Floats, n_via: int, free_ends: bool) -> _Fit:
     first, length = time[0], time[-1] - time[0]
     centre = position.mean(axis=0)
     size = math.sqrt(np.square(position - centre).sum(axis=-1).mean())
-    samples = _Samples((time - first) / length, (position - centre) / size)
+    samples = (time - first) / length, (position - centre) / size
     every = max(1, len(time) // _ENOUGH)
-    some = _Samples(samples.time[::every], samples.position[::every])
-    theta = _theta(_starts(some, n_via, free_ends), free_ends)
+    some = samples[0][::every], samples[1][::every]
+    theta = _theta(_starts(*some, n_via, free_ends), free_ends)
     for count, steps in _STAGES:
-        theta, squares = _descend(theta[:count], samples if count == 1 else some, free_ends, steps)
+        theta, squares = _descend(theta[:count], *(samples if count == 1 else some), free_ends, steps)
         theta = theta[np.argsort(squares, kind="stable")]
     knots = _knots(theta[0], free_ends)
-    basis = _basis(knots[None], samples.time)[0]
-    points = np.linalg.lstsq(basis, samples.position)[0]
-    residual = float(np.square(basis @ points - samples.position).sum())
+    basis = _basis(knots[None], samples[0])[0]
+    points = np.linalg.lstsq(basis, samples[1])[0]
+    residual = float(np.square(basis @ points - samples[1]).sum())
     count, parameters = position.size, points.size + n_via + 2 * free_ends
     variance = max(residual / count, _ROUNDING**2) * size**2
     return _Fit(

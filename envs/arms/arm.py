@@ -12,7 +12,7 @@ import numpy as np
 
 from viapoint.envs.arms.chain import Chain, FirstTwo, Spheres
 from viapoint.envs.arms.kinematics import forward, inverse_dynamics
-from viapoint.envs.arms.spheres import Capsule, Cover, LeftOut, cover, touching_at_home
+from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, touching_at_home
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.clearance import memory, nearest_spheres, place
 from viapoint.envs.geometry.compiled import compiled
@@ -110,12 +110,7 @@ class Arm:
         return forward(self.chain, joints)[0]
 
     def compile(self, n_obstacles: int, meshes: Sequence[str] = ()) -> mujoco.MjModel:
-        """Return the MuJoCo model of the arm with movable obstacles `obstacle_0`, `obstacle_1`, ...
-
-        Args:
-            n_obstacles: Number of obstacles.
-            meshes: Names of registered meshes that obstacles may be.
-        """
+        """Return the MuJoCo model of the arm with movable obstacles `obstacle_0`, ..., also registered meshes."""
         spec = mujoco.MjSpec.from_string(self.xml)
         _set_contacts(spec, self)
         _add_actuators(spec, self)
@@ -138,16 +133,11 @@ class Arm:
         return spec.compile()
 
     def controls(self, position: Float, velocity: Float, acceleration: Float, stride: int = 1) -> Float:
-        """Return controls of the actuators that track motions of the joints, shape (N, T, J).
+        """Return controls of the actuators that track motions of the joints at T physics steps, shape (N, T, J).
 
-        The torque of an actuator is control - stiffness * position - damping * velocity. So its control is the
-        torque of the motion, plus stiffness and damping times the references.
-
-        Args:
-            position: References of the joints at T physics steps, shape (N, T, J).
-            velocity: Their rates.
-            acceleration: Their accelerations.
-            stride: Steps between two computed torques; those in between are interpolated linearly.
+        The torque of an actuator is control - stiffness * position - damping * velocity. So its control is the torque
+        of the motion, plus stiffness and damping times the references. Torques are computed every `stride` steps; those
+        in between are interpolated linearly.
         """
         out = np.empty(position.shape)
         _controls(
@@ -176,19 +166,11 @@ def arm_from_xml(
     bandwidth: float = 50.0,
     exclude: Mapping[frozenset[str], str] | None = None,
 ) -> Arm:
-    """Return the arm of an MJCF text in which all collision geoms are capsules and spheres.
+    """Return the arm of an MJCF text without actuators, in which all collision geoms are capsules and spheres.
 
-    Args:
-        name: Name of the arm.
-        xml: MJCF text of the arm and its surroundings, without actuators.
-        joints: Names of its hinges and slides from the base to the tool; all other bodies move with one of them.
-        tool: Name of the site that is the tool.
-        home: Joint positions at home, shape (J,).
-        velocity_limit: Greatest velocities, shape (J,).
-        torque_limit: Greatest torques, shape (J,).
-        space: Space in which movements are planned.
-        bandwidth: Natural frequency of the critically damped joint servos, [rad/s].
-        exclude: Pairs of bodies that may pass through one another, with the reason.
+    The joints are hinges and slides from the base to the tool, which is a site; all other bodies move with one of them.
+    Pairs of bodies in `exclude` may pass through one another, with the reason. The servos of the joints are critically
+    damped; `bandwidth` is their natural frequency, [rad/s].
 
     Raises:
         ValueError: Bodies that are apart at home cannot be told apart.
@@ -203,9 +185,16 @@ def arm_from_xml(
     mujoco.mj_comPos(model, data)
     bodies = [model.body(i).name for i in range(1, model.nbody) if model.body(i).name in links]
     touching = touching_at_home(model, data, bodies)
-    covered = cover(chain, capsules, links, home, touching, exclude or {})
+    names, spheres, left_out, excess = cover(chain, capsules, links, home, touching, exclude or {})
+    # Pairs that touch in none of many configurations are not compared, either.
     ranges = np.array([model.joint(each).range for each in joints])
-    covered = _without_distant_pairs(chain, covered, ranges)
+    low, high = ranges.T
+    drawn = np.random.default_rng(0).uniform(low, high, (COMPARED, len(ranges)))
+    touch = _touching(chain, spheres, drawn)
+    for first, second in spheres.pairs[~touch]:
+        reason = f"in contact in none of {COMPARED:,} configurations"
+        left_out.append(LeftOut(names[first], names[second], reason))
+    spheres = spheres._replace(pairs=spheres.pairs[touch])
     inertia = _greatest_inertia(model, data, tuple(joints))
     stiffness = inertia * bandwidth**2
     return Arm(
@@ -217,30 +206,16 @@ def arm_from_xml(
         torque_limit=np.array(torque_limit, dtype=np.float64),
         home=home,
         chain=chain,
-        spheres=covered.spheres,
-        group_names=covered.names,
-        left_out=covered.left_out,
-        excess=covered.excess,
-        reach=_reach(chain, covered.spheres, ranges),
+        spheres=spheres,
+        group_names=names,
+        left_out=tuple(left_out),
+        excess=excess,
+        reach=_reach(chain, spheres, ranges),
         stiffness=stiffness,
         damping=np.maximum(2.0 * inertia * bandwidth - chain.damping, 0.0),
         space=space,
         timestep=float(model.opt.timestep),
     )
-
-
-def _without_distant_pairs(chain: Chain, covered: Cover, ranges: Float) -> Cover:
-    """Return the spheres without the pairs of bodies that touch in none of many configurations."""
-    spheres, names = covered.spheres, covered.names
-    low, high = ranges.T
-    random = np.random.default_rng(0).uniform(low, high, (COMPARED, len(ranges)))
-    touching = _touching(chain, spheres, random)
-    left_out = [
-        LeftOut(names[first], names[second], f"in contact in none of {COMPARED:,} configurations")
-        for first, second in spheres.pairs[~touching]
-    ]
-    spheres = spheres._replace(pairs=spheres.pairs[touching])
-    return covered._replace(spheres=spheres, left_out=(*covered.left_out, *left_out))
 
 
 @compiled

@@ -99,10 +99,9 @@ def split(model: mujoco.MjModel, capsule: FittedCapsule) -> list[FittedCapsule]:
 
 
 def polytope_around(model: mujoco.MjModel, geom: int) -> tuple[Float, float]:
-    """Return the corners of a polytope that contains a geom, in the geom's frame, shape (n, 3), and its excess, [m].
+    """Return the corners, shape (n, 3), of a polytope that contains a geom, in the geom's frame, and its excess, [m].
 
-    The excess is an upper bound of the distance of the corners from the geom. It is 0 for boxes and the convex hulls of
-    meshes.
+    The excess bounds the distance of the corners from the geom. It is 0 for boxes and the convex hulls of meshes.
 
     Raises:
         ValueError: The geom is neither of these, nor a cylinder or an ellipsoid.
@@ -191,15 +190,10 @@ def fit_capsule(corners: Float, body: Body, last_step: float = LAST_STEP) -> Fit
 def _refine(
     ends: Float, corners: Float, body: tuple[Float, Float], moves: Float, size: float, last_step: float
 ) -> float:
-    """Move ends to the least excess (1) near them, by a compass search, and return the excess without rounding.
+    """Move ends, shape (2, 3), to the least excess (1) near them, and return it without rounding.
 
-    Args:
-        ends: Ends of the axis, shape (2, 3), which are changed, [m].
-        corners: Points that the capsule contains, shape (n, 3), those far from the middle first, [m].
-        body: Outward normals of the faces of the body, shape (F, 3), and their distances from the origin, shape (F,).
-        moves: Directions of the search, shape (m, 2, 3).
-        size: Size of the body, [m].
-        last_step: Last step, as a share of the size.
+    It is a compass search for the corners of a capsule, those far from the middle first, in a body of normals and
+    offsets of its faces. The last step is a share of the size, [m].
     """
     probe, best = np.empty((2, 3)), np.empty((2, 3))
     step, least = FIRST_STEP * size, _excess(ends, corners, body, np.inf)

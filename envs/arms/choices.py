@@ -246,10 +246,7 @@ def choose_home(
 ) -> tuple[Float, str]:
     """Return the first configuration in which the arm does not touch itself, and where it comes from.
 
-    Args:
-        ranges: Ranges of the joints, shape (J, 2).
-        candidates: Configurations that are tried first, by their names.
-        apart: Function that returns the least distance of bodies that should not touch, [m].
+    Named candidates are tried first. `apart` returns the least distance of bodies that should not touch, [m].
     """
     low, high = ranges.T
     candidates = {**candidates, "the middle of the ranges": 0.5 * (low + high)}

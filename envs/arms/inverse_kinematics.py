@@ -11,10 +11,9 @@ import numpy as np
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.chain import Chain
 from viapoint.envs.arms.kinematics import link_frames, tool_jacobian, transform
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.common.validation import finite_array, whole_number
-from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.kernels import kernel
+from viapoint.envs.geometry.compiled import compiled, kernel
 
 ITERATIONS = 80
 """Greatest number of iterations from one seed."""
@@ -69,17 +68,8 @@ def descend(
     """Move joints towards a target by damped least squares, and return the remaining error, 0 if it is reached.
 
     The step is J^T (J J^T + d^2 I)^-1 e for the error e of place and orientation, cut off at the limits of the joints
-    (Y. Nakamura and H. Hanafusa, Inverse kinematic solutions with singularity robustness, 1986).
-
-    Args:
-        chain: Chain of the arm.
-        joint_range: Ranges of the joints, shape (J, 2).
-        position: Target place of the tool, shape (3,), [m].
-        axes: Target axes of the tool as columns, shape (3, 3).
-        oriented: True if the axes matter.
-        joints: Joint positions, which are changed.
-        rotation: Memory for the axes of the links.
-        origin: Memory for the origins of the links.
+    (Y. Nakamura and H. Hanafusa, Inverse kinematic solutions with singularity robustness, 1986). Axes, shape (3, 3),
+    matter only if `oriented`; rotation and origin are memory for the frames of the links.
     """
     last = len(chain.mass)
     rows = 6 if oriented else 3
@@ -202,10 +192,12 @@ def in_planar_reach(chain: Chain, limits: Float, x: float, y: float) -> bool:
 
 
 @compiled
-def _planar_joints(chain: Chain, joint_range: Float, places: Float, out: Float) -> None:
-    """Fill in the joints for N places."""
+def planar_solutions(chain: Chain, joint_range: Float, places: Float, joints: Float) -> Bool:
+    """Fill in the joints for places of the hand in the plane, (N, 2), [m], and return True where it gets there."""
+    found = np.empty(len(places), np.bool_)
     for i in range(len(places)):
-        solve_planar(chain, joint_range, places[i, 0], places[i, 1], out[i])
+        found[i] = solve_planar(chain, joint_range, places[i, 0], places[i, 1], joints[i])
+    return found
 
 
 @compiled
@@ -251,7 +243,7 @@ def planar_joints(arm: Arm, places: Any) -> Float:
     places = np.asarray(places, dtype=np.float64)
     flat = places.reshape(-1, 2)
     out = np.empty((len(flat), 2))
-    _planar_joints(arm.chain, arm.joint_range, flat, out)
+    planar_solutions(arm.chain, arm.joint_range, flat, out)
     return out.reshape(places.shape)
 
 

@@ -1,4 +1,4 @@
-"""Forward kinematics, Jacobians and inverse dynamics of a chain of joints.
+"""Forward kinematics, Jacobians, inverse dynamics and limits of movements of a chain of joints.
 
 Compiled functions work on one configuration and fill arrays of the caller. The functions at the end of the module are
 batched over leading axes; they check their arguments and return new arrays.
@@ -13,23 +13,21 @@ import numpy as np
 from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.kernels import inlined, kernel
+from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 
 Vector = tuple[float, float, float]
 """Three components."""
+LIMIT_SHARE = 0.97
+"""Share of the velocity and torque limits that plans may use; feedback uses the rest."""
+LEAST_TORQUE_SHARE = 0.01
+"""Least share of a joint's torque limit that counts as available for motion, however heavy the arm is."""
+TORQUE_STRIDE = 2
+"""Torques are looked at in every second configuration: they change slowly."""
 
 
 @kernel
 def link_frames(chain: Chain, joints: Float, rotation: Float, origin: Float) -> None:
-    """Fill the world frames of links 0 to J.
-
-    Args:
-        chain: Chain of J joints.
-        joints: Configuration, shape (J,), [rad] or [m].
-        rotation: Axes of the frames as columns, shape (J + 1, 3, 3).
-        origin: Origins of the frames, shape (J + 1, 3), [m].
-    """
+    """Fill the world frames of links 0 to J: axes as columns, (J + 1, 3, 3), and origins, (J + 1, 3), [m]."""
     for row in range(3):
         for column in range(3):
             rotation[0, row, column] = 0.0
@@ -178,13 +176,6 @@ def inverse_dynamics(chain: Chain, q: Float, v: Float, a: Float, torque: Float) 
     Recursive Newton-Euler algorithm in the frames of the links (J. Y. S. Luh, M. W. Walker and R. P. C. Paul, On-line
     computational scheme for mechanical manipulators, 1980), with gravity as an acceleration of the base, and with the
     inertia of the motors and viscous friction.
-
-    Args:
-        chain: Chain of J joints.
-        q: Configuration, shape (J,), [rad] or [m].
-        v: Velocities, shape (J,).
-        a: Accelerations, shape (J,).
-        torque: Result, shape (J,).
     """
     n_joints = q.shape[0]
     fixed = chain.rotation
@@ -248,6 +239,69 @@ def _product(matrix: Float, vector: Vector) -> Vector:
 
 
 @compiled
+def slowdown(
+    chain: Chain,
+    velocity_limit: Float,
+    torque_limit: Float,
+    position: Float,
+    velocity: Float,
+    acceleration: Float,
+) -> float:
+    """Return the factor by which a movement must be slower to keep the limits; less than 1 if it may be faster.
+
+    If all durations are multiplied by s, velocities become 1/s of what they were, and the torque of the motion becomes
+    a sum of a term with 1/s^2 and one with 1/s, the viscous friction. Gravity stays. So joint j needs
+
+        |v| / s <= share limit_v,    |m| / s^2 + |f| / s <= share limit_t - g,
+
+    with the torques m of inertia, f of friction, and g of gravity in the direction of the motion's torque. Positions,
+    velocities and accelerations have the shape (T, J); limits are infinite for none.
+    """
+    joints = position.shape[1]
+    least = 0.0
+    rest = np.zeros(joints)
+    heavy = np.empty(joints)
+    whole = np.empty(joints)
+    for k in range(len(position)):
+        for j in range(joints):
+            least = max(least, abs(velocity[k, j]) / (LIMIT_SHARE * velocity_limit[j]))
+        if k % TORQUE_STRIDE:
+            continue
+        inverse_dynamics(chain, position[k], rest, rest, heavy)
+        inverse_dynamics(chain, position[k], velocity[k], acceleration[k], whole)
+        for j in range(joints):
+            friction = chain.damping[j] * velocity[k, j]
+            motion = whole[j] - heavy[j] - friction
+            against = heavy[j] if motion + friction >= 0.0 else -heavy[j]
+            room = max(LIMIT_SHARE * torque_limit[j] - against, LEAST_TORQUE_SHARE * torque_limit[j])
+            if room > 1e9:
+                continue
+            friction = abs(friction)
+            # The positive root of room s^2 - |f| s - |m| = 0.
+            root = np.sqrt(friction * friction + 4.0 * room * abs(motion))
+            least = max(least, (friction + root) / (2.0 * room))
+    return least
+
+
+@compiled
+def slowdowns(
+    chain: Chain,
+    velocity_limit: Float,
+    torque_limit: Float,
+    position: Float,
+    velocity: Float,
+    acceleration: Float,
+) -> Float:
+    """Return :func:`slowdown` of N movements, with arrays of shape (N, T, J)."""
+    found = np.empty(len(position))
+    for row in range(len(position)):
+        found[row] = slowdown(
+            chain, velocity_limit, torque_limit, position[row], velocity[row], acceleration[row]
+        )
+    return found
+
+
+@compiled
 def _all_frames(chain: Chain, joints: Float, rotation: Float, origin: Float) -> None:
     for n in range(joints.shape[0]):
         link_frames(chain, joints[n], rotation[n], origin[n])
@@ -288,15 +342,7 @@ def _flat(name: str, chain: Chain, joints: Float) -> tuple[Float, tuple[int, ...
 
 
 def forward(chain: Chain, joints: Float) -> tuple[Float, Float]:
-    """Return the pose of the tool.
-
-    Args:
-        chain: Chain of J joints.
-        joints: Configurations, shape (..., J), [rad] or [m].
-
-    Returns:
-        Position of the tool, shape (..., 3), [m], and its axes as the columns of a matrix, shape (..., 3, 3).
-    """
+    """Return places of the tool, (..., 3), [m], and its axes as columns, (..., 3, 3), for joints (..., J)."""
     flat, batch = _flat("joints", chain, joints)
     position, rotation = np.empty((len(flat), 3)), np.empty((len(flat), 3, 3))
     _all_tools(chain, flat, rotation, position)
@@ -313,14 +359,7 @@ def link_poses(chain: Chain, joints: Float) -> tuple[Float, Float]:
 
 
 def torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
-    """Return the torques or forces of a motion by inverse dynamics, shape (..., J), [N m] or [N].
-
-    Args:
-        chain: Chain of J joints.
-        q: Configurations, shape (..., J), [rad] or [m].
-        v: Velocities of the same shape.
-        a: Accelerations of the same shape.
-    """
+    """Return the torques or forces of motions by inverse dynamics, shape (..., J), [N m] or [N]."""
     flat, batch = _flat("q", chain, q)
     rates, _ = _flat("v", chain, np.broadcast_to(v, np.shape(q)))
     accelerations, _ = _flat("a", chain, np.broadcast_to(a, np.shape(q)))

@@ -175,7 +175,7 @@ def load_arm(
     path = cached_path(whole, {**given, "name": name, "notes": notes, "urdf": urdf[2:]})
     arm = read_cached(path)
     if arm is None:
-        arm = _load(whole, name, f"{name} {spec.modelname}", urdf, notes, **given)
+        arm = _load(whole, name, f"{name} {spec.modelname}", urdf, notes, given)
         write_cached(path, arm)
     for note in arm.notes:
         if note.startswith(WARNING):
@@ -189,21 +189,13 @@ def _load(
     known_as: str,
     urdf: Urdf,
     notes: list[str],
-    *,
-    tool: Any,
-    joints: tuple[str, ...] | None,
-    base: str | None,
-    home: Any,
-    origin: Any,
-    joint_range: Any,
-    torque_limit: Any,
-    velocity_limit: Any,
-    tolerance: float,
+    given: Mapping[str, Any],
 ) -> Arm:
-    """Return the arm of a model; see :func:`load_arm`."""
-    chosen = choose_tool(whole, tool, base)
+    """Return the arm of a model and the given arguments; see :func:`load_arm`."""
+    base = given["base"]
+    chosen = choose_tool(whole, given["tool"], base)
     notes.insert(0, f"tool: {chosen.name!r}")
-    names = joints
+    names = given["joints"]
     if names is None:
         names = _joint_names(arm_joints(whole, chain_joints(whole, chosen.body, base), notes))
         notes.append(f"joints: {', '.join(names)}")
@@ -212,9 +204,9 @@ def _load(
     if missing:
         named = ", ".join(filter(None, there)) or "none"
         raise ValueError(f"there is no joint {', '.join(map(repr, missing))} in the file; there are: {named}")
-    ranges = _ranges(whole, names, joint_range, notes)
-    velocity = _velocities(whole, names, velocity_limit, urdf.velocity_limits, known_as, notes)
-    torque, stated = _torques(whole, names, torque_limit, known_as, notes)
+    ranges = _ranges(whole, names, given["joint_range"], notes)
+    velocity = _velocities(whole, names, given["velocity_limit"], urdf.velocity_limits, known_as, notes)
+    torque, stated = _torques(whole, names, given["torque_limit"], known_as, notes)
     for what, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
         if not (limit > 0.0).all():
             raise ValueError(f"{what} must be positive, got {limit}")
@@ -223,14 +215,16 @@ def _load(
     exclude = dict.fromkeys(_excluded(parsed, urdf.never_touch), "excluded in the file")
     never = f"in contact in none of {NEAR_LOOKED_AT:,} configurations, though always near"
     pairs = parsed.compared(exclude)
-    drawn = np.random.default_rng(0).uniform(ranges[:, 0], ranges[:, 1], (NEAR_LOOKED_AT, len(names)))
+    low, high = ranges.T
+    drawn = np.random.default_rng(0).uniform(low, high, (NEAR_LOOKED_AT, len(names)))
     looked_at = np.array([_distances(parsed, each, pairs) for each in drawn[:LOOKED_AT]])
     near = list(itertools.compress(pairs, np.median(looked_at, axis=0) < NEAR))
     apart = _apart(parsed, near, drawn)
     exclude |= dict.fromkeys(map(parsed.pair, apart), never)
     movable = itertools.compress(pairs, looked_at.max(axis=0) > 0.0)
-    home = _home(parsed, ranges, home, [pair for pair in movable if parsed.pair(pair) not in exclude], notes)
-    zero = np.zeros(3) if origin is None else finite_array("origin", origin, (3,))
+    kept = [pair for pair in movable if parsed.pair(pair) not in exclude]
+    home = _home(parsed, ranges, given["home"], kept, notes)
+    origin = np.zeros(3) if given["origin"] is None else finite_array("origin", given["origin"], (3,))
     # Bodies that are near at home get smaller capsules, or are not compared, either.
     pairs = parsed.compared(exclude)
     at_home = _distances(parsed, home, pairs)
@@ -240,10 +234,11 @@ def _load(
     for pair, away in zip(pairs, at_home.tolist(), strict=True):
         if away > 0.0 and parsed.pair(pair) not in exclude:
             distances[pair] = away
+    tolerance = given["tolerance"]
     tolerances = dict.fromkeys(parsed.geoms, tolerance)
     for pair in set(near) - set(apart):
         tolerances.update(dict.fromkeys(pair, min(FINE, tolerance)))
-    xml, excess = _fitted(parsed, ranges, zero, home, distances, tolerances)
+    xml, excess = _fitted(parsed, ranges, origin, home, distances, tolerances)
     arm = arm_from_xml(
         name,
         xml,
@@ -267,7 +262,9 @@ def _load(
             "hold; give torque_limit"
         )
         torque = np.where(weak, WEIGHTS * weight, torque)
-    endless = [name for name in names if joint_range is None and not whole.jnt_limited[whole.joint(name).id]]
+    endless = []
+    if given["joint_range"] is None:
+        endless = [each for each in names if not whole.jnt_limited[whole.joint(each).id]]
     return replace(
         arm,
         excess=arm.excess + excess,

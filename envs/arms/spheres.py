@@ -44,18 +44,6 @@ class LeftOut(NamedTuple):
     reason: str
 
 
-class Cover(NamedTuple):
-    """Spheres of an arm."""
-
-    spheres: Spheres
-    names: tuple[str, ...]
-    """Names of the groups: bodies of the model."""
-    left_out: tuple[LeftOut, ...]
-    """Pairs that are not compared."""
-    excess: float
-    """Greatest distance by which a sphere sticks out of a geom, [m]."""
-
-
 def cover(
     chain: Chain,
     capsules: Sequence[Capsule],
@@ -63,16 +51,10 @@ def cover(
     home: Float,
     touching: Collection[frozenset[str]],
     exclude: Mapping[frozenset[str], str],
-) -> Cover:
-    """Return spheres that contain all capsules, and the pairs of bodies that must not touch one another.
+) -> tuple[tuple[str, ...], Spheres, list[LeftOut], float]:
+    """Return groups of spheres that contain all capsules: names of bodies, spheres, pairs left out, and excess, [m].
 
-    Args:
-        chain: Chain of the arm.
-        capsules: Collision geoms.
-        links: Link that each body moves with.
-        home: Joint positions at home, shape (J,).
-        touching: Pairs of bodies whose geoms are in contact at home.
-        exclude: Pairs that may pass through one another, with the reason.
+    Pairs that are in contact at home, `touching`, or named in `exclude` with the reason, may pass through one another.
 
     Raises:
         ValueError: Spheres of bodies that are apart at home overlap there, however small they are.
@@ -85,7 +67,7 @@ def cover(
         centres = sphere_centres(chain, spheres, home)
         close = [(names[a], names[b]) for a, b in pairs if _least_distance(spheres, centres, a, b) <= 0.0]
         if not close:
-            return Cover(spheres, names, left_out, max(excess.values()))
+            return names, spheres, left_out, max(excess.values())
         for name in {name for pair in close for name in pair}:
             excess[name] *= SHRUNK
     raise ValueError(
@@ -121,7 +103,7 @@ def _pairs(
     links: dict[str, int],
     touching: Collection[frozenset[str]],
     exclude: Mapping[frozenset[str], str],
-) -> tuple[list[tuple[int, int]], tuple[LeftOut, ...]]:
+) -> tuple[list[tuple[int, int]], list[LeftOut]]:
     """Return the pairs of groups that are compared, and those of different links that are not."""
     pairs, left_out = [], []
     for (i, first), (j, second) in itertools.combinations(enumerate(names), 2):
@@ -137,7 +119,7 @@ def _pairs(
             left_out.append(LeftOut(first, second, "in contact at home"))
         else:
             pairs.append((i, j))
-    return pairs, tuple(left_out)
+    return pairs, left_out
 
 
 def _spheres(

@@ -14,8 +14,7 @@ Record = TypeVar("Record", bound=tuple[Any, ...])
 
 def take(record: Record, rows: Any) -> Record:
     """Return the rows of a named tuple of arrays, or of such tuples; `rows` is an index, slice or mask."""
-    parts = (take(part, rows) if isinstance(part, tuple) else part[rows] for part in record)
-    return type(record)(*parts)
+    return type(record)(*[take(part, rows) if isinstance(part, tuple) else part[rows] for part in record])
 
 
 def put(record: Record, rows: Any, others: Record) -> None:

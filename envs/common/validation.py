@@ -69,14 +69,7 @@ def as_given(arguments: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def fewest_and_most(name: str, number: Any, most: int, most_drawn: int) -> tuple[int, int]:
-    """Return (fewest, most) from an exact number or such a pair.
-
-    Args:
-        name: Name of the argument for errors.
-        number: Number or pair.
-        most: Greatest allowed number.
-        most_drawn: Greatest allowed `fewest`.
-    """
+    """Return (fewest, most) from a number or such a pair; at most `most_drawn` and `most`."""
     try:
         fewest, greatest = (number, number) if is_whole(number) else number
     except (TypeError, ValueError):
@@ -140,11 +133,8 @@ def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int
 def finite_array(name: str, values: Any, *shapes: tuple[Any, ...]) -> Float:
     """Return finite real numbers as an array of double precision; an array that is one already is not copied.
 
-    Args:
-        name: Name of the argument for errors.
-        values: Array or nested lists.
-        *shapes: Allowed shapes; None stands for any length but 0, and an ellipsis in front for any leading axes.
-            Without shapes, all are allowed.
+    In allowed shapes, None stands for any length but 0, and an ellipsis in front for any leading axes; without shapes,
+    all are allowed.
     """
     array = as_real_array(values)
     if array is None:
@@ -165,5 +155,7 @@ def _fits(shape: tuple[int, ...], allowed: tuple[Any, ...]) -> bool:
         shape = shape[max(len(shape) - len(allowed), 0) :]
     if len(shape) != len(allowed):
         return False
-    pairs = zip(shape, allowed, strict=True)
-    return all(size > 0 if wanted is None else size == wanted for size, wanted in pairs)
+    for size, wanted in zip(shape, allowed, strict=True):
+        if size != wanted and (wanted is not None or size == 0):
+            return False
+    return True

@@ -15,9 +15,8 @@ import numpy as np
 from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.arms.kinematics import link_frames
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 from viapoint.envs.geometry.distance import point_distance
-from viapoint.envs.geometry.kernels import inlined, kernel
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 
 FAR = 1.0
@@ -167,18 +166,10 @@ def obstacle_clearance(
     least: float,
     floor: float,
 ) -> float:
-    """Return the clearance of a placed arm from the obstacles of a scene, at most `least`, [m].
+    """Return the clearance of a placed arm from the obstacles of a scene at a time, at most `least`, [m].
 
-    The base does not count, as it may stand on an obstacle. The search stops at the first clearance below `floor`.
-
-    Args:
-        spheres: Spheres of the arm.
-        placed: Places of links and bounding balls, see :func:`place`.
-        obstacles: Obstacles of N scenes.
-        scene: Index of the scene.
-        time: Time at which the obstacles are looked at, [s].
-        least: Greatest clearance of interest, [m].
-        floor: Clearance below which the exact value does not matter, [m].
+    The base does not count, as it may stand on an obstacle. The search stops at the first clearance below `floor`: the
+    exact value below it does not matter.
     """
     for group in range(len(spheres.link)):
         if spheres.link[group] > 0:
@@ -244,10 +235,7 @@ def _are_apart(first: Float, i: int, second: Float, j: int, distance: float) -> 
 def travel(reach: Float, first: Float, second: Float) -> float:
     """Return a bound of the way of any sphere between two configurations of shape (J,), [m].
 
-    Args:
-        reach: Greatest distance of a sphere's centre from the axis of each joint, 1 for sliding joints, shape (J,).
-        first: Joint positions.
-        second: Joint positions a short time later.
+    `reach` is the greatest distance of a sphere's centre from the axis of each joint, 1 for sliding joints.
     """
     total = 0.0
     for joint in range(len(reach)):
@@ -280,19 +268,9 @@ def movement_clearance(
 ) -> tuple[float, float]:
     """Return the least clearance of T configurations from obstacles and from the arm itself, at most FAR each, [m].
 
-    The values are exact, but most configurations are skipped: after a clearance c of some spheres, none of them is
-    nearer than the least so far before they, and the obstacles, have moved by the difference.
-
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        reach: Reach of the joints, see :func:`travel`.
-        path: Configurations, shape (T, J).
-        obstacles: Obstacles of N scenes.
-        scene: Index of the scene.
-        begin: Time of the first configuration, [s].
-        step: Time between two configurations, [s].
-        placed: Memory of :func:`memory`.
+    The values are exact, but most configurations of the path, shape (T, J), are skipped: after a clearance c of some
+    spheres, none of them is nearer than the least so far before they, and the obstacles, have moved by the difference.
+    The path begins at the time `begin` and takes `step` from one configuration to the next, [s].
     """
     least, least_self = FAR, FAR
     drift = step * fastest(obstacles, scene)
@@ -354,15 +332,7 @@ def _move(reach: Float, first: Float, second: Float, drift: float, spheres: Sphe
 def configuration_clearances(
     chain: Chain, spheres: Spheres, configurations: Float, obstacles: Obstacles, times: Float
 ) -> Float:
-    """Return the clearance of N arms in N scenes from obstacles and from themselves, shape (N, 2), at most FAR, [m].
-
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        configurations: Joint positions, shape (N, J).
-        obstacles: Obstacles of N scenes.
-        times: Times at which the obstacles are looked at, shape (N,), [s].
-    """
+    """Return the clearance of N arms in N scenes from obstacles and from themselves, shape (N, 2), at most FAR, [m]."""
     placed = memory(chain, spheres)
     found = np.empty((len(configurations), 2))
     for scene in range(len(configurations)):

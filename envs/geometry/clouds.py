@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.common.types import Float, Int
-from viapoint.envs.geometry.kernels import kernel
+from viapoint.envs.geometry.compiled import kernel
 
 LEAF = 16
 """Greatest number of points of a leaf of the tree."""
@@ -123,12 +123,7 @@ def _box_square(boxes: Float, node: int, x: float, y: float, z: float) -> float:
 def build_cloud(points: Float, radius: float) -> Clouds:
     """Return a cloud with its tree from points, shape (K, 3), [m]."""
     points, boxes = _tree(points)
-    return _one_cloud(points, np.array([radius]), boxes)
-
-
-def _one_cloud(points: Float, radius: Float, boxes: Float) -> Clouds:
-    """Return packed arrays of one cloud."""
-    return Clouds(points, radius, np.array([0, len(points)]), np.array([0, len(boxes)]), boxes)
+    return Clouds(points, np.array([radius]), np.array([0, len(points)]), np.array([0, len(boxes)]), boxes)
 
 
 def _tree(points: Float) -> tuple[Float, Float]:
@@ -176,5 +171,6 @@ def split_clouds(clouds: Clouds) -> list[Clouds]:
     for i in range(len(clouds.radius)):
         points = clouds.points[clouds.first[i] : clouds.first[i + 1]]
         boxes = clouds.boxes[clouds.node[i] : clouds.node[i + 1]]
-        found.append(_one_cloud(points, clouds.radius[i : i + 1], boxes))
+        first, node = np.array([0, len(points)]), np.array([0, len(boxes)])
+        found.append(Clouds(points, clouds.radius[i : i + 1], first, node, boxes))
     return found

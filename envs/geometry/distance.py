@@ -9,8 +9,7 @@ import numpy as np
 
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.kernels import inlined
+from viapoint.envs.geometry.compiled import compiled, inlined
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.envs.geometry.shapes import Distance, Shape, as_obstacles, local_distance
 
@@ -30,15 +29,8 @@ def point_distance_and_normal(
 ) -> Distance:
     """Return the signed distance of a point from an obstacle, [m], and its gradient, the outward normal.
 
-    Args:
-        obstacles: Obstacles of N scenes.
-        scene: Index of the scene.
-        row: Index of the obstacle; absent ones are far away.
-        x: First coordinate of the point, [m].
-        y: Second coordinate, [m].
-        z: Third coordinate, [m].
-        time: Time since the obstacle was at its centre, [s].
-        limit: Distance beyond which any number between `limit` and the distance may be returned, [m].
+    The obstacle has moved for `time` since it was at its centre; absent ones are far away. Beyond `limit`, [m], any
+    number between it and the distance may be returned.
     """
     centre, velocity, size = obstacles.centre, obstacles.velocity, obstacles.size
     dx = x - centre[scene, row, 0] - time * velocity[scene, row, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.common.types import Float, Int
-from viapoint.envs.geometry.kernels import kernel
+from viapoint.envs.geometry.compiled import kernel
 
 TINY = 1e-12
 """Length below which a vector has no direction, [m]."""
@@ -121,9 +122,7 @@ def _from_triangle(
 def build_mesh(vertices: Float, faces: Int | None) -> Meshes:
     """Return the convex mesh of vertices, shape (V, 3), [m], with the triangles of their hull.
 
-    Args:
-        vertices: Vertices.
-        faces: Triangles as indices of vertices, shape (F, 3), which must be closed and convex; None for the hull.
+    Given faces, shape (F, 3), must be closed and convex.
 
     Raises:
         ValueError: The vertices lie in a plane, or the mesh is open or not convex.
@@ -143,20 +142,13 @@ def build_mesh(vertices: Float, faces: Int | None) -> Meshes:
     clockwise = (area * normals).sum(axis=1) < 0.0
     corners[clockwise] = corners[clockwise, ::-1]
     wide = np.linalg.norm(area, axis=1) > SLIVER * size**2
-    return _one_mesh(corners[wide], normals[wide])
-
-
-def _one_mesh(corners: Float, normals: Float) -> Meshes:
-    """Return packed arrays of one mesh."""
-    return Meshes(np.array([0, len(normals)]), corners, normals)
+    return Meshes(np.array([0, int(wide.sum())]), corners[wide], normals[wide])
 
 
 def convex_hull(vertices: Float, coplanar: float = 0.0) -> Any:
-    """Return the :class:`scipy.spatial.ConvexHull` of vertices, as triangles.
+    """Return the :class:`scipy.spatial.ConvexHull` of vertices, shape (V, 3), as triangles.
 
-    Args:
-        vertices: Shape (V, 3), [m].
-        coplanar: Distance within which neighbouring faces have the same plane, as a share of the mesh's size.
+    Neighbouring faces within the distance `coplanar`, as a share of the size, have the same plane.
 
     Raises:
         ValueError: The vertices lie in a plane, or numbers are too large.
@@ -206,5 +198,8 @@ def join_meshes(meshes: Iterable[Meshes]) -> Meshes:
 
 def split_meshes(meshes: Meshes) -> list[Meshes]:
     """Return a record of its own for each mesh."""
-    parts = [slice(*ends) for ends in zip(meshes.first, meshes.first[1:], strict=False)]
-    return [_one_mesh(meshes.corners[part], meshes.normals[part]) for part in parts]
+    found = []
+    for first, last in itertools.pairwise(meshes.first):
+        part = slice(first, last)
+        found.append(Meshes(np.array([0, last - first]), meshes.corners[part], meshes.normals[part]))
+    return found

@@ -87,15 +87,7 @@ class Obstacles(NamedTuple):
     def take(self, scenes: Any) -> Obstacles:
         """Return some of the scenes, by indices, mask or slice."""
         scenes = np.arange(len(self.kind))[scenes]
-        return Obstacles(
-            self.kind[scenes],
-            self.centre[scenes],
-            self.rotation[scenes],
-            self.size[scenes],
-            self.velocity[scenes],
-            self.meshes,
-            self.clouds,
-        )
+        return Obstacles(*[part[scenes] for part in self[:5]], self.meshes, self.clouds)
 
     def with_rows(self, rows: int) -> Obstacles:
         """Return the obstacles with room for more of them in each scene."""
@@ -123,13 +115,9 @@ class Obstacles(NamedTuple):
         return self._replace(meshes=join_meshes(meshes), clouds=join_clouds(clouds))
 
     def _merged(self, kind: int, new: Bool, before: list[Table], added: list[Table]) -> list[Table]:
-        """Return the different tables in use, and set the indices of the obstacles that refer to them.
+        """Return the different tables of a kind in use, and set the indices of the obstacles that refer to them.
 
-        Args:
-            kind: Number of the kind.
-            new: True for obstacles that refer to the added tables, shape (N, n).
-            before: Tables of the other obstacles.
-            added: Tables of the new ones.
+        Those that are `new`, shape (N, n), refer to the added tables.
         """
         rows = self.kind == kind
         number = self.size[rows][:, 0].astype(np.int64) + len(before) * new[rows]
@@ -259,12 +247,9 @@ def mesh_names(meshes: Meshes) -> list[str]:
 
 
 def bounding_boxes(obstacles: Obstacles) -> tuple[Float, Float]:
-    """Return centres in the world, and half lengths along the axes of the frames, of boxes around obstacles, [m].
+    """Return centres in the world and half lengths along the axes of boxes around obstacles, (N, n, 3) each, [m].
 
     The box of a half-space is a cube below the point of the surface that is nearest to the origin.
-
-    Returns:
-        Centres and half lengths, shape (N, n, 3) each.
     """
     kind, rotation = obstacles.kind, obstacles.rotation
     half = np.einsum("...i,...ij->...j", obstacles.size, BOXES[kind])

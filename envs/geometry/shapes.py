@@ -26,7 +26,7 @@ from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least
 from viapoint.envs.geometry.clouds import Clouds, build_cloud, cloud_distance, join_clouds
-from viapoint.envs.geometry.kernels import inlined, kernel
+from viapoint.envs.geometry.compiled import inlined, kernel
 from viapoint.envs.geometry.meshes import (
     Meshes,
     build_mesh,
@@ -130,17 +130,8 @@ def local_distance(
 ) -> Distance:
     """Return the signed distance of a point in the frame of a shape, and its gradient.
 
-    Args:
-        kind: Number of the kind.
-        a: First size, see :attr:`Shape.packed_size`, [m].
-        b: Second size, [m].
-        c: Third size, [m].
-        meshes: Meshes of the scene.
-        clouds: Point clouds of the scene.
-        x: First coordinate of the point, [m].
-        y: Second coordinate, [m].
-        z: Third coordinate, [m].
-        limit: Distance beyond which any number between `limit` and the distance may be returned, [m].
+    The sizes a, b and c are those of :attr:`Shape.packed_size`. Beyond `limit`, any number between it and the distance
+    may be returned, [m].
     """
     if kind == SPHERE:
         found = sphere_distance(a, x, y, z)

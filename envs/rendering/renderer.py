@@ -74,13 +74,10 @@ class EpisodeRenderer:
         self._view = self._screen = None
 
     def _draw(self, recorded: Recorded, step: int) -> Any:
-        """Return the picture of a step, or show it and return False after the window has been closed."""
-        view, screen = self._open()
-        view.write(picture_of(self._episodes.task, recorded, step))
-        return screen.draw()
+        """Return the picture of a step, or show it and return False after the window has been closed.
 
-    def _open(self) -> tuple[SceneView, Canvas | Window]:
-        """Return the scene view, and the canvas or window for it, which the first picture opens."""
+        The first picture opens the canvas or window.
+        """
         if self._view is None or self._screen is None:
             view = SceneView(self._episodes.simulator.single(), *self._size)
             if self._mode == "human":
@@ -90,7 +87,8 @@ class EpisodeRenderer:
                 self._screen = Canvas(view.model, *self._size, supersampling=factor)
             view.scene = self._screen.scene
             self._view = view
-        return self._view, self._screen
+        self._view.write(picture_of(self._episodes.task, recorded, step))
+        return self._screen.draw()
 
     def _play(self, recorded: Recorded, steps: Int) -> None:
         """Play the film in the window in real time; late frames are left out."""

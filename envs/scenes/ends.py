@@ -64,9 +64,10 @@ class Mover(NamedTuple):
     """Least length of the way from start to goal in joint space, [rad]."""
 
 
-class Attempts(NamedTuple):
-    """One attempt at each of N scenes: layouts as padded tables, and random numbers."""
+class Draft(NamedTuple):
+    """N scenes that are being drawn: one attempt at each, with a layout as padded tables, and memory."""
 
+    mover: Mover
     rows: Float
     """Obstacles of the layouts, shape (N, W, ROW)."""
     n_rows: Int
@@ -81,13 +82,6 @@ class Attempts(NamedTuple):
     """True for starts and goals that are given, shape (N, 2)."""
     numbers: Float
     """Uniform random numbers, shape (N, PAIRS, 2, :func:`numbers_of_end`)."""
-
-
-class Draft(NamedTuple):
-    """N scenes that are being drawn, and memory."""
-
-    mover: Mover
-    attempts: Attempts
     ends: Float
     """Starts and goals, shape (N, 2, J)."""
     obstacles: Obstacles
@@ -111,14 +105,13 @@ def numbers_of_end(joints: int) -> int:
 @compiled
 def draw_ends(draft: Draft, which: Int) -> Bool:
     """Draw starts and goals, and obstacles, of the scenes at K indices; return True for those that were found, (K,)."""
-    attempts = draft.attempts
     found = np.zeros(len(which), np.bool_)
     for k in range(len(which)):
         scene = which[k]
         # Places in the plane are points: another attempt would be the same one.
-        once = draft.mover.plane or (attempts.fixed[scene, 0] and attempts.fixed[scene, 1])
+        once = draft.mover.plane or (draft.fixed[scene, 0] and draft.fixed[scene, 1])
         for pair in range(1 if once else PAIRS):
-            if attempts.n_rows[scene] >= 0:
+            if draft.n_rows[scene] >= 0:
                 _unpack_rows(draft, scene)
             if _draw_pair(draft, scene, pair):
                 found[k] = True
@@ -129,11 +122,11 @@ def draw_ends(draft: Draft, which: Int) -> Bool:
 @compiled
 def _unpack_rows(draft: Draft, scene: int) -> None:
     """Put the obstacles of a layout into a scene, at rest; the rows behind them become absent."""
-    obstacles, rows = draft.obstacles, draft.attempts.rows[scene]
+    obstacles, rows = draft.obstacles, draft.rows[scene]
     for row in range(obstacles.kind.shape[1]):
         draft.turn_time[scene, row] = NEVER
         obstacles.kind[scene, row] = ABSENT
-        if row < draft.attempts.n_rows[scene]:
+        if row < draft.n_rows[scene]:
             obstacles.kind[scene, row] = int(rows[row, 0])
         for axis in range(3):
             draft.turn_velocity[scene, row, axis] = 0.0
@@ -147,16 +140,15 @@ def _unpack_rows(draft: Draft, scene: int) -> None:
 @compiled
 def _draw_pair(draft: Draft, scene: int, pair: int) -> bool:
     """Draw a start and a goal, and return True if they and the straight movement between them are as they must be."""
-    attempts = draft.attempts
-    start_given, goal_given = attempts.fixed[scene, 0], attempts.fixed[scene, 1]
+    start_given, goal_given = draft.fixed[scene, 0], draft.fixed[scene, 1]
     # The goal first: it is harder to find.
     if not goal_given and not _draw_end(draft, scene, pair, 1):
         return False
     if not start_given and not _draw_end(draft, scene, pair, 0):
         return False
     start, goal = draft.ends[scene, 0], draft.ends[scene, 1]
-    exchange = not start_given and not goal_given and attempts.n_places[scene, 0] == 0
-    if exchange and attempts.numbers[scene, pair, 0, 1] < EXCHANGED:
+    exchange = not start_given and not goal_given and draft.n_places[scene, 0] == 0
+    if exchange and draft.numbers[scene, pair, 0, 1] < EXCHANGED:
         for joint in range(len(start)):
             start[joint], goal[joint] = goal[joint], start[joint]
     way = 0.0
@@ -165,28 +157,28 @@ def _draw_pair(draft: Draft, scene: int, pair: int) -> bool:
     both_given = start_given and goal_given
     if not both_given and np.sqrt(way) < draft.mover.least_way:
         return False
-    drawn = attempts.n_rows[scene] >= 0
-    if drawn and (start_given or goal_given or attempts.keep[scene]) and not _make_room(draft, scene):
+    drawn = draft.n_rows[scene] >= 0
+    if drawn and (start_given or goal_given or draft.keep[scene]) and not _make_room(draft, scene):
         return False
     what = straight_movement(draft, scene)
     if what == FREE:
         # Given obstacles need not be in the way.
-        return bool(attempts.n_rows[scene] <= 0)
+        return bool(draft.n_rows[scene] <= 0)
     return what == BLOCKED or both_given
 
 
 @compiled
 def _draw_end(draft: Draft, scene: int, pair: int, end: int) -> bool:
     """Draw a start (end 0) or a goal (end 1), and return True if it is free."""
-    mover, attempts, joints = draft.mover, draft.attempts, draft.ends[scene, end]
-    numbers = attempts.numbers[scene, pair, end]
+    mover, joints = draft.mover, draft.ends[scene, end]
+    numbers = draft.numbers[scene, pair, end]
     size = len(joints)
     listed = end
     home, reaching = 0.0, 1.0 if mover.plane else 1.0 - FREE_GOALS
-    if end == 0 and attempts.n_places[scene, 0] == 0 and not mover.plane:
+    if end == 0 and draft.n_places[scene, 0] == 0 and not mover.plane:
         listed = 1
         home, reaching = HOME, REACHING
-    n_places = attempts.n_places[scene, listed]
+    n_places = draft.n_places[scene, listed]
     for k in range(1 if mover.plane else TRIES):
         first = 2 + k * (8 + size)
         for joint in range(size):
@@ -197,10 +189,10 @@ def _draw_end(draft: Draft, scene: int, pair: int, end: int) -> bool:
                 deviation = JITTER if numbers[first] < 0.5 else 0.0
                 joints[joint] = mover.home[joint] + deviation * (2.0 * seed - 1.0)
         if n_places > 0 and home <= numbers[0] < reaching:
-            there = attempts.places[scene, listed, int(numbers[first] * n_places)]
+            there = draft.places[scene, listed, int(numbers[first] * n_places)]
             if not _reach(draft, scene, there, numbers[first + 1 : first + 8], joints):
                 continue
-        if is_end(draft, joints) and (attempts.keep[scene] > 0 or _is_clear(draft, scene)):
+        if is_end(draft, joints) and (draft.keep[scene] > 0 or _is_clear(draft, scene)):
             return True
     return False
 
@@ -240,7 +232,7 @@ def _make_room(draft: Draft, scene: int) -> bool:
 
     If the obstacles of the layout belong together, none may touch an end.
     """
-    mover, obstacles, keep = draft.mover, draft.obstacles, draft.attempts.keep[scene]
+    mover, obstacles, keep = draft.mover, draft.obstacles, draft.keep[scene]
     place(mover.chain, mover.spheres, draft.ends[scene, 0], draft.at_start)
     place(mover.chain, mover.spheres, draft.ends[scene, 1], draft.at_goal)
     count = 0
@@ -332,7 +324,7 @@ def _reach(draft: Draft, scene: int, there: Float, numbers: Float, joints: Float
     if len(joints) < 6:
         return bool(descend(chain, limits, position, axes, False, joints, rotation, origin) == 0.0)
     _tool_axes(there[3:6], there[11], numbers[3:7], axes)
-    if draft.attempts.keep[scene] == 0 and not _is_hand_clear(draft, scene, position, axes):
+    if draft.keep[scene] == 0 and not _is_hand_clear(draft, scene, position, axes):
         return False
     return bool(descend(chain, limits, position, axes, True, joints, rotation, origin) == 0.0)
 

@@ -52,11 +52,9 @@ class Changes(NamedTuple):
     moving: bool
     """True if obstacles move."""
     shortest: float
-    """Shortest duration of movements, [s], in joint space relative to the shortest possible."""
+    """Shortest duration of movements, [s], in joint space relative to the shortest possible; then centre, longest."""
     centre: float
-    """Centre duration."""
     longest: float
-    """Longest duration."""
 
 
 def numbers_of_jumps(joints: int) -> int:
@@ -84,13 +82,9 @@ def time_unit(mover: Mover, start: Float, goal: Float) -> float:
 
 @compiled
 def draw_courses(draft: Draft, changes: Changes, which: Int, numbers: Float) -> None:
-    """Set the obstacles of some scenes in motion; half-spaces, and obstacles of which no course fits, stand still.
+    """Set the obstacles of the scenes at indices (K,) in motion, but half-spaces, and those of which no course fits.
 
-    Args:
-        draft: N scenes with W obstacles each.
-        changes: Distribution of changes.
-        which: Indices of the scenes, shape (K,).
-        numbers: Uniform random numbers, shape (K, W, CANDIDATES, COURSE_NUMBERS).
+    `numbers` are uniform random numbers, shape (K, W, CANDIDATES, COURSE_NUMBERS).
     """
     mover, obstacles = draft.mover, draft.obstacles
     for k in range(len(which)):
@@ -183,13 +177,9 @@ def clearance_at(draft: Draft, placed: Placed, scene: int, row: int, time: float
 
 @compiled
 def draw_jumps(draft: Draft, changes: Changes, which: Int, numbers: Float) -> Bool:
-    """Draw the jumps of the target of some scenes, and return True for scenes in which all of them fit, shape (K,).
+    """Draw the jumps of the target of the scenes at indices (K,), and return True where all of them fit, shape (K,).
 
-    Args:
-        draft: N scenes.
-        changes: Distribution of changes.
-        which: Indices of the scenes, shape (K,).
-        numbers: Uniform random numbers, shape (K, :func:`numbers_of_jumps`).
+    `numbers` are uniform random numbers, shape (K, :func:`numbers_of_jumps`).
     """
     joints = draft.ends.shape[2]
     each = 1 + CANDIDATES * (1 + joints)

@@ -25,7 +25,7 @@ from viapoint.envs.geometry.shapes import (
     obstacles_from_json,
 )
 from viapoint.envs.plans import SpaceName
-from viapoint.envs.scenes.sampler import VIEW_MARGIN, Given, SceneSampler
+from viapoint.envs.scenes.sampler import VIEW_MARGIN, SceneSampler
 from viapoint.envs.scenes.scene import (
     ENDS,
     MOST_JUMPS,
@@ -101,15 +101,8 @@ def draw_given(
         scenes = scenes._replace(turn_velocity=turns[..., 1:].copy())
     # What is wrong with the given parts is said before others are drawn around them.
     check_scenes(scenes, arm, names, tuple(ends))
-    parts = Given(
-        start=ends.get("start"),
-        goal=ends.get("goal"),
-        obstacles=None if shapes is None else obstacles,
-        jumps=scenes.jumps if "jumps" in options else None,
-        turns=(scenes.turn_time, scenes.turn_velocity) if "turns" in options else None,
-    )
     try:
-        drawn = sampler(generators, parts)
+        drawn = sampler(generators, scenes, options)
     except RuntimeError as error:
         raise ValueError(str(error)) from None
     check_scenes(drawn, arm, names)

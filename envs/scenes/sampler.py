@@ -7,8 +7,8 @@ straight movement between them is not. A scene depends on its own random generat
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Collection, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,14 +19,13 @@ from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import memory
 from viapoint.envs.geometry.distance import point_clearances
-from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
+from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.plans import SpaceName
 from viapoint.envs.scenes import families_plane, families_space
 from viapoint.envs.scenes.ends import (
     HOME_SHARE,
     PAIRS,
     SELF_MARGIN,
-    Attempts,
     Draft,
     Mover,
     draw_ends,
@@ -42,7 +41,7 @@ from viapoint.envs.scenes.motions import (
     draw_jumps,
     numbers_of_jumps,
 )
-from viapoint.envs.scenes.scene import Scenes, resting, row_clearances
+from viapoint.envs.scenes.scene import ENDS, NEVER, Scenes, resting, row_clearances
 
 LOW_HALF_HEIGHT, TALL_HALF_HEIGHT = 0.04, 0.3
 """Half heights of obstacles in the plane that the hand alone must clear, and that links must clear, too, [m]."""
@@ -66,37 +65,13 @@ ATTEMPTS, FAMILY_ATTEMPTS = 1000, 50
 """Layouts that are drawn for a scene at most, and layouts after which another family is tried."""
 
 
-class Given(NamedTuple):
-    """Parts of N scenes that are given and not drawn; None for those that are drawn."""
-
-    start: Float | None = None
-    """Joint positions, shape (N, J)."""
-    goal: Float | None = None
-    """Joint positions, shape (N, J)."""
-    obstacles: Obstacles | None = None
-    """Obstacles, with as many rows as the sampler's scenes."""
-    jumps: Float | None = None
-    """Jumps of the target, shape (N, MOST_JUMPS, J + 1)."""
-    turns: tuple[Float, Float] | None = None
-    """Times and velocities of changes of course, shape (N, n) and (N, n, 3)."""
-
-
 class SceneSampler:
     """Sampler of scenes for an arm; a :class:`~viapoint.envs.task.Task` makes it of checked values.
 
-    Args:
-        arm: Arm.
-        space: Space in which the straight movement is straight: `hand` or `joints`.
-        n_obstacles: Fewest and most obstacles; furniture has as many as it needs.
-        kinds: Kinds that obstacles may have.
-        families: Names of families, drawn with equal chances; a repeated name is drawn more often.
-        rows: Rows for obstacles in the scenes, at least as many as are drawn.
-        tall: True if obstacles in the plane are in the way of the links, too.
-        jumps: Fewest and most jumps of the target.
-        moving: True if obstacles move.
-        durations: Shortest, centre and longest duration of a movement, [s]; in joint space relative to the shortest
-            duration of the straight movement that the velocity limits of the joints allow.
-        viewpoint: Place of a sensor, from which obstacles keep away, [m]; None for none.
+    Scenes have `rows` for obstacles, at least as many as are drawn; furniture has as many as it needs. Obstacles in the
+    plane are in the way of the links, too, if they are `tall`, and keep away from the place of a sensor, `viewpoint`,
+    [m]. The durations are the shortest, the centre and the longest of a movement, [s]; in joint space relative to the
+    shortest one of the straight movement that the velocity limits of the joints allow.
     """
 
     def __init__(
@@ -127,29 +102,38 @@ class SceneSampler:
         self._width = max(most_rows(most), rows)
         self._memories = [memory(arm.chain, arm.spheres) for _ in range(3)]
 
-    def __call__(self, generators: Sequence[np.random.Generator], given: Given | None = None) -> Scenes:
+    def __call__(
+        self,
+        generators: Sequence[np.random.Generator],
+        scenes: Scenes | None = None,
+        given: Collection[str] = (),
+    ) -> Scenes:
         """Draw one scene from each of N random generators.
 
         Args:
             generators: N random generators.
-            given: Parts of the scenes that are not drawn.
+            scenes: Scenes with parts that are not drawn.
+            given: Names of these parts: `start`, `goal`, `obstacles`, `jumps`, `turns`.
 
         Raises:
             RuntimeError: No scene was found in many attempts.
         """
-        given = given or Given()
-        draft = self._draft(len(generators), given)
-        rooms = self._rooms(len(generators), given)
-        bare = self.room.most == 0 or given.obstacles is not None
+        number = len(generators)
+        if scenes is None:
+            home = np.tile(self.arm.home, (number, 1))
+            scenes = resting(home, home, no_obstacles(number, self.rows))
+        draft = self._draft(scenes, given)
+        rooms = self._rooms(scenes, given)
+        bare = self.room.most == 0 or "obstacles" in given
         builds = [self._bare if bare else self._any_family(rng) for rng in generators]
-        pending = np.arange(len(generators))
+        pending = np.arange(number)
         for attempt in range(ATTEMPTS):
             for i in map(int, pending):
                 rng = generators[i]
                 if attempt and attempt % FAMILY_ATTEMPTS == 0 and not bare:
                     builds[i] = self._any_family(rng)
-                self._write(draft.attempts, i, builds[i](rng, rooms[i]), given)
-                rng.random(out=draft.attempts.numbers[i])
+                _write(draft, i, builds[i](rng, rooms[i]))
+                rng.random(out=draft.numbers[i])
             found = draw_ends(draft, pending)
             if self.viewpoint is not None:
                 found &= point_clearances(draft.obstacles.take(pending), self.viewpoint) >= VIEW_MARGIN
@@ -163,33 +147,37 @@ class SceneSampler:
             "other families, or give other ends"
         )
 
-    def _draft(self, number: int, given: Given) -> Draft:
-        """Return N scenes with the given parts."""
-        width, joints = self._width, len(self.arm.home)
-        attempts = Attempts(
+    def _draft(self, scenes: Scenes, given: Collection[str]) -> Draft:
+        """Return scenes with the given parts."""
+        number, joints = scenes.start.shape
+        width, fixed = self._width, np.zeros((number, 2), np.bool_)
+        fixed[:, 0], fixed[:, 1] = "start" in given, "goal" in given
+        n_rows = np.full(number, -1)
+        if "obstacles" not in given:
+            n_rows[:] = 0
+            scenes = scenes._replace(
+                obstacles=no_obstacles(number, width),
+                turn_time=np.full((number, width), NEVER),
+                turn_velocity=np.zeros((number, width, 3)),
+            )
+        return Draft(
+            mover=self._mover,
             rows=np.zeros((number, width, ROW)),
-            n_rows=np.zeros(number, np.int64),
+            n_rows=n_rows,
             keep=np.zeros(number, np.int64),
             places=np.zeros((number, 2, MOST_PLACES, PLACE)),
             n_places=np.zeros((number, 2), np.int64),
-            fixed=np.zeros((number, 2), np.bool_),
+            fixed=fixed,
             numbers=np.zeros((number, PAIRS, 2, numbers_of_end(joints))),
+            ends=np.stack((scenes.start, scenes.goal), axis=1),
+            obstacles=scenes.obstacles,
+            turn_time=scenes.turn_time.copy(),
+            turn_velocity=scenes.turn_velocity.copy(),
+            jumps=scenes.jumps.copy(),
+            placed=self._memories[0],
+            at_start=self._memories[1],
+            at_goal=self._memories[2],
         )
-        ends = np.zeros((number, 2, joints))
-        for end, configurations in enumerate((given.start, given.goal)):
-            if configurations is not None:
-                ends[:, end] = configurations
-                attempts.fixed[:, end] = True
-        if given.obstacles is not None:
-            attempts.n_rows[:] = -1
-        obstacles = no_obstacles(number, width) if given.obstacles is None else given.obstacles
-        scenes = resting(ends[:, 0], ends[:, 1], obstacles)
-        if given.jumps is not None:
-            scenes.jumps[:] = given.jumps
-        if given.turns is not None:
-            scenes.turn_time[:], scenes.turn_velocity[:] = given.turns
-        changes = scenes.turn_time, scenes.turn_velocity, scenes.jumps
-        return Draft(self._mover, attempts, ends, obstacles, *changes, *self._memories)
 
     def _finished(self, draft: Draft) -> Scenes:
         """Return drawn scenes, without the rows for obstacles that were left out."""
@@ -219,44 +207,44 @@ class SceneSampler:
         """Return the function of a random family."""
         return self._builds[int(len(self._builds) * rng.random())]
 
-    def _rooms(self, number: int, given: Given) -> list[Room]:
+    def _rooms(self, scenes: Scenes, given: Collection[str]) -> list[Room]:
         """Return the room of each scene; in the plane it tells the ends that are given."""
-        room = self.room if given.obstacles is None else self.room._replace(fewest=0, most=0)
-        if not self.plane or (given.start is None and given.goal is None):
-            return [room] * number
-        ends: list[list[Any]] = []
-        for joints in (given.start, given.goal):
-            if joints is None:
-                ends.append([None] * number)
-                continue
-            hand = (self.arm.hand(joints) - np.array(room.foot)) / room.scale
-            ends.append([(float(x), float(y)) for x, y, _ in hand])
-        return [room._replace(start=start, goal=goal) for start, goal in zip(*ends, strict=True)]
-
-    def _write(self, attempts: Attempts, scene: int, layout: Layout, given: Given) -> None:
-        """Write a layout into the tables of attempts."""
-        rows, starts, goals, keep = layout.rows, layout.starts, layout.goals, layout.keep
-        attempts.keep[scene] = keep
-        if given.obstacles is None:
-            attempts.n_rows[scene] = len(rows) // ROW
-            attempts.rows[scene].reshape(-1)[: len(rows)] = rows
-        for end, places in enumerate((starts, goals)):
-            attempts.places[scene, end].reshape(-1)[: len(places)] = places
-            attempts.n_places[scene, end] = len(places) // PLACE
+        room = self.room
+        if "obstacles" in given:
+            room = room._replace(fewest=0, most=0)
+        rooms = [room] * len(scenes.start)
+        for end in ENDS:
+            if self.plane and end in given:
+                hand = (self.arm.hand(getattr(scenes, end)) - np.array(room.foot)) / room.scale
+                for i, (x, y, _) in enumerate(hand.tolist()):
+                    place: dict[str, Any] = {end: (x, y)}
+                    rooms[i] = rooms[i]._replace(**place)
+        return rooms
 
     def _change(
-        self, draft: Draft, which: Int, generators: Sequence[np.random.Generator], given: Given
+        self, draft: Draft, which: Int, generators: Sequence[np.random.Generator], given: Collection[str]
     ) -> Bool:
         """Draw the changes of K scenes, and return True for those in which they fit, shape (K,)."""
 
         def numbers(*shape: int) -> Float:
             return np.array([generators[scene].random(shape) for scene in which]).reshape(-1, *shape)
 
-        if self.changes.moving and given.obstacles is None:
+        if self.changes.moving and "obstacles" not in given:
             draw_courses(draft, self.changes, which, numbers(self._width, CANDIDATES, COURSE_NUMBERS))
-        if self.changes.most_jumps == 0 or given.jumps is not None:
+        if self.changes.most_jumps == 0 or "jumps" in given:
             return np.ones(len(which), bool)
         return draw_jumps(draft, self.changes, which, numbers(numbers_of_jumps(len(self.arm.home))))
+
+
+def _write(draft: Draft, scene: int, layout: Layout) -> None:
+    """Write a layout into the tables of a scene."""
+    draft.keep[scene] = layout.keep
+    if draft.n_rows[scene] >= 0:
+        draft.n_rows[scene] = len(layout.rows) // ROW
+        draft.rows[scene].reshape(-1)[: len(layout.rows)] = layout.rows
+    for end, places in enumerate((layout.starts, layout.goals)):
+        draft.places[scene, end].reshape(-1)[: len(places)] = places
+        draft.n_places[scene, end] = len(places) // PLACE
 
 
 def is_planar(arm: Arm) -> bool:

@@ -65,22 +65,14 @@ class Scenes(NamedTuple):
 
     def take(self, rows: Any) -> Scenes:
         """Return the scenes at `rows`, an index array, slice or mask."""
-        return Scenes(
-            self.start[rows],
-            self.goal[rows],
-            self.obstacles.take(rows),
-            self.jumps[rows],
-            self.turn_time[rows],
-            self.turn_velocity[rows],
-        )
+        start, goal, obstacles, *changes = self
+        return Scenes(start[rows], goal[rows], obstacles.take(rows), *[part[rows] for part in changes])
 
     def put(self, rows: Any, scenes: Scenes) -> Scenes:
         """Return the scenes after the ones at `rows` were overwritten in place; only tables of shapes are new."""
-        self.start[rows] = scenes.start
-        self.goal[rows] = scenes.goal
-        self.jumps[rows] = scenes.jumps
-        self.turn_time[rows] = scenes.turn_time
-        self.turn_velocity[rows] = scenes.turn_velocity
+        for mine, theirs in zip(self, scenes, strict=True):
+            if not isinstance(mine, Obstacles):
+                mine[rows] = theirs
         return self._replace(obstacles=self.obstacles.put(rows, scenes.obstacles))
 
     @classmethod
@@ -93,14 +85,11 @@ class Scenes(NamedTuple):
             last = first + len(part.start)
             obstacles = obstacles.put(slice(first, last), part.obstacles)
             first = last
-        return cls(
-            start=np.concatenate([part.start for part in parts]),
-            goal=np.concatenate([part.goal for part in parts]),
-            obstacles=obstacles,
-            jumps=np.concatenate([part.jumps for part in parts]),
-            turn_time=np.concatenate([part.turn_time for part in parts]),
-            turn_velocity=np.concatenate([part.turn_velocity for part in parts]),
-        )
+        arrays = {"obstacles": obstacles}
+        for name in cls._fields:
+            if name != "obstacles":
+                arrays[name] = np.concatenate([getattr(part, name) for part in parts])
+        return cls(**arrays)
 
     def as_dict(self) -> dict[str, Any]:
         """Return copies of all arrays in nested dictionaries, for :meth:`from_dict`."""
@@ -124,6 +113,8 @@ class Scenes(NamedTuple):
 
     def goals(self, time: Float) -> Float:
         """Return the targets, shape (N, J), at one time for each scene, shape (N,), [s]; a jump counts at once."""
+        if not self.jumps.any():
+            return self.goal
         number = (self.jump_times <= time[:, None] + ROUNDING).sum(axis=-1)
         targets = np.concatenate((self.goal[:, None], self.jumps[..., 1:]), axis=1)
         return np.asarray(targets[np.arange(len(targets)), number])
@@ -189,12 +180,7 @@ def row_clearances(
 ) -> tuple[Float, Float]:
     """Return the clearances of N arms from n obstacles at time 0, shape (N, n), and from themselves, shape (N,), [m].
 
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        joints: Joint positions, shape (N, J).
-        obstacles: Obstacles of N scenes.
-        most: Greatest clearance of interest, [m].
+    They are at most `most`.
     """
     placed = memory(chain, spheres)
     number, rows = obstacles.kind.shape
@@ -212,109 +198,83 @@ def check_scenes(
 ) -> None:
     """Check that a movement can start and end in each scene, and its changes.
 
-    Args:
-        scenes: N scenes whose obstacles were made from shapes.
-        arm: Arm.
-        names: Names of the obstacles, for messages: one list for each scene.
-        ends: Ends that are looked at, `start` and `goal`; jumps are only checked together with both.
+    Names of the obstacles, a list for each scene, are for messages. Jumps are only checked together with both ends.
 
     Raises:
         ValueError: A scene is impossible; the message names the scene, the fault and what is allowed.
     """
-    check = _Check(scenes, arm, names)
-    check.obstacles()
+    _check_obstacles(scenes, names)
+    everywhere = np.ones(len(scenes.start), bool)
     for name in ends:
-        check.end(name, getattr(scenes, name), scenes.obstacles)
+        _check_end(arm, name, getattr(scenes, name), scenes.obstacles, everywhere, names)
     if len(ends) == len(ENDS):
         apart = np.abs(scenes.goal - scenes.start).max(axis=-1)
         allowed = f"start and goal must differ by {LEAST_APART} or more in a joint"
-        check.refuse(apart < LEAST_APART, allowed, apart)
-        check.jumps()
+        _refuse(apart < LEAST_APART, allowed, apart)
+        check_jumps(scenes, arm, names)
 
 
-def check_jumps(scenes: Scenes, arm: Arm) -> None:
-    """Check the jumps of the target.
+def check_jumps(scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]] = ()) -> None:
+    """Check the jumps of the target; the arguments are those of :func:`check_scenes`.
 
     Raises:
         ValueError: A jump is not later than the one before it, or its target is impossible.
     """
-    _Check(scenes, arm, ()).jumps()
+    before = np.zeros(len(scenes.start))
+    for jump in range(MOST_JUMPS):
+        time = scenes.jump_times[:, jump]
+        given = time < NEVER
+        if not given.any():
+            break
+        late = given & (time <= before)
+        _refuse(late, f"jump {jump} must come after the one before it, and after 0 s", time)
+        obstacles = scenes.obstacles_at(np.where(given, time, 0.0))
+        target = np.where(given[:, None], scenes.jumps[:, jump, 1:], scenes.goal)
+        _check_end(arm, f"target of jump {jump}", target, obstacles, given, names)
+        before = time
 
 
-class _Check:
-    """Checks of N scenes, which raise ValueError for the first scene that has a fault."""
+def _check_obstacles(scenes: Scenes, names: Sequence[Sequence[str]]) -> None:
+    """Check sizes, places and courses of obstacles."""
+    obstacles, turn_time = scenes.obstacles, scenes.turn_time
+    kind, present, size = obstacles.kind, obstacles.present, obstacles.size
+    largest = np.where(np.isin(kind, IN_TABLES), size[..., 1], size.max(axis=-1))
+    _refuse(present & (largest > FARTHEST), f"must be at most {FARTHEST:g} m large", largest, names)
+    away = np.abs(obstacles.centre).max(axis=-1)
+    far = present & (kind != HALF_SPACE) & (away > FARTHEST)
+    _refuse(far, f"must be at most {FARTHEST:g} m from the origin along each axis", away, names)
+    for velocity in (obstacles.velocity, scenes.turn_velocity):
+        speed = norm(velocity)
+        _refuse(present & (speed > FASTEST), f"must be at most {FASTEST:g} m/s fast", speed, names)
+    _refuse(present & (turn_time <= 0.0), "must change its course after 0 s", turn_time, names)
 
-    def __init__(self, scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]]) -> None:
-        self.scenes, self.arm, self.names = scenes, arm, names
 
-    def obstacles(self) -> None:
-        """Check sizes, places and courses of obstacles."""
-        obstacles, turn_time = self.scenes.obstacles, self.scenes.turn_time
-        kind, present, size = obstacles.kind, obstacles.present, obstacles.size
-        largest = np.where(np.isin(kind, IN_TABLES), size[..., 1], size.max(axis=-1))
-        self.refuse_row(present & (largest > FARTHEST), f"must be at most {FARTHEST:g} m large", largest)
-        away = np.abs(obstacles.centre).max(axis=-1)
-        far = present & (kind != HALF_SPACE) & (away > FARTHEST)
-        self.refuse_row(far, f"must be at most {FARTHEST:g} m from the origin along each axis", away)
-        for velocity in (obstacles.velocity, self.scenes.turn_velocity):
-            speed = norm(velocity)
-            self.refuse_row(present & (speed > FASTEST), f"must be at most {FASTEST:g} m/s fast", speed)
-        self.refuse_row(present & (turn_time <= 0.0), "must change its course after 0 s", turn_time)
+def _check_end(
+    arm: Arm, name: str, joints: Float, obstacles: Obstacles, there: Bool, names: Sequence[Sequence[str]]
+) -> None:
+    """Check an end of the scenes that have it: inside the joint limits, and free of the arm itself and of obstacles."""
+    for joint, (low, high) in enumerate(arm.joint_range):
+        position = joints[:, joint]
+        outside = (position < low - ROUNDING) | (position > high + ROUNDING)
+        allowed = f"must be from {low:.4g} to {high:.4g}"
+        _refuse(there & outside, f"{name}: joint {arm.joint_names[joint]!r} {allowed}", position)
+    rows, own = row_clearances(arm.chain, arm.spheres, joints, obstacles, FAR)
+    touches = "the arm touches itself; its clearance must be over 0 m"
+    _refuse(there & (own <= 0.0), f"{name}: {touches}", own)
+    touches = f"touches the arm at the {name}; its clearance must be over 0 m"
+    _refuse(there[:, None] & obstacles.present & (rows <= 0.0), touches, rows, names)
 
-    def end(self, name: str, joints: Float, obstacles: Obstacles, where: Bool | None = None) -> None:
-        """Check an end: inside the joint limits, and free of the arm itself and of obstacles.
 
-        Args:
-            name: Name of the end.
-            joints: Joint positions, shape (N, J).
-            obstacles: Obstacles at the time of the end.
-            where: True for scenes that have this end, shape (N,); by default all have it.
-        """
-        there = np.ones(len(joints), bool) if where is None else where
-        for joint, (low, high) in enumerate(self.arm.joint_range):
-            position = joints[:, joint]
-            outside = (position < low - ROUNDING) | (position > high + ROUNDING)
-            allowed = f"must be from {low:.4g} to {high:.4g}"
-            self.refuse(there & outside, f"{name}: joint {self.arm.joint_names[joint]!r} {allowed}", position)
-        rows, own = row_clearances(self.arm.chain, self.arm.spheres, joints, obstacles, FAR)
-        touches = "the arm touches itself; its clearance must be over 0 m"
-        self.refuse(there & (own <= 0.0), f"{name}: {touches}", own)
-        touches = f"touches the arm at the {name}; its clearance must be over 0 m"
-        self.refuse_row(there[:, None] & obstacles.present & (rows <= 0.0), touches, rows)
-
-    def jumps(self) -> None:
-        """Check the jumps of the target."""
-        scenes = self.scenes
-        before = np.zeros(len(scenes.start))
-        for jump in range(MOST_JUMPS):
-            time = scenes.jump_times[:, jump]
-            given = time < NEVER
-            if not given.any():
-                break
-            late = given & (time <= before)
-            self.refuse(late, f"jump {jump} must come after the one before it, and after 0 s", time)
-            obstacles = scenes.obstacles_at(np.where(given, time, 0.0))
-            target = np.where(given[:, None], scenes.jumps[:, jump, 1:], scenes.goal)
-            self.end(f"target of jump {jump}", target, obstacles, given)
-            before = time
-
-    def refuse(self, wrong: Bool, message: str, values: Float) -> None:
-        """Raise ValueError for the first scene in which something is wrong, shape (N,)."""
-        if wrong.any():
-            scene = int(wrong.argmax())
-            raise ValueError(f"{self._scene(scene)}{message}, got {values[scene]:.4g}")
-
-    def refuse_row(self, wrong: Bool, message: str, values: Float) -> None:
-        """Raise ValueError for the first obstacle with which something is wrong, shape (N, n)."""
-        if wrong.any():
-            scene = int(wrong.any(axis=-1).argmax())
-            row = int(wrong[scene].argmax())
-            known = self.names[scene] if scene < len(self.names) else ()
-            name = f" {known[row]!r}" if row < len(known) and known[row] else ""
-            raise ValueError(
-                f"{self._scene(scene)}obstacle {row}{name} {message}, got {values[scene, row]:.4g}"
-            )
-
-    def _scene(self, scene: int) -> str:
-        """Return the beginning of a message: the scene, if there are several."""
-        return f"scene {scene}: " if len(self.scenes.start) > 1 else ""
+def _refuse(wrong: Bool, message: str, values: Float, names: Sequence[Sequence[str]] = ()) -> None:
+    """Raise ValueError for the first scene, shape (N,), or obstacle, shape (N, n), with which something is wrong."""
+    if not wrong.any():
+        return
+    place = np.unravel_index(int(wrong.argmax()), wrong.shape)
+    scene = int(place[0])
+    which = f"scene {scene}: " if len(wrong) > 1 else ""
+    if wrong.ndim == 2:
+        row = int(place[1])
+        known = names[scene] if scene < len(names) else ()
+        name = f" {known[row]!r}" if row < len(known) and known[row] else ""
+        which += f"obstacle {row}{name} "
+    raise ValueError(f"{which}{message}, got {values[place]:.4g}")

@@ -79,17 +79,10 @@ class PassageCost:
 
 
 def duration_gradient(coefficients: Array, rates: Array) -> Array:
-    """Return dJ/dh of each segment, which is minus its Hamiltonian (Flash & Hogan 1985, Eqs. C6, C7).
+    """Return dJ/dh of each segment, (..., S), minus its Hamiltonian (Flash & Hogan 1985, Eqs. C6, C7).
 
-    For order m, dJ/dh = -1/2 |x^(m)|^2 - sum_{i=1}^{m-1} (-1)^i x^(m+i) . x^(m-i), constant along a segment;
-    for jerk it is -|jerk|^2/2 + snap . acceleration - crackle . velocity.
-
-    Args:
-        coefficients: (..., 2m, S, D) in unit time.
-        rates: (..., S) 1 / h.
-
-    Returns:
-        (..., S) [cost / s].
+    For order m, dJ/dh = -1/2 |x^(m)|^2 - sum_{i=1}^{m-1} (-1)^i x^(m+i) . x^(m-i), constant along a segment; for jerk
+    it is -|jerk|^2/2 + snap . acceleration - crackle . velocity. Coefficients are (..., 2m, S, D) in unit time.
     """
     order = coefficients.shape[-3] // 2
     total: Any = 0.0

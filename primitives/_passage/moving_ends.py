@@ -130,16 +130,10 @@ class _Expansion:
 
 
 def fractions_moving(points: Floats, ends: list[Any], slack: Floats) -> Floats:
-    """Return the fractions of the duration before and after the via-point.
+    """Return the fractions (N, 2) of the duration before and after the via-points of points (N, 3, D), all different.
 
-    Args:
-        points: (N, 3, D) start, via-point, goal [m], each different from its neighbour.
-        ends: start velocity and acceleration, goal velocity and acceleration in unit time: (N, D), None or
-            FREE.
-        slack: (N,) tolerance of the waypoints, see `_weighted_solver`.
-
-    Returns:
-        (N, 2), each pair adds up to 1; the smaller one has full relative accuracy.
+    The ends are start velocity and acceleration, goal velocity and acceleration in unit time: (N, D), None or FREE.
+    Each pair adds up to 1; the smaller one has full relative accuracy.
     """
     expansion, cost = _expand(points, ends, slack, from_goal=False)
     stationary = expansion.stationary()

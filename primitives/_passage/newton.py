@@ -17,7 +17,6 @@ has the value z* and the derivative dz/dp = -H^-1 dg/dp. So no iteration is unro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -56,36 +55,24 @@ _ITERATIONS = 80
 _HALVINGS = 12
 
 
-@dataclass(frozen=True)
-class Minima:
-    """Results of the iterations: z (n, N), value (N,), and True where one converged (N,)."""
-
-    z: Floats
-    value: Floats
-    converged: Any
-
-
 def fractions_by_newton(
     cost: PassageCost, guess: Floats, bound: Floats, *, several: bool
 ) -> tuple[Floats, Any]:
     """Return fractions of the duration (N, S), from several starts if asked, and True where it converged (N,).
 
-    Args:
-        cost: of N movements.
-        guess: (S, N) durations to start from, NaN for none.
-        bound: (N,) lower bound of the cost, NaN for none.
-        several: True for several starts.
+    A guess (S, N) of the durations and a lower bound (N,) of the cost are NaN for none.
     """
     first, *others = _starts(cost, guess, several)
-    best = _minimise(cost, first)
+    z, value, converged = _minimise(cost, first)
     for start in others:
-        found = _minimise(cost, start)
+        other, other_value, other_converged = _minimise(cost, start)
         # A later start must be better by more than rounding, or noise would decide ties.
-        better = (found.value < best.value - 1e-9) & (found.converged | ~best.converged)
-        pairs = ((found.z, best.z), (found.value, best.value), (found.converged, best.converged))
-        best = Minima(*(np.where(better, new, old) for new, old in pairs))
-    reached = best.value < np.log(bound + cost.reference()) + _REACHED
-    return np.ascontiguousarray(_softmax(best.z).T), best.converged | reached
+        better = (other_value < value - 1e-9) & (other_converged | ~converged)
+        z = np.where(better, other, z)
+        value = np.where(better, other_value, value)
+        converged = np.where(better, other_converged, converged)
+    reached = value < np.log(bound + cost.reference()) + _REACHED
+    return np.ascontiguousarray(_softmax(z).T), converged | reached
 
 
 def _starts(cost: PassageCost, guess: Floats, several: bool) -> list[Floats]:
@@ -163,8 +150,8 @@ def _softmax(z: Floats) -> Floats:
     return shares
 
 
-def _minimise(cost: PassageCost, start: Floats) -> Minima:
-    """Return local minima of log(J + reference) from durations (S, N)."""
+def _minimise(cost: PassageCost, start: Floats) -> tuple[Floats, Floats, Any]:
+    """Return local minima of log(J + reference) from durations (S, N): z (S, N), value and convergence (N,)."""
     z, reference = np.log(start), cost.reference()
     active = np.arange(z.shape[1])
     value, gradient, hessian = log_cost(cost, z, reference)
@@ -190,7 +177,7 @@ def _minimise(cost: PassageCost, start: Floats) -> Minima:
         converged[active[stays & (gain < _SMALL_GAIN)]] = True
         active, value = active[~stays], value[~stays]
         gradient, hessian = gradient[:, ~stays], hessian[..., ~stays]
-    return Minima(z, result, converged)
+    return z, result, converged
 
 
 def _search(
@@ -264,16 +251,9 @@ def solve_positive(matrix: Floats, right: Floats) -> Floats:
 def attach_gradient(
     fractions: Array, waypoints: Array, ends: list[Any], cost: PassageCost, xp: Namespace
 ) -> Array:
-    """Return the fractions (..., S), differentiable with respect to waypoints and boundary values.
+    """Return the fractions (..., S), differentiable with respect to waypoints and boundary values in unit time.
 
     Movements with a dropped via-point get the gradient zero.
-
-    Args:
-        fractions: in double precision.
-        waypoints: (..., S + 1, D), likewise.
-        ends: the four boundary values in unit time, (..., D) each, None or FREE.
-        cost: of the same movements.
-        xp: namespace.
     """
     segments = fractions.shape[-1]
     if segments == 1:

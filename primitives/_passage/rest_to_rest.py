@@ -57,14 +57,9 @@ _FLOATS = Functions(
 
 
 def fractions_at_rest(points: Any) -> Any:
-    """Return the fractions of the duration before and after the via-point.
+    """Return the fractions (N, 2) of the duration around the via-points of points (N, 3, D) of a size of about 1.
 
-    Args:
-        points: (N, 3, D) NumPy float64: start, via-point, goal [m], of a size of about 1.
-
-    Returns:
-        (N, 2), each pair adds up to 1; the smaller one has full relative accuracy. A via-point on the start
-        or goal has fraction 0 there.
+    Each pair adds up to 1; the smaller one has full relative accuracy. A via-point on the start or goal has fraction 0.
     """
     places = np.ascontiguousarray(points.transpose(1, 2, 0))
     legs, whole = places[1:] - places[:-1], places[2] - places[0]

@@ -36,20 +36,6 @@ def test_movements_at_half_of_the_speed_limits_are_tracked_within_a_milliradian(
         assert error < 1e-3
 
 
-def test_built_in_arms_stick_out_by_five_millimetres_at_most_and_list_what_is_left_out():
-    arm = arm_of("panda")
-    assert arm.excess <= 0.005
-    assert {pair.reason for pair in arm.left_out} <= {
-        "consecutive links",
-        "in contact at home",
-        "never in contact",
-        "in contact in none of 100,000 configurations",
-    }
-    compared = {frozenset((arm.group_names[a], arm.group_names[b])) for a, b in arm.spheres.pairs}
-    assert frozenset(("link0", "gripper")) in compared
-    assert frozenset(("link2", "gripper")) in compared
-
-
 LINKS = """
 <mujoco>
   <worldbody>

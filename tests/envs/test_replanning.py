@@ -21,8 +21,8 @@ from episodes import (
 )
 
 from viapoint import primitives
+from viapoint.envs.arms.kinematics import LIMIT_SHARE, slowdowns
 from viapoint.envs.events import FORESIGHT, LOOK, Event
-from viapoint.envs.limits import LIMIT_SHARE, slowdowns
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import Plan
 from viapoint.envs.replanning import least_remaining

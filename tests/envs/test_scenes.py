@@ -95,21 +95,6 @@ def test_a_scene_depends_on_its_generator_alone(env_id):
     same_scenes(Scenes.together([together.take([0, 1]), together.take([2, 3, 4, 5])]), together)
 
 
-def test_changes_are_drawn_and_applied_in_time():
-    task = gym.make(PANDA_MOVING).unwrapped.task
-    scenes = task.sampler()(generators(12))
-    velocity, turns = scenes.obstacles.velocity, scenes.turn_time
-    present = scenes.obstacles.present
-    assert (np.linalg.norm(velocity[present], axis=-1) > 0.0).mean() > 0.5
-    time = 0.4
-    later = scenes.obstacles_at(np.full(12, time)).centre
-    before = np.minimum(time, turns)[..., None]
-    after = np.maximum(time - turns, 0.0)[..., None]
-    wanted = scenes.obstacles.centre + before * velocity + after * scenes.turn_velocity
-    np.testing.assert_allclose(later, wanted, atol=1e-12)
-    assert (turns[~present] == NEVER).all()
-
-
 def test_targets_jump_in_time():
     task = gym.make("viapoint/PlanarTargetJump-v0").unwrapped.task
     scenes = task.sampler()(generators(12))

@@ -139,21 +139,6 @@ def test_the_number_of_via_points_is_found_where_noise_is_low():
     assert right >= 38
 
 
-def test_a_range_is_searched_and_exact_movements_get_the_fewest(rng):
-    _, _, trajectory = movement(rng, 1)
-    time, position = samples(trajectory, True, rng)
-    found = [int(fit_via_points(time, position, n_via).n_via) for n_via in (None, (0, 2), 2)]
-    assert found == [1, 1, 2]
-
-
-@pytest.mark.parametrize("n_via", [0, 2, None])
-def test_the_explained_share_is_one_of_the_whole(n_via, rng):
-    walk = np.cumsum(rng.normal(size=(5, 40, 2)), axis=1)
-    fit = fit_via_points(np.arange(40.0), walk, n_via)
-    assert ((fit.r_squared >= 0.0) & (fit.r_squared <= 1.0)).all()
-    assert np.isfinite(fit.bic).all()
-
-
 def test_a_batch_holds_the_fits_of_its_movements(rng):
     several = []
     for n_via in (0, 1, 2, 1):

@@ -152,16 +152,6 @@ def test_a_batch_gives_bit_for_bit_what_each_item_gives_alone(vias, dimension, r
                     np.testing.assert_array_equal(whole[items], part)
 
 
-def test_shared_and_own_durations_agree_bit_for_bit(rng):
-    waypoints, _, _ = random_movement(rng, 2, batch=(20,))
-    shared = np.array([0.3, 0.5, 0.4])
-    together = through(waypoints, shared)
-    own = through(waypoints, np.tile(shared, (20, 1)))
-    assert together.knots.shape == own.knots.shape == (20, 4)
-    for a, b in zip(together.sample(50), own.sample(50), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_sample_fills_given_buffers(rng):
     waypoints, durations, ends = random_movement(rng, 2, batch=(9,))
     trajectory = through(waypoints, durations, **ends)

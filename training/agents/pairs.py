@@ -22,8 +22,7 @@ from torch import Tensor, nn
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, place_group, self_clearance
 from viapoint.envs.geometry.clearance import memory as memory_of
-from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.kernels import kernel
+from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.obstacles import ABSENT, KINDS, MESH, Obstacles, bounding_boxes
 from viapoint.envs.task import Task
 from viapoint.training.planning.movements import INSTANTS, Setting, place_arm

@@ -31,8 +31,7 @@ from viapoint.envs.geometry.clearance import (
     self_clearance,
     travel,
 )
-from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.kernels import inlined, kernel
+from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import SHORTEST_DURATION
 

@@ -17,13 +17,12 @@ import numpy as np
 from viapoint import primitives
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import inverse_kinematics
-from viapoint.envs.arms.kinematics import torques
+from viapoint.envs.arms.kinematics import slowdown, torques
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least, whole_number
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape
-from viapoint.envs.limits import slowdown
 from viapoint.envs.plans import SHORTEST_DURATION, Motion, Plan, SpaceName
 from viapoint.envs.scenes.options import Pose
 from viapoint.envs.scenes.scene import row_clearances

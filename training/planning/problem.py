@@ -14,8 +14,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.chain import Spheres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.kernels import kernel
+from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
 from viapoint.envs.plans import SHORTEST_DURATION

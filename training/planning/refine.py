@@ -26,9 +26,8 @@ from viapoint.envs.geometry.clearance import (
     nearest_spheres,
     place,
 )
-from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.distance import point_distance, point_distance_and_normal
-from viapoint.envs.geometry.kernels import kernel
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.training.planning.movements import (
     OUTSIDE,
