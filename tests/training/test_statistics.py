@@ -23,16 +23,6 @@ def test_wilson_equals_published_values():
     assert round(statistics.wilson(0, 20).high, 4) == 0.1611
 
 
-@pytest.mark.parametrize("trials", [1, 7, 500])
-def test_wilson_solves_the_score_equation(trials):
-    z = 1.959963984540054
-    for successes in range(1, trials):
-        p, low, high = statistics.wilson(successes, trials)
-        for bound in (low, high):
-            assert abs(p - bound) == pytest.approx(z * math.sqrt(bound * (1 - bound) / trials), rel=1e-9)
-    assert statistics.wilson(trials, trials).high == 1.0
-
-
 def test_mcnemar_is_the_exact_binomial_test():
     """With the sum over the tail of the binomial distribution as an independent computation."""
     generator = np.random.default_rng(0)

@@ -12,6 +12,7 @@ are a little larger than the arm, so that success in physics alone could be luck
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import sys
 from collections.abc import Iterator, Sequence
@@ -149,17 +150,14 @@ class Maker:
         for first in range(0, MOST_DRAWN * number, TOGETHER):
             seeds = [(seed, *family.encode(), first + each) for each in range(TOGETHER)]
             scenes = rounded(sampler([np.random.default_rng(seed) for seed in seeds]))
-            scenes = scenes.take([row for row in range(TOGETHER) if self._is_possible(scenes.take([row]))])
+            possible = []
+            for row in range(TOGETHER):
+                with contextlib.suppress(ValueError):  # rounding may have made one impossible
+                    check_scenes(scenes.take([row]), self.task.arm)
+                    possible.append(row)
+            scenes = scenes.take(possible)
             share = self._share(scenes)
             yield FrozenScenes(name=name, task=self.task.as_dict(), scenes=scenes, share=share, family=family)
-
-    def _is_possible(self, scene: Scenes) -> bool:
-        """Return True for one scene that rounding left possible."""
-        try:
-            check_scenes(scene, self.task.arm)
-        except ValueError:
-            return False
-        return True
 
     def _share(self, scenes: Scenes) -> Float:
         """Return the solution shares of scenes, shape (N,)."""

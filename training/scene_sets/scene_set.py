@@ -36,11 +36,6 @@ CONTENT = ("start", "goal", "kind", *MOVING, "jumps", "turn_time", "turn_velocit
 SCENE_FIELDS = ("arm", "n_obstacles", "whole_arm", "moving_obstacles", "n_jumps")
 
 
-def bands(share: Float) -> NDArray[np.int64]:
-    """Return the index into BANDS of each solution share, shape (N,)."""
-    return np.searchsorted(-np.array(BAND_EDGES), -share, side="right").astype(np.int64)
-
-
 @dataclass(frozen=True, kw_only=True)
 class FrozenScenes:
     """Set of N scenes."""
@@ -59,7 +54,8 @@ class FrozenScenes:
     @property
     def band(self) -> NDArray[np.int64]:
         """Index into BANDS, shape (N,); -1 where the share is unknown."""
-        return np.where(np.isnan(self.share), -1, bands(self.share))
+        band = np.searchsorted(-np.array(BAND_EDGES), -self.share, side="right")
+        return np.where(np.isnan(self.share), -1, band).astype(np.int64)
 
     @property
     def hidden(self) -> Float:
@@ -150,14 +146,13 @@ def shipped_set(name: str, task: Task) -> Path | None:
     return None
 
 
-def _scene_key(task: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Return what scenes of a task depend on."""
-    kinds = sorted(task["shapes"]), sorted(task["families"])
-    others = tuple(task[name] for name in SCENE_FIELDS)
-    changing = task["moving_obstacles"] or list(task["n_jumps"]) != [0, 0]
-    when = tuple(task["duration_range"]) if changing else ()
-    sensor = json.dumps(task.get("sensor"), sort_keys=True)
-    return (*(tuple(each) if isinstance(each, list) else each for each in (*kinds, *others)), when, sensor)
+def _scene_key(task: Mapping[str, Any]) -> str:
+    """Return what scenes of a task depend on, as text."""
+    values = [task[name] for name in SCENE_FIELDS]
+    values += [sorted(task["shapes"]), sorted(task["families"]), task.get("sensor")]
+    if task["moving_obstacles"] or any(task["n_jumps"]):
+        values.append(task["duration_range"])  # things happen at parts of the longest movement
+    return json.dumps(values, sort_keys=True)
 
 
 def load(path: Path, name: str = "") -> FrozenScenes:
@@ -250,9 +245,8 @@ def scenes_for(name_or_path: str | Path, task: Task, number: int | None = None) 
     if name not in SETS:
         frozen = load(Path(name_or_path).expanduser())
         _check_fit(frozen, task)
-        return dataclasses.replace(frozen, scenes=_padded(frozen.scenes, task.observation.n_rows)).spread(
-            number
-        )
+        scenes = _padded(frozen.scenes, task.observation.n_rows)
+        return dataclasses.replace(frozen, scenes=scenes).spread(number)
     path = shipped_set(name, task)
     if path is not None:
         return load(path, name).spread(number)

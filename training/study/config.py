@@ -336,8 +336,12 @@ def _search(
         for value in _ends(path, values):  # an impossible value is an error now, and not in the last trial
             _made("parameters", _agent, {"seeds": [0], **_with(training, {path: value})}, env, row)
     check_whole("trials", trials, 1)
-    given = {"parameters": parameters, "trials": trials, "first": tuple(first or ())}
-    return [Search(**env, row=row, seed=trial.seed, training=training, **given)]
+    return [
+        Search(
+            **env, row=row, seed=trial.seed, training=training, parameters=parameters, trials=trials,
+            first=tuple(first or ()),
+        )
+    ]  # fmt: skip
 
 
 def _ends(path: str, given: Any) -> list[Any]:
