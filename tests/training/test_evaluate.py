@@ -45,9 +45,8 @@ class Given:
 
 
 def run(methods, scenes, **kwargs):
-    return evaluate_methods(
-        methods, scenes, ENV, env_kwargs={"threads": 1}, **{"time_decisions": False, **kwargs}
-    )
+    settings = {"env_kwargs": {"threads": 1}, "time_decisions": False, **kwargs}
+    return evaluate_methods(methods, scenes, ENV, **settings)
 
 
 def test_every_method_meets_the_same_scenes(small_scenes, solutions):

@@ -127,9 +127,7 @@ def test_an_own_file_is_replaced(write, name, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-@pytest.mark.parametrize(
-    "name", ["notes.txt", "thesis/a.tex", "versions.json", "config.json", "best/model.json"]
-)
+@pytest.mark.parametrize("name", ["thesis/a.tex", "versions.json", "best/model.json"])
 def test_a_training_begins_in_no_folder_of_something_else(name, tmp_path):
     put(tmp_path, name)
     before = content_of(tmp_path)

@@ -41,13 +41,9 @@ def results_in(folder):
     found = {}
     for path in sorted(folder.glob("PlanarObstacles-v0/*/*/result.json")):
         record = json.loads(path.read_text())
-        weights = path.parent / "best" / "weights.safetensors"
         successes = [line["solved"] for line in record["rows"]]
-        found[path.relative_to(folder).as_posix()] = (
-            successes,
-            record.get("curve"),
-            weights.read_bytes() if weights.is_file() else b"",
-        )
+        weights = [each.read_bytes() for each in path.parent.glob("best/weights.safetensors")]
+        found[path.relative_to(folder).as_posix()] = (successes, record.get("curve"), weights)
     return found
 
 

@@ -97,7 +97,8 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
         UsageError: A word is not understood or not allowed.
     """
     if words and words[0] in ("-h", "--help"):
-        print(_overview())
+        lines = [f"  {name:<10}{str(kind.__doc__).splitlines()[0]}" for name, (kind, _) in COMMANDS.items()]
+        print(OVERVIEW.format(commands="\n".join(lines)))
         raise SystemExit(0)
     if not words:
         raise UsageError(f"name a command: {', '.join(COMMANDS)} (viapoint --help)")
@@ -114,12 +115,6 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
         if not end.code:
             raise
         raise UsageError(_complaint(complaint.getvalue(), command, kind)) from None
-
-
-def _overview() -> str:
-    """Return the help of the command without a subcommand."""
-    lines = [f"  {name:<10}{str(kind.__doc__).splitlines()[0]}" for name, (kind, _) in COMMANDS.items()]
-    return OVERVIEW.format(commands="\n".join(lines))
 
 
 def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:

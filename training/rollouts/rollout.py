@@ -41,12 +41,7 @@ class SimulationResults(NamedTuple):
 
 
 class SceneSimulation:
-    """Simulation of episodes in given scenes, `num_envs` at a time.
-
-    Args:
-        env_id: Id of a registered environment.
-        num_envs: Greatest number of scenes that are simulated together.
-        **kwargs: Keyword arguments of the environment.
+    """Simulation of episodes in given scenes, `num_envs` at a time; `kwargs` are arguments of the environment.
 
     Raises:
         ValueError: There is no such environment, or an argument is not allowed.
@@ -65,10 +60,10 @@ class SceneSimulation:
 
     def observe(self, scenes: Scenes) -> Observation:
         """Return first observations in N scenes."""
-        pieces = [
-            {name: part[: rows.stop - rows.start] for name, part in self._begin(env, scenes, rows).items()}
-            for rows, env in self._groups(len(scenes.start))
-        ]
+        pieces = []
+        for rows, env in self._groups(len(scenes.start)):
+            seen = self._begin(env, scenes, rows)
+            pieces.append({name: part[: rows.stop - rows.start] for name, part in seen.items()})
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
     def __call__(self, scenes: Scenes, actions: Float) -> SimulationResults:

@@ -231,15 +231,10 @@ def drawn(name: str, task: Task, number: int) -> FrozenScenes:
 
 
 def scenes_for(name_or_path: str | Path, task: Task, number: int | None = None) -> FrozenScenes:
-    """Return the named scenes; where no frozen ones are those of the task, draw them and print a line that says so.
+    """Return scenes of a set in SETS or of a file, evenly spread over it, up to a number.
 
-    Args:
-        name_or_path: One of SETS, or the path of a file.
-        task: Task.
-        number: Number of scenes, evenly spread over a set; all if not given, or if there are fewer.
-
-    Raises:
-        ValueError: There is no such set, or its scenes cannot be those of the task.
+    Where no frozen scenes are those of the task, they are drawn, and a line says so. A set that there is not, or scenes
+    that cannot be those of the task, raise ValueError.
     """
     name = str(name_or_path)
     if name not in SETS:

@@ -21,7 +21,7 @@ from viapoint.training.io.files import BadFileError, read_json, write_bytes, wri
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
 from viapoint.training.study.config import Search, Study, Trial, Values
-from viapoint.training.study.trials import finished_record, markdown, run_trial, tables, write_results
+from viapoint.training.study.trials import finished_record, markdown, run_trial, write_results
 
 RETRIES = 2  # Number of times that a trial whose worker died is begun again
 SETTINGS = {
@@ -96,8 +96,7 @@ def run_study(
             failed += _run_trials(missing, folder, told)
             for search in searches:
                 failed += _search(search, folder, workers, told)
-    table = tables(study.trials, folder)
-    write_results(table, study, folder)
+    table = write_results(study, folder)
     if failed:
         raise StudyFailedError(
             f"{len(failed)} trials failed; the same command tries them again: {'; '.join(failed)}"

@@ -90,14 +90,9 @@ def light_movements(agent: Path | None) -> ObstacleMovements:
 def features(profiles: list[Profile], plan: Plan) -> pd.DataFrame:
     """Compute the features of the paper's analysis, with the point of greatest curvature as via-point.
 
-    Returns:
-        A line for each movement, with NaN where it lacks a feature:
-
-        * valley, bend: times of speed valley and curvature peak, as fractions of the duration;
-        * along: d1 / (d1 + d2) of the point of greatest curvature;
-        * residual: t1 / (t1 + t2) minus that of the model through this point, as in Fig. 10B;
-        * agrees: whether movement and model both have a speed valley, or neither has (False without a model);
-        * apart: greatest distance from the model / distance of the targets, as in Fig. 8.
+    A line for each movement, with NaN where it lacks a feature, holds the times of speed valley and curvature peak (as
+    fractions of the duration), d1 / (d1 + d2) of that point, the residual of t1 / (t1 + t2) from the model through it
+    (Fig. 10B), whether both have a valley or neither, and the distance from the model / that of the targets (Fig. 8).
     """
     lines = []
     for profile, (start, *_, goal) in zip(profiles, plan.waypoints, strict=True):
