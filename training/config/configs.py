@@ -479,7 +479,7 @@ class FitConfig(Config):
             raise ValueError(
                 f"n_via must be one number, or the fewest and the most, from 0 to {MOST_VIA_POINTS}, got {self.n_via}"
             )
-        check_folder("out", self.out)
+        check_folder(f"out {self.out}", self.out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -507,7 +507,7 @@ class PaperConfig(Config):
     """Run folder or model folder of an agent that moves around the rows of lights; default: the geometry search."""
 
     def _check(self) -> None:
-        check_folder("out", self.out)
+        check_folder(f"out {self.out}", self.out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -529,7 +529,7 @@ class DemoConfig(Config):
         check_registered(self.env)
         if not registered_task(self.env).whole_movement:
             raise ValueError(f"env must have whole movements as actions, as {DEFAULT_ENV}, got {self.env!r}")
-        check_folder("out", self.out)
+        check_folder(f"out {self.out}", self.out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -562,4 +562,4 @@ class StudyConfig(Config):
     least: ClassVar = {"workers": 1}
 
     def _check(self) -> None:
-        check_folder("out", self.out)
+        check_folder(f"out {self.out}", self.out)

@@ -163,7 +163,9 @@ class RunCallback(BaseCallback):
                 file=sys.stderr,
                 flush=True,
             )
-        if record is max(self.curve, key=_ranking):
+        # A validation is better with more success, then with less jerk.
+        best = max(self.curve, key=lambda each: (each["success"]["rate"], -(each["jerk_ratio"] or 0.0)))
+        if record is best:
             self.run.save("best", self.model)
         self._show_progress()
         self._began += time.monotonic() - began
@@ -217,11 +219,6 @@ class RunCallback(BaseCallback):
         if self.curve:
             shown["validation"] = f"{100.0 * self.curve[-1]['success']['rate']:.1f} %"
         self._bar.set_postfix(shown, refresh=False)
-
-
-def _ranking(record: dict[str, Any]) -> tuple[float, float]:
-    """Return what makes a validation better than another one: success, then less jerk."""
-    return record["success"]["rate"], -(record["jerk_ratio"] or 0.0)
 
 
 def resume_command(run: Run) -> str:

@@ -57,14 +57,6 @@ RANDOM_ACTIONS = 512  # Number of random actions for the solution share
 HARD_SHARE = 0.01  # Solution share below which scenes are hard
 
 
-def _ids() -> tuple[str, ...]:
-    """Return the ids of environments whose scenes differ; a set fits every task with the same scenes."""
-    first: dict[str, str] = {}
-    for env_id in dict.fromkeys(twin_of(each) for each in ENV_IDS):
-        first.setdefault(str(TASKS[env_id]), env_id)
-    return tuple(first.values())
-
-
 class Maker:
     """Maker of the sets of one environment."""
 
@@ -214,7 +206,12 @@ def make_sets(env: tuple[str, ...] = (), sets: tuple[str, ...] = SETS, check: bo
         check: Make the sets that ship again, and compare their hashes; the exit code is 1 if one differs.
     """
     different = 0
-    for env_id in env or _ids():
+    first: dict[
+        str, str
+    ] = {}  # ids of environments whose scenes differ; a set fits every task with the same scenes
+    for env_id in map(twin_of, ENV_IDS):
+        first.setdefault(str(TASKS[env_id]), env_id)
+    for env_id in env or first.values():
         maker = Maker(env_id)
         for name in [each for each in sets if each in maker.numbers()]:
             path = shipped_path(name, env_id)

@@ -84,7 +84,11 @@ def run_study(
         [1.0]
     """
     folder = Path(study.out if out is None else out).expanduser().absolute()
-    _claim(folder, study.name)
+    mark = folder / "study.json"
+    if not mark.is_file() or read_json(mark).get("viapoint") != "study":
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise BadFileError(folder, "holds something else than a study; name another folder")
+        write_json(mark, {"viapoint": "study", "name": study.name})
     missing = [trial for trial in study.trials if finished_record(trial, folder) is None]
     searches = [search for search in study.searches if not search.is_finished(folder)]
     failed = []
@@ -102,16 +106,6 @@ def run_study(
             f"{len(failed)} trials failed; the same command tries them again: {'; '.join(failed)}"
         )
     return table
-
-
-def _claim(folder: Path, name: str) -> None:
-    """Create the folder of a study, or check that it is one."""
-    mark = folder / "study.json"
-    if mark.is_file() and read_json(mark).get("viapoint") == "study":
-        return
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise BadFileError(folder, "holds something else than a study; name another folder")
-    write_json(mark, {"viapoint": "study", "name": name})
 
 
 def _import_libraries() -> tuple[Any, Any]:

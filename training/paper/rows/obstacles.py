@@ -141,15 +141,10 @@ def obstacle_claims(avoidance: ObstacleMovements) -> list[Claim]:
               lambda f: f.residual.mean(), near(0.0, 0.02)),
         claim("The same: standard deviation", ".02", lambda f: f.residual.std(ddof=0), at_most(0.04)),
         claim("The same: slope over d1/(d1+d2); it has a trend, in the model as on the arm", "no trend",
-              lambda f: _slope(f.along, f.residual), near(0.035, 0.015)),
+              lambda f: np.polyfit(*f[["along", "residual"]].dropna().to_numpy().T, 1)[0], near(0.035, 0.015)),
         claim("Distance from the model through the point of greatest curvature / distance of the targets: median",
               "close match", lambda f: 100 * f.apart.median(), at_most(5.0), "%"),
         Claim(12, f"Time scaling: every movement again in 1.1 s and .85 s: greatest distance of the paths ({who})",
               "8, 11", "the same path", (apart, at_most(1e-9)), (arm_apart, at_most(1.0)),
               max(each.worst for each in scaled), "mm"),
     ]  # fmt: skip
-
-
-def _slope(place: pd.Series, value: pd.Series) -> float:
-    known = value.notna()
-    return float(np.polyfit(place[known], value[known], 1)[0])
