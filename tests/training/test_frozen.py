@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 
+import frozen_scenes as make
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets import make, scene_set
+from viapoint.training.scene_sets import scene_set
 from viapoint.training.scene_sets.scene_set import (
     BANDS,
     SETS,

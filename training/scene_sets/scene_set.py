@@ -7,7 +7,7 @@ import hashlib
 import json
 import sys
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -59,15 +59,7 @@ class FrozenScenes:
 
     @property
     def hidden(self) -> Float:
-        """Share of the obstacles of each scene that the sensor does not see at all, shape (N,); NaN without a sensor.
-
-        Example:
-            >>> from viapoint.training.planning.search import registered_task
-            >>> from viapoint.training.scene_sets.scene_set import scenes_for
-            >>> frozen = scenes_for("validation", registered_task("viapoint/PlanarSensed-v0"), 100)
-            >>> float(frozen.hidden.mean()) > 0.1
-            True
-        """
+        """Share of obstacles that the sensor does not see at all in each scene, shape (N,); NaN without a sensor."""
         task = Task.from_dict(self.task)
         if task.sensor is None:
             return np.full(self.share.shape, np.nan)
@@ -116,16 +108,6 @@ def evenly_spread(number: int, count: int | None) -> Int:
     """Return up to `count` rows of `number`, evenly spread from the first to the last; all if `count` is None."""
     kept = number if count is None else min(number, count)
     return np.linspace(0, number - 1, kept).round().astype(np.int64)
-
-
-def together(parts: Sequence[FrozenScenes]) -> FrozenScenes:
-    """Return the scenes of several sets of one task under the name of the first."""
-    return dataclasses.replace(
-        parts[0],
-        scenes=Scenes.together([part.scenes for part in parts]),
-        share=np.concatenate([part.share for part in parts]),
-        family=np.concatenate([part.family for part in parts]),
-    )
 
 
 def shipped_path(name: str, env_id: str) -> Path:

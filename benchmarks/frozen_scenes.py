@@ -1,8 +1,8 @@
 """Frozen sets of scenes of every task, made anew.
 
-    python -m viapoint.training.scene_sets.make                       # all sets; those that exist are left as they are
-    python -m viapoint.training.scene_sets.make --env viapoint/PlanarObstacles-v0 --sets test hard
-    python -m viapoint.training.scene_sets.make --check               # make them in memory, and compare their hashes
+    python benchmarks/frozen_scenes.py                       # all sets; those that exist are left as they are
+    python benchmarks/frozen_scenes.py --env viapoint/PlanarObstacles-v0 --sets test hard
+    python benchmarks/frozen_scenes.py --check               # make them in memory, and compare their hashes
 
 Scenes are drawn one after the other, each with a generator of its own. The solution share of a scene is the share of
 random actions whose plan is clear. A scene is kept where its band of shares is still wanted, and where the search finds
@@ -44,7 +44,6 @@ from viapoint.training.scene_sets.scene_set import (
     FrozenScenes,
     load,
     shipped_path,
-    together,
 )
 
 SEEDS = {"validation": 11, "test": 12, "hard": 13, "uniform": 14}  # First part of seeds
@@ -189,6 +188,16 @@ def rounded(scenes: Scenes) -> Scenes:
 def _single(record: Any, names: Sequence[str]) -> dict[str, Any]:
     """Return fields of a record in numbers that single precision represents."""
     return {name: getattr(record, name).astype(np.float32).astype(np.float64) for name in names}
+
+
+def together(parts: Sequence[FrozenScenes]) -> FrozenScenes:
+    """Return the scenes of several sets of one task under the name of the first."""
+    return dataclasses.replace(
+        parts[0],
+        scenes=Scenes.together([part.scenes for part in parts]),
+        share=np.concatenate([part.share for part in parts]),
+        family=np.concatenate([part.family for part in parts]),
+    )
 
 
 def _hardest(found: list[FrozenScenes], number: int) -> FrozenScenes:
