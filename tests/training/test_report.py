@@ -65,10 +65,7 @@ def test_the_table_fits_a_terminal_of_80_columns(record, number):
 
 def test_pictures_are_drawn(record, tmp_path):
     rates = ({"rate": r, "low": r - 0.1, "high": r + 0.1} for r in (0.2, 0.5, 0.9))
-    curve = [
-        {"decisions": 10 * i, "simulated_seconds": 9.0 * i, "seconds": float(i), "success": rate}
-        for i, rate in enumerate(rates)
-    ]
+    curve = [{"decisions": 10 * i, "seconds": float(i), "success": rate} for i, rate in enumerate(rates)]
     line = plots.learning_curve(tmp_path / "a" / "curve.png", curve)
     bars = plots.success_by_band(tmp_path / "bars.png", record)
     for path in (line, bars):

@@ -200,8 +200,10 @@ class View:
         planned, vias = [self._line(plan)], arena.tool(plan.waypoints[1:-1])
         if movement is not None and movement.plan is not None and arena.task.replanning:
             planned, vias = [(arena.path(movement.plan), PALETTE.plan)], vias[:0]
-        others = state.proposals if len(state.proposals) > 1 else ()
-        pale = [(path, _lighter(colour)) for path, colour in (self._line(each.motion) for each in others)]
+        pale = []
+        for each in state.proposals if len(state.proposals) > 1 else ():
+            path, colour = self._line(each.motion)
+            pale.append((path, _lighter(colour)))
         self._draw_handles("via", vias)
         if state.before is not None and self._is_new("before", state.before.waypoints):
             colour = PALETTE.plan if state.before.success else PALETTE.contact

@@ -90,13 +90,18 @@ def _episode(env: gym.Env[Any, Any], method: Method, number: int, seed: int) -> 
         steps.append((action, reward, terminated, truncated, info))
         over = terminated or truncated
     actions, rewards, terminations, truncations, infos = zip(*steps, strict=True)
+    observations, reports = {}, {}
+    for name in seen[0]:
+        observations[name] = np.stack([each[name] for each in seen])
+    for name in infos[0]:
+        reports[name] = np.array([info[name] for info in infos])
     return EpisodeBuffer(
         id=number,
         seed=seed,
-        observations={name: np.stack([each[name] for each in seen]) for name in seen[0]},
+        observations=observations,
         actions=np.stack(actions),
         rewards=list(rewards),
         terminations=list(terminations),
         truncations=list(truncations),
-        infos={name: np.array([info[name] for info in infos]) for name in infos[0]},
+        infos=reports,
     )

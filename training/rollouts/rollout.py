@@ -36,8 +36,8 @@ class SimulationResults(NamedTuple):
     @classmethod
     def concatenate(cls, pieces: Sequence[SimulationResults]) -> SimulationResults:
         """Join the results of several batches."""
-        info = {name: np.concatenate([piece.info[name] for piece in pieces]) for name in pieces[0].info}
-        return cls(np.concatenate([piece.reward for piece in pieces]), info)
+        reward = np.concatenate([piece.reward for piece in pieces])
+        return cls(reward, _joined([piece.info for piece in pieces]))
 
 
 class SceneSimulation:
@@ -64,7 +64,7 @@ class SceneSimulation:
         for rows, env in self._groups(len(scenes.start)):
             seen = self._begin(env, scenes, rows)
             pieces.append({name: part[: rows.stop - rows.start] for name, part in seen.items()})
-        return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+        return _joined(pieces)
 
     def __call__(self, scenes: Scenes, actions: Float) -> SimulationResults:
         """Simulate episodes that begin with one action in each of N scenes; all later actions are zero."""
@@ -118,6 +118,11 @@ class SceneSimulation:
                 made: Any = gym.make_vec(self.env_id, num_envs=size, **self.kwargs)
                 self._envs[size] = made.unwrapped
             yield rows, self._envs[size]
+
+
+def _joined(pieces: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """Return arrays by name, joined over batches."""
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
 def _filled(rows: slice, number: int) -> NDArray[np.int64]:

@@ -173,10 +173,11 @@ class RunCallback(BaseCallback):
     def _record(self, result: MethodResult, seconds: float) -> dict[str, Any]:
         """Return the record of a validation for the learning curve, and log it."""
         summary = result.summary()
+        env = self.training_env
+        assert isinstance(env, ViaVecEnv)
         record = {
             "decisions": self.num_timesteps,
-            "physics_steps": self._env.physics_steps,
-            "simulated_seconds": round(self._simulated_seconds, 6),
+            "physics_steps": env.physics_steps,
             "seconds": round(seconds, 3),
             "success_by_band": summary["success_by_band"],
         }
@@ -188,18 +189,6 @@ class RunCallback(BaseCallback):
                 self.logger.record(f"validation/{name}", value)
         return record
 
-    @property
-    def _env(self) -> ViaVecEnv:
-        env = self.training_env
-        assert isinstance(env, ViaVecEnv)
-        return env
-
-    @property
-    def _simulated_seconds(self) -> float:
-        """Time that was simulated, [s]; 0 if the environment does not count its steps."""
-        steps = self._env.physics_steps
-        return steps * float(self._env.get_attr("model", [0])[0].opt.timestep) if steps else 0.0
-
     def _log(self) -> None:
         episodes = list(self.model.ep_info_buffer or ())
         for name in LOGGED:
@@ -207,8 +196,6 @@ class RunCallback(BaseCallback):
             if values:
                 tag = f"rollout/{name}_rate" if name in RATES else f"rollout/{name}"
                 self.logger.record(tag, float(np.mean(values)))
-        if self._simulated_seconds:
-            self.logger.record("time/simulated_seconds", self._simulated_seconds)
         self.model.dump_logs()
 
     def _show_progress(self) -> None:
