@@ -37,7 +37,7 @@ format: $(READY) ## let ruff put the source in order
 	@$(BIN)/ruff check --fix .
 
 scenes: $(READY) ## make the frozen scenes again and compare their hashes
-	@$(BIN)/python -m viapoint.training.scene_sets.make --check
+	@$(BIN)/python benchmarks/frozen_scenes.py --check
 
 versions: $(READY) ## the suite with the oldest versions that are allowed, in an environment of its own
 	@$(BIN)/python benchmarks/versions.py oldest

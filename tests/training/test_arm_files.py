@@ -1,10 +1,8 @@
 """Arms of files in training, evaluation and models."""
 
 import shutil
-import warnings
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -80,16 +78,3 @@ def test_a_copy_of_an_arm_is_the_same_arm(tmp_path) -> None:
             np.testing.assert_array_equal(first, second)
     for name in ("joint_range", "velocity_limit", "torque_limit", "home", "stiffness", "damping"):
         np.testing.assert_array_equal(getattr(copy, name), getattr(arm, name))
-
-
-def test_environments_take_files_and_say_what_is_missing() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gym.make("viapoint/Reach-v0", arm=str(UR5E))
-    env.reset(seed=0)
-    assert env.unwrapped.task.arm is arm_of(str(UR5E))
-    assert env.unwrapped.task.as_dict()["arm"] == str(UR5E)
-    assert np.isfinite(env.step(env.action_space.sample())[1])
-    env.close()
-    with pytest.raises(ValueError, match=r"no file 'nowhere\.urdf'"):
-        gym.make("viapoint/Reach-v0", arm="nowhere.urdf")

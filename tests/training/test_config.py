@@ -10,36 +10,18 @@ import pytest
 from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
 from viapoint.training.cli import main as cli
 from viapoint.training.config.configs import (
-    DemoConfig,
     EvaluateConfig,
-    PlayConfig,
-    StudyConfig,
     TrainConfig,
 )
 from viapoint.training.config.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
 from viapoint.training.config.words import from_words, to_words
 
-EXAMPLES = [
-    TrainConfig(),
-    TrainConfig(
-        env="viapoint/PlanarReach-v0",
-        algo="ppo",
-        out=Path("runs") / "x",
-        n_timesteps=5,
-        env_kwargs={"n_via": 2, "timing": "learned"},
-        hyperparameters={"batch_size": 3},
-    ),
-    EvaluateConfig(agent="runs/x", baselines=("untrained", "random80"), json=Path("a.json")),
-    PlayConfig(agent="viapoint/PlanarReach-v0"),
-    DemoConfig(out=Path("d"), n_scenes=4),
-    StudyConfig(file=Path("study.yaml"), workers=2),
-]
 
-
-@pytest.mark.parametrize("config", EXAMPLES, ids=lambda config: type(config).__name__)
-def test_configurations_are_frozen_and_that_of_a_training_survives_json(config):
-    if isinstance(config, TrainConfig):
-        assert TrainConfig(**json.loads(json.dumps(config.as_json()))) == config
+def test_configurations_are_frozen_and_that_of_a_training_survives_json():
+    config = TrainConfig(
+        algo="ppo", out=Path("x"), env_kwargs={"n_via": 2}, hyperparameters={"batch_size": 3}
+    )
+    assert TrainConfig(**json.loads(json.dumps(config.as_json()))) == config
     with pytest.raises(dataclasses.FrozenInstanceError):
         config.env = "other"
 
@@ -47,14 +29,11 @@ def test_configurations_are_frozen_and_that_of_a_training_survives_json(config):
 @pytest.mark.parametrize(
     ("text", "value"),
     [
-        ("2", 2),
         ("-1.5e-3", -0.0015),
         ("1e-3", 0.001),
         ("true", True),
-        ("null", None),
         ("[1,8]", [1, 8]),
         ('{"a":[16]}', {"a": [16]}),
-        ("learned", "learned"),
         ("auto_0.1", "auto_0.1"),
         ("a=b", "a=b"),
     ],
@@ -106,4 +85,3 @@ def test_every_algorithm_has_presets_that_fit():
             check_hyperparameters(algo, preset.arguments())
     for algo, preset in PRESETS.items():
         assert TrainConfig(algo=algo).total_timesteps == preset.n_timesteps
-        assert TrainConfig(algo=algo, n_timesteps=7, n_envs=3).copies == 3

@@ -89,13 +89,10 @@ def changed(name, value):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (lambda table: table.drop(columns="y"), "no column y"),
         (lambda table: table.drop(columns=["time", "x"]), "no column time, x"),
-        (changed("x", np.nan), "line 5, column x"),
         (changed("z", "far"), "line 5, column z: far"),
         (changed("movement", np.nan), "names no movement in line 5"),
         (lambda table: table[::-1], "movement straight: time must ascend"),
-        (lambda table: table[:6], "movement around: position must have 11 or more"),
         (lambda table: table[:0], "holds no samples"),
     ],
 )

@@ -6,11 +6,8 @@ import json
 import socket
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 pytest.importorskip("viser", reason="the extra `live` is not installed")
 pytest.importorskip("mjviser", reason="the extra `live` is not installed")
@@ -150,13 +147,6 @@ def test_a_plan_of_the_motion_planner_is_free_or_says_why_not(env_id, arenas):
     assert executed >= 3
 
 
-def test_other_numbers_of_via_points_are_searched(arenas):
-    arena = arenas(PLANAR)
-    for number in (0, 2, 3):
-        state = with_proposals(arena, decided(arena, drawn(arena), n_via=number))
-        assert len(state.plan.durations) == number + 1
-
-
 @pytest.mark.parametrize("env_id", [PLANAR, PANDA])
 def test_a_plan_by_hand_is_valued_as_the_same_decision(env_id, arenas):
     arena = arenas(env_id)
@@ -168,6 +158,9 @@ def test_a_plan_by_hand_is_valued_as_the_same_decision(env_id, arenas):
     assert first.motion.clearance == pytest.approx(chosen.motion.clearance, abs=1e-6)
     assert first.motion.duration == pytest.approx(chosen.motion.duration)
     assert first.reward == pytest.approx(chosen.reward, abs=1e-6)
+    for number in (0, 2, 3):
+        other = with_proposals(arena, decided(arena, state.scene, n_via=number))
+        assert len(other.plan.durations) == number + 1
     longer = decided(arena, state.scene, duration=chosen.motion.duration + 0.3)
     assert longer.plan.duration == pytest.approx(chosen.motion.duration + 0.3)
     np.testing.assert_allclose(longer.plan.waypoints, chosen.motion.waypoints)
@@ -236,16 +229,6 @@ def test_obstacles_of_every_shape_are_added_resized_drawn_and_kept_in_files(env_
     assert [each.kind for each in scene.without(0).obstacles] == [each.kind for each in scene.obstacles[1:]]
 
 
-@settings(max_examples=20)
-@given(st.floats(0.01, 0.1), st.floats(0.001, 0.2), st.floats(-3.0, 3.0))
-def test_obstacles_are_drawn_where_they_are(radius, length, angle):
-    """All corners lie on the surface."""
-    turn = transforms.SO3.from_rpy_radians(0.0, angle, 2.0 * angle).wxyz
-    shape = ve.Capsule(radius, length, position=(0.1, 0.2, 0.3), quaternion=turn)
-    corners = drawing.obstacle_mesh(shape).vertices + np.asarray(shape.position)
-    np.testing.assert_allclose(shape.distance(corners), 0.0, atol=2e-6)
-
-
 def test_tubes_are_closed_and_have_their_radius():
     angle = np.linspace(0.0, 2.0, 40)
     points = np.stack((np.cos(angle), np.sin(angle), 0.2 * angle), axis=-1)
@@ -291,16 +274,6 @@ def test_an_agent_of_control_steps_moves_to_the_end_of_its_episode():
     np.testing.assert_allclose(movement.rollout.hand[0], arena.tool(state.scene.start), atol=0.01)
 
 
-@pytest.mark.parametrize("env_id", [PLANAR, PANDA, MOVING])
-def test_python_code_sets_the_scene_up(env_id, arenas):
-    arena = arenas(env_id)
-    scene, names = drawn(arena), {}
-    exec(scene.to_python(env_id, arena.arguments["own"]), names)
-    assert_same(arena.scene_of(names["env"].unwrapped.batch.scenes), scene, atol=1e-5)
-    assert isinstance(names["observation"], dict)
-    assert isinstance(names["gym"].spec(env_id), gym.envs.registration.EnvSpec)
-
-
 def test_scene_files_are_exact_and_keep_names_and_changes(arenas):
     """The page writes what `scene_from_json` reads."""
     arena = arenas(MOVING)
@@ -314,14 +287,22 @@ def test_scene_files_are_exact_and_keep_names_and_changes(arenas):
     again = arena.read(scene.to_json(MOVING))
     assert_same(again, scene, atol=1e-9)
     np.testing.assert_array_equal(again.turns, turns)
-    assert [each.name for each in again.obstacles] == ["", "ball"]
     more = again.with_obstacle(2, again.obstacles[0]).without(0)
     options = ve.scene_from_json(more.to_json(MOVING))
     assert [each.name for each in options["obstacles"]] == ["ball", ""]
     np.testing.assert_array_equal(more.turns, turns[1:])
-    np.testing.assert_allclose(options["start"], record["start"], atol=1e-9)
+    names = {}
+    exec(again.to_python(MOVING, arena.arguments["any"]), names)
+    assert_same(
+        arena.scene_of(names["env"].unwrapped.batch.scenes), again._replace(obstacles=unnamed(again)), 1e-5
+    )
 
 
+def unnamed(scene):
+    return tuple(dataclasses.replace(shape, name="") for shape in scene.obstacles)
+
+
+IN_THE_WAY = {"shape": "cylinder", "radius": 0.03, "half_length": 0.1, "position": [0.1, 0.4, 0.0]}
 GOOD_FILE = {"format": "viapoint-scene", "start": [-0.2, 0.3], "goal": [0.1, 0.4]}
 
 
@@ -329,18 +310,12 @@ GOOD_FILE = {"format": "viapoint-scene", "start": [-0.2, 0.3], "goal": [0.1, 0.4
     "change",
     [
         {"format": "other"},
-        {"goal": [0.1]},
         {"goal": [0.1, float("nan")]},
         {"start": [2.0, 2.0]},
-        {
-            "obstacles": [
-                {"shape": "cylinder", "radius": 0.03, "half_length": 0.1, "position": [0.1, 0.4, 0.0]}
-            ]
-        },
+        {"obstacles": [IN_THE_WAY]},
         {"obstacles": 25 * [{"shape": "sphere", "radius": 0.01, "position": [0.5, 0.5, 0.0]}]},
         {"obstacles": [{"shape": "point_cloud", "points": [[0.5, 0.5, 0.0]], "radius": 0.01}]},
         {"turns": [[0.5, 0.1, 0.0, 0.0]]},
-        {"jumps": [[0.5, 0.1]]},
     ],
 )
 def test_impossible_files_are_refused(change, arenas):
@@ -348,12 +323,6 @@ def test_impossible_files_are_refused(change, arenas):
     arena.read(json.dumps(GOOD_FILE).encode())
     with pytest.raises(ValueError):
         arena.read(json.dumps(GOOD_FILE | change).encode())
-
-
-def test_the_page_is_private():
-    with LivePage(env=PLANAR, port=0) as page:
-        assert page.url.startswith("http://127.0.0.1:")
-        assert page._server.request_share_url() is None
 
 
 def test_what_cannot_be_served_is_refused(capsys, tmp_path):
@@ -373,6 +342,9 @@ def test_what_cannot_be_served_is_refused(capsys, tmp_path):
             assert named in line
     with pytest.raises(ValueError):
         LivePage(PLANAR, env=PANDA, port=0)
+    with LivePage(env=PLANAR, port=0) as page:
+        assert page.url.startswith("http://127.0.0.1:")
+        assert page._server.request_share_url() is None
 
 
 def test_scenes_that_exceed_the_environment_of_the_agent_are_searched():
@@ -388,6 +360,3 @@ def test_scenes_that_exceed_the_environment_of_the_agent_are_searched():
     for other in (crowded, walled):
         assert arena.limit(other)
         assert decided(arena, other, AGENT).proposals[0].maker == SEARCH
-        names = {}
-        exec(other.to_python(PLANAR, arena.arguments["any"]), names)
-        assert_same(arena.scene_of(names["env"].unwrapped.batch.scenes), other, atol=1e-5)

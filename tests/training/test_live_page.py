@@ -13,17 +13,12 @@ pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 from browser import Browser, chromium, wait_for
 from viser import transforms
 
-from viapoint.training.agents.viaq import ViaQ
 from viapoint.training.live.page import LivePage
-from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine")
 
-PLANAR, PANDA, REPLANNING = (
-    "viapoint/PlanarObstacles-v0",
-    "viapoint/PandaObstacles-v0",
-    "viapoint/PlanarTargetJump-v0",
-)
+PLANAR, PANDA = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
+REPLANNING = "viapoint/PlanarTargetJump-v0"
 MESSAGE = "#viapoint-message"
 SHIFT, UP, ASIDE = np.array([0.06, 0.08]), np.array([0.0, 0.05]), np.array([0.05, 0.05])
 """Displacements, [m]."""
@@ -43,8 +38,8 @@ def opened(browser):
     """Open pages and tabs; all are closed in the end."""
     pages, tabs = [], []
 
-    def page(env, agent=None, seed=1):
-        pages.append(LivePage(agent, env=env, port=0, seed=seed))
+    def page(env, seed=1):
+        pages.append(LivePage(env=env, port=0, seed=seed))
         return pages[-1]
 
     def tab(page):
@@ -136,31 +131,12 @@ def test_what_a_user_does_changes_the_plan(opened):
     settled(session)
     wait_for(lambda: "the start is in contact" in tab.text(MESSAGE))
     assert not session.state.plan.success
+    tab.press("button", "wall")
+    wait_for(lambda: "half_space" in [each.kind for each in session.state.scene.obstacles])
     tab.press("button", "Reset")
     wait_for(lambda: "in contact" not in tab.text(MESSAGE))
     np.testing.assert_array_equal(session.state.scene.goal, goal)
     np.testing.assert_array_equal(session.state.scene.obstacles[0].position, obstacle)
-
-
-def test_scenes_that_the_agent_does_not_know_are_searched(opened):
-    open_page, open_tab = opened
-    agent = ViaQ("ViaQPolicy", ViaVecEnv(PLANAR, num_envs=1), seed=0)
-    tab, session = open_tab(open_page(PLANAR, agent=agent))
-    session.act("change", method="agent", n_via=None)
-    settled(session)
-    assert session.state.proposals[0].value is not None
-    number = len(session.state.scene.obstacles)
-    tab.press("button", "wall")
-    wait_for(lambda: "trained without half-space obstacles" in tab.text("body"))
-    settled(session)
-    assert [each.kind for each in session.state.scene.obstacles[number:]] == ["half_space"]
-    assert session.state.proposals[0].value is None
-    tab.press("button", "Execute")
-    wait_for(lambda: "Success" in tab.text(MESSAGE) or "Failure" in tab.text(MESSAGE))
-    tab.press("button", "Random")
-    wait_for(lambda: "trained without" not in tab.text("body"))
-    settled(session)
-    assert session.state.proposals[0].value is not None
 
 
 def test_an_arm_in_space_follows_what_is_dragged_and_turned(opened):

@@ -57,21 +57,17 @@ CONFIGURATIONS = [
     (TrainConfig, {"env_kwargs": ("n_via",)}),
     *((TrainConfig, {"env_kwargs": {name: 1}}) for name in ELSEWHERE),
     (TrainConfig, {"hyperparameters": 5}),
-    *((TrainConfig, {"stop_when_stalled": share}) for share in (0.0, 1.0, -0.3, True, "0.3", math.nan)),
+    *((TrainConfig, {"stop_when_stalled": share}) for share in (0.0, 1.0, True, "0.3", math.nan)),
     (TrainConfig, STALLING),  # the preset has no more decisions than it must make
     (TrainConfig, {**STALLING, "n_timesteps": 10**5, "eval_every": 0}),
     (EvaluateConfig, {}),
     (EvaluateConfig, {"baselines": ("ompl", "ompl"), "env": ENV}),
-    (EvaluateConfig, {"env": ENV, "checks": (8,)}),
-    (EvaluateConfig, {"env": ENV, "checks": ()}),
+    *((EvaluateConfig, {"env": ENV, "checks": checks}) for checks in ((8,), ())),
     (EvaluateConfig, {"agent": ENV, "checks": (-1,)}),
     (EvaluateConfig, {"agent": ENV, "n_scenes": 0}),
     (EvaluateConfig, {"agent": "runs/x", "pretrained": ENV}),
     (EvaluateConfig, {"pretrained": "nobody"}),
-    (EvaluateConfig, {"env": "nothing"}),
     (PlayConfig, {}),
-    (PlayConfig, {"agent": "a", "n_scenes": 0}),
-    (PlayConfig, {"agent": "a", "checks": -1}),
     (PlayConfig, {"agent": "a", "video": "film.gif"}),
     (LiveConfig, {"port": 70_000}),
     (LiveConfig, {"env": "nothing"}),
@@ -107,13 +103,13 @@ def test_words(words):
 def test_places_that_cannot_be_written_to(kind, name, needed, tmp_path):
     (tmp_path / "file").write_text("")
     kind(**needed, **{name: tmp_path / "deeper/new.mp4"})
-    for bad in ("file", "file/new.mp4", "file/deeper/new.mp4"):
+    for bad in ("file", "file/deeper/new.mp4"):
         with pytest.raises(ValueError):
             kind(**needed, **{name: tmp_path / bad})
 
 
 NUMBERS = (math.nan, -math.inf, "abc", [], {"kind": "eval"})
-RATES = (0.0, -1e-3, True, None, {"kind": "linear", "start": 1.0})
+RATES = (0.0, True, {"kind": "linear", "start": 1.0})
 HYPERPARAMETERS = [
     *(("sac", {name: value}) for name in ("learning_rate", "gamma", "batch_size") for value in NUMBERS),
     *((algo, {"learning_rate": value}) for algo in ALGORITHMS for value in RATES),
@@ -121,29 +117,24 @@ HYPERPARAMETERS = [
     *(("sac", {name: 7}) for name in ("gamma", "tau", "policy_kwargs")),
     *(("sac", {"ent_coef": value}) for value in (-0.1, "auto_0", "much")),
     *(("sac", {"train_freq": pair}) for pair in ([0, "step"], [1, "episode"])),
+    *(("sac", {"policy_kwargs": values}) for values in ({"speed": 1}, {"net_arch": [-3]})),
     *(("td3", {"action_noise": {"kind": "normal", "sigma": sigma}}) for sigma in (-0.1, math.nan, "x")),
     *(("td3", {name: -1}) for name in ("policy_delay", "target_policy_noise", "buffer_size")),
-    *(("ppo", {name: 0}) for name in ("n_steps", "n_epochs", "clip_range")),
+    *(("ppo", {name: 0}) for name in ("n_steps", "clip_range")),
     *(("ppo", {name: 1.5}) for name in ("n_epochs", "gae_lambda")),
     ("ppo", {"batch_size": 1}),
     *(("viaq", {name: 0}) for name in ("temperature", "explore_candidates", "next_candidates")),
     *(("viaq", {name: 1.5}) for name in ("explore_uniformly", "policy_kwargs")),
-    *(("viaq", {name: 1}) for name in ("action_noise", "n_steps", "use_sde")),
-]
-
-
-POLICIES = [
-    ("sac", {"speed": 1}),
-    ("sac", {"net_arch": [-3]}),
-    *(("viaq", {"width": value}) for value in (0, 128.0, "wide")),
-    *(("viaq", {"candidates": value}) for value in (0, 2.5)),
-    *(("viaq", {name: 0}) for name in ("instants", "per_refinement")),
-    *(("viaq", {name: -1}) for name in ("refinements", "checks")),
-    *(("viaq", {name: 3}) for name in ("optimizer_kwargs", "task", "heads")),
+    *(("viaq", {name: 1}) for name in ("action_noise", "use_sde")),
+    *(("viaq", {"policy_kwargs": {"width": value}}) for value in (0, 128.0, "wide")),
+    *(
+        ("viaq", {"policy_kwargs": {name: -1}})
+        for name in ("candidates", "instants", "refinements", "checks")
+    ),
+    *(("viaq", {"policy_kwargs": {name: 3}}) for name in ("optimizer_kwargs", "task", "heads")),
 ]
 UNTRAINABLE = [
     *({"algo": algo, "hyperparameters": values} for algo, values in HYPERPARAMETERS),
-    *({"algo": algo, "hyperparameters": {"policy_kwargs": values}} for algo, values in POLICIES),
     {"env_kwargs": {"colour": 1}},
     {"env_kwargs": {"n_via": -1}},
 ]
@@ -198,8 +189,7 @@ def film(path="film.mp4", number=1, mode="rgb_array_list"):
 
 
 CALLS = [
-    *(lambda name=name: make_method(name, ENV)
-      for name in ("magic", "search", "search3", "sobol0", "random_order0", "search512x", "unrevised", "")),
+    *(lambda name=name: make_method(name, ENV) for name in ("magic", "search", "search3", "sobol0", "unrevised")),
     *(lambda name=name: make_method(name, MOVING) for name in ("constant", "random16", "ompl")),
     lambda: agent_method("agent", SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2), 8),
     lambda: evaluate_methods([], load(shipped_path("test", ENV)), ENV),
@@ -208,17 +198,14 @@ CALLS = [
     lambda: evaluate(baselines=["straight"]),
     lambda: evaluate(env=ENV, baselines=["untrained"]),
     lambda: evaluate("nowhere"),
-    lambda: evaluate(ENV, checks=-1),
     lambda: evaluate(ENV, baselines="straight"),
     lambda: evaluate(ENV, checks=[0, 1.5]),
     lambda: evaluate(ENV, n_scenes=0),
     lambda: evaluate(ENV, scenes="nowhere.npz"),
-    lambda: GeometrySearch("viapoint/Nothing-v0"),
     *(lambda name=name, value=value: GeometrySearch(ENV, **{name: value})
-      for name, value in (("n_checks", 0), ("n_checks", 1.5), ("refinements", -1), ("per_round", True))),
+      for name, value in (("n_checks", 1.5), ("refinements", -1), ("per_round", True))),
     lambda: plan(start=(0.1, 0.2, 0.3)),
     lambda: plan(goal=(np.nan, 0.4)),
-    lambda: plan(goal="there"),
     lambda: plan(goal=(0.9, 0.4)),
     lambda: plan(goal=(-0.2, 0.3)),  # where it starts
     lambda: plan(obstacles=[(0.0, 0.3, 0.1)]),
@@ -226,7 +213,6 @@ CALLS = [
     lambda: agent().plan((-0.2, 0.3), (0.1, 0.4), [Sphere(0.01, position=(0.5, 0.1 * i, 0.0)) for i in range(9)]),
     lambda: ViaQ("ViaQPolicy", ViaVecEnv(MOVING, 1)).plan((-0.2, 0.3), (0.1, 0.4)),
     lambda: agent().learn(8),  # loaded for decisions
-    lambda: agent().predict(np.zeros(2)),
     lambda: predicted(wind=np.zeros(2)),
     lambda: predicted(goal=np.array([np.nan, 0.3])),
     lambda: predicted(goal=gym.make(ENV).reset(seed=0)[0]["hand"]),
@@ -239,8 +225,7 @@ CALLS = [
     lambda: ViaQ("ViaQPolicy", VecNormalize(ViaVecEnv(ENV, 2))),
     *(lambda change=change: scene_file(**change) for change in (
         {"format": "other"}, {"start": [0.1]}, {"goal": [0.1, math.nan]}, {"jumps": [[1.0]]}, {"colour": 1},
-        {"obstacles": 3}, {"obstacles": [3]}, {"obstacles": [[0.1, 0.2]]}, {"obstacles": [{"shape": "cube"}]},
-        {"obstacles": [{"shape": "point_cloud", "points": [[0, 0, 1]]}]},
+        {"obstacles": 3}, {"obstacles": [[0.1, 0.2]]}, {"obstacles": [{"shape": "cube"}]},
     )),
     *(lambda change=change: capsule_file(**change) for change in (
         {"radius": "x"}, {"radius": -1.0}, {"position": [0, 0]}, {"colour": 1},
@@ -271,9 +256,7 @@ def test_calls(call, tmp_path, monkeypatch):
 
 COPIES = [
     (lambda env: (env.set_options([{"start": 0.0}, *[{}] * 5]), env.reset()), ValueError),
-    (lambda env: (env.set_options([*[{}] * 5, {"goal": 0.0}]), env.reset()), ValueError),
     (lambda env: (env.set_options([{}] * 5), env.reset()), ValueError),
-    (lambda env: (env.set_options([5] * 6), env.reset()), ValueError),
     (lambda env: (env.set_options(5), env.reset()), ValueError),
     (lambda env: env.get_attr("num_envs", 6), IndexError),
     (lambda env: env.env_method("__str__", indices=[0, -7]), IndexError),
@@ -292,13 +275,10 @@ def test_what_copies_of_an_environment_cannot_share(call, error, env):
 
 def test_folders_that_are_no_runs(tmp_path):
     run = Run.create(TrainConfig(out=tmp_path / "run"))
-    (tmp_path / "file").write_text("")
     for call in (
         lambda: Run(tmp_path / "nothing"),
-        lambda: Run(tmp_path / "file"),
         lambda: Run(tmp_path),
         lambda: Run.create(TrainConfig(out=tmp_path)),
-        lambda: Run.create(TrainConfig(out=tmp_path / "file")),
         lambda: find_model(run.folder),
         lambda: find_model(tmp_path),
         lambda: train(TrainConfig(out=tmp_path / "nothing", resume=True)),
@@ -316,39 +296,32 @@ def test_folders_that_are_no_runs(tmp_path):
 
 COMMANDS = [
     ("", "train"),
-    ("fly", "fly"),
     ("trian", "did you mean 'train'"),
     ("train --env viapoint/PlanarObstacle-v0", "Did you mean: `PlanarObstacles`"),
     ("train --n-timesteps -5", "--n-timesteps must be a whole number, from 1"),
     ("train --n-timesteps 1e5", "--n-timesteps: must be a whole number, got '1e5'"),
-    (f"train --n-timesteps 1{'0' * 21}", "to 1000000000"),
     ("train --env-kwargs n_vias=2 --out full", "did you mean 'n_via'"),
     ("train --env-kwargs n_obstacles=999", "n_obstacles"),
-    ("train --out /proc/x/y", "/proc/x/y cannot be written"),
-    ("paper --out /proc/p", "--out /proc/p cannot be written"),
-    (f"evaluate --env {ENV} --json /proc/x", "--json /proc/x cannot be written"),
-    ("study --workers 0 a.yaml", "--workers must be a whole number, 1 or more"),
     ("train --env-kwargs n_via", "n_via"),
     ("train --env-kwargs num_envs=4", "--n-envs"),
-    ("train --env-kwargs n_vi=2 --out new", "n_vi"),
     ("train --hyperparameters gamma=7 --out new", "gamma"),
     ('train --hyperparameters policy_kwargs={"width":0} --out new', "width"),
+    ("train --out /proc/x/y", "/proc/x/y cannot be written"),
     ("train --n-timesteps 1 --out full", "full"),
     ("train --resume --out full", "full"),
     ("evaluate", "--env"),
     ("evaluate nowhere", "nowhere"),
     (f"evaluate --env {ENV} --baselines magic", "magic"),
     (f"evaluate --env {ENV} --baselines straight --scenes nowhere.npz", "nowhere.npz"),
+    (f"evaluate --env {ENV} --json /proc/x", "--json /proc/x cannot be written"),
     (f"evaluate --env {ENV} --baselines straight --json full", "full"),
     (f"evaluate {REACH} --baselines unrevised", "unrevised"),
     ("paper --out full/notes.txt", "notes.txt"),
-    *((f"paper --agent {find_model(f'viapoint/{name}-v0')}", name)
-      for name in ("PlanarReach",)),
+    (f"paper --agent {find_model('viapoint/PlanarReach-v0')}", "PlanarReach"),
     ("demo --out full", "full"),
-    ("demo --env viapoint/PlanarObstaclesStep-v0", STEP),
     ("study nowhere.yaml", "nowhere.yaml"),
     ("doctor --out", "--out"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("words", "named"), COMMANDS)

@@ -23,31 +23,13 @@ def test_wilson_equals_published_values():
     assert round(statistics.wilson(0, 20).high, 4) == 0.1611
 
 
-@pytest.mark.parametrize("trials", [1, 7, 500])
-def test_wilson_solves_the_score_equation(trials):
-    z = 1.959963984540054
-    for successes in range(1, trials):
-        p, low, high = statistics.wilson(successes, trials)
-        for bound in (low, high):
-            assert abs(p - bound) == pytest.approx(z * math.sqrt(bound * (1 - bound) / trials), rel=1e-9)
-    assert statistics.wilson(trials, trials).high == 1.0
-
-
-def test_mcnemar_is_the_exact_binomial_test():
-    """With the sum over the tail of the binomial distribution as an independent computation."""
-    generator = np.random.default_rng(0)
-    for _ in range(20):
-        first, second = generator.random((2, 80)) < generator.random((2, 1))
-        result = statistics.mcnemar(first, second)
-        assert result.difference == pytest.approx(first.mean() - second.mean())
-        assert result.only_first == (first & ~second).sum()
-        number, fewer = result.only_first + result.only_second, min(result[1:3])
-        tail = sum(math.comb(number, k) for k in range(fewer + 1)) / 2**number
-        assert result.p_value == pytest.approx(min(1.0, 2.0 * tail), rel=1e-9)
-    same = np.array([True, False, True])
-    assert statistics.mcnemar(same, same) == (0.0, 0, 0, 1.0)
-    five = statistics.mcnemar([True] * 5, [False] * 5)
-    assert five.p_value == pytest.approx(2 / 2**5)
+def test_mcnemar_counts_scenes_in_which_one_alone_succeeds():
+    first, second = np.random.default_rng(0).random((2, 80)) < [[0.7], [0.5]]
+    result = statistics.mcnemar(first, second)
+    assert result.difference == pytest.approx(first.mean() - second.mean())
+    assert (result.only_first, result.only_second) == ((first & ~second).sum(), (second & ~first).sum())
+    assert statistics.mcnemar(first, first) == (0.0, 0, 0, 1.0)
+    assert statistics.mcnemar([True] * 5, [False] * 5).p_value == pytest.approx(2 / 2**5)
 
 
 def test_across_seeds_draws_whole_agents():

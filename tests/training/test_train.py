@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from viapoint.training.agents.model_io import load_model
 from viapoint.training.cli import main as cli
@@ -25,6 +26,7 @@ from viapoint.training.runs.callback import TrainingStoppedError
 from viapoint.training.runs.checkpoints import read_state
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import TrainingFailedError, train
+from viapoint.training.scene_sets.scene_set import scenes_for
 
 OFF_POLICY = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16}
 TINY = {
@@ -41,18 +43,9 @@ WHOLE, MOVING, STEP = (
 
 
 def config(folder, algo="viaq", **changes):
-    values = {
-        "out": folder,
-        "algo": algo,
-        "n_timesteps": STEPS,
-        "n_envs": 16,
-        "eval_every": 64,
-        "eval_scenes": 8,
-        "checkpoint_every": 64,
-        "env_kwargs": {"threads": 1},
-        "hyperparameters": TINY[algo],
-        "progress": False,
-    }
+    values = {"out": folder, "algo": algo, "n_timesteps": STEPS, "n_envs": 16, "progress": False}
+    values |= {"eval_every": 64, "eval_scenes": 8, "checkpoint_every": 64}
+    values |= {"env_kwargs": {"threads": 1}, "hyperparameters": TINY[algo]}
     return TrainConfig(**{**values, **changes})
 
 
@@ -60,13 +53,17 @@ def curve(run):
     return [{**record, "seconds": None} for record in run.curve]
 
 
+def same_weights(one, other, name):
+    first, second = (read_arrays(run.folder / name / "weights.safetensors") for run in (one, other))
+    assert set(first) == set(second)
+    for part in first:
+        np.testing.assert_array_equal(first[part], second[part], err_msg=f"{name} {part}")
+
+
 def same_result(one, other):
     assert curve(one) == curve(other)
-    for name in ("best", "final"):
-        first, second = (read_arrays(run.folder / name / "weights.safetensors") for run in (one, other))
-        assert set(first) == set(second)
-        for part in first:
-            np.testing.assert_array_equal(first[part], second[part], err_msg=f"{name} {part}")
+    same_weights(one, other, "best")
+    same_weights(one, other, "final")
     same_state(*(read_state(run.checkpoints()[-1]) for run in (one, other)))
 
 
@@ -115,28 +112,34 @@ def test_a_killed_run_resumes_to_the_same_result(env_id, algo, tmp_path, monkeyp
 def test_a_run_is_the_same_watched_or_not(tmp_path):
     watched = train(config(tmp_path / "watched"))
     alone = train(config(tmp_path / "alone", eval_every=0, checkpoint_every=10_000))
-    for part, array in read_arrays(watched.folder / "final" / "weights.safetensors").items():
-        np.testing.assert_array_equal(
-            read_arrays(alone.folder / "final" / "weights.safetensors")[part], array
-        )
+    same_weights(watched, alone, "final")
     assert alone.curve == []
     assert alone.best.name == "final"
 
 
-def test_what_a_run_leaves(tmp_path):
-    run = train(config(tmp_path / "run"))
+def test_what_a_run_leaves(tmp_path, capsys):
+    run = train(config(tmp_path / "run", progress=True))
     assert [record["decisions"] for record in run.curve] == [0, 64, 128, 192]
+    told = capsys.readouterr().err  # a line for each validation, and no bar
+    assert len(told.strip().splitlines()) == 4
+    assert "\r" not in told
     for name in ("physics_steps", "seconds"):
         assert (np.diff([record[name] for record in run.curve]) > 0.0).all()
     best = max(record["success"]["rate"] for record in run.curve)
-    model = load_model(run.best)
     assert run.best.name == "best"
-    scenes = callback.validation_scenes(run)
-    method = callback.agent_method("agent", model)
-    again = evaluate_methods(
-        [method], scenes, run.config.env, env_kwargs={"threads": 1}, time_decisions=False
-    )
-    assert again.results[0].success.mean() == best
+    method = callback.agent_method("agent", load_model(run.best))
+    scenes = scenes_for("validation", run.config.task, 8)
+    (again,) = evaluate_methods([method], scenes, WHOLE, time_decisions=False).results
+    assert again.success.mean() == best
+
+    events = EventAccumulator(str(run.folder / "tensorboard"))
+    events.Reload()
+    assert {"rollout/success_rate", "rollout/duration"} <= set(events.Tags()["scalars"])
+    for name in ("success", "min_clearance", "goal_error"):
+        values = [record[name]["rate"] if name == "success" else record[name] for record in run.curve]
+        logged = events.Scalars(f"validation/{name}_rate" if name == "success" else f"validation/{name}")
+        assert [event.step for event in logged] == [0, 64, 128, 192]
+        assert [event.value for event in logged] == pytest.approx(values, rel=1e-6)
 
 
 def test_ctrl_c_saves_and_leaves_and_the_rest_follows(tmp_path, monkeypatch):
@@ -186,7 +189,7 @@ def with_success(monkeypatch, rates):
 
 
 @pytest.mark.parametrize("algo", ["viaq", "ppo"])
-def test_a_training_that_stalls_ends_there_and_says_so(algo, tmp_path, monkeypatch, shipped):
+def test_a_training_that_stalls_ends_there_also_if_it_was_interrupted(algo, tmp_path, monkeypatch, shipped):
     with_success(monkeypatch, [0.0, 0.1, 0.2, 0.5, 0.4, 0.5, 0.5, 0.5, 0.5, 0.5, 1.0])
     heard = Heard()
     run = train(config(tmp_path / "run", algo, **STALLING), heard)
@@ -197,7 +200,13 @@ def test_a_training_that_stalls_ends_there_and_says_so(algo, tmp_path, monkeypat
     assert heard.ended == 1
     again = train(TrainConfig(out=run.folder, resume=True, n_timesteps=1280, progress=False))
     same_result(run, again)
-    assert (again.stalled, again.decisions) == (True, 320)
+    with monkeypatch.context() as patch:
+        kill_after(patch, 18)  # between the checkpoints at 256 and 320 decisions
+        with pytest.raises(SystemError):
+            train(config(tmp_path / "killed", algo, **STALLING))
+    killed = Run(tmp_path / "killed")
+    assert (killed.stalled, killed.ended, killed.decisions) == (False, False, 256)
+    same_result(run, train(TrainConfig(out=killed.folder, resume=True, progress=False)))
 
 
 class Heard(BaseCallback):
@@ -210,19 +219,6 @@ class Heard(BaseCallback):
 
     def _on_training_end(self):
         self.ended += 1
-
-
-def test_a_stalling_run_is_the_same_with_and_without_interruption(tmp_path, monkeypatch, shipped):
-    with_success(monkeypatch, [0.0, 0.1, 0.2, 0.5, 0.4, 0.5])
-    whole = train(config(tmp_path / "whole", **STALLING))
-    with monkeypatch.context() as patch:
-        kill_after(patch, 18)  # between the checkpoints at 256 and 320 decisions
-        with pytest.raises(SystemError):
-            train(config(tmp_path / "killed", **STALLING))
-    killed = Run(tmp_path / "killed")
-    assert (killed.stalled, killed.ended, killed.decisions) == (False, False, 256)
-    same_result(whole, train(TrainConfig(out=killed.folder, resume=True, progress=False)))
-    assert (killed.stalled, killed.decisions) == (True, 320)
 
 
 def test_learning_happens(tmp_path):
@@ -285,14 +281,7 @@ def test_a_full_disk_stops_training_and_keeps_what_was_there(full_disk, tmp_path
     full_disk()  # there is room again
     resumed = train(TrainConfig(out=run.folder, resume=True, progress=False))
     whole = train(small(tmp_path / "whole"))
-    same_arrays(*(each.folder / "final" / "weights.safetensors" for each in (resumed, whole)))
-
-
-def same_arrays(one, other):
-    one, other = read_arrays(one), read_arrays(other)
-    assert set(one) == set(other)
-    for name, array in one.items():
-        np.testing.assert_array_equal(array, other[name], err_msg=name)
+    same_weights(resumed, whole, "final")
 
 
 def test_other_versions_are_told(tmp_path, capsys):
@@ -313,13 +302,6 @@ def test_what_cannot_learn_is_told(tmp_path, capsys):
     told = capsys.readouterr().err
     assert "n_via=0" in told
     assert "updated" not in told
-
-
-def test_a_log_holds_a_line_for_each_validation_and_no_bar(tmp_path, capsys):
-    run = train(config(tmp_path / "run", n_timesteps=64, progress=True))
-    told = capsys.readouterr().err
-    assert "\r" not in told
-    assert len(told.strip().splitlines()) == len(run.curve) == 2
 
 
 def test_half_a_training_and_the_other_half_are_a_whole_one(tmp_path):

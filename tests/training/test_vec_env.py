@@ -92,23 +92,6 @@ def test_seeds_options_and_attributes(env):
     assert env.env_method("__str__", indices=1) == [str(env.venv.unwrapped)]
 
 
-def test_a_restored_state_goes_on_alike(env):
-    env.reset()
-    env.step(actions(env))
-    state = env.state()
-    expected = [env.step(actions(env, seed)) for seed in (1, 2)]
-    other = ViaVecEnv(ENV, 6, seed=99, threads=1)
-    other.reset()
-    other.restore(state)
-    for seed, (observed, reward, _, _) in zip((1, 2), expected, strict=True):
-        mine = other.step(actions(env, seed))
-        np.testing.assert_array_equal(mine[1], reward)
-        for name, part in observed.items():
-            np.testing.assert_array_equal(mine[0][name], part)
-    assert other.physics_steps == env.physics_steps
-    other.close()
-
-
 def test_episodes_are_told_as_a_monitor_tells_them(env, recwarn):
     """So SB3 takes returns and lengths from the infos, and does not ask for a wrapper."""
     assert env.env_is_wrapped(Monitor) == [True] * 6

@@ -55,7 +55,8 @@ def run(config: Any) -> None:
     for name, check in CHECKS.items():
         works, found = outcome(check.script, str(config.out))
         all_well &= works or not check.needed
-        print(f"{'ok' if works else 'MISSING' if check.needed else 'without':<8} {name:<14} {found}")
+        failure = "MISSING" if check.needed else "without"
+        print(f"{'ok' if works else failure:<8} {name:<14} {found}")
         if not works:
             print(f"{'':<23} -> {check.remedy}")
     raise SystemExit(0 if all_well else 1)

@@ -141,38 +141,28 @@ def fitted_movements(path: Path, movements: Sequence[Measured], fits: Sequence[V
         figure = Figure(figsize=(WIDTH / 2.54, height / 2.54))
         axes = figure.subplots(len(movements), 2, squeeze=False)
         for (left, right), movement, fit in zip(axes, movements, fits, strict=True):
-            _draw_path(left, movement, fit)
-            _draw_speed(right, movement, fit)
+            # The path is seen in the plane of the two coordinates that change most.
+            shown = np.sort(np.argsort(-np.ptp(movement.position, axis=0), kind="stable")[:2])
+            path_fitted = fit(np.linspace(fit.onset, fit.end, 200))
+            left.plot(*path_fitted[:, shown].T, **FITTED)
+            left.plot(*movement.position[:, shown].T, label="samples", **SAMPLES)
+            left.plot(*fit.start[shown], **START)
+            left.plot(*fit.via_points[:, shown].T, **VIA)
+            left.plot(*fit.goal[shown], **GOAL)
+            left.set_aspect("equal", adjustable="datalim")
+            horizontal, vertical = ("xyz"[i] for i in shown)
+            left.set(xlabel=f"{horizontal} [m]", ylabel=f"{vertical} [m]", title=f"movement {movement.name}")
+
+            measured = np.linalg.norm(np.gradient(movement.position, movement.time, axis=0), axis=1)
+            time = np.linspace(min(fit.onset, movement.time[0]), max(fit.end, movement.time[-1]), 300)
+            right.plot(time, np.linalg.norm(fit(time, 1), axis=1), **FITTED)
+            right.plot(movement.time, measured, **SAMPLES)
+            right.plot(fit.passage_times, np.linalg.norm(fit(fit.passage_times, 1), axis=1), **VIA)
+            right.set_ylim(bottom=0.0)
+            right.set(xlabel="time [s]", ylabel="speed [m/s]")
+            title = f"residuals {1e3 * fit.noise:.2g} mm, $R^2$ = {fit.r_squared:.5f}"
+            right.set_title(title, fontweight="normal")
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), markerscale=1.2)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, metadata={"Software": MARK.decode()})
-
-
-def _draw_path(ax: Any, movement: Measured, fit: ViaPointFit) -> None:
-    """Draw the path in the plane of the two coordinates that change most."""
-    shown = np.sort(np.argsort(-np.ptp(movement.position, axis=0), kind="stable")[:2])
-    path = fit(np.linspace(fit.onset, fit.end, 200))
-    ax.plot(*path[:, shown].T, **FITTED)
-    ax.plot(*movement.position[:, shown].T, label="samples", **SAMPLES)
-    ax.plot(*fit.start[shown], **START)
-    ax.plot(*fit.via_points[:, shown].T, **VIA)
-    ax.plot(*fit.goal[shown], **GOAL)
-    ax.set_aspect("equal", adjustable="datalim")
-    horizontal, vertical = ("xyz"[i] for i in shown)
-    ax.set_xlabel(f"{horizontal} [m]")
-    ax.set_ylabel(f"{vertical} [m]")
-    ax.set_title(f"movement {movement.name}")
-
-
-def _draw_speed(ax: Any, movement: Measured, fit: ViaPointFit) -> None:
-    """Draw the speed over time."""
-    measured = np.linalg.norm(np.gradient(movement.position, movement.time, axis=0), axis=1)
-    time = np.linspace(min(fit.onset, movement.time[0]), max(fit.end, movement.time[-1]), 300)
-    ax.plot(time, np.linalg.norm(fit(time, 1), axis=1), **FITTED)
-    ax.plot(movement.time, measured, **SAMPLES)
-    ax.plot(fit.passage_times, np.linalg.norm(fit(fit.passage_times, 1), axis=1), **VIA)
-    ax.set_ylim(bottom=0.0)
-    ax.set_xlabel("time [s]")
-    ax.set_ylabel("speed [m/s]")
-    ax.set_title(f"residuals {1e3 * fit.noise:.2g} mm, $R^2$ = {fit.r_squared:.5f}", fontweight="normal")

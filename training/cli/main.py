@@ -15,20 +15,8 @@ from typing import Any
 import tyro
 
 from viapoint.training.cli.doctor import explain_import_error
+from viapoint.training.config import configs
 from viapoint.training.config.checks import unknown_name
-from viapoint.training.config.configs import (
-    DemoConfig,
-    DoctorConfig,
-    EvaluateConfig,
-    FitConfig,
-    LiveConfig,
-    PaperConfig,
-    PlanConfig,
-    PlayConfig,
-    RecordConfig,
-    StudyConfig,
-    TrainConfig,
-)
 from viapoint.training.config.words import REGISTRY
 
 
@@ -37,17 +25,17 @@ class UsageError(ValueError):
 
 
 COMMANDS: dict[str, tuple[type[Any], str]] = {
-    "train": (TrainConfig, "cli.commands:train"),
-    "evaluate": (EvaluateConfig, "cli.commands:evaluate"),
-    "plan": (PlanConfig, "cli.plan:run"),
-    "play": (PlayConfig, "cli.commands:play"),
-    "record": (RecordConfig, "cli.commands:record"),
-    "fit": (FitConfig, "cli.fit:run"),
-    "paper": (PaperConfig, "paper.run:run"),
-    "demo": (DemoConfig, "cli.demo:run"),
-    "study": (StudyConfig, "study.run:run"),
-    "live": (LiveConfig, "live.page:run"),
-    "doctor": (DoctorConfig, "cli.doctor:run"),
+    "train": (configs.TrainConfig, "cli.commands:train"),
+    "evaluate": (configs.EvaluateConfig, "cli.commands:evaluate"),
+    "plan": (configs.PlanConfig, "cli.plan:run"),
+    "play": (configs.PlayConfig, "cli.commands:play"),
+    "record": (configs.RecordConfig, "cli.commands:record"),
+    "fit": (configs.FitConfig, "cli.fit:run"),
+    "paper": (configs.PaperConfig, "paper.run:run"),
+    "demo": (configs.DemoConfig, "cli.demo:run"),
+    "study": (configs.StudyConfig, "study.run:run"),
+    "live": (configs.LiveConfig, "live.page:run"),
+    "doctor": (configs.DoctorConfig, "cli.doctor:run"),
 }
 """Configuration and function of each subcommand; the function is imported when it is called."""
 OVERVIEW = """usage: viapoint COMMAND [OPTIONS]
@@ -68,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = [word for word in words if word != "--debug"]
     try:
         config = parse(words)
-        if isinstance(config, TrainConfig) and config.resume:
+        if isinstance(config, configs.TrainConfig) and config.resume:
             _check_resumed(config, words)
         run_command(config)
     except KeyboardInterrupt:
@@ -97,7 +85,8 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
         UsageError: A word is not understood or not allowed.
     """
     if words and words[0] in ("-h", "--help"):
-        print(_overview())
+        lines = [f"  {name:<10}{str(kind.__doc__).splitlines()[0]}" for name, (kind, _) in COMMANDS.items()]
+        print(OVERVIEW.format(commands="\n".join(lines)))
         raise SystemExit(0)
     if not words:
         raise UsageError(f"name a command: {', '.join(COMMANDS)} (viapoint --help)")
@@ -116,13 +105,7 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
         raise UsageError(_complaint(complaint.getvalue(), command, kind)) from None
 
 
-def _overview() -> str:
-    """Return the help of the command without a subcommand."""
-    lines = [f"  {name:<10}{str(kind.__doc__).splitlines()[0]}" for name, (kind, _) in COMMANDS.items()]
-    return OVERVIEW.format(commands="\n".join(lines))
-
-
-def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
+def _check_resumed(config: configs.TrainConfig, words: Sequence[str]) -> None:
     """Check that flags equal those of the run to resume, including flags with default values."""
     from viapoint.training.runs.run_dir import Run, check_unchanged
 

@@ -66,25 +66,21 @@ def check_file(name: str, path: Path | None, suffix: str = "") -> None:
     if suffix and path.suffix.lower() != suffix:
         raise ValueError(f"{name} must end in {suffix}, got {path}")
     check_ours(path)
-    _check_place(name, path, path.parent)
+    check_folder(f"{name} {path}", path.parent)
 
 
-def check_folder(name: str, path: Path | None) -> None:
-    """Check that a folder can be written to."""
-    if path is not None:
-        _check_place(name, path, path)
-
-
-def _check_place(name: str, path: Path, folder: Path) -> None:
+def check_folder(name: str, folder: Path | None) -> None:
     """Check that a folder exists or can be created, and can be written to."""
+    if folder is None:
+        return
     there = next(each for each in (folder.absolute(), *folder.absolute().parents) if os.path.exists(each))
     if not os.path.isdir(there):
-        raise ValueError(f"{name} {path} cannot be written: {there} is no folder")
+        raise ValueError(f"{name} cannot be written: {there} is no folder")
     try:
         with tempfile.TemporaryFile(dir=there):  # permissions alone do not tell, in /proc for example
             pass
     except OSError:
-        raise ValueError(f"{name} {path} cannot be written: nothing may be written in {there}") from None
+        raise ValueError(f"{name} cannot be written: nothing may be written in {there}") from None
 
 
 # Hyperparameters that must be greater than zero

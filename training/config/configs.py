@@ -241,19 +241,9 @@ class TrainConfig(Config):
         return self.n_timesteps or self.preset.n_timesteps
 
     @property
-    def copies(self) -> int:
-        """Environments that are stepped together."""
-        return self.n_envs or self.preset.n_envs
-
-    @property
     def evaluation_interval(self) -> int:
         """Decisions between two evaluations, 0 for none."""
         return self.preset.eval_every if self.eval_every is None else self.eval_every
-
-    @property
-    def checkpoint_interval(self) -> int:
-        """Decisions between two checkpoints."""
-        return self.checkpoint_every or self.preset.checkpoint_every
 
     @property
     def command(self) -> str:
@@ -288,8 +278,7 @@ class AgentConfig(Config):
     """Run folder, model folder, or id of an environment with a shipped agent."""
     pretrained: Annotated[str | None, PRETRAINED] = None
     """Id of an environment: its shipped agent, as if the id were given as AGENT."""
-    env: Annotated[str | None, ENV] = None
-    """Id of the environment; default: that of the agent."""
+    env: Annotated[str | None, ENV] = None  # Id of the environment; default: that of the agent.
     arm: Annotated[str | None, ARM] = None
     """Arm, in an environment with obstacles if none is named, or in place of that of an agent."""
 
@@ -330,12 +319,10 @@ class EvaluateConfig(AgentConfig):
     on which planners are measured: straight, plan_motion, plan_motion+ompl, ompl, search512."""
     problems: Path | None = None
     """Folder of MotionBenchMaker's own files, in place of the problems that are shipped."""
-    n_scenes: int | None = None
-    """Number of scenes, evenly spread over the set; all if not given."""
+    n_scenes: int | None = None  # Number of scenes, evenly spread over the set; all if not given.
     format: Format = "table"
     """Form in which the table is printed: for the terminal, Markdown, CSV or JSON."""
-    json: Path | None = None
-    """JSON file for all results, scene by scene."""
+    json: Path | None = None  # JSON file for all results, scene by scene.
 
     least: ClassVar = {"n_scenes": 1}
 
@@ -372,14 +359,10 @@ class PlayConfig(AgentConfig):
     Example: viapoint play viapoint/PlanarObstacles-v0 --video movements.mp4 --scenes hard
     """
 
-    video: Path = Path("movements.mp4")
-    """MP4 file to write."""
-    scenes: str = "test"
-    """Scene set: validation, test, hard, uniform, or a scene file."""
-    n_scenes: int = 8
-    """Number of scenes, evenly spread over the set."""
-    checks: int = 0
-    """Number of proposals that the agent checks with exact geometry; 0 for none."""
+    video: Path = Path("movements.mp4")  # MP4 file to write.
+    scenes: str = "test"  # Scene set: validation, test, hard, uniform, or a scene file.
+    n_scenes: int = 8  # Number of scenes, evenly spread over the set.
+    checks: int = 0  # Number of proposals that the agent checks with exact geometry; 0 for none.
 
     least: ClassVar = {"n_scenes": 1, "checks": 0}
 
@@ -403,12 +386,10 @@ class RecordConfig(AgentConfig):
 
     agent: Annotated[tyro.conf.Positional[str | None], RECORDED] = None
     """Run folder, model folder, id of an environment with a shipped agent, or name of a baseline."""
-    episodes: int = 100
-    """Number of episodes."""
+    episodes: int = 100  # Number of episodes.
     dataset: str | None = None
     """Name of the dataset; default: <environment>/<method>-v0, in the folder MINARI_DATASETS_PATH."""
-    seed: int = 0
-    """Seed of the first episode; others follow."""
+    seed: int = 0  # Seed of the first episode; others follow.
     env_kwargs: NamedValues = field(default_factory=dict)
     """Arguments of the environment, values in YAML: n_via=2 n_obstacles=[1,8]; not with an agent."""
 
@@ -428,46 +409,33 @@ class PlanConfig(Config):
     Example: viapoint plan --arm panda --position 0.5 0.3 0.4 --out plan.csv
     """
 
-    arm: str = "panda"
-    """Name of an arm, or MJCF or URDF file of one."""
+    arm: str = "panda"  # Name of an arm, or MJCF or URDF file of one.
     start: tuple[float, ...] = ()
     """Joint positions at the start, [rad]; by default those of the scene file, or home."""
     goal: tuple[float, ...] = ()
     """Joint positions at the goal, [rad]; by default those of the scene file."""
     position: tuple[float, ...] = ()
     """Place of the tool at the goal, x y z, [m], in place of joint positions."""
-    quaternion: tuple[float, ...] = ()
-    """Orientation of the tool there, w x y z; any if not given."""
-    scene: Path | None = None
-    """JSON file of a scene, or of a list of obstacles."""
+    quaternion: tuple[float, ...] = ()  # Orientation of the tool there, w x y z; any if not given.
+    scene: Path | None = None  # JSON file of a scene, or of a list of obstacles.
     tool: str = ""
     """Site or body of the tool of an arm of a file; by default one with a usual name, or the tip."""
     joints: tuple[str, ...] = ()
     """Names of its joints from the base to the tool; by default all of the chain."""
-    base: str = ""
-    """Body that the chain begins at, where a file has two arms."""
-    packages: tuple[Path, ...] = ()
-    """Folders for package:// in a URDF."""
+    base: str = ""  # Body that the chain begins at, where a file has two arms.
+    packages: tuple[Path, ...] = ()  # Folders for package:// in a URDF.
     velocity_limit: float | None = None
     """Velocity limit of its joints, [rad/s]; by default that of the file."""
-    n_via: int = 2
-    """Number of via-points, 1 to 3."""
-    margin: float = 0.0
-    """Least clearance, [m]."""
-    duration: float | None = None
-    """Duration, [s]; by default the shortest that the limits allow."""
-    time_limit: float = 1.0
-    """Time after which no further seed is tried, [s]."""
-    rate: float = 100.0
-    """Instants per second of the file, [Hz]."""
+    n_via: int = 2  # Number of via-points, 1 to 3.
+    margin: float = 0.0  # Least clearance, [m].
+    duration: float | None = None  # Duration, [s]; by default the shortest that the limits allow.
+    time_limit: float = 1.0  # Time after which no further seed is tried, [s].
+    rate: float = 100.0  # Instants per second of the file, [Hz].
     out: Path | None = None
     """File to write: .csv, or .yaml for a message trajectory_msgs/JointTrajectory of ROS 2."""
-    video: Path | None = None
-    """MP4 file to write."""
-    seed: int = 0
-    """Seed of the random numbers."""
-    force: bool = False
-    """True to write plans that touch something, too."""
+    video: Path | None = None  # MP4 file to write.
+    seed: int = 0  # Seed of the random numbers.
+    force: bool = False  # True to write plans that touch something, too.
 
     least: ClassVar = {"n_via": 1, "seed": 0}
 
@@ -493,14 +461,12 @@ class FitConfig(Config):
     Example: viapoint fit movements.csv --n-via 1 --out fit
     """
 
-    file: tyro.conf.Positional[Path]
-    """CSV file with one sample in each line, [s] and [m]."""
+    file: tyro.conf.Positional[Path]  # CSV file with one sample in each line, [s] and [m].
     n_via: tuple[int, ...] = ()
     """Number of via-points, or the fewest and the most to choose among; by default 0 to 3."""
     free_ends: bool = True
     """Fit onset and end, too; otherwise a movement begins with its first sample and ends with its last."""
-    out: Path = Path("fit")
-    """Folder for the table fit.csv and the figure fit.png."""
+    out: Path = Path("fit")  # Folder for the table fit.csv and the figure fit.png.
 
     @property
     def numbers(self) -> tuple[int, int] | None:
@@ -513,7 +479,7 @@ class FitConfig(Config):
             raise ValueError(
                 f"n_via must be one number, or the fewest and the most, from 0 to {MOST_VIA_POINTS}, got {self.n_via}"
             )
-        check_folder("out", self.out)
+        check_folder(f"out {self.out}", self.out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -523,10 +489,8 @@ class LiveConfig(AgentConfig):
     Example: viapoint live --arm panda
     """
 
-    port: int = 8080
-    """Port to listen on; 0 for a free one."""
-    seed: int | None = None
-    """Seed of the random scenes."""
+    port: int = 8080  # Port to listen on; 0 for a free one.
+    seed: int | None = None  # Seed of the random scenes.
 
     least: ClassVar = {"port": 0, "seed": 0}
 
@@ -538,13 +502,12 @@ class PaperConfig(Config):
     Example: viapoint paper --out paper
     """
 
-    out: Path = Path("paper")
-    """Folder for the figures and the table."""
+    out: Path = Path("paper")  # Folder for the figures and the table.
     agent: Path | None = None
     """Run folder or model folder of an agent that moves around the rows of lights; default: the geometry search."""
 
     def _check(self) -> None:
-        check_folder("out", self.out)
+        check_folder(f"out {self.out}", self.out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -554,12 +517,9 @@ class DemoConfig(Config):
     Example: viapoint demo --out runs/demo
     """
 
-    out: Path = Path("runs/demo")
-    """Folder for all files; existing results are kept."""
-    env: Annotated[str, ENV] = DEFAULT_ENV
-    """Id of the environment."""
-    n_timesteps: int | None = None
-    """Decisions in total; default: a quarter of those of the preset."""
+    out: Path = Path("runs/demo")  # Folder for all files; existing results are kept.
+    env: Annotated[str, ENV] = DEFAULT_ENV  # Id of the environment.
+    n_timesteps: int | None = None  # Decisions in total; default: a quarter of those of the preset.
     n_scenes: int | None = None
     """Number of test scenes, evenly spread over the set; all if not given."""
 
@@ -569,7 +529,7 @@ class DemoConfig(Config):
         check_registered(self.env)
         if not registered_task(self.env).whole_movement:
             raise ValueError(f"env must have whole movements as actions, as {DEFAULT_ENV}, got {self.env!r}")
-        check_folder("out", self.out)
+        check_folder(f"out {self.out}", self.out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -579,8 +539,7 @@ class DoctorConfig(Config):
     Example: viapoint doctor
     """
 
-    out: Path = Path("runs")
-    """Folder for runs, which is checked for write access."""
+    out: Path = Path("runs")  # Folder for runs, which is checked for write access.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -592,8 +551,7 @@ class StudyConfig(Config):
     Example: echo '{environments: [viapoint/PlanarReach-v0], baselines: [straight]}' > a.yaml; viapoint study a.yaml
     """
 
-    file: tyro.conf.Positional[Path]
-    """YAML file that describes the study (docs/studies.md)."""
+    file: tyro.conf.Positional[Path]  # YAML file that describes the study (docs/studies.md).
     out: Path | None = None
     """Folder of runs and results; default: the one in the file, or runs/<name of the file>."""
     address: str | None = None
@@ -604,4 +562,4 @@ class StudyConfig(Config):
     least: ClassVar = {"workers": 1}
 
     def _check(self) -> None:
-        check_folder("out", self.out)
+        check_folder(f"out {self.out}", self.out)

@@ -20,17 +20,15 @@ KINDS = {
     str: ("TEXT", ""),
 }
 """Name in helps and in errors of the types of values."""
-UNIONS = (Union, UnionType)
 
 
 @REGISTRY.primitive_rule
 def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     """Return the form of a number, path or text, or of one that may be left out."""
-    kinds = get_args(info.type) if info.type_origin in UNIONS else (info.type,)
-    found: list[Any] = [each for each in KINDS if each in kinds]
-    if not found or not set(kinds) <= {NoneType, *KINDS}:
+    kinds = get_args(info.type) if info.type_origin in (Union, UnionType) else (info.type,)
+    kind: Any = next((each for each in KINDS if each in kinds), None)  # a path before a text
+    if kind is None or not set(kinds) <= {NoneType, *KINDS}:
         return None
-    kind = found[0]  # a path before a text
     metavar, what = KINDS[kind]
 
     def read(words: list[str]) -> Any:

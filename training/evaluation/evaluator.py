@@ -147,7 +147,12 @@ class EvaluationResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return metrics, comparisons with the first method, and every outcome, as JSON can represent them."""
-        first = self.results[0]
+        first, *others = self.results
+        compared = {}
+        for each in others:
+            number = min(len(first.success), len(each.success))  # of an evaluation that was interrupted
+            pairs = each.success[:number], first.success[:number]
+            compared[each.name] = mcnemar(*pairs)._asdict() if number else None
         outcomes = {}
         for result in self.results:
             arrays = {"action": result.actions, **result.outcomes}
@@ -159,7 +164,7 @@ class EvaluationResult:
             "sha256": self.sha256,
             "partial": self.partial,
             "methods": {result.name: result.summary() for result in self.results},
-            "compared_with_first": {each.name: _compare(first, each) for each in self.results[1:]},
+            "compared_with_first": compared,
             "outcomes": outcomes,
         }
 
@@ -384,11 +389,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _compare(first: MethodResult, second: MethodResult) -> dict[str, Any] | None:
-    number = min(len(first.success), len(second.success))
-    return mcnemar(second.success[:number], first.success[:number])._asdict() if number else None
 
 
 def _rate(values: NDArray[np.bool_]) -> dict[str, Any]:

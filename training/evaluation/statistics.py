@@ -46,14 +46,10 @@ def wilson(successes: int, trials: int) -> Interval:
 
 
 def mcnemar(first: ArrayLike, second: ArrayLike) -> Comparison:
-    """Compare the successes of two methods on the same scenes by the exact McNemar test.
+    """Compare the successes of two methods on the same N > 0 scenes, shape (N,), by the exact McNemar test.
 
     Only the b scenes where the first alone succeeded and the c where the second alone did distinguish them. If
     both are equally likely, b is binomial(b + c, 1/2). Source: McNemar 1947, Psychometrika 12, 153-157.
-
-    Args:
-        first: Successes, true or false, or 0 and 1, shape (N,).
-        second: Successes, shape (N,), N > 0, in the same scenes.
     """
     a, b = np.asarray(first), np.asarray(second)
     only_first, only_second = int((a > b).sum()), int((b > a).sum())
@@ -71,18 +67,14 @@ def across_seeds(
 ) -> Interval:
     """Return the interquartile mean over seeds of each seed's mean over scenes, with a two-way bootstrap interval.
 
-    The interquartile mean leaves out the lowest and the highest floor(n / 4): robust as the median, efficient almost as
-    the mean (Agarwal et al. 2021, section 4.3).
+    The interquartile mean leaves out the lowest and the highest floor(n / 4) of the seeds. A draw takes seeds as whole
+    rows and scenes as whole columns, scenes within their strata, as all agents meet the same scenes; drawn one by one,
+    the entries of an agent that fails in many scenes would pass for many agents. Scores of 0 and 1 that differ in no
+    stratum show no spread to a bootstrap; then the interval is Wilson's over the scenes.
 
-    The interval is for other seeds in other scenes of the same distribution. All agents meet the same scenes, so a draw
-    takes seeds as whole rows and scenes as whole columns, scenes within their strata. Were the entries drawn one by
-    one, an agent that fails in many scenes would pass for many agents, and the interval would be far too narrow
-    (`scipy.stats.bootstrap` resamples one axis only). Scores of 0 and 1 that differ in no stratum show no spread to a
-    bootstrap; then the interval is Wilson's over the scenes.
-
-    Sources: Owen 2007, The Pigeonhole Bootstrap, Ann. Appl. Stat. 1, 386-411; strata and aggregate from Agarwal et al.
-        2021, arXiv 2108.13264. Intervals of a few seeds may be a little too narrow: those of five simulated agents
-        covered the truth in 88 to 99 % of trials, least where agents differed most.
+    Sources: Owen 2007, The Pigeonhole Bootstrap, Ann. Appl. Stat. 1, 386-411; Agarwal et al. 2021, arXiv 2108.13264.
+        Intervals of a few seeds may be a little too narrow: those of five simulated agents covered the truth in 88 to
+        99 % of trials, least where agents differed most.
 
     Args:
         scores: Scores, shape (seeds, scenes).

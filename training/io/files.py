@@ -47,12 +47,12 @@ class BadFileError(ValueError):
     """Error of a file or folder; the message names it and the reason."""
 
     def __init__(self, path: Path, reason: str) -> None:
-        super().__init__(path, reason)  # both, so that the error can be pickled by workers of a study
-        self.path = path
-        self.reason = reason
+        super().__init__(f"{path}: {reason}")
+        self.path, self.reason = path, reason
 
-    def __str__(self) -> str:
-        return f"{self.path}: {self.reason}"
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what makes the error again, in another process of a study."""
+        return type(self), (self.path, self.reason)
 
 
 def check_ours(path: Path) -> None:

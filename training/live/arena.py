@@ -13,21 +13,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
-from viapoint.envs import (
-    Box,
-    Capsule,
-    Cylinder,
-    HalfSpace,
-    Obstacles,
-    Plan,
-    ReachVectorEnv,
-    Scenes,
-    Shape,
-    Sphere,
-    inverse_kinematics,
-    scene_from_json,
-    scene_to_json,
-)
+import viapoint.envs as ve
 from viapoint.envs.arms.kinematics import forward
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.clearance import configuration_clearances
@@ -80,7 +66,7 @@ class Arena:
             "any": {**others, **changes},  # with obstacles of any number and shape
             "whole": {**others, **changes, **never},  # the same, with a plan that is never revised
         }
-        self._envs: dict[str, ReachVectorEnv] = {}
+        self._envs: dict[str, ve.ReachVectorEnv] = {}
         self.task = self.env("own").task
         self.planar = task.arm.space == "hand"  # True if the arm moves in a horizontal plane
         self._sampler = self.task.sampler()
@@ -92,7 +78,7 @@ class Arena:
             methods += [OMPL] if importlib.util.find_spec("ompl") else []
         self.methods = tuple(methods)  # those that can be chosen; the first one is the default
 
-    def env(self, name: str) -> ReachVectorEnv:
+    def env(self, name: str) -> ve.ReachVectorEnv:
         """Return a batch of one environment, `own`, `any`, `whole` or `steps`, which is made once."""
         if name not in self._envs:
             env: Any = gym.make_vec(self.env_id, num_envs=1, **self._arguments[name])
@@ -150,7 +136,7 @@ class Arena:
         while True:
             yield self.scene_of(self._sampler([generator])), ""
 
-    def _shipped(self, name: str, scenes: Scenes) -> Iterator[tuple[Scene, str]]:
+    def _shipped(self, name: str, scenes: ve.Scenes) -> Iterator[tuple[Scene, str]]:
         for row in itertools.cycle(range(len(scenes.start))):
             yield self.scene_of(scenes, row), f"Scene {row} of the set {name}."
 
@@ -159,15 +145,15 @@ class Arena:
             sentence = f"From {first} to {last} past a row of lights, Flash & Hogan 1985."
             yield Scene(TARGETS[first], TARGETS[last], (lights,)), sentence
 
-    def scene_of(self, scenes: Scenes, row: int = 0) -> Scene:
+    def scene_of(self, scenes: ve.Scenes, row: int = 0) -> Scene:
         """Return one of the scenes of an environment."""
-        options = scene_from_json(scene_to_json(scenes, self.task.arm, self.task.space_name, scene=row))
+        options = ve.scene_from_json(ve.scene_to_json(scenes, self.task.arm, self.task.space_name, scene=row))
         arrays = {name: np.array(value) for name, value in options.items() if name != "obstacles"}
         return Scene(obstacles=tuple(options["obstacles"]), **arrays)
 
     def read(self, content: str | bytes) -> Scene:
         """Return the scene of a JSON file; missing parts are drawn, and an impossible one raises ValueError."""
-        options = scene_from_json(content)
+        options = ve.scene_from_json(content)
         env = self.env("any")
         try:
             env.reset(options=options)
@@ -198,7 +184,7 @@ class Arena:
         level = np.full((*coordinates.shape[:-1], 1), arm.hand(arm.home)[2])
         return np.concatenate((coordinates, level), axis=-1)
 
-    def path(self, plan: Plan, samples: int = 80) -> Float:
+    def path(self, plan: ve.Plan, samples: int = 80) -> Float:
         """Return places of the tool at evenly spaced times of plans, shape (..., samples, 3), [m]."""
         times = plan.duration[..., None] * np.linspace(0.0, 1.0, samples)
         return self.tool(np.asarray(plan.trajectory()(times)))
@@ -209,7 +195,7 @@ class Arena:
         mujoco.mju_mat2Quat(quaternion, forward(self.task.arm.chain, coordinates)[1].ravel())
         return quaternion
 
-    def clearances(self, coordinates: Float, obstacles: Obstacles, times: Float | None = None) -> Float:
+    def clearances(self, coordinates: Float, obstacles: ve.Obstacles, times: Float | None = None) -> Float:
         """Return clearances from obstacles at T times [s] and of the arm from itself, shape (T, 2), [m]."""
         arm = self.task.arm
         joints = self.task.space.joints(coordinates)
@@ -227,7 +213,7 @@ class Arena:
             return np.array(place[:2])
         if turn is None and len(coordinates) >= 6:  # with fewer joints, the tool cannot have any orientation
             turn = self.orientation(coordinates)
-        found = inverse_kinematics(self.task.arm, place, turn, seed=coordinates, n_seeds=8)
+        found = ve.inverse_kinematics(self.task.arm, place, turn, seed=coordinates, n_seeds=8)
         if scene is None:
             return np.asarray(found[0])
         free = self.clearances(found, pack([scene.obstacles])).min(axis=-1) > 0.0
@@ -235,19 +221,19 @@ class Arena:
 
     # Obstacles
 
-    def new_shapes(self) -> dict[str, Shape]:
+    def new_shapes(self) -> dict[str, ve.Shape]:
         """Return the obstacles that can be added, by name."""
         height = self._sampler.room.height
-        shapes: dict[str, Shape]
+        shapes: dict[str, ve.Shape]
         if self.planar:
-            shapes = {"post": Cylinder(0.025, height), "bar": Box((0.09, 0.015, height))}
-            shapes["box"] = Box((0.03, 0.03, height))
+            shapes = {"post": ve.Cylinder(0.025, height), "bar": ve.Box((0.09, 0.015, height))}
+            shapes["box"] = ve.Box((0.03, 0.03, height))
         else:
-            shapes = {"sphere": Sphere(0.06), "capsule": Capsule(0.035, 0.1)}
-            shapes |= {"box": Box((0.05, 0.05, 0.05)), "cylinder": Cylinder(0.04, 0.08)}
-        return {**shapes, "wall": HalfSpace()}
+            shapes = {"sphere": ve.Sphere(0.06), "capsule": ve.Capsule(0.035, 0.1)}
+            shapes |= {"box": ve.Box((0.05, 0.05, 0.05)), "cylinder": ve.Cylinder(0.04, 0.08)}
+        return {**shapes, "wall": ve.HalfSpace()}
 
-    def new_obstacle(self, scene: Scene, name: str) -> Shape:
+    def new_obstacle(self, scene: Scene, name: str) -> ve.Shape:
         """Return a new obstacle beside the middle of a movement, clear of the others and of both ends if possible.
 
         A half-space is a wall along the movement, on the side away from the base of the arm.
@@ -260,7 +246,7 @@ class Arena:
             aside = -aside
         shape, sides, least, others = self.new_shapes()[name], [aside, -aside], 0.02, scene.obstacles
         if name == "wall":  # others may stand in it
-            shape, sides, least, others = HalfSpace.facing(-aside), [aside], 0.17, ()
+            shape, sides, least, others = ve.HalfSpace.facing(-aside), [aside], 0.17, ()
         for way, side in itertools.product(least + 0.02 * np.arange(20), sides):
             shape = dataclasses.replace(shape, position=middle + way * side)
             alone = all(other.distance(shape.position, 0.03) > 0.0 for other in others)
@@ -268,18 +254,18 @@ class Arena:
                 break
         return shape
 
-    def sizes_of(self, shape: Shape) -> dict[str, float]:
+    def sizes_of(self, shape: ve.Shape) -> dict[str, float]:
         """Return the sizes of an obstacle by the names of their sliders, [m]; in the plane without its height."""
-        if isinstance(shape, Box):
+        if isinstance(shape, ve.Box):
             sizes = dict(zip(BOX_SIZES, map(float, shape.size), strict=True))
         else:
             sizes = {name.replace("_", "-"): getattr(shape, name) for name in shape.sizes}
         upright = ("half-length", "half-height") if self.planar else ()
         return {name: value for name, value in sizes.items() if name in SIZES and name not in upright}
 
-    def resized(self, shape: Shape, name: str, value: float) -> Shape:
+    def resized(self, shape: ve.Shape, name: str, value: float) -> ve.Shape:
         """Return an obstacle with another size, see :meth:`sizes_of`."""
-        if isinstance(shape, Box):
+        if isinstance(shape, ve.Box):
             size = np.array(shape.size)
             size[BOX_SIZES.index(name)] = value
             return dataclasses.replace(shape, size=size)

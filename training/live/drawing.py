@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,16 +46,11 @@ def tube(points: Float, radius: float) -> Any:
     along = np.gradient(points, axis=0)
     along = along / np.maximum(norm(along), 1e-12)[:, None]
     sides = np.empty_like(points)
-    x, y, z = np.eye(3)[np.abs(along[0]).argmin()].tolist()
-    for i, (a, b, c) in enumerate(along.tolist()):  # parallel transport: the tube does not twist
-        share = a * x + b * y + c * z
-        x, y, z = x - share * a, y - share * b, z - share * c
-        length = math.sqrt(x * x + y * y + z * z)
-        if length < 1e-9:
-            x, y, z = np.eye(3)[np.abs(along[i]).argmin()].tolist()
-            length = 1.0
-        x, y, z = x / length, y / length, z / length
-        sides[i] = x, y, z
+    side = np.eye(3)[np.abs(along[0]).argmin()]
+    for i, direction in enumerate(along):  # parallel transport: the tube does not twist
+        side = side - (side @ direction) * direction
+        side = side / max(float(np.sqrt(side @ side)), 1e-12)
+        sides[i] = side
     angle = 2.0 * np.pi * np.arange(SIDES) / SIDES
     across = np.cross(along, sides)
     ring = np.cos(angle)[:, None] * sides[:, None] + np.sin(angle)[:, None] * across[:, None]
@@ -206,8 +200,10 @@ class View:
         planned, vias = [self._line(plan)], arena.tool(plan.waypoints[1:-1])
         if movement is not None and movement.plan is not None and arena.task.replanning:
             planned, vias = [(arena.path(movement.plan), PALETTE.plan)], vias[:0]
-        others = state.proposals if len(state.proposals) > 1 else ()
-        pale = [(path, _lighter(colour)) for path, colour in (self._line(each.motion) for each in others)]
+        pale = []
+        for each in state.proposals if len(state.proposals) > 1 else ():
+            path, colour = self._line(each.motion)
+            pale.append((path, _lighter(colour)))
         self._draw_handles("via", vias)
         if state.before is not None and self._is_new("before", state.before.waypoints):
             colour = PALETTE.plan if state.before.success else PALETTE.contact

@@ -112,10 +112,15 @@ class Tab:
     def _next(self) -> Callable[[], None]:
         """Return the next job; wait for one, but only for a moment while there is something else to do."""
         with self._wake:
-            self._busy, playing = False, self.state.playing
-            quiet_in = max(self._posted + PAUSE - time.perf_counter(), 0.0)
+            self._busy = False
+            playing = self.state.playing
+            patience = None
+            if playing:
+                patience = TICK
+            elif self._later:
+                patience = max(self._posted + PAUSE - time.perf_counter(), 0.0)
             if not self._jobs and not self._closed:
-                self._wake.wait(TICK if playing else quiet_in if self._later else None)
+                self._wake.wait(patience)
             self._busy = True
             if self._jobs:
                 self._posted, job = self._jobs.pop(next(iter(self._jobs)))

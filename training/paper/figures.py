@@ -105,8 +105,16 @@ def model() -> Figure:
         ax[1].plot(profile.time, profile.speed / profile.speed.max(), **MODEL)
         ax[1].set(ylabel="$T/V_M$", ylim=(0, 1.08))
     via = second(float(second.knots[1]))
-    _construction(axes[1, 0], *(100.0 * each for each in (second(0.0), via, second(1.0))))
     dot(axes[1, 0], via)
+    # The construction of d1, d2 and d3, in centimetres
+    start, (x, y), goal = 100.0 * second(0.0), 100.0 * via, 100.0 * second(1.0)
+    thin: Any = {"color": "0.45", "linewidth": 0.6}
+    axes[1, 0].plot([start[0], goal[0]], [start[1], goal[1]], **thin)
+    axes[1, 0].plot([x, x], [start[1], y], **thin)
+    label = functools.partial(axes[1, 0].annotate, fontsize=6.5, color="0.3")
+    label("$d_1$", ((start[0] + x) / 2, start[1] - 0.8), ha="center", va="top")
+    label("$d_2$", ((x + goal[0]) / 2, start[1] - 0.8), ha="center", va="top")
+    label("$d_3$", (x + 1.0, y + 4.0), ha="left", va="center")
     axes[2, 0].plot(profile.time, profile.curvature, **MODEL)
     axes[2, 0].axvline(profile.valley, color="0.6", linewidth=0.7, linestyle=":")
     axes[2, 0].set(ylabel="$C$ [1/m]", ylim=(0, 1.15 * profile.bend[1]))
@@ -118,18 +126,6 @@ def model() -> Figure:
     for ax in (axes[0, 1], axes[1, 1], axes[2, 0], axes[2, 1]):
         ax.set(xlabel="$t/t_f$", xlim=(0, 1), xticks=[0, 0.5, 1], xticklabels=["0", "0.5", "1"])
     return figure
-
-
-def _construction(ax: Axes, start: Float, via: Float, goal: Float) -> None:
-    """Draw the construction of d1, d2 and d3, in centimetres."""
-    (x, y), base = via, start[1]
-    thin: Any = {"color": "0.45", "linewidth": 0.6}
-    ax.plot([start[0], goal[0]], [base, goal[1]], **thin)
-    ax.plot([x, x], [base, y], **thin)
-    label = functools.partial(ax.annotate, fontsize=6.5, color="0.3")
-    label("$d_1$", ((start[0] + x) / 2, base - 0.8), ha="center", va="top")
-    label("$d_2$", ((x + goal[0]) / 2, base - 0.8), ha="center", va="top")
-    label("$d_3$", (x + 1.0, y + 4.0), ha="left", va="center")
 
 
 def straight_movements() -> Figure:

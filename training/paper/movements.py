@@ -88,16 +88,9 @@ def rows_of_lights(
     shift: tuple[float, float] = (0.0, 0.0),
     half_height: float = 0.04,
 ) -> list[tuple[str, str, Box]]:
-    """Return the obstacle paradigm of Flash & Hogan 1985: pairs of targets, and a row of lights across the way.
+    """Return the obstacle paradigm of Flash & Hogan 1985: pairs of targets far apart, and a row of lights between.
 
-    Args:
-        length: Length of the row, [m]; the paper's rows were up to 25 cm long.
-        radius: Half width of the row, [m].
-        shift: Offset of the row's middle from that of the line between the targets, along and across it, [m].
-        half_height: Half height of the obstacle that stands for the row, [m].
-
-    Returns:
-        Names of start and goal, and the row, for each two targets that are far apart.
+    `radius` is half the width of the row, and `shift` the offset of its middle along and across the line, [m].
 
     Example:
         >>> from viapoint.training.paper.movements import rows_of_lights

@@ -12,7 +12,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from viapoint.envs.env import ReachEnv
 from viapoint.training.planning.baselines import Method, OpenLoopBaseline, PlannerMethod
 
 DATASET_ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")  # As Minari allows: groups, name, version
@@ -35,19 +34,11 @@ def record_dataset(
     seed: int = 0,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> Any:
-    """Record episodes of a method as a Minari dataset, and return it.
+    """Record episodes of a method as a Minari dataset, such as group/name-v0, and return it.
 
     Episode i is reset with `seed + i`. Its actions are those of the method in single precision, as the action space has
-    them, so that a replay gives the same observations and rewards.
-
-    Args:
-        dataset_id: Name of the dataset, such as group/name-v0.
-        env_id: Id of a registered environment.
-        env_kwargs: Keyword arguments of the environment, as JSON can hold them.
-        method: Agent or baseline.
-        episodes: Number of episodes.
-        seed: Seed of the first episode.
-        progress: Function of the method's name, and the numbers of recorded and of all episodes.
+    them, so that a replay gives the same observations and rewards. `progress` is called with the method's name and the
+    numbers of recorded and of all episodes.
 
     Raises:
         ValueError: The dataset exists, its name is not allowed, or decisions of the method are no actions.
@@ -59,19 +50,13 @@ def record_dataset(
     if folder.exists():
         raise ValueError(f"dataset {dataset_id} exists in {folder}; name another one, or a new version")
     if isinstance(method, PlannerMethod | OpenLoopBaseline):
-        raise ValueError(
-            f"movements of {method.name} are no actions of the environment, which a dataset holds"
-        )
+        raise ValueError(f"movements of {method.name} are no actions, which a dataset holds")
     env = gym.make(env_id, **env_kwargs)
-    if not isinstance(env.unwrapped, ReachEnv):
-        raise ValueError(f"env must be an environment of this package, got {env_id!r}")
     buffers = []
     for episode in range(episodes):
         buffers.append(_episode(env, method, episode, seed + episode))
         progress(method.name, episode + 1, episodes)
-    with (
-        warnings.catch_warnings()
-    ):  # about an author, a web address and an evaluation environment, which may be missing
+    with warnings.catch_warnings():  # an author, a web address and an evaluation environment may be missing
         warnings.simplefilter("ignore", UserWarning)
         dataset = minari.create_dataset_from_buffers(
             dataset_id,
@@ -105,13 +90,18 @@ def _episode(env: gym.Env[Any, Any], method: Method, number: int, seed: int) -> 
         steps.append((action, reward, terminated, truncated, info))
         over = terminated or truncated
     actions, rewards, terminations, truncations, infos = zip(*steps, strict=True)
+    observations, reports = {}, {}
+    for name in seen[0]:
+        observations[name] = np.stack([each[name] for each in seen])
+    for name in infos[0]:
+        reports[name] = np.array([info[name] for info in infos])
     return EpisodeBuffer(
         id=number,
         seed=seed,
-        observations={name: np.stack([each[name] for each in seen]) for name in seen[0]},
+        observations=observations,
         actions=np.stack(actions),
         rewards=list(rewards),
         terminations=list(terminations),
         truncations=list(truncations),
-        infos={name: np.array([info[name] for info in infos]) for name in infos[0]},
+        infos=reports,
     )

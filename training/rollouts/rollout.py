@@ -36,17 +36,12 @@ class SimulationResults(NamedTuple):
     @classmethod
     def concatenate(cls, pieces: Sequence[SimulationResults]) -> SimulationResults:
         """Join the results of several batches."""
-        info = {name: np.concatenate([piece.info[name] for piece in pieces]) for name in pieces[0].info}
-        return cls(np.concatenate([piece.reward for piece in pieces]), info)
+        reward = np.concatenate([piece.reward for piece in pieces])
+        return cls(reward, _joined([piece.info for piece in pieces]))
 
 
 class SceneSimulation:
-    """Simulation of episodes in given scenes, `num_envs` at a time.
-
-    Args:
-        env_id: Id of a registered environment.
-        num_envs: Greatest number of scenes that are simulated together.
-        **kwargs: Keyword arguments of the environment.
+    """Simulation of episodes in given scenes, `num_envs` at a time; `kwargs` are arguments of the environment.
 
     Raises:
         ValueError: There is no such environment, or an argument is not allowed.
@@ -65,11 +60,11 @@ class SceneSimulation:
 
     def observe(self, scenes: Scenes) -> Observation:
         """Return first observations in N scenes."""
-        pieces = [
-            {name: part[: rows.stop - rows.start] for name, part in self._begin(env, scenes, rows).items()}
-            for rows, env in self._groups(len(scenes.start))
-        ]
-        return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+        pieces = []
+        for rows, env in self._groups(len(scenes.start)):
+            seen = self._begin(env, scenes, rows)
+            pieces.append({name: part[: rows.stop - rows.start] for name, part in seen.items()})
+        return _joined(pieces)
 
     def __call__(self, scenes: Scenes, actions: Float) -> SimulationResults:
         """Simulate episodes that begin with one action in each of N scenes; all later actions are zero."""
@@ -123,6 +118,11 @@ class SceneSimulation:
                 made: Any = gym.make_vec(self.env_id, num_envs=size, **self.kwargs)
                 self._envs[size] = made.unwrapped
             yield rows, self._envs[size]
+
+
+def _joined(pieces: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """Return arrays by name, joined over batches."""
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
 def _filled(rows: slice, number: int) -> NDArray[np.int64]:

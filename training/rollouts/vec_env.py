@@ -119,13 +119,10 @@ class ViaVecEnv(VecEnv):
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         given: Any = self._options
         self._reset_options()  # refused ones must not be met again
-        try:
-            names, *others = [set(each.keys()) for each in given]
-        except (TypeError, AttributeError):
-            names, others = set(), []
-        if len(others) != self.num_envs - 1 or any(each != names for each in others):
+        whole = isinstance(given, Sequence) and len(given) == self.num_envs
+        if not whole or not all(isinstance(each, Mapping) and set(each) == set(given[0]) for each in given):
             raise ValueError(f"options must be a mapping, or a list of {self.num_envs} alike, got {given!r}")
-        options = {name: [each[name] for each in given] for name in names}
+        options = {name: [each[name] for each in given] for name in given[0]}
         observation, _ = self.venv.reset(seed=seeds, options=options or None)
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0.0, 0

@@ -53,7 +53,9 @@ class RunCallback(BaseCallback):
         self._seconds_before, self._began = 0.0, time.monotonic()
         self._before = 0
         """Decisions when it was last decided what is due."""
-        self._validation = validation_scenes(run) if self.config.evaluation_interval else None
+        self._validation: FrozenScenes | None = None
+        if self.config.evaluation_interval:
+            self._validation = scenes_for("validation", self.config.task, self.config.eval_scenes)
         self._stop = False
 
     def restore(self, seconds: float, decisions: int) -> None:
@@ -122,7 +124,7 @@ class RunCallback(BaseCallback):
             self._validate()
         if validates or final or self._is_due(LOG_EVERY):
             self._log()
-        saves = final or self._is_due(config.checkpoint_interval)
+        saves = final or self._is_due(config.checkpoint_every or config.preset.checkpoint_every)
         self._before = self.num_timesteps
         if saves:
             self._save_checkpoint()
@@ -138,10 +140,10 @@ class RunCallback(BaseCallback):
         """Evaluate the policy, extend the learning curve, and save the model if it is the best so far."""
         if self._validation is None or (self.curve and self.curve[-1]["decisions"] == self.num_timesteps):
             return
-        seconds, began = self.seconds, time.monotonic()
-        calibrate = getattr(self.model, "calibrate", None)
-        if calibrate is not None:  # of agents that predict their success
-            calibrate()
+        seconds = self.seconds
+        began = time.monotonic()
+        if hasattr(self.model, "calibrate"):  # of agents that predict their success
+            self.model.calibrate()
         result = evaluate_methods(
             [agent_method("agent", self.model)],
             self._validation,
@@ -161,27 +163,30 @@ class RunCallback(BaseCallback):
                 file=sys.stderr,
                 flush=True,
             )
-        if record is max(self.curve, key=_ranking):
+        # A validation is better with more success, then with less jerk.
+        best = max(self.curve, key=lambda each: (each["success"]["rate"], -(each["jerk_ratio"] or 0.0)))
+        if record is best:
             self.run.save("best", self.model)
         self._show_progress()
         self._began += time.monotonic() - began
 
     def _record(self, result: MethodResult, seconds: float) -> dict[str, Any]:
-        env, summary = self.training_env, result.summary()
-        steps = env.physics_steps if isinstance(env, ViaVecEnv) else 0
+        """Return the record of a validation for the learning curve, and log it."""
+        summary = result.summary()
+        env = self.training_env
+        assert isinstance(env, ViaVecEnv)
         record = {
             "decisions": self.num_timesteps,
-            "physics_steps": steps,
-            "simulated_seconds": round(steps * _timestep(env), 6) if steps else 0.0,
+            "physics_steps": env.physics_steps,
             "seconds": round(seconds, 3),
             "success_by_band": summary["success_by_band"],
-            **{name: summary[name] for name in VALIDATED},
         }
         for name in VALIDATED:
-            if isinstance(record[name], dict):
-                self.logger.record(f"validation/{name}_rate", record[name]["rate"])
-            elif record[name] is not None:  # the median of no values
-                self.logger.record(f"validation/{name}", record[name])
+            value = record[name] = summary[name]
+            if isinstance(value, dict):
+                self.logger.record(f"validation/{name}_rate", value["rate"])
+            elif value is not None:  # the median of no values
+                self.logger.record(f"validation/{name}", value)
         return record
 
     def _log(self) -> None:
@@ -191,9 +196,6 @@ class RunCallback(BaseCallback):
             if values:
                 tag = f"rollout/{name}_rate" if name in RATES else f"rollout/{name}"
                 self.logger.record(tag, float(np.mean(values)))
-        env = self.training_env
-        if isinstance(env, ViaVecEnv) and env.physics_steps:
-            self.logger.record("time/simulated_seconds", env.physics_steps * _timestep(env))
         self.model.dump_logs()
 
     def _show_progress(self) -> None:
@@ -206,21 +208,6 @@ class RunCallback(BaseCallback):
         self._bar.set_postfix(shown, refresh=False)
 
 
-def _ranking(record: dict[str, Any]) -> tuple[float, float]:
-    """Return what makes a validation better than another one: success, then less jerk."""
-    return record["success"]["rate"], -(record["jerk_ratio"] or 0.0)
-
-
 def resume_command(run: Run) -> str:
     """Return the command that goes on with a run."""
     return shlex.join(["viapoint", "train", "--resume", "--out", str(run.folder)])
-
-
-def _timestep(env: Any) -> float:
-    """Return the timestep of the physics, [s]."""
-    return float(env.get_attr("model", [0])[0].opt.timestep)
-
-
-def validation_scenes(run: Run) -> FrozenScenes:
-    """Return the shipped validation scenes of a run's environment, or reproducibly sampled ones if none fit."""
-    return scenes_for("validation", run.config.task, run.config.eval_scenes)

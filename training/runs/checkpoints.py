@@ -43,13 +43,19 @@ MAY_DIFFER = ("num_timesteps", "viapoint")  # Entries that do not tell models ap
 
 def write_checkpoint(model: BaseAlgorithm, path: Path, extra: Mapping[str, Any]) -> None:
     """Write the complete state of a training run; :func:`read_checkpoint` returns `extra`."""
+    env = model.get_env()
+    assert isinstance(env, ViaVecEnv)
     arrays = {
         "counters": {name: getattr(model, name) for name in COUNTERS},
         "recent": {name: list(getattr(model, name) or ()) for name in DEQUES},
         "last": {name: getattr(model, name) for name in ARRAYS},
         "buffer": _buffer_state(model),
-        "random": _random_state(model),
-        "env": _env(model).state(),
+        "random": {
+            "python": random.getstate(),
+            "numpy": np.random.get_state(legacy=False),  # noqa: NPY002 - SB3 draws from it
+            "actions": model.action_space.np_random.bit_generator.state,
+        },
+        "env": env.state(),
     }
     state = {
         "format": FORMAT,
@@ -118,7 +124,8 @@ def _restore(model: BaseAlgorithm, state: dict[str, Any], arrays: dict[str, Any]
     if buffer is not None:
         _fill(_buffer_arrays(buffer), saved["arrays"])
         buffer.pos, buffer.full = saved["pos"], saved["full"]
-    _env(model).restore(arrays["env"])
+    env: Any = model.get_env()
+    env.restore(arrays["env"])
     # Last: nothing may be drawn after it.
     random.setstate(arrays["random"]["python"])
     np.random.set_state(arrays["random"]["numpy"])  # noqa: NPY002 - SB3 draws from it
@@ -129,14 +136,6 @@ def _restore(model: BaseAlgorithm, state: dict[str, Any], arrays: dict[str, Any]
 def _variables(model: BaseAlgorithm) -> dict[str, Any]:
     """Return tensors outside of modules and optimisers, such as SAC's entropy coefficient."""
     return {name: recursive_getattr(model, name) for name in model._get_torch_save_params()[1]}
-
-
-def _random_state(model: BaseAlgorithm) -> dict[str, Any]:
-    return {
-        "python": random.getstate(),
-        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002
-        "actions": model.action_space.np_random.bit_generator.state,
-    }
 
 
 def _buffer_arrays(buffer: Any) -> dict[str, Any]:
@@ -160,12 +159,6 @@ def _fill(arrays: Any, saved: Any) -> None:
     elif isinstance(arrays, dict):
         for name, each in arrays.items():
             _fill(each, saved[name])
-
-
-def _env(model: BaseAlgorithm) -> ViaVecEnv:
-    env = model.get_env()
-    assert isinstance(env, ViaVecEnv)
-    return env
 
 
 def _to_torch(value: Any) -> Any:

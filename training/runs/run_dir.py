@@ -229,7 +229,7 @@ def check_free(folder: Path) -> None:
     """Check that a folder can be written to and holds nothing but what an attempt to create a run left there."""
     if (folder / "config.json").exists():
         raise BadFileError(folder, "holds a run already; continue it with --resume or name another folder")
-    check_folder("run folder", folder)
+    check_folder(f"run folder {folder}", folder)
     names = {path.name for path in folder.iterdir()} if folder.exists() else set()
     begun = {name for name in names if UNFINISHED.fullmatch(name)}
     if names - begun - {"versions.json", COPY, "lock"}:

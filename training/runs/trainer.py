@@ -108,9 +108,9 @@ def resolved(config: TrainConfig) -> TrainConfig:
     return dataclasses.replace(
         config,
         n_timesteps=config.total_timesteps,
-        n_envs=config.copies,
+        n_envs=config.n_envs or config.preset.n_envs,
         eval_every=config.evaluation_interval,
-        checkpoint_every=config.checkpoint_interval,
+        checkpoint_every=config.checkpoint_every or config.preset.checkpoint_every,
         hyperparameters=config.all_hyperparameters,
     )
 
@@ -132,7 +132,7 @@ def _warn(config: TrainConfig) -> None:
 def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
     """Build the untrained model of a resolved configuration with its own environments, and close them at the end."""
     try:
-        env = ViaVecEnv(config.env, config.copies, **config.env_kwargs)
+        env = ViaVecEnv(config.env, config.n_envs or config.preset.n_envs, **config.env_kwargs)
     except TypeError as error:
         raise ValueError(f"env_kwargs of {config.env}: {error}") from error
     with closing(env):

@@ -7,7 +7,7 @@ import hashlib
 import json
 import sys
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -37,11 +37,6 @@ CONTENT = ("start", "goal", "kind", *MOVING, "jumps", "turn_time", "turn_velocit
 SCENE_FIELDS = ("arm", "n_obstacles", "whole_arm", "moving_obstacles", "n_jumps")
 
 
-def bands(share: Float) -> NDArray[np.int64]:
-    """Return the index into BANDS of each solution share, shape (N,)."""
-    return np.searchsorted(-np.array(BAND_EDGES), -share, side="right").astype(np.int64)
-
-
 @dataclass(frozen=True, kw_only=True)
 class FrozenScenes:
     """Set of N scenes."""
@@ -60,19 +55,12 @@ class FrozenScenes:
     @property
     def band(self) -> NDArray[np.int64]:
         """Index into BANDS, shape (N,); -1 where the share is unknown."""
-        return np.where(np.isnan(self.share), -1, bands(self.share))
+        band = np.searchsorted(-np.array(BAND_EDGES), -self.share, side="right")
+        return np.where(np.isnan(self.share), -1, band).astype(np.int64)
 
     @property
     def hidden(self) -> Float:
-        """Share of the obstacles of each scene that the sensor does not see at all, shape (N,); NaN without a sensor.
-
-        Example:
-            >>> from viapoint.training.planning.search import registered_task
-            >>> from viapoint.training.scene_sets.scene_set import scenes_for
-            >>> frozen = scenes_for("validation", registered_task("viapoint/PlanarSensed-v0"), 100)
-            >>> float(frozen.hidden.mean()) > 0.1
-            True
-        """
+        """Share of obstacles that the sensor does not see at all in each scene, shape (N,); NaN without a sensor."""
         task = Task.from_dict(self.task)
         if task.sensor is None:
             return np.full(self.share.shape, np.nan)
@@ -123,16 +111,6 @@ def evenly_spread(number: int, count: int | None) -> Int:
     return np.linspace(0, number - 1, kept).round().astype(np.int64)
 
 
-def together(parts: Sequence[FrozenScenes]) -> FrozenScenes:
-    """Return the scenes of several sets of one task under the name of the first."""
-    return dataclasses.replace(
-        parts[0],
-        scenes=Scenes.together([part.scenes for part in parts]),
-        share=np.concatenate([part.share for part in parts]),
-        family=np.concatenate([part.family for part in parts]),
-    )
-
-
 def shipped_path(name: str, env_id: str) -> Path:
     """Return the path of a shipped set of an environment."""
     task = env_id.removeprefix("viapoint/").partition("-")[0]
@@ -152,13 +130,13 @@ def shipped_set(name: str, task: Task) -> Path | None:
     return None
 
 
-def _scene_key(task: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Return what scenes of a task depend on."""
-    kinds = sorted(task["shapes"]), sorted(task["families"])
-    others = tuple(task[name] for name in SCENE_FIELDS)
-    changing = task["moving_obstacles"] or list(task["n_jumps"]) != [0, 0]
-    when = tuple(task["duration_range"]) if changing else ()
-    return (*(tuple(each) if isinstance(each, list) else each for each in (*kinds, *others)), when)
+def _scene_key(task: Mapping[str, Any]) -> str:
+    """Return what scenes of a task depend on, as text."""
+    values = [task[name] for name in SCENE_FIELDS]
+    values += [sorted(task["shapes"]), sorted(task["families"])]
+    if task["moving_obstacles"] or any(task["n_jumps"]):
+        values.append(task["duration_range"])  # things happen at parts of the longest movement
+    return json.dumps(values, sort_keys=True)
 
 
 def _eyes_agree(frozen: Sensor | None, wanted: Sensor | None) -> bool:
@@ -244,23 +222,17 @@ def drawn(name: str, task: Task, number: int) -> FrozenScenes:
 
 
 def scenes_for(name_or_path: str | Path, task: Task, number: int | None = None) -> FrozenScenes:
-    """Return the named scenes; where no frozen ones are those of the task, draw them and print a line that says so.
+    """Return scenes of a set in SETS or of a file, evenly spread over it, up to a number.
 
-    Args:
-        name_or_path: One of SETS, or the path of a file.
-        task: Task.
-        number: Number of scenes, evenly spread over a set; all if not given, or if there are fewer.
-
-    Raises:
-        ValueError: There is no such set, or its scenes cannot be those of the task.
+    Where no frozen scenes are those of the task, they are drawn, and a line says so. A set that there is not, or scenes
+    that cannot be those of the task, raise ValueError.
     """
     name = str(name_or_path)
     if name not in SETS:
         frozen = load(Path(name_or_path).expanduser())
         _check_fit(frozen, task)
-        return dataclasses.replace(frozen, scenes=_padded(frozen.scenes, task.observation.n_rows)).spread(
-            number
-        )
+        scenes = _padded(frozen.scenes, task.observation.n_rows)
+        return dataclasses.replace(frozen, scenes=scenes).spread(number)
     path = shipped_set(name, task)
     if path is not None:
         return load(path, name).spread(number)

@@ -21,21 +21,16 @@ from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its im
 from viapoint.training.agents.model_io import check_hyperparameters
 from viapoint.training.config.checks import check_arguments, check_env_kwargs, check_whole, unknown_name
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.config.presets import preset_of, usual_algorithm
 from viapoint.training.io.files import read_json, read_yaml
 from viapoint.training.planning.baselines import check_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.scene_sets.scene_set import SEEDS, SETS, shipped_set
 
 Values = Mapping[str, Any]
-TRAINING_FIELDS = tuple(
-    each.name
-    for each in dataclasses.fields(TrainConfig)
-    if each.name not in ("env", "seed", "out", "resume", "progress")
-)
-"""Fields of a training that an agent may set."""
-# Sets that are measured by default; models are selected on `validation`
-MEASURED = ("test", "hard", "uniform")
+# Fields of a training that an agent may set
+TRAINING_FIELDS = {each.name for each in dataclasses.fields(TrainConfig)}
+TRAINING_FIELDS -= {"env", "seed", "out", "resume", "progress"}
+MEASURED = ("test", "hard", "uniform")  # by default; models are selected on `validation`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,12 +44,9 @@ class Trial:
     n_scenes: int | None = None  # Number of scenes of each set, evenly spread over it; None for all
     row: str  # Name of the row, which is also that of its folder
     seed: int = 0
-    # Fields of :class:`TrainConfig`; empty for a baseline
-    training: Values = field(default_factory=dict)
-    # Numbers of proposals that the agent checks with exact geometry, one measurement each
-    checks: tuple[int, ...] = (0,)
-    # Numbers of proposals that the planner refines, one further measurement each
-    refine: tuple[int, ...] = ()
+    training: Values = field(default_factory=dict)  # Fields of TrainConfig; empty for a baseline
+    checks: tuple[int, ...] = (0,)  # Numbers of proposals that the agent checks, a row each
+    refine: tuple[int, ...] = ()  # Numbers of proposals that the planner refines, a row each
     untrained: bool = False  # True to measure the network before training, too
     method: str = ""  # Name of a baseline; empty for an agent
 
@@ -64,25 +56,21 @@ class Trial:
 
     def config(self, out: Path) -> TrainConfig:
         """Return the configuration of the training; `policy_kwargs` are merged with those of the preset."""
-        given = dict(self.training)
-        env_kwargs = {**self.env_kwargs, **given.pop("env_kwargs", {})}
-        hyperparameters = dict(given.get("hyperparameters", {}))
-        if "policy_kwargs" in hyperparameters:
-            task = registered_task(self.env_id, **env_kwargs)
-            algo = given.get("algo") or usual_algorithm(task)
-            usual = preset_of(task, algo).arguments().get("policy_kwargs", {})
-            hyperparameters["policy_kwargs"] = {**usual, **hyperparameters["policy_kwargs"]}
-        given |= {"env_kwargs": env_kwargs, "hyperparameters": hyperparameters}
-        return TrainConfig(env=self.env_id, seed=self.seed, out=self.folder(out), progress=False, **given)
+        given = {**self.training, "env_kwargs": {**self.env_kwargs, **self.training.get("env_kwargs", {})}}
+        config = TrainConfig(env=self.env_id, seed=self.seed, out=self.folder(out), progress=False, **given)
+        own = config.hyperparameters.get("policy_kwargs")
+        if own is None:
+            return config
+        usual = config.preset.arguments().get("policy_kwargs", {})
+        hyperparameters = {**config.hyperparameters, "policy_kwargs": {**usual, **own}}
+        return dataclasses.replace(config, hyperparameters=hyperparameters)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Search(Trial):
     """Search for hyperparameters of one algorithm in one environment; the fields of the trial are what all share."""
 
-    parameters: (
-        Values  # range or list of values by the path of a field, such as `hyperparameters.learning_rate`
-    )
+    parameters: Values  # range or list of values by the path of a field
     trials: int = 20
     first: tuple[Values, ...] = ()  # parameters of the first trials
 
@@ -161,7 +149,7 @@ def _made(where: str, make: Callable[..., Any], fields: Any, *args: Any) -> Any:
     parameters = inspect.signature(make).parameters
     known = [name for name, each in parameters.items() if each.kind == each.KEYWORD_ONLY]
     if "training" in parameters:
-        known += TRAINING_FIELDS
+        known += sorted(TRAINING_FIELDS)
     for name in fields:
         if name not in known:
             raise ValueError(unknown_name(f"{where}: fields", name, known))
@@ -336,8 +324,12 @@ def _search(
         for value in _ends(path, values):  # an impossible value is an error now, and not in the last trial
             _made("parameters", _agent, {"seeds": [0], **_with(training, {path: value})}, env, row)
     check_whole("trials", trials, 1)
-    given = {"parameters": parameters, "trials": trials, "first": tuple(first or ())}
-    return [Search(**env, row=row, seed=trial.seed, training=training, **given)]
+    return [
+        Search(
+            **env, row=row, seed=trial.seed, training=training, parameters=parameters, trials=trials,
+            first=tuple(first or ()),
+        )
+    ]  # fmt: skip
 
 
 def _ends(path: str, given: Any) -> list[Any]:

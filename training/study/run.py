@@ -21,7 +21,7 @@ from viapoint.training.io.files import BadFileError, read_json, write_bytes, wri
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
 from viapoint.training.study.config import Search, Study, Trial, Values
-from viapoint.training.study.trials import finished_record, markdown, run_trial, tables, write_results
+from viapoint.training.study.trials import finished_record, markdown, run_trial, write_results
 
 RETRIES = 2  # Number of times that a trial whose worker died is begun again
 SETTINGS = {
@@ -84,7 +84,11 @@ def run_study(
         [1.0]
     """
     folder = Path(study.out if out is None else out).expanduser().absolute()
-    _claim(folder, study.name)
+    mark = folder / "study.json"
+    if not mark.is_file() or read_json(mark).get("viapoint") != "study":
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise BadFileError(folder, "holds something else than a study; name another folder")
+        write_json(mark, {"viapoint": "study", "name": study.name})
     missing = [trial for trial in study.trials if finished_record(trial, folder) is None]
     searches = [search for search in study.searches if not search.is_finished(folder)]
     failed = []
@@ -96,23 +100,12 @@ def run_study(
             failed += _run_trials(missing, folder, told)
             for search in searches:
                 failed += _search(search, folder, workers, told)
-    table = tables(study.trials, folder)
-    write_results(table, study, folder)
+    table = write_results(study, folder)
     if failed:
         raise StudyFailedError(
             f"{len(failed)} trials failed; the same command tries them again: {'; '.join(failed)}"
         )
     return table
-
-
-def _claim(folder: Path, name: str) -> None:
-    """Create the folder of a study, or check that it is one."""
-    mark = folder / "study.json"
-    if mark.is_file() and read_json(mark).get("viapoint") == "study":
-        return
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise BadFileError(folder, "holds something else than a study; name another folder")
-    write_json(mark, {"viapoint": "study", "name": name})
 
 
 def _import_libraries() -> tuple[Any, Any]:

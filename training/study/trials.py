@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,19 +75,34 @@ def finished_record(trial: Trial, out: Path) -> Record | None:
     return record if record.get("asked") == _asked(trial) else None
 
 
-def tables(trials: Sequence[Trial], folder: Path) -> pd.DataFrame:
-    """Return one line for each environment, set of scenes and row of the trials that are complete."""
+def write_results(study: Study, folder: Path) -> pd.DataFrame:
+    """Write `results.csv`, `results.md` and a figure for each environment from all records, and return the table."""
     lines = []
-    for trial in trials:
+    curves: dict[str, dict[str, list[Any]]] = {}
+    for trial in study.trials:
         record = finished_record(trial, folder) or {"rows": []}
         lines += [{"environment": trial.environment, **line} for line in record["rows"]]
+        if "curve" in record:
+            of_rows = curves.setdefault(trial.environment, {})
+            of_rows.setdefault(trial.row, []).append(record["curve"])
+    table = _table(lines)
+    write_bytes(folder / "results.csv", table.to_csv(index=False).encode())
+    write_bytes(folder / "results.md", markdown(table, study.name).encode())
+    for environment, part in table.groupby("environment", sort=False):
+        figure = folder / f"{environment.rpartition('/')[2]}.png"
+        success_of_rows(figure, part, curves.get(environment, {}))
+    return table
+
+
+def _table(lines: list[Record]) -> pd.DataFrame:
+    """Return one line for each environment, set of scenes and row, over all its seeds."""
     rows = []
     for keys, runs in pd.DataFrame(lines, columns=[*COLUMNS, "solved", "band"]).groupby(KEYS, sort=False):
         solved = np.array([[bit == "1" for bit in each] for each in runs["solved"]], dtype=float)
-        band = np.array(runs["band"].iloc[0])
         if len(runs) == 1:
             success, low, high = wilson(int(solved.sum()), solved.size)
         else:
+            band = np.array(runs["band"].iloc[0])
             success, low, high = across_seeds(solved, band, np.random.default_rng(0))
         row = dict(zip(KEYS, keys, strict=True))
         row |= {"seeds": len(runs), "scenes": solved.shape[1], "success": success, "low": low, "high": high}
@@ -110,19 +124,6 @@ def markdown(table: pd.DataFrame, title: str) -> str:
         text = shown.fillna("-").reset_index().to_markdown(index=False, disable_numparse=True)
         parts += [f"## {environment}", text]
     return "\n\n".join(parts) + "\n"
-
-
-def write_results(table: pd.DataFrame, study: Study, folder: Path) -> None:
-    """Write `results.csv`, `results.md` and a figure for each environment."""
-    write_bytes(folder / "results.csv", table.to_csv(index=False).encode())
-    write_bytes(folder / "results.md", markdown(table, study.name).encode())
-    for environment, part in table.groupby("environment", sort=False):
-        curves: dict[str, list[list[list[float]]]] = {}
-        for trial in study.trials:
-            record = finished_record(trial, folder) or {}
-            if trial.environment == environment and "curve" in record:
-                curves.setdefault(trial.row, []).append(record["curve"])
-        success_of_rows(folder / f"{environment.rpartition('/')[2]}.png", part, curves)
 
 
 def _asked(trial: Trial) -> Record:

@@ -90,14 +90,9 @@ def light_movements(agent: Path | None) -> ObstacleMovements:
 def features(profiles: list[Profile], plan: Plan) -> pd.DataFrame:
     """Compute the features of the paper's analysis, with the point of greatest curvature as via-point.
 
-    Returns:
-        A line for each movement, with NaN where it lacks a feature:
-
-        * valley, bend: times of speed valley and curvature peak, as fractions of the duration;
-        * along: d1 / (d1 + d2) of the point of greatest curvature;
-        * residual: t1 / (t1 + t2) minus that of the model through this point, as in Fig. 10B;
-        * agrees: whether movement and model both have a speed valley, or neither has (False without a model);
-        * apart: greatest distance from the model / distance of the targets, as in Fig. 8.
+    A line for each movement, with NaN where it lacks a feature, holds the times of speed valley and curvature peak (as
+    fractions of the duration), d1 / (d1 + d2) of that point, the residual of t1 / (t1 + t2) from the model through it
+    (Fig. 10B), whether both have a valley or neither, and the distance from the model / that of the targets (Fig. 8).
     """
     lines = []
     for profile, (start, *_, goal) in zip(profiles, plan.waypoints, strict=True):
@@ -146,15 +141,10 @@ def obstacle_claims(avoidance: ObstacleMovements) -> list[Claim]:
               lambda f: f.residual.mean(), near(0.0, 0.02)),
         claim("The same: standard deviation", ".02", lambda f: f.residual.std(ddof=0), at_most(0.04)),
         claim("The same: slope over d1/(d1+d2); it has a trend, in the model as on the arm", "no trend",
-              lambda f: _slope(f.along, f.residual), near(0.035, 0.015)),
+              lambda f: np.polyfit(*f[["along", "residual"]].dropna().to_numpy().T, 1)[0], near(0.035, 0.015)),
         claim("Distance from the model through the point of greatest curvature / distance of the targets: median",
               "close match", lambda f: 100 * f.apart.median(), at_most(5.0), "%"),
         Claim(12, f"Time scaling: every movement again in 1.1 s and .85 s: greatest distance of the paths ({who})",
               "8, 11", "the same path", (apart, at_most(1e-9)), (arm_apart, at_most(1.0)),
               max(each.worst for each in scaled), "mm"),
     ]  # fmt: skip
-
-
-def _slope(place: pd.Series, value: pd.Series) -> float:
-    known = value.notna()
-    return float(np.polyfit(place[known], value[known], 1)[0])

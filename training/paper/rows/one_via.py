@@ -116,15 +116,9 @@ def closest_approach(motion: SimulatedMovements, vias: Float) -> Float:
 def features(along: ArrayLike, height: ArrayLike) -> tuple[pd.DataFrame, float]:
     """Compare movements of the family on the model and on the simulated arm.
 
-    Returns:
-        A line for each of model and arm and for each via-point, with the columns
-
-        * who: "model" or "arm"; along, height: d1 / (d1 + d2) and d3 / (d1 + d2) of the via-point;
-        * late: time from the speed valley to the curvature peak, as a fraction of the duration;
-        * depth: speed in the valley relative to the peaks; curvature: its peak, [1/m];
-        * lead: ratio of the speed peak on the longer side to the other one, NaN without two peaks;
-
-        and the greatest deviation of the arm from the plan, [mm].
+    A line for each who (model or arm) and via-point holds the time from speed valley to curvature peak as a fraction of
+    the duration (late), the speed in the valley relative to the peaks (depth), the curvature peak, [1/m], and the ratio
+    of the speed peak on the longer side to the other (lead). The second result is the deviation of the arm, [mm].
     """
     alongs, heights = np.atleast_1d(*np.broadcast_arrays(along, height))
     movement = curved(*ENDS, alongs, heights)

@@ -1,8 +1,8 @@
 """Frozen sets of scenes of every task, made anew.
 
-    python -m viapoint.training.scene_sets.make                       # all sets; those that exist are left as they are
-    python -m viapoint.training.scene_sets.make --env viapoint/PlanarObstacles-v0 --sets test hard
-    python -m viapoint.training.scene_sets.make --check               # make them in memory, and compare their hashes
+    python benchmarks/frozen_scenes.py                       # all sets; those that exist are left as they are
+    python benchmarks/frozen_scenes.py --env viapoint/PlanarObstacles-v0 --sets test hard
+    python benchmarks/frozen_scenes.py --check               # make them in memory, and compare their hashes
 
 Scenes are drawn one after the other, each with a generator of its own. The solution share of a scene is the share of
 random actions whose plan is clear. A scene is kept where its band of shares is still wanted, and where the search finds
@@ -12,6 +12,7 @@ are a little larger than the arm, so that success in physics alone could be luck
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import sys
 from collections.abc import Iterator, Sequence
@@ -43,7 +44,6 @@ from viapoint.training.scene_sets.scene_set import (
     FrozenScenes,
     load,
     shipped_path,
-    together,
 )
 
 SEEDS = {"validation": 11, "test": 12, "hard": 13, "uniform": 14}  # First part of seeds
@@ -54,14 +54,6 @@ MOST_DRAWN = 40  # Greatest number of drawn scenes for each one that is wanted
 TOGETHER = 250  # Scenes that are drawn together
 RANDOM_ACTIONS = 512  # Number of random actions for the solution share
 HARD_SHARE = 0.01  # Solution share below which scenes are hard
-
-
-def _ids() -> tuple[str, ...]:
-    """Return the ids of environments whose scenes differ; a set fits every task with the same scenes."""
-    first: dict[str, str] = {}
-    for env_id in dict.fromkeys(twin_of(each) for each in ENV_IDS):
-        first.setdefault(str(TASKS[env_id]), env_id)
-    return tuple(first.values())
 
 
 class Maker:
@@ -149,17 +141,14 @@ class Maker:
         for first in range(0, MOST_DRAWN * number, TOGETHER):
             seeds = [(seed, *family.encode(), first + each) for each in range(TOGETHER)]
             scenes = rounded(sampler([np.random.default_rng(seed) for seed in seeds]))
-            scenes = scenes.take([row for row in range(TOGETHER) if self._is_possible(scenes.take([row]))])
+            possible = []
+            for row in range(TOGETHER):
+                with contextlib.suppress(ValueError):  # rounding may have made one impossible
+                    check_scenes(scenes.take([row]), self.task.arm)
+                    possible.append(row)
+            scenes = scenes.take(possible)
             share = self._share(scenes)
             yield FrozenScenes(name=name, task=self.task.as_dict(), scenes=scenes, share=share, family=family)
-
-    def _is_possible(self, scene: Scenes) -> bool:
-        """Return True for one scene that rounding left possible."""
-        try:
-            check_scenes(scene, self.task.arm)
-        except ValueError:
-            return False
-        return True
 
     def _share(self, scenes: Scenes) -> Float:
         """Return the solution shares of scenes, shape (N,)."""
@@ -201,6 +190,16 @@ def _single(record: Any, names: Sequence[str]) -> dict[str, Any]:
     return {name: getattr(record, name).astype(np.float32).astype(np.float64) for name in names}
 
 
+def together(parts: Sequence[FrozenScenes]) -> FrozenScenes:
+    """Return the scenes of several sets of one task under the name of the first."""
+    return dataclasses.replace(
+        parts[0],
+        scenes=Scenes.together([part.scenes for part in parts]),
+        share=np.concatenate([part.share for part in parts]),
+        family=np.concatenate([part.family for part in parts]),
+    )
+
+
 def _hardest(found: list[FrozenScenes], number: int) -> FrozenScenes:
     """Return the scenes with the least shares."""
     scenes = together(found)
@@ -216,7 +215,12 @@ def make_sets(env: tuple[str, ...] = (), sets: tuple[str, ...] = SETS, check: bo
         check: Make the sets that ship again, and compare their hashes; the exit code is 1 if one differs.
     """
     different = 0
-    for env_id in env or _ids():
+    first: dict[
+        str, str
+    ] = {}  # ids of environments whose scenes differ; a set fits every task with the same scenes
+    for env_id in map(twin_of, ENV_IDS):
+        first.setdefault(str(TASKS[env_id]), env_id)
+    for env_id in env or first.values():
         maker = Maker(env_id)
         for name in [each for each in sets if each in maker.numbers()]:
             path = shipped_path(name, env_id)
