@@ -37,7 +37,7 @@ def write_pages(docs: Path) -> None:
     for env_id in TASKS:
         name = env_id.partition("/")[2]
         if "Step-" in name:
-            write(docs / "environments" / f"{name}.md", stepwise_page(name))
+            write(docs / "environments" / f"{name}.md", stepwise_page(docs, name))
     for package in PACKAGES:
         module = importlib.import_module(package)
         write(docs / "api" / f"{package}.rst", package_page(package))
@@ -100,12 +100,14 @@ def title(text: str) -> str:
     return f"{text}\n{'=' * len(text)}\n\n"
 
 
-def stepwise_page(name: str) -> str:
-    """Return the page of a task with an action in every control step."""
+def stepwise_page(docs: Path, name: str) -> str:
+    """Return the page of a task with an action in every control step, with the picture of its twin."""
     twin = name.replace("Step-", "-")
+    text = (docs / "environments" / f"{twin}.md").read_text(encoding="utf-8")
+    picture = re.findall(r"(?m)^!\[.*$", text)[:1]
     return (
         f"# {name}\n\nThe task of [{twin}]({twin}.md) with an action in every control step: a velocity of the hand or "
-        f"of the joints ([actions](../environments.md#actions)).\n\n{HERE}\n"
+        f"of the joints ([actions](../environments.md#actions)).\n\n{''.join(picture)}\n\n{HERE}\n"
     )
 
 

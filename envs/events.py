@@ -193,7 +193,7 @@ class EventPredictor:
         while rows.size:
             since = self.timestep * (step - began)[rows]
             joints = self.space.joints(plan.take(rows).trajectory()(since[:, None]))[:, 0]
-            obstacles = scenes.take(rows).obstacles_at(self.timestep * step[rows])
+            obstacles = scenes.take(rows).obstacles_at(np.asarray(self.timestep * step[rows]))
             glance = self.sensor.read(self.arm, joints, obstacles)
             hit = glance.ranges < nothing
             new = _count_new(glance.points, hit, known[rows], known_hit[rows]) >= NEW_POINTS

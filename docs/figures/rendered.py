@@ -32,11 +32,16 @@ from viapoint.training.scene_sets.scene_set import scenes_for
 ROOT = Path(__file__).parents[2]
 IN_PLANE, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
 STILLS = {
-    "planar_reach.png": "viapoint/PlanarReach-v0",
-    "planar_obstacles.png": IN_PLANE,
-    "planar_whole_arm.png": "viapoint/PlanarWholeArm-v0",
+    "planar_reach.png": ("viapoint/PlanarReach-v0", 0),
+    "planar_obstacles.png": (IN_PLANE, 0),
+    "planar_whole_arm.png": ("viapoint/PlanarWholeArm-v0", 0),
+    "planar_target_jump.png": ("viapoint/PlanarTargetJump-v0", 0),
+    "planar_moving_obstacles.png": ("viapoint/PlanarMovingObstacles-v0", 0),
+    "panda_reach.png": ("viapoint/PandaReach-v0", 0),
+    "panda_moving_obstacles.png": ("viapoint/PandaMovingObstacles-v0", 0),
+    "panda_sensed.png": ("viapoint/PandaSensed-v0", 6),
 }
-"""Tasks of the pictures of single movements."""
+"""Tasks of the pictures of single movements, and which of the scenes that show something."""
 TRIED = 100
 """Scenes among which those that are shown are chosen."""
 CLEAREST = 0.012
@@ -70,8 +75,10 @@ def shown(env_id: str, number: int) -> Shown:
     """Return scenes of the validation set in which straight movements fail, and those of the method are clear."""
     simulation = SceneSimulation(env_id, TRIED)
     task = simulation.task
-    shipped = env_id in SHIPPED_IDS
-    method: Method = agent_method("agent", load_agent(env_id), 16) if shipped else GeometrySearch(task)
+    method: Method = GeometrySearch(task)
+    if env_id in SHIPPED_IDS:
+        checks = 0 if task.sensor else 16
+        method = agent_method("agent", load_agent(env_id), checks)
     plain = Straight(simulation)
     scenes = scenes_for("validation", task).scenes.take(slice(0, TRIED))
     observation = simulation.observe(scenes)
@@ -86,11 +93,11 @@ def shown(env_id: str, number: int) -> Shown:
     return Shown(method, plain, scenes.take(rows))
 
 
-def still(path: Path, env_id: str) -> None:
+def still(path: Path, env_id: str, number: int) -> None:
     """Render one movement of a task."""
-    some = shown(env_id, 1)
+    some = shown(env_id, number + 1)
     env = gym.make(env_id, render_mode="rgb_array")
-    play(env, some.scenes, some.method.decide)
+    play(env, some.scenes.take([number]), some.method.decide)
     frame: Any = env.unwrapped.render()
     env.close()
     Image.fromarray(frame).save(path, optimize=True)
@@ -159,8 +166,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/images"), help="folder to write to")
     out: Path = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
-    for name, env_id in STILLS.items():
-        still(out / name, env_id)
+    for name, (env_id, number) in STILLS.items():
+        still(out / name, env_id, number)
     in_space(out / "panda_obstacles.png")
     own_arm(out / "own_arm.png")
     for path in sorted(out.iterdir()):

@@ -21,6 +21,7 @@ class Palette(NamedTuple):
     arm: Colour = (0.63, 0.69, 0.77)
     joint: Colour = (0.30, 0.35, 0.44)
     table: Colour = (0.965, 0.96, 0.945)
+    seen: Colour = (0.98, 0.80, 0.10)
 
 
 PALETTE = Palette()

@@ -124,7 +124,22 @@ def picture_of(task: Task, recorded: Recorded, step: int) -> Picture:
         done=done,
         touched=int(contact.argmax()) if contact.any() else len(done),
         replaced=paths[:-1],
+        seen=_seen(task, recorded, joints, now[0]),
     )
+
+
+def _seen(task: Task, recorded: Recorded, joints: Float, now: float) -> Float:
+    """Return the points that the sensor of a task has met in its last looks until a time, shape (M, 3)."""
+    sensor = task.sensor
+    if sensor is None:
+        return np.zeros((0, 3))
+    # Each plan began with a look.
+    times = [0.0, *(began for began, _ in recorded.history if 0.0 < began <= now + 1e-9)]
+    looks = np.array(times[-sensor.looks :])
+    steps = np.minimum(np.round(looks / task.arm.timestep).astype(np.int64), len(joints) - 1)
+    scenes = recorded.scene.take(np.zeros(len(looks), np.int64))
+    readings = sensor.read(task.arm, joints[steps], scenes.obstacles_at(looks))
+    return readings.points[readings.seen >= 0]
 
 
 def _path(plan: Plan) -> Float:

@@ -12,7 +12,7 @@ import numpy as np
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.obstacles import Obstacles
+from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes
 from viapoint.envs.simulator import Simulator
 
 Geom = Any
@@ -25,6 +25,12 @@ PLAN, DONE, REPLACED = 0.0065, 0.0030, 0.0045
 """Radii of the planned, the executed and a replaced path, [m]; the planned one shows as a rim of the executed."""
 SPACING = 0.011
 """Distance of the points of a drawn path, [m]."""
+SEEN, MOST_SEEN = 0.004, 600
+"""Radius of the points that a sensor has met, [m], and how many of them are drawn at most."""
+HALF_SPACE_BOARD, GLASSY = (1.0, 1.0, 0.002), 0.4
+"""Half lengths of the board that stands for a half-space, [m], and its opacity."""
+BELOW_SURFACE = 0.008
+"""Depth of this board, [m]: a floor at the height of the table is hidden by it."""
 ABOVE_TABLE = 0.001
 """Height of paths of the plane above the table, [m]."""
 FADED: Colour = tuple(0.6 * a + 0.4 * b for a, b in zip(PALETTE.plan, PALETTE.table, strict=True))  # type: ignore[assignment]
@@ -50,6 +56,8 @@ class Picture(NamedTuple):
     """Index into the executed path of the first contact; its length without contact."""
     replaced: Sequence[Float]
     """Paths of plans that were replaced, shape (n, 3) each, [m]."""
+    seen: Float
+    """Points that a sensor has met, shape (M, 3), [m]."""
 
 
 class SceneView:
@@ -84,6 +92,12 @@ class SceneView:
             shapes.line(self._lowered(picture.planned), PLAN, PALETTE.plan)
         for via in self._lowered(picture.vias):
             shapes.ball(via, 0.011, PALETTE.via, GLOWING)
+        seen = picture.seen[:: -(-len(picture.seen) // MOST_SEEN) or 1].copy()
+        if self._flat and len(seen):  # on top of the obstacles, whose sides the camera hardly sees
+            centre, half = bounding_boxes(picture.obstacles)
+            seen[:, 2] = (centre + half)[0, picture.obstacles.present[0], 2].max()
+        for point in seen:
+            shapes.ball(point, SEEN, PALETTE.seen, GLOWING)
         free = picture.touched
         done = self._lowered(picture.done)
         for part, colour in ((done[: free + 1], PALETTE.executed), (done[free:], PALETTE.contact)):
@@ -100,8 +114,16 @@ class SceneView:
         mujoco.mj_camlight(model, data)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self.scene)
-        for geom in self._shown({model.geom("table").id}):
+        table = model.geom("table").id
+        for geom in self._shown({table}):
             geom.castshadow = False  # there is nothing below it, and its own surface would be speckled
+        for geom in self.scene.geoms[: self.scene.ngeom]:
+            if geom.type == mujoco.mjtGeom.mjGEOM_PLANE and geom.objid != table:
+                # MuJoCo draws the planes that the model was compiled with, and others as something else.
+                geom.type, geom.dataid, geom.size = mujoco.mjtGeom.mjGEOM_BOX, -1, HALF_SPACE_BOARD
+                geom.pos = geom.pos - BELOW_SURFACE * geom.mat[:, 2]
+                geom.rgba[3], geom.transparent = GLASSY, True
+                geom.castshadow = False
         if picture.touched < len(picture.done):
             mujoco.mj_collision(model, data)
             pairs = data.contact.geom[: data.ncon].ravel()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from episodes import AROUND, DRAWN, OBSTACLES, STRAIGHT, moved
 
-from viapoint.envs import Sphere, arm_of
+from viapoint.envs import HalfSpace, Sphere, arm_of
 from viapoint.envs.rendering import gl, renderer
 
 WHOLE_ARM = "viapoint.envs:viapoint/PlanarWholeArm-v0"
@@ -54,6 +54,28 @@ def test_contact_is_red_and_nothing_else_is(make, name):
     assert red(env.render()) > 60
     assert not moved(env, AROUND)["collision"]
     assert red(env.render()) == 0
+
+
+def test_a_half_space_below_the_table_is_hidden_by_it(make):
+    # MuJoCo would draw a plane that the compiled model did not have as something else.
+    env = make("viapoint.envs:viapoint/PandaObstacles-v0", side=120)
+    ball = Sphere(0.05, position=(0.5, 0.4, 0.6))
+    frames = []
+    for obstacles in ([ball], [ball, HalfSpace(position=(0.0, 0.0, -0.01))]):
+        env.reset(options={"obstacles": obstacles})
+        frames.append(env.render().astype(int))
+    assert (np.abs(frames[0] - frames[1]).max(axis=-1) > 20).mean() < 0.15
+
+
+def test_points_that_a_sensor_sees_are_drawn(make):
+    yellow = []
+    for name in (OBSTACLES, "viapoint.envs:viapoint/PlanarSensed-v0"):
+        env = make(name, side=240)
+        env.reset(options=DRAWN)
+        r, g, b = (env.render()[..., i].astype(int) for i in range(3))
+        yellow.append(int(((r > 200) & (g > 150) & (b < 90)).sum()))
+    assert yellow[0] == 0
+    assert yellow[1] > 10
 
 
 def test_pictures_leave_no_trace_in_the_simulation(make):

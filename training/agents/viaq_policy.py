@@ -147,8 +147,13 @@ class ViaQPolicy(PlanPolicy):
         pairs = pairs_of(self.task, problem, moves, self.shown_instants, until)
         ends = seen_ends(self.task, problem)
         # Geometry is computed on the processor, the networks may be on another device.
-        own = (_tensor(values).to(self.device) for values in (ends, actions, effort))
-        return PlanInputs(*own, pairs.to(self.device))
+        device = self.device
+        return PlanInputs(
+            _tensor(ends).to(device),
+            _tensor(actions).to(device),
+            _tensor(effort).to(device),
+            pairs.to(device),
+        )
 
     @torch.inference_mode()
     def values(self, problem: Problem, actions: Numbers) -> Numbers:
