@@ -18,6 +18,7 @@ from viapoint.envs.geometry.shapes import (
     CAPSULE,
     CYLINDER,
     HALF_SPACE,
+    IN_TABLES,
     KINDS,
     MESH,
     POINT_CLOUD,
@@ -243,13 +244,11 @@ def bounding_boxes(obstacles: Obstacles) -> tuple[Float, Float]:
     kind, rotation = obstacles.kind, obstacles.rotation
     half = np.einsum("...i,...ij->...j", obstacles.size, BOXES[kind])
     middle = np.zeros_like(half)
-    for number, tables in (
-        (MESH, _mesh_boxes(obstacles.meshes)),
-        (POINT_CLOUD, _cloud_boxes(obstacles.clouds)),
-    ):
+    for number in IN_TABLES:
         rows = kind == number
         if rows.any():
-            box = tables[obstacles.size[rows][:, 0].astype(np.int64)]
+            boxes = _mesh_boxes(obstacles.meshes) if number == MESH else _cloud_boxes(obstacles.clouds)
+            box = boxes[obstacles.size[rows][:, 0].astype(np.int64)]
             middle[rows] = 0.5 * (box[:, 1] + box[:, 0])
             half[rows] = 0.5 * (box[:, 1] - box[:, 0])
     centre = obstacles.centre + np.einsum("...ij,...j->...i", rotation, middle)
