@@ -16,17 +16,14 @@ from ._polynomial import differentiate, multiply, root_candidates, unit_size
 from .array_api import Array, Namespace, as_number, error_state, is_whole, like, to_numpy, unit_factors
 from .trajectory import Trajectory, require_trajectory
 
+# Number of speed samples for the spectral arc length, for any duration: far beyond a movement's bandwidth.
 _SPECTRUM_SAMPLES = 1000
-"""Number of speed samples for the spectral arc length, for any duration: far beyond a movement's bandwidth."""
-
+# Greatest padding; beyond it the spectrum of a single movement takes gigabytes of memory.
 _MOST_PADDING = 16
-"""Greatest padding; beyond it the spectrum of a single movement takes gigabytes of memory."""
-
+# Least rate of the squared speed, relative to its greatest, that is more than rounding in double precision.
 _LEAST_TREND = 1e-12
-"""Least rate of the squared speed, relative to its greatest, that is more than rounding in double precision."""
-
+# Least rate in lower precisions, in units of machine epsilon: their coefficients are rounded more.
 _ROUNDINGS = 64
-"""Least rate in lower precisions, in units of machine epsilon: their coefficients are rounded more."""
 
 
 @dataclass(frozen=True)
