@@ -371,7 +371,7 @@ class Episodes:
     def _decision(self, before: Outcome, begin: Int, first: Bool, final: Bool, event: Int) -> Decision:
         """Return the results of a decision that ended with an event, if nothing went wrong."""
         state, task = self.executor.state, self.task
-        event = np.where(state.collision, Event.CONTACT, event)
+        event = np.where(state.first_contact >= 0, Event.CONTACT, event)
         event = np.where(state.reachable, event, Event.REACH)
         event = np.where(state.unstable, Event.UNSTABLE, event)
         if not task.stepwise:

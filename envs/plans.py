@@ -215,12 +215,12 @@ class ActionLayout:
         low, high = self.duration_range
         object.__setattr__(self, "duration_range", (float(low), float(high)))
 
-    @property
+    @functools.cached_property
     def dimension(self) -> int:
         """Dimension D of the space."""
         return len(self.names_of_axes)
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         """Number of components m."""
         return len(self.names)
@@ -242,13 +242,13 @@ class ActionLayout:
         splits = ["factor 4 between the segments before and after"] * (self.size - len(vias) - 1)
         return (*vias, f"factor {(high / low) ** 0.5:.4g} on {middle}", *splits)
 
-    @property
+    @functools.cached_property
     def centre(self) -> float:
         """Duration of the zero action, [s] in hand space, relative in joint space."""
         low, high = self.duration_range
         return float((low * high) ** 0.5)
 
-    @property
+    @functools.cached_property
     def log_half_range(self) -> float:
         """Logarithm of the factor on the duration for an action of 1."""
         low, high = self.duration_range

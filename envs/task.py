@@ -170,17 +170,17 @@ class Task:
             task.steering  # noqa: B018 - checks the control step
         return dataclasses.replace(task, duration_range=task.action.duration_range)
 
-    @property
+    @functools.cached_property
     def whole_movement(self) -> bool:
         """True if an episode is one decision."""
         return self.decide_at == END
 
-    @property
+    @functools.cached_property
     def stepwise(self) -> bool:
         """True if a decision is made in every control step."""
         return self.decide_at == STEPS
 
-    @property
+    @functools.cached_property
     def replanning(self) -> bool:
         """True if an episode is several plans, each made while the one before is under way."""
         return not isinstance(self.decide_at, str)
@@ -190,7 +190,7 @@ class Task:
         """Space in which movements are planned."""
         return space_of(self.arm, self.space_name)
 
-    @property
+    @functools.cached_property
     def tolerance(self) -> Tolerance:
         """Bounds of success."""
         return TOLERANCES[self.space_name]

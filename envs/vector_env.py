@@ -408,12 +408,18 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def _joined(self, parts: list[Decision]) -> Decision:
         """Return the decisions of all environments together."""
-        observation = _together([part.observation for part in parts])
-        info = _together([part.info for part in parts])
-        reward = np.concatenate([part.reward for part in parts])
-        self.terminated = np.concatenate([part.terminated for part in parts])
-        self.truncated = np.concatenate([part.truncated for part in parts])
-        return Decision(observation, reward, self.terminated, self.truncated, info)
+        decision = parts[0]
+        if len(parts) > 1:
+            decision = Decision(
+                observation=_together([part.observation for part in parts]),
+                reward=np.concatenate([part.reward for part in parts]),
+                terminated=np.concatenate([part.terminated for part in parts]),
+                truncated=np.concatenate([part.truncated for part in parts]),
+                info=_together([part.info for part in parts]),
+            )
+        self.terminated = decision.terminated
+        self.truncated = decision.truncated
+        return decision
 
     def _as_step(
         self, decision: Decision, active: Bool

@@ -23,8 +23,8 @@ from .array_api import (
 Ends = dict[str, Boundary]
 """The four boundary values by name, in the order of END_NAMES."""
 
+# Distance of waypoints that count as equal, in units of the rounding of their greatest coordinate.
 _EQUAL = 64.0
-"""Distance of waypoints that count as equal, in units of the rounding of their greatest coordinate."""
 
 END_NAMES = ("start_velocity", "start_acceleration", "goal_velocity", "goal_acceleration")
 

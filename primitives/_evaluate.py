@@ -22,11 +22,10 @@ import numpy as np
 from ._hermite_tables import derivative_factors
 from .array_api import Array, Namespace, constant
 
+# Size of the basis of one block of trajectories, which stays in a core's second-level cache.
 _BLOCK_BYTES = 1_200_000
-"""Size of the basis of one block of trajectories, which stays in a core's second-level cache."""
-
+# Number of times below which linear algebra libraries have special cases that depend on the row distance.
 _FEW = 8
-"""Number of times below which linear algebra libraries have special cases that depend on the row distance."""
 
 
 def _power_basis(time: Array, starts: Array, rates: Array, degree: int, xp: Namespace) -> Array:

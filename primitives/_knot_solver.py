@@ -35,20 +35,15 @@ States: TypeAlias = list[list[Any]]
 Nodes: TypeAlias = dict[tuple[int, int], int]
 """Row of each unknown states[k][i] in Eq. 1, by (k, i)."""
 
+# Power of the machine epsilon that is the least ratio of two durations of a movement for the normal equations. Their
+# relative error is about epsilon times the square of the inverse ratio: below 1e-9, in single precision 1e-4.
 _DIGITS = 0.2
-"""Power of the machine epsilon that is the least ratio of two durations of a movement for the normal equations.
-
-Their relative error is about epsilon times the square of the inverse ratio: below 1e-9, in single precision 1e-4.
-"""
-
+# Greatest distance by which a movement may miss a waypoint because of rounding, relative to its extent.
 _MISS = 1e-9
-"""Greatest distance by which a movement may miss a waypoint because of rounding, relative to its extent."""
-
+# Least relative change of the cost for which the tolerance of waypoints counts.
 _GAIN = 1e-8
-"""Least relative change of the cost for which the tolerance of waypoints counts."""
-
+# Durations [s] between which no power of them over- or underflows, even in single precision.
 _SHORT, _LONG = 1e-3, 1e3
-"""Durations [s] between which no power of them over- or underflows, even in single precision."""
 
 
 def _solve_states(order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States) -> States:

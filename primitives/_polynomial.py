@@ -15,9 +15,8 @@ import numpy as np
 if TYPE_CHECKING:
     from .array_api import Floats
 
+# s of w = 1 / (u + s), irrational so that -s is no root of a polynomial with simple coefficients.
 _SHIFT = 0.6180339887498949
-"""s of w = 1 / (u + s), irrational so that -s is no root of a polynomial with simple coefficients."""
-
 _POLISHING_STEPS = 3
 
 

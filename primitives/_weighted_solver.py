@@ -47,17 +47,14 @@ Entry: TypeAlias = Any
 Column: TypeAlias = tuple[int, int]
 """Unknown states[k][i], by (k, i)."""
 
+# Tolerance of waypoints, relative to their greatest coordinate.
 _ROUNDING = 64.0 * 2.0**-52
-"""Tolerance of waypoints, relative to their greatest coordinate."""
-
+# Distances that cost about as much as a velocity, an acceleration and a jerk of 1 at an end, in unit time.
 _REACHES = (0.5, 0.1, 0.02)
-"""Distances that cost about as much as a velocity, an acceleration and a jerk of 1 at an end, in unit time."""
-
+# Mean velocity of a segment, relative to the speed on the whole path, above which it tells nothing.
 _FASTEST = 100.0
-"""Mean velocity of a segment, relative to the speed on the whole path, above which it tells nothing."""
-
+# Bound on the tolerance relative to the extent of the movement, for points far from the origin.
 _LARGEST_SLACK = 1e-6
-"""Bound on the tolerance relative to the extent of the movement, for points far from the origin."""
 
 
 @dataclass(eq=False)

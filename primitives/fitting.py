@@ -38,37 +38,27 @@ MOST_VIA_POINTS = 8
 USUAL_RANGE = (0, 3)
 """Fewest and most via-points among which n_via=None chooses."""
 
+# Time before the first and after the last sample in which a movement may begin and end, in lengths of the recording.
 _BEYOND = 0.25
-"""Time before the first and after the last sample in which a movement may begin and end, in lengths of the
-recording."""
-
+# Shortest segment, in durations of the movement: via-points closer in time cannot be told apart; least share of the
+# recording that the movement takes.
 _SHORTEST, _LEAST = 0.02, 1e-3
-"""Shortest segment, in durations of the movement: via-points closer in time cannot be told apart; least share of the
-recording that the movement takes."""
-
+# Number of instants among which the first passage times are chosen.
 _GRID = 8
-"""Number of instants among which the first passage times are chosen."""
-
+# Numbers of the best starts that go on, and of their steps.
 _STAGES = ((40, 3), (10, 8), (1, 80))
-"""Numbers of the best starts that go on, and of their steps."""
-
+# Number of samples, evenly spread, with which the best start is found.
 _ENOUGH = 200
-"""Number of samples, evenly spread, with which the best start is found."""
-
+# Greatest size of a parameter; beyond it a share does not change any more.
 _GREATEST = 40.0
-"""Greatest size of a parameter; beyond it a share does not change any more."""
-
+# Step of the difference quotients of the residuals.
 _STEP = 1e-7
-"""Step of the difference quotients of the residuals."""
-
+# Least gain of a step, relative to the squares and absolute, in units of the recording.
 _CONVERGED, _TINY = 1e-10, 1e-28
-"""Least gain of a step, relative to the squares and absolute, in units of the recording."""
-
+# Residual, in sizes of the movement, below which a better fit is only rounding.
 _ROUNDING = 1e-7
-"""Residual, in sizes of the movement, below which a better fit is only rounding."""
-
+# Share of the integral of the squared speed of a reach, and the part of its duration in which it is reached.
 _ENERGY, _BEFORE = 0.01, 0.17
-"""Share of the integral of the squared speed of a reach, and the part of its duration in which it is reached."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,16 +29,13 @@ from .array_api import (
 )
 from .trajectory import connect
 
+# Fraction of the duration below which a segment is dropped in lower than double precision, which it would overflow.
 _LEAST_FRACTION = 1e-7
-"""Fraction of the duration below which a segment is dropped in lower than double precision, which it would overflow."""
-
+# Distance of a via-point from the one before, relative to the longest, below which it is left out at first.
 _NEAR = 1e-2
-"""Distance of a via-point from the one before, relative to the longest, below which it is left out at first."""
-
 _LEVEL_STEPS = 5
-
+# Entries of the Hessians of the movements that are solved at a time.
 _ENTRIES = 50_000
-"""Entries of the Hessians of the movements that are solved at a time."""
 
 
 def passage_durations(

@@ -7,7 +7,7 @@ spectral arc length -1.4024. Where nothing moves the ratios are undefined and Na
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,17 +16,14 @@ from ._polynomial import differentiate, multiply, root_candidates, unit_size
 from .array_api import Array, Namespace, as_number, error_state, is_whole, like, to_numpy, unit_factors
 from .trajectory import Trajectory, require_trajectory
 
+# Number of speed samples for the spectral arc length, for any duration: far beyond a movement's bandwidth.
 _SPECTRUM_SAMPLES = 1000
-"""Number of speed samples for the spectral arc length, for any duration: far beyond a movement's bandwidth."""
-
+# Greatest padding; beyond it the spectrum of a single movement takes gigabytes of memory.
 _MOST_PADDING = 16
-"""Greatest padding; beyond it the spectrum of a single movement takes gigabytes of memory."""
-
+# Least rate of the squared speed, relative to its greatest, that is more than rounding in double precision.
 _LEAST_TREND = 1e-12
-"""Least rate of the squared speed, relative to its greatest, that is more than rounding in double precision."""
-
+# Least rate in lower precisions, in units of machine epsilon: their coefficients are rounded more.
 _ROUNDINGS = 64
-"""Least rate in lower precisions, in units of machine epsilon: their coefficients are rounded more."""
 
 
 @dataclass(frozen=True)
@@ -198,28 +195,6 @@ def spectral_arc_length(
         raise ValueError(f"threshold must be a number of at least 0 and below 1, got {threshold!r}")
     if not is_whole(padding) or padding > _MOST_PADDING:
         raise ValueError(f"padding must be a whole number from 0 to {_MOST_PADDING}, got {padding!r}")
-    xp, dtype = trajectory.namespace, trajectory.coefficients.dtype
-    if xp is not np and dtype.itemsize < 4:  # torch has no Fourier transform of half precision
-        arrays = {f.name: getattr(trajectory, f.name) for f in fields(trajectory) if f.name != "order"}
-        single = replace(trajectory, **{name: xp.astype(array, xp.float32) for name, array in arrays.items()})
-        return xp.astype(_arc_length(single, cutoff, threshold, padding), dtype)
-    return _arc_length(trajectory, cutoff, threshold, padding)
-
-
-def _unit_sized(trajectory: Trajectory) -> Trajectory:
-    """Return the movements scaled by powers of two, which is exact, to a size and a duration of about 1."""
-    xp, t = trajectory.namespace, trajectory
-    if 0 in t.batch_shape:
-        return t
-    size = unit_factors(xp, xp.reshape(t.coefficients, (*t.batch_shape, -1)))[..., None, None]
-    pace = unit_factors(xp, t.end)
-    return Trajectory(
-        t.coefficients * size, t.durations * pace, t.order, t.starts * pace, t.rates / pace, t.end * pace
-    )
-
-
-def _arc_length(trajectory: Trajectory, cutoff: float, threshold: float, padding: int) -> Array:
-    """Return the spectral arc length (...,)."""
     xp = trajectory.namespace
     if 0 in trajectory.batch_shape:  # not all libraries transform empty batches
         return 0.0 * trajectory.duration
@@ -238,6 +213,18 @@ def _arc_length(trajectory: Trajectory, cutoff: float, threshold: float, padding
     width = like(xp, 1.0 / np.maximum(last, 1), spectrum)
     rise = spectrum[..., 1:] - spectrum[..., :-1]
     return -xp.sum(used * xp.sqrt(width * width + rise * rise), axis=-1)
+
+
+def _unit_sized(trajectory: Trajectory) -> Trajectory:
+    """Return the movements scaled by powers of two, which is exact, to a size and a duration of about 1."""
+    xp, t = trajectory.namespace, trajectory
+    if 0 in t.batch_shape:
+        return t
+    size = unit_factors(xp, xp.reshape(t.coefficients, (*t.batch_shape, -1)))[..., None, None]
+    pace = unit_factors(xp, t.end)
+    return Trajectory(
+        t.coefficients * size, t.durations * pace, t.order, t.starts * pace, t.rates / pace, t.end * pace
+    )
 
 
 def speed_valleys(trajectory: Trajectory) -> SpeedEvents:

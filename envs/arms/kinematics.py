@@ -66,22 +66,6 @@ def transform(rotation: Float, origin: Float, link: int, point: Float) -> Vector
 
 
 @kernel
-def tool_frame(
-    chain: Chain, rotation: Float, origin: Float, tool_rotation: Float, tool_origin: Float
-) -> None:
-    """Fill the world frame of the tool, shapes (3, 3) and (3,), from the frames of the links."""
-    last = chain.origin.shape[0]
-    tool_origin[0], tool_origin[1], tool_origin[2] = transform(rotation, origin, last, chain.tool_origin)
-    for row in range(3):
-        for column in range(3):
-            tool_rotation[row, column] = (
-                rotation[last, row, 0] * chain.tool_rotation[0, column]
-                + rotation[last, row, 1] * chain.tool_rotation[1, column]
-                + rotation[last, row, 2] * chain.tool_rotation[2, column]
-            )
-
-
-@kernel
 def tool_position(chain: Chain, joints: Float, rotation: Float, origin: Float) -> Vector:
     """Return the world position of the tool, [m], and fill the frames of the links."""
     link_frames(chain, joints, rotation, origin)
@@ -312,8 +296,15 @@ def _all_tools(chain: Chain, joints: Float, tool_rotation: Float, tool_origin: F
     n_joints = joints.shape[1]
     rotation, origin = np.empty((n_joints + 1, 3, 3)), np.empty((n_joints + 1, 3))
     for n in range(joints.shape[0]):
-        link_frames(chain, joints[n], rotation, origin)
-        tool_frame(chain, rotation, origin, tool_rotation[n], tool_origin[n])
+        x, y, z = tool_position(chain, joints[n], rotation, origin)
+        tool_origin[n, 0], tool_origin[n, 1], tool_origin[n, 2] = x, y, z
+        for row in range(3):
+            for column in range(3):
+                tool_rotation[n, row, column] = (
+                    rotation[n_joints, row, 0] * chain.tool_rotation[0, column]
+                    + rotation[n_joints, row, 1] * chain.tool_rotation[1, column]
+                    + rotation[n_joints, row, 2] * chain.tool_rotation[2, column]
+                )
 
 
 @compiled

@@ -18,6 +18,7 @@ from viapoint.envs.geometry.shapes import (
     CAPSULE,
     CYLINDER,
     HALF_SPACE,
+    IN_TABLES,
     KINDS,
     MESH,
     POINT_CLOUD,
@@ -87,7 +88,8 @@ class Obstacles(NamedTuple):
     def take(self, scenes: Any) -> Obstacles:
         """Return some of the scenes, by indices, mask or slice."""
         scenes = np.arange(len(self.kind))[scenes]
-        return Obstacles(*[part[scenes] for part in self[:5]], self.meshes, self.clouds)
+        kind, centre, rotation, size, velocity = (part[scenes] for part in self[:5])
+        return Obstacles(kind, centre, rotation, size, velocity, self.meshes, self.clouds)
 
     def with_rows(self, rows: int) -> Obstacles:
         """Return the obstacles with room for more of them in each scene."""
@@ -213,24 +215,12 @@ def unpack(obstacles: Obstacles, scene: int) -> list[Shape]:
 
 
 def quaternions_of(rotation: Float) -> Float:
-    """Return the quaternions, shape (..., 4), of rotation matrices, shape (..., 3, 3).
-
-    Of the products of w, x, y and z with one of them, those with the greatest are taken (S. W. Shepperd, Quaternion
-    from rotation matrix, 1978).
-    """
-    (a, d, g), (b, e, h), (c, f, i) = np.moveaxis(rotation, (-2, -1), (0, 1))
-    products = np.stack(
-        [
-            np.stack((1.0 + a + e + i, f - h, g - c, b - d), axis=-1),
-            np.stack((f - h, 1.0 + a - e - i, d + b, g + c), axis=-1),
-            np.stack((g - c, d + b, 1.0 - a + e - i, h + f), axis=-1),
-            np.stack((b - d, g + c, h + f, 1.0 - a - e + i), axis=-1),
-        ],
-        axis=-2,
-    )
-    greatest = np.diagonal(products, axis1=-2, axis2=-1).argmax(axis=-1)
-    chosen = np.take_along_axis(products, greatest[..., None, None], axis=-2)[..., 0, :]
-    return np.asarray(chosen / np.linalg.norm(chosen, axis=-1, keepdims=True))
+    """Return the quaternions, shape (..., 4), of rotation matrices, shape (..., 3, 3)."""
+    matrices = rotation.reshape(-1, 9)
+    found = np.empty((len(matrices), 4))
+    for quaternion, matrix in zip(found, matrices, strict=True):
+        mujoco.mju_mat2Quat(quaternion, matrix)
+    return found.reshape(*rotation.shape[:-2], 4)
 
 
 def mesh_names(meshes: Meshes) -> list[str]:
@@ -254,13 +244,11 @@ def bounding_boxes(obstacles: Obstacles) -> tuple[Float, Float]:
     kind, rotation = obstacles.kind, obstacles.rotation
     half = np.einsum("...i,...ij->...j", obstacles.size, BOXES[kind])
     middle = np.zeros_like(half)
-    for number, tables in (
-        (MESH, _mesh_boxes(obstacles.meshes)),
-        (POINT_CLOUD, _cloud_boxes(obstacles.clouds)),
-    ):
+    for number in IN_TABLES:
         rows = kind == number
         if rows.any():
-            box = tables[obstacles.size[rows][:, 0].astype(np.int64)]
+            boxes = _mesh_boxes(obstacles.meshes) if number == MESH else _cloud_boxes(obstacles.clouds)
+            box = boxes[obstacles.size[rows][:, 0].astype(np.int64)]
             middle[rows] = 0.5 * (box[:, 1] + box[:, 0])
             half[rows] = 0.5 * (box[:, 1] - box[:, 0])
     centre = obstacles.centre + np.einsum("...ij,...j->...i", rotation, middle)

@@ -100,7 +100,8 @@ class Window:
             GLUnavailableError: There is no display, or no OpenGL on it.
         """
         self._window: Any = None
-        if not _has_display():
+        always = sys.platform in ("darwin", "win32")
+        if not (always or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             raise GLUnavailableError(
                 "render_mode='human' opens a window, and there is no display (neither DISPLAY nor "
                 "WAYLAND_DISPLAY is set): use render_mode='rgb_array' or 'rgb_array_list', or run under a "
@@ -123,9 +124,8 @@ class Window:
             raise GLUnavailableError(f"render_mode='human' cannot open a window: no OpenGL there; {INSTALL}")
         self._glfw.make_context_current(self._window)
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        self._glfw.make_context_current(
-            None
-        )  # a thread may have the context of one platform alone, GLFW or EGL
+        # A thread may have the context of one platform alone, GLFW or EGL.
+        self._glfw.make_context_current(None)
         self.scene = mujoco.MjvScene(model, MAX_GEOMS)
         """Scene that is shown."""
 
@@ -173,9 +173,3 @@ def _import_triton() -> None:
     if importlib.util.find_spec("torch") and importlib.util.find_spec("triton"):
         with contextlib.suppress(Exception):  # a broken triton concerns torch only
             importlib.import_module("triton")
-
-
-def _has_display() -> bool:
-    if sys.platform in ("darwin", "win32"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

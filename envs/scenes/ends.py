@@ -128,13 +128,12 @@ def _unpack_rows(draft: Draft, scene: int) -> None:
         obstacles.kind[scene, row] = ABSENT
         if row < draft.n_rows[scene]:
             obstacles.kind[scene, row] = int(rows[row, 0])
+        draft.turn_velocity[scene, row] = 0.0
+        obstacles.velocity[scene, row] = 0.0
+        obstacles.centre[scene, row] = rows[row, 1:4]
+        obstacles.size[scene, row] = rows[row, 13:16]
         for axis in range(3):
-            draft.turn_velocity[scene, row, axis] = 0.0
-            obstacles.velocity[scene, row, axis] = 0.0
-            obstacles.centre[scene, row, axis] = rows[row, 1 + axis]
-            obstacles.size[scene, row, axis] = rows[row, 13 + axis]
-            for column in range(3):
-                obstacles.rotation[scene, row, axis, column] = rows[row, 4 + 3 * axis + column]
+            obstacles.rotation[scene, row, axis] = rows[row, 4 + 3 * axis : 7 + 3 * axis]
 
 
 @compiled
@@ -246,26 +245,15 @@ def _make_room(draft: Draft, scene: int) -> bool:
         free = free and _is_row_clear(draft, draft.at_goal, scene, row, 1)
         if not free and keep == 0:
             return False
-        if free:
-            _move_row(obstacles, scene, row, count)
+        kind = obstacles.kind[scene, row]
+        obstacles.kind[scene, row] = ABSENT
+        if free:  # it moves to the first row that is left
+            obstacles.kind[scene, count] = kind
+            obstacles.centre[scene, count] = obstacles.centre[scene, row]
+            obstacles.size[scene, count] = obstacles.size[scene, row]
+            obstacles.rotation[scene, count] = obstacles.rotation[scene, row]
             count += 1
-        else:
-            obstacles.kind[scene, row] = ABSENT
     return bool(keep == 0 or count == keep)
-
-
-@compiled
-def _move_row(obstacles: Obstacles, scene: int, row: int, to: int) -> None:
-    """Move an obstacle to an earlier row."""
-    if row == to:
-        return
-    obstacles.kind[scene, to] = obstacles.kind[scene, row]
-    obstacles.kind[scene, row] = ABSENT
-    for axis in range(3):
-        obstacles.centre[scene, to, axis] = obstacles.centre[scene, row, axis]
-        obstacles.size[scene, to, axis] = obstacles.size[scene, row, axis]
-        for column in range(3):
-            obstacles.rotation[scene, to, axis, column] = obstacles.rotation[scene, row, axis, column]
 
 
 @compiled

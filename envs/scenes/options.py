@@ -86,7 +86,12 @@ def draw_given(
     obstacles = no_obstacles(number, sampler.rows) if shapes is None else pack(shapes, sampler.rows)
     names = [[shape.name for shape in each] for each in shapes or ()]
     if sampler.viewpoint is not None:
-        _check_view(obstacles, sampler.viewpoint)
+        apart = point_clearances(obstacles, sampler.viewpoint)
+        if (apart < VIEW_MARGIN).any():
+            raise ValueError(
+                f"options['obstacles'] must be {VIEW_MARGIN} m or more from the sensor at {sampler.viewpoint}, got "
+                f"{apart.min():.3g} m in scene {int(apart.argmin())}"
+            )
     ends = {name: _end(name, options[name], sampler, obstacles) for name in ENDS if name in options}
     home = np.tile(arm.home, (number, 1))
     scenes = resting(ends.get("start", home), ends.get("goal", home), obstacles)
@@ -107,17 +112,6 @@ def draw_given(
         raise ValueError(str(error)) from None
     check_scenes(drawn, arm, names)
     return drawn
-
-
-def _check_view(obstacles: Obstacles, viewpoint: tuple[float, float, float]) -> None:
-    """Check that no obstacle contains the sensor."""
-    apart = point_clearances(obstacles, viewpoint)
-    if (apart < VIEW_MARGIN).any():
-        scene = int(apart.argmin())
-        raise ValueError(
-            f"options['obstacles'] must be {VIEW_MARGIN} m or more from the sensor at {viewpoint}, got "
-            f"{apart[scene]:.3g} m in scene {scene}"
-        )
 
 
 def _refuse_unknown(names: Mapping[str, Any]) -> None:
@@ -174,11 +168,8 @@ def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles) -> 
     number, joints = len(obstacles.kind), len(sampler.arm.home)
     label = f"options[{name!r}]"
     several = [value] * number if isinstance(value, Pose | Mapping) else value
-    if (
-        isinstance(several, Sequence)
-        and several
-        and all(isinstance(each, Pose | Mapping) for each in several)
-    ):
+    is_list = isinstance(several, Sequence) and len(several) > 0
+    if is_list and all(isinstance(each, Pose | Mapping) for each in several):
         if len(several) != number:
             raise ValueError(f"{label} must be one pose, or {number} poses, got {len(several)}")
         poses = [_pose(label, each) for each in several]

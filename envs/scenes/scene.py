@@ -70,9 +70,9 @@ class Scenes(NamedTuple):
 
     def put(self, rows: Any, scenes: Scenes) -> Scenes:
         """Return the scenes after the ones at `rows` were overwritten in place; only tables of shapes are new."""
-        for mine, theirs in zip(self, scenes, strict=True):
-            if not isinstance(mine, Obstacles):
-                mine[rows] = theirs
+        for name in self._fields:
+            if name != "obstacles":
+                getattr(self, name)[rows] = getattr(scenes, name)
         return self._replace(obstacles=self.obstacles.put(rows, scenes.obstacles))
 
     @classmethod
@@ -85,7 +85,7 @@ class Scenes(NamedTuple):
             last = first + len(part.start)
             obstacles = obstacles.put(slice(first, last), part.obstacles)
             first = last
-        arrays = {"obstacles": obstacles}
+        arrays: dict[str, Any] = {"obstacles": obstacles}
         for name in cls._fields:
             if name != "obstacles":
                 arrays[name] = np.concatenate([getattr(part, name) for part in parts])

@@ -36,26 +36,20 @@ _GREEN: dict[tuple[bool, bool], tuple[int, tuple[float, ...]]] = {
 }
 """(goal velocity FREE, goal acceleration FREE) -> q and the coefficients of g."""
 
+# Estimated relative error of the shorter fraction above which a movement is expanded around both ends.
 _DOUBT = 1e-13
-"""Estimated relative error of the shorter fraction above which a movement is expanded around both ends."""
-
+# Relative difference above which that result replaces the first.
 _TOLERANCE = 1e-13
-"""Relative difference above which that result replaces the first."""
-
+# Size of F at an end relative to its coefficients, below which a root close to it may be missed.
 _NEAR = 1e-6
-"""Size of F at an end relative to its coefficients, below which a root close to it may be missed."""
-
+# Number of time scales, from the whole movement down to the least root.
 _SCALES = 6
-"""Number of time scales, from the whole movement down to the least root."""
-
+# Newton steps from the roots of the polynomial.
 _STEPS = 8
-"""Newton steps from the roots of the polynomial."""
-
+# Relative size of the last step that identifies a root; other points must not win as an earlier equal.
 _CONVERGED_STEP = 1e-9
-"""Relative size of the last step that identifies a root; other points must not win as an earlier equal."""
-
+# Greatest unit time of the roots taken from each end; roots found twice do no harm.
 _OVERLAP = 0.75
-"""Greatest unit time of the roots taken from each end; roots found twice do no harm."""
 
 
 @dataclass(frozen=True)

@@ -26,31 +26,23 @@ from ..trajectory import connect
 from .cost import PassageCost, duration_gradient
 from .rest_to_rest import attach_root_gradient, nearer_fraction
 
+# Starts with moving ends: even durations, durations by chord, eight from a flat Dirichlet distribution.
 _STARTS = 10
-"""Starts with moving ends: even durations, durations by chord, eight from a flat Dirichlet distribution."""
-
+# Number of segments up to which several starts are tried.
 _MOST_SEGMENTS = 16
-"""Number of segments up to which several starts are tried."""
-
+# Bound on the entries of the inverse Hessian of the log-cost: knots about to merge keep a finite gradient.
 _LARGEST = 1e3
-"""Bound on the entries of the inverse Hessian of the log-cost: knots about to merge keep a finite gradient."""
-
+# Steps of the log-durations for one-sided and for central difference quotients of the gradient.
 _DIFFERENCE, _WIDE_DIFFERENCE = 1e-8, 1e-6
-"""Steps of the log-durations for one-sided and for central difference quotients of the gradient."""
-
 _LONGEST_STEP = 1.5
+# Relative error of a cost.
 _NOISE = 1e-13
-"""Relative error of a cost."""
-
+# Newton step that is the last: by quadratic convergence its successor would be of the order of its square.
 _CONVERGED_STEP = 1e-8
-"""Newton step that is the last: by quadratic convergence its successor would be of the order of its square."""
-
+# Gain of the logarithm of the cost that counts as none, if rounding forbids it or only a large step would make it.
 _SMALL_GAIN, _LARGE_STEP = 1e-8, 1e-2
-"""Gain of the logarithm of the cost that counts as none, if rounding forbids it or only a large step would make it."""
-
+# Distance from a lower bound of the logarithm of the cost that is close enough.
 _REACHED = 1e-6
-"""Distance from a lower bound of the logarithm of the cost that is close enough."""
-
 _ITERATIONS = 80
 _HALVINGS = 12
 

@@ -29,11 +29,10 @@ Number: TypeAlias = Any
 SHORTEST = 1e-40
 """Least fraction of a via-point apart from its neighbour; a higher power of it must not underflow."""
 
+# Newton steps; the start is within 34 % of the root everywhere, and after five the error is 2e-16 (measured).
 _STEPS = 5
-"""Newton steps; the start is within 34 % of the root everywhere, and after five the error is 2e-16 (measured)."""
-
+# Distance of the via-point from an end, relative to the movement's extent, that clips the gradient.
 _FLOOR = 1e-5
-"""Distance of the via-point from an end, relative to the movement's extent, that clips the gradient."""
 
 
 class Functions(NamedTuple):
