@@ -275,12 +275,9 @@ class AgentConfig(Config):
     """Configuration of a command for an agent, an environment or an arm."""
 
     agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
-    """Run folder, model folder, or id of an environment with a shipped agent."""
-    pretrained: Annotated[str | None, PRETRAINED] = None
-    """Id of an environment: its shipped agent, as if the id were given as AGENT."""
-    env: Annotated[str | None, ENV] = None  # Id of the environment; default: that of the agent.
-    arm: Annotated[str | None, ARM] = None
-    """Arm, in an environment with obstacles if none is named, or in place of that of an agent."""
+    pretrained: Annotated[str | None, PRETRAINED] = None  # as if the id were given as agent
+    env: Annotated[str | None, ENV] = None  # default: that of the agent
+    arm: Annotated[str | None, ARM] = None  # in place of that of the agent, if any
 
     @property
     def unnamed(self) -> bool:
@@ -385,7 +382,6 @@ class RecordConfig(AgentConfig):
     """
 
     agent: Annotated[tyro.conf.Positional[str | None], RECORDED] = None
-    """Run folder, model folder, id of an environment with a shipped agent, or name of a baseline."""
     episodes: int = 100  # Number of episodes.
     dataset: str | None = None
     """Name of the dataset; default: <environment>/<method>-v0, in the folder MINARI_DATASETS_PATH."""
