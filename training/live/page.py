@@ -52,8 +52,7 @@ class Tab:
         on_end: Callable[[], object],
     ) -> None:
         self.client, self._make, self._on_end = client, make, on_end
-        self.latencies: deque[float] = deque(maxlen=200)
-        """Times from the last changes to the messages with their plans, [s]."""
+        self.latencies: deque[float] = deque(maxlen=200)  # from changes to messages with plans, [s]
         self._jobs: dict[Any, tuple[float, Callable[[], None]]] = {}
         self._later: dict[str, Callable[[], None]] = {}
         self._posted = time.perf_counter()
