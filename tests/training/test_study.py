@@ -15,8 +15,7 @@ import pytest
 import yaml
 
 from viapoint.training import Study, run_study
-from viapoint.training.study.run import StudyFailedError, _connected, _import_libraries
-from viapoint.training.study.trials import COLUMNS
+from viapoint.training.study.run import COLUMNS, StudyFailedError, _connected, _import_libraries
 
 ENV = "viapoint/PlanarObstacles-v0"
 FEW = {"learning_starts": 64, "gradient_steps": 1}

@@ -34,8 +34,16 @@ ELSEWHERE = {
     "wrappers": "the environments are trained on as they are",
 }
 """Arguments that a training's environment does not take, and what to use instead."""
-# Greatest values: seeds of NumPy's legacy generator, environments in memory, days of training, and ports
-GREATEST = {"seed": 2**32 - 1, "n_envs": 1 << 16, "n_timesteps": 10**9, "port": 65535}
+# Least and greatest values of whole numbers, by the names of arguments and fields
+RANGES: dict[str, tuple[int, int | None]] = {
+    "seed": (0, 2**32 - 1),  # that of NumPy's legacy generator
+    "n_envs": (1, 1 << 16),  # environments in memory
+    "n_timesteps": (1, 10**9),  # days of training
+    "port": (0, 65535),
+    **dict.fromkeys(("checks", "eval_every"), (0, None)),
+    **dict.fromkeys(("n_scenes", "n_via", "refine", "trials", "workers"), (1, None)),
+    **dict.fromkeys(("checkpoint_every", "episodes", "eval_scenes"), (1, None)),
+}
 
 
 def unknown_name(what: str, value: object, allowed: Collection[str]) -> str:
@@ -54,9 +62,9 @@ def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:
             raise ValueError(f"{name} cannot be among env_kwargs: {ELSEWHERE[name]}")
 
 
-def check_whole(name: str, value: Any, least: int) -> int:
-    """Return a whole number from `least` to its greatest value."""
-    return whole_number(name, value, least, GREATEST.get(name))
+def check_whole(name: str, value: Any) -> int:
+    """Return a whole number in the range of its name."""
+    return whole_number(name, value, *RANGES[name])
 
 
 def check_file(name: str, path: Path | None, suffix: str = "") -> None:

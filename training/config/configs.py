@@ -9,7 +9,7 @@ import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import tyro
@@ -22,6 +22,7 @@ from viapoint.envs.task import Task
 from viapoint.primitives.fitting import MOST_VIA_POINTS, USUAL_RANGE
 from viapoint.training.config.checks import (
     DEFAULT_ENV,
+    RANGES,
     SHIPPED_IDS,
     check_env_kwargs,
     check_file,
@@ -100,9 +101,6 @@ USUAL_BASELINES = ("straight", "random", "search512")  # Baselines of an evaluat
 class Config:
     """Configuration of a command; paths may be given as strings."""
 
-    least: ClassVar[Mapping[str, int]] = {}
-    """Least values of the whole numbers, by name; None is allowed where it is the default."""
-
     def __post_init__(self) -> None:
         """Check the values."""
         for each in dataclasses.fields(self):
@@ -111,8 +109,9 @@ class Config:
                 object.__setattr__(self, each.name, Path(value).expanduser())
             if str(each.type) == "NamedValues":
                 object.__setattr__(self, each.name, _plain(each.name, value))
-            if each.name in self.least and not (value is None and each.default is None):
-                object.__setattr__(self, each.name, check_whole(each.name, value, self.least[each.name]))
+            optional = value is None and each.default is None
+            if each.name in RANGES and not optional and not isinstance(value, tuple | list):
+                object.__setattr__(self, each.name, check_whole(each.name, value))
         self._check()
 
     def _check(self) -> None:
@@ -134,10 +133,6 @@ class TrainConfig(Config):
         >>> config.folder.as_posix(), config.total_timesteps
         ('runs/PandaObstacles-v0-viaq-1', 16000)
     """
-
-    least: ClassVar = dict.fromkeys(("seed", "eval_every"), 0) | dict.fromkeys(
-        ("n_timesteps", "n_envs", "eval_scenes", "checkpoint_every"), 1
-    )
 
     env: Annotated[str, ENV] = DEFAULT_ENV
     """Id of the environment."""
@@ -275,12 +270,9 @@ class AgentConfig(Config):
     """Configuration of a command for an agent, an environment or an arm."""
 
     agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
-    """Run folder, model folder, or id of an environment with a shipped agent."""
-    pretrained: Annotated[str | None, PRETRAINED] = None
-    """Id of an environment: its shipped agent, as if the id were given as AGENT."""
-    env: Annotated[str | None, ENV] = None  # Id of the environment; default: that of the agent.
-    arm: Annotated[str | None, ARM] = None
-    """Arm, in an environment with obstacles if none is named, or in place of that of an agent."""
+    pretrained: Annotated[str | None, PRETRAINED] = None  # as if the id were given as agent
+    env: Annotated[str | None, ENV] = None  # default: that of the agent
+    arm: Annotated[str | None, ARM] = None  # in place of that of the agent, if any
 
     @property
     def unnamed(self) -> bool:
@@ -324,8 +316,6 @@ class EvaluateConfig(AgentConfig):
     """Form in which the table is printed: for the terminal, Markdown, CSV or JSON."""
     json: Path | None = None  # JSON file for all results, scene by scene.
 
-    least: ClassVar = {"n_scenes": 1}
-
     @property
     def of_planners(self) -> bool:
         """True if planners are measured on the problems of MotionBenchMaker."""
@@ -342,9 +332,9 @@ class EvaluateConfig(AgentConfig):
         if not self.checks:
             raise ValueError("checks must name at least one number, such as 0")
         for number in self.checks:
-            check_whole("checks", number, 0)
+            check_whole("checks", number)
         for number in self.refine:
-            check_whole("refine", number, 1)
+            check_whole("refine", number)
         if (any(self.checks) or self.refine) and self.agent is None:
             raise ValueError(NOTHING_TO_CHECK)
         check_file("json", self.json)
@@ -363,8 +353,6 @@ class PlayConfig(AgentConfig):
     scenes: str = "test"  # Scene set: validation, test, hard, uniform, or a scene file.
     n_scenes: int = 8  # Number of scenes, evenly spread over the set.
     checks: int = 0  # Number of proposals that the agent checks with exact geometry; 0 for none.
-
-    least: ClassVar = {"n_scenes": 1, "checks": 0}
 
     def _check(self) -> None:
         super()._check()
@@ -385,15 +373,12 @@ class RecordConfig(AgentConfig):
     """
 
     agent: Annotated[tyro.conf.Positional[str | None], RECORDED] = None
-    """Run folder, model folder, id of an environment with a shipped agent, or name of a baseline."""
     episodes: int = 100  # Number of episodes.
     dataset: str | None = None
     """Name of the dataset; default: <environment>/<method>-v0, in the folder MINARI_DATASETS_PATH."""
     seed: int = 0  # Seed of the first episode; others follow.
     env_kwargs: NamedValues = field(default_factory=dict)
     """Arguments of the environment, values in YAML: n_via=2 n_obstacles=[1,8]; not with an agent."""
-
-    least: ClassVar = {"episodes": 1, "seed": 0}
 
     def _check(self) -> None:
         super()._check()
@@ -436,8 +421,6 @@ class PlanConfig(Config):
     video: Path | None = None  # MP4 file to write.
     seed: int = 0  # Seed of the random numbers.
     force: bool = False  # True to write plans that touch something, too.
-
-    least: ClassVar = {"n_via": 1, "seed": 0}
 
     def _check(self) -> None:
         super()._check()
@@ -492,8 +475,6 @@ class LiveConfig(AgentConfig):
     port: int = 8080  # Port to listen on; 0 for a free one.
     seed: int | None = None  # Seed of the random scenes.
 
-    least: ClassVar = {"port": 0, "seed": 0}
-
 
 @dataclass(frozen=True, kw_only=True)
 class PaperConfig(Config):
@@ -522,8 +503,6 @@ class DemoConfig(Config):
     n_timesteps: int | None = None  # Decisions in total; default: a quarter of those of the preset.
     n_scenes: int | None = None
     """Number of test scenes, evenly spread over the set; all if not given."""
-
-    least: ClassVar = {"n_timesteps": 1, "n_scenes": 1}
 
     def _check(self) -> None:
         check_registered(self.env)
@@ -558,8 +537,6 @@ class StudyConfig(Config):
     """Address HOST:PORT of a Ray cluster; default: a Ray of its own on this machine."""
     workers: int | None = None
     """Number of trials at the same time on this machine; default: as many as the cores allow."""
-
-    least: ClassVar = {"workers": 1}
 
     def _check(self) -> None:
         check_folder(f"out {self.out}", self.out)

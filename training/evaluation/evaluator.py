@@ -216,14 +216,14 @@ def evaluate(
         ['agent', 'straight']
     """
     if n_scenes is not None:
-        check_whole("n_scenes", n_scenes, 1)
+        check_whole("n_scenes", n_scenes)
     if isinstance(baselines, str):
         raise ValueError(f"baselines must be a list, such as [{baselines!r}], got {baselines!r}")
     settings: list[dict[str, int]] = []
     for number in [checks] if checks is None or isinstance(checks, int) else checks:
-        settings.append({} if number is None else {"checks": check_whole("checks", number, 0)})
+        settings.append({} if number is None else {"checks": check_whole("checks", number)})
     for number in [refine] if isinstance(refine, int) else refine:
-        settings.append({"checks": 0, "refine": check_whole("refine", number, 1)})
+        settings.append({"checks": 0, "refine": check_whole("refine", number)})
     if isinstance(agent, str | Path):
         agent = load_agent(agent)
     env_id, kwargs = _environment_of(agent, env, env_kwargs)

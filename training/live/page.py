@@ -52,8 +52,7 @@ class Tab:
         on_end: Callable[[], object],
     ) -> None:
         self.client, self._make, self._on_end = client, make, on_end
-        self.latencies: deque[float] = deque(maxlen=200)
-        """Times from the last changes to the messages with their plans, [s]."""
+        self.latencies: deque[float] = deque(maxlen=200)  # from changes to messages with plans, [s]
         self._jobs: dict[Any, tuple[float, Callable[[], None]]] = {}
         self._later: dict[str, Callable[[], None]] = {}
         self._posted = time.perf_counter()
@@ -364,20 +363,16 @@ class LivePage:
         **env_kwargs: Any,
     ) -> None:
         loaded = load_agent(agent) if isinstance(agent, str | Path) else agent
-        own: dict[str, Any] = {} if loaded is None else loaded.env_kwargs
         known = None if loaded is None else loaded.env_id
-        if arm is not None:
-            env, argument = env_of_arm(str(arm) if isinstance(arm, Path) else arm, known or env)
-            env_kwargs = {**(env_kwargs or own), **argument}
-        env = env or known or DEFAULT_ENV
-        if loaded is None and env in SHIPPED_IDS and not env_kwargs:
-            loaded = load_agent(env)
-            known, own = loaded.env_id, loaded.env_kwargs
+        found, argument = env_of_arm(str(arm) if isinstance(arm, Path) else arm, env or known)
+        env = found or DEFAULT_ENV
+        check_registered(env)
         if known not in (None, env):
             raise ValueError(f"the agent decides in {known}, not in {env}")
-        check_registered(env)
-        env_kwargs = env_kwargs or own
-        self._made = env, loaded, seed, env_kwargs
+        if loaded is None and env in SHIPPED_IDS and not env_kwargs and not argument:
+            loaded = load_agent(env)
+        own = {} if loaded is None else loaded.env_kwargs
+        self._made = env, loaded, seed, {**(env_kwargs or own), **argument}
         self._model_file = model_file
         self._warm_up()
         self._tabs: dict[int, Tab] = {}

@@ -48,11 +48,9 @@ class RunCallback(BaseCallback):
     def __init__(self, run: Run) -> None:
         super().__init__()
         self.run, self.config = run, run.config
-        self.curve: list[dict[str, Any]] = []
-        """Learning curve: one record for each evaluation so far."""
+        self.curve: list[dict[str, Any]] = []  # one record for each evaluation so far
         self._seconds_before, self._began = 0.0, time.monotonic()
-        self._before = 0
-        """Decisions when it was last decided what is due."""
+        self._before = 0  # Decisions when it was last decided what is due
         self._validation: FrozenScenes | None = None
         if self.config.evaluation_interval:
             self._validation = scenes_for("validation", self.config.task, self.config.eval_scenes)

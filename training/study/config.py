@@ -244,7 +244,7 @@ def _environment(
     kwargs = env_kwargs or {}
     check_env_kwargs(kwargs)
     task = registered_task(env_id, **kwargs)
-    check_whole("n_scenes", 1 if n_scenes is None else n_scenes, 1)
+    check_whole("n_scenes", 1 if n_scenes is None else n_scenes)
     places = []
     for each in MEASURED if scenes is None else scenes:
         if each in SETS:
@@ -276,8 +276,8 @@ def _agent(
     **training: Any,
 ) -> list[Trial]:
     """Return a trial for each seed of an agent whose configuration is allowed in its environment."""
-    numbers = tuple(check_whole("checks", number, 0) for number in checks or [0])
-    refined = tuple(check_whole("refine", number, 1) for number in refine or [])
+    numbers = tuple(check_whole("checks", number) for number in checks or [0])
+    refined = tuple(check_whole("refine", number) for number in refine or [])
     if (any(numbers) or refined) and training.get("algo", "viaq") != "viaq":
         raise ValueError(f"checks and refine are for the proposals of viaq, got algo {training['algo']}")
     if refined and registered_task(env["env_id"], **env["env_kwargs"]).replanning:
@@ -323,7 +323,7 @@ def _search(
     for path, values in parameters.items():
         for value in _ends(path, values):  # an impossible value is an error now, and not in the last trial
             _made("parameters", _agent, {"seeds": [0], **_with(training, {path: value})}, env, row)
-    check_whole("trials", trials, 1)
+    check_whole("trials", trials)
     return [
         Search(
             **env, row=row, seed=trial.seed, training=training, parameters=parameters, trials=trials,
