@@ -94,6 +94,73 @@ def test_wrappers_of_observations_take_the_native_batch(mode):
     assert returns >= 2
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_statistics_of_episodes_are_sums_of_rewards(mode):
+    env = wrappers.RecordEpisodeStatistics(native(JUMP, mode))
+    env.reset(seed=0)
+    total = np.zeros(3)
+    for _ in range(20):
+        _, reward, terminated, truncated, info = env.step(zeros(env))
+        total += reward
+        over = terminated | truncated
+        if over.any():
+            found = info["episode"]["r"] if "episode" in info else info["final_info"]["episode"]["r"]
+            np.testing.assert_allclose(found[over], total[over])
+            break
+    assert over.any()
+
+
+@pytest.mark.parametrize("env_id", [OBSTACLES, MOVING])
+def test_vectorised_processes_of_gymnasium(env_id):
+    envs = gym.make_vec(env_id, num_envs=2, vectorization_mode="sync")
+    seen, _ = envs.reset(seed=0)
+    same(seen, gym.make_vec(env_id, num_envs=2).reset(seed=0)[0])
+    envs.step(zeros(envs))
+    envs.close()
+
+
+def test_a_loop_as_in_cleanrl_learns():
+    """PPO's loop in one file: a batch, a flat observation, a buffer and a few updates."""
+    torch = pytest.importorskip("torch")
+    torch.manual_seed(0)
+    number, steps = 32, 4
+    envs = wrappers.FlattenObservation(native("viapoint/PlanarReach-v0", number=number))
+    envs = wrappers.RecordEpisodeStatistics(envs)
+    size, actions = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+    actor = torch.nn.Sequential(torch.nn.Linear(size, 32), torch.nn.Tanh(), torch.nn.Linear(32, actions))
+    critic = torch.nn.Sequential(torch.nn.Linear(size, 32), torch.nn.Tanh(), torch.nn.Linear(32, 1))
+    spread = torch.nn.Parameter(torch.full((actions,), -1.0))
+    optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters(), spread], lr=1e-2)
+    seen, _ = envs.reset(seed=1)
+    means = []
+    over = np.zeros(number, bool)
+    for _ in range(8):
+        batch = []
+        for _ in range(steps):
+            x = torch.as_tensor(seen, dtype=torch.float32)
+            with torch.no_grad():
+                chosen = torch.distributions.Normal(actor(x), spread.exp()).sample()
+            seen, reward, terminated, truncated, _ = envs.step(chosen.numpy())
+            # With next-step autoreset, the step after the end of an episode only resets it.
+            valid = torch.as_tensor(~over)
+            batch.append((x[valid], chosen[valid], torch.as_tensor(reward, dtype=torch.float32)[valid]))
+            over = terminated | truncated
+        x, chosen, reward = (torch.cat(parts) for parts in zip(*batch, strict=True))
+        means.append(float(reward.mean()))
+        before = torch.distributions.Normal(actor(x), spread.exp()).log_prob(chosen).sum(-1).detach()
+        for _ in range(4):
+            value = critic(x).squeeze(-1)
+            now = torch.distributions.Normal(actor(x), spread.exp()).log_prob(chosen).sum(-1)
+            ratio = (now - before).exp()
+            gain = reward - value.detach()
+            policy = torch.min(ratio * gain, ratio.clamp(0.8, 1.2) * gain).mean()
+            loss = ((reward - value) ** 2).mean() - policy
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    assert np.mean(means[-3:]) > np.mean(means[:3]) + 0.02
+
+
 def test_torchrl():
     envs = pytest.importorskip("torchrl.envs")
     for env_id in IDS:
