@@ -260,6 +260,8 @@ def to_numpy(array: Array) -> np.ndarray[Any, Any]:
         return array
     if hasattr(array, "detach"):
         array = array.detach().cpu()
+        if str(array.dtype) == "torch.bfloat16":  # a dtype that NumPy lacks; float32 represents it exactly
+            array = array.float()
     return np.asarray(array)
 
 

@@ -7,7 +7,7 @@ spectral arc length -1.4024. Where nothing moves the ratios are undefined and Na
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -195,6 +195,28 @@ def spectral_arc_length(
         raise ValueError(f"threshold must be a number of at least 0 and below 1, got {threshold!r}")
     if not is_whole(padding) or padding > _MOST_PADDING:
         raise ValueError(f"padding must be a whole number from 0 to {_MOST_PADDING}, got {padding!r}")
+    xp, dtype = trajectory.namespace, trajectory.coefficients.dtype
+    if xp is not np and dtype.itemsize < 4:  # torch has no Fourier transform of half precision
+        arrays = {f.name: getattr(trajectory, f.name) for f in fields(trajectory) if f.name != "order"}
+        single = replace(trajectory, **{name: xp.astype(array, xp.float32) for name, array in arrays.items()})
+        return xp.astype(_arc_length(single, cutoff, threshold, padding), dtype)
+    return _arc_length(trajectory, cutoff, threshold, padding)
+
+
+def _unit_sized(trajectory: Trajectory) -> Trajectory:
+    """Return the movements scaled by powers of two, which is exact, to a size and a duration of about 1."""
+    xp, t = trajectory.namespace, trajectory
+    if 0 in t.batch_shape:
+        return t
+    size = unit_factors(xp, xp.reshape(t.coefficients, (*t.batch_shape, -1)))[..., None, None]
+    pace = unit_factors(xp, t.end)
+    return Trajectory(
+        t.coefficients * size, t.durations * pace, t.order, t.starts * pace, t.rates / pace, t.end * pace
+    )
+
+
+def _arc_length(trajectory: Trajectory, cutoff: float, threshold: float, padding: int) -> Array:
+    """Return the spectral arc length (...,)."""
     xp = trajectory.namespace
     if 0 in trajectory.batch_shape:  # not all libraries transform empty batches
         return 0.0 * trajectory.duration
@@ -213,18 +235,6 @@ def spectral_arc_length(
     width = like(xp, 1.0 / np.maximum(last, 1), spectrum)
     rise = spectrum[..., 1:] - spectrum[..., :-1]
     return -xp.sum(used * xp.sqrt(width * width + rise * rise), axis=-1)
-
-
-def _unit_sized(trajectory: Trajectory) -> Trajectory:
-    """Return the movements scaled by powers of two, which is exact, to a size and a duration of about 1."""
-    xp, t = trajectory.namespace, trajectory
-    if 0 in t.batch_shape:
-        return t
-    size = unit_factors(xp, xp.reshape(t.coefficients, (*t.batch_shape, -1)))[..., None, None]
-    pace = unit_factors(xp, t.end)
-    return Trajectory(
-        t.coefficients * size, t.durations * pace, t.order, t.starts * pace, t.rates / pace, t.end * pace
-    )
 
 
 def speed_valleys(trajectory: Trajectory) -> SpeedEvents:

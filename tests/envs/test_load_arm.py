@@ -508,3 +508,24 @@ def test_urdf_files_with_odd_parts_load(crane):
     assert "boom" not in arm.group_names
     for told in ("inertia of boom", "its box has no size", "boom.dae"):
         assert any(told in note for note in arm.notes), told
+
+
+def test_files_of_several_parts_in_degrees(tmp_path):
+    (tmp_path / "links.xml").write_text(
+        '<mujoco><body name="fore" pos="0 0 .3"><joint name="two" axis="1 0 0" range="-90 90"/>'
+        '<geom type="capsule" fromto="0 0 0 0 0 .3" size=".03" mass="1"/>'
+        '<replicate count="2" offset="0 .05 0" sep="_"><site name="tip" pos="0 0 .3"/></replicate></body></mujoco>'
+    )
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        '<mujoco model="parts"><compiler angle="degree"/><default><joint damping="2" actuatorfrcrange="-90 90"/>'
+        '<default class="thin"><geom type="capsule" size=".03"/></default></default><worldbody>'
+        '<frame euler="180 0 0" pos="0 0 2"><body name="upper"><joint name="one" axis="1 0 0" range="-180 90"/>'
+        '<geom class="thin" fromto="0 0 0 0 0 .3" mass="1"/><include file="links.xml"/></body></frame>'
+        "</worldbody></mujoco>"
+    )
+    arm = load_arm(path, tool="tip_1", velocity_limit=2.0)
+    np.testing.assert_allclose(arm.joint_range, [(-np.pi, np.pi / 2), (-np.pi / 2, np.pi / 2)], atol=1e-5)
+    np.testing.assert_allclose(arm.hand((0.0, 0.0)), (0.0, -0.05, 1.4), atol=1e-5)  # hangs from the ceiling
+    np.testing.assert_array_equal(arm.torque_limit, 90.0)
+    assert arm.name == "parts"

@@ -1,7 +1,8 @@
 """Videos of movements."""
 
+import gymnasium as gym
 import pytest
-from episodes import JUMP, OBSTACLES, play
+from episodes import AROUND, JUMP, OBSTACLES, moved, play
 
 from viapoint.envs.env import RecordMovements
 
@@ -25,3 +26,11 @@ def frames_of(path):
     reader = pytest.importorskip("imageio_ffmpeg").read_frames(str(path))
     next(reader)
     return sum(1 for _ in reader)
+
+
+def test_gymnasium_records_two_frames_of_a_movement_and_a_warning_says_so(make, tmp_path):
+    env = gym.wrappers.RecordVideo(make(side=64), str(tmp_path / "videos"), episode_trigger=lambda _: True)
+    with pytest.warns(UserWarning, match="RecordMovements"):
+        moved(env, AROUND)
+    env.close()
+    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == 2

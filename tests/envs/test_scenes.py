@@ -319,3 +319,18 @@ def test_where_nothing_fits_the_random_generator_stays_as_it_was():
     with pytest.raises(ValueError, match="was found"):
         refused.reset(options={"start": start, "obstacles": walls})
     same(refused.reset()[0], usual.reset()[0])
+
+
+def test_changes_are_drawn_and_applied_in_time():
+    task = gym.make(PANDA_MOVING).unwrapped.task
+    scenes = task.sampler()(generators(12))
+    velocity, turns = scenes.obstacles.velocity, scenes.turn_time
+    present = scenes.obstacles.present
+    assert (np.linalg.norm(velocity[present], axis=-1) > 0.0).mean() > 0.5
+    time = 0.4
+    later = scenes.obstacles_at(np.full(12, time)).centre
+    before = np.minimum(time, turns)[..., None]
+    after = np.maximum(time - turns, 0.0)[..., None]
+    wanted = scenes.obstacles.centre + before * velocity + after * scenes.turn_velocity
+    np.testing.assert_allclose(later, wanted, atol=1e-12)
+    assert (turns[~present] == NEVER).all()

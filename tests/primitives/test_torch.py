@@ -107,6 +107,27 @@ def test_a_number_beside_tensors_adds_no_dimension(number):
         assert answer.shape == ()
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_gives_what_single_precision_gives_within_its_rounding(dtype):
+    waypoints = torch.tensor([[0.0, 0.0], [0.5, 0.75], [1.0, 0.0]])
+    half, single = (
+        vp.through(points, vp.passage_durations(points, 1.0)) for points in (waypoints.to(dtype), waypoints)
+    )
+    for ask in (
+        lambda movement: movement.durations,
+        lambda movement: movement.peak(1),
+        lambda movement: movement.extrema(1).maximum,
+        lambda movement: vp.speed_valleys(movement).time,
+        lambda movement: vp.minimum_duration(movement, velocity=1.0, acceleration=[4.0, 4.0]),
+        vp.dimensionless_jerk,
+        vp.spectral_arc_length,
+    ):
+        assert ask(half).dtype == dtype
+        torch.testing.assert_close(ask(half).float(), ask(single), rtol=0.05, atol=0.02)
+    dropped = vp.through(torch.tensor([[0.0], [0.0], [1.0]], dtype=dtype), [0.0, 1.0])
+    torch.testing.assert_close(dropped.cost().float(), torch.tensor(360.0), rtol=0.01, atol=0.0)
+
+
 @pytest.mark.parametrize("order", [2, 3, 4])
 def test_closed_forms_equal_autograd(order, tensor, rng):
     waypoints, ends = tensor(3, 5, 2), {"start_velocity": tensor(3, 2), "goal_velocity": tensor(3, 2)}

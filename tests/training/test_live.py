@@ -360,3 +360,9 @@ def test_scenes_that_exceed_the_environment_of_the_agent_are_searched():
     for other in (crowded, walled):
         assert arena.limit(other)
         assert decided(arena, other, AGENT).proposals[0].maker == SEARCH
+
+
+def test_the_page_is_private():
+    with LivePage(env=PLANAR, port=0) as page:
+        assert page.url.startswith("http://127.0.0.1:")
+        assert page._server.request_share_url() is None
