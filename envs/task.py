@@ -243,7 +243,8 @@ class Task:
             return self
         changes = self.moving_obstacles or self.n_jumps[1] > 0
         weights = dataclasses.replace(self.weights, progress=0.0)
-        return dataclasses.replace(self, decide_at=TRIGGERS if changes else END, weights=weights)
+        every = TRIGGERS if self.sensor else tuple(each for each in TRIGGERS if each != "sight")
+        return dataclasses.replace(self, decide_at=every if changes else END, weights=weights)
 
     @property
     def time_limit(self) -> float:
