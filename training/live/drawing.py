@@ -16,7 +16,7 @@ from viapoint.envs import Arm, Box, Capsule, HalfSpace, Shape, Sphere
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
-from viapoint.envs.geometry.obstacles import add_to_model
+from viapoint.envs.geometry.obstacles import add_to_model, pack
 from viapoint.training.live.arena import Arena
 from viapoint.training.live.state import State
 from viapoint.training.planning.motion_plan import MotionPlan
@@ -36,6 +36,7 @@ PLANE = (-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), 33.0
 # First views: position of the camera, point that it looks at, [m], direction up, and field of view, [degrees]
 SPACE = (2.6, -2.0, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), 38.0
 OPACITY, GHOST, PALE = 0.45, 0.16, 0.25  # Of what hides others, the arm at the goal, an old plan
+POINT = 0.005  # Size of the points that a sensor sees, [m]
 LARGE = 0.16  # Greatest size of obstacles in space that are not large, [m]
 LOW, TALL = 0.030, 0.060  # Height of obstacles in the plane, [m]: below links, and as tall as links
 FARTHEST = 1.2  # Greatest coordinate to which something can be dragged, [m]
@@ -191,6 +192,7 @@ class View:
         if not self._planar:
             self._draw_arm("ghost", arena.task.space.joints(scene.goal))
         self._draw_obstacles(scene.obstacles, places, state.selected)
+        self._draw_seen(state)
         start, goal = arena.tool(np.stack((scene.start, scene.goal)))
         self._draw_handles("start", [start])
         self._draw_handles("goal", [goal])
@@ -246,6 +248,21 @@ class View:
             node.color = _rgb(PALETTE.obstacle if i != selected else _lighter(PALETTE.obstacle))
             node.position, node.visible = place, True
         self._hide("obstacle", len(shapes))
+
+    def _draw_seen(self, state: State) -> None:
+        """Draw the points that the sensor of the task sees from the start."""
+        task, scene = self._arena.task, state.scene
+        if task.sensor is None:
+            return
+        joints = task.space.joints(scene.start)[None]
+        found = task.sensor.read(task.arm, joints, pack([scene.obstacles]))
+        points = found.points[found.seen >= 0].astype(np.float32)
+        if self._planar:
+            points[:, 2] = LOW + 0.002  # on top of the obstacles
+        if self._is_new("seen", points):
+            self._scene.add_point_cloud(
+                "/seen", points, _rgb(PALETTE.seen), point_size=POINT, point_shape="circle"
+            )
 
     def _draw_paths(
         self, name: str, paths: list[tuple[Float, Colour]], radius: float, opacity: float | None = None
