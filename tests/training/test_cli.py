@@ -94,6 +94,14 @@ def test_train_then_evaluate_then_play(trained, shipped, tmp_path, capsys):
     assert video.stat().st_size > 1000
 
 
+def test_arguments_of_the_environment_are_taken(capsys):
+    words = "evaluate --env viapoint/PlanarSensed-v0 --scenes validation --n-scenes 4 --baselines search16 --env-kwargs"
+    run(*words.split(), "sensor=hand_rays", "decide_at=[sight]")
+    assert "search16" in capsys.readouterr().out
+    for argument, named in (("sensr=rays", "sensor"), ("sensor=nose", "hand_rays"), ("n_via=a", "n_via")):
+        assert named in failed(capsys, *words.split(), argument)
+
+
 def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, tmp_path):
     few, file = shipped.take(slice(3, 6)), tmp_path / "validation.npz"
     few.save(file)

@@ -18,6 +18,7 @@ from viapoint.training.config.configs import (
     RecordConfig,
     TrainConfig,
     env_of_arm,
+    task_with,
 )
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate as measure
@@ -47,7 +48,9 @@ def _named(config: EvaluateConfig | PlayConfig | RecordConfig) -> tuple[Agent | 
         raise ValueError(f"env must be {agent.env_id}, on which the agent was trained, got {config.env!r}")
     env_id, argument = env_of_arm(config.arm, config.env if agent is None else agent.env_id)
     assert env_id is not None
-    return agent, env_id, {**({} if agent is None else agent.env_kwargs), **argument}
+    env_kwargs = {**({} if agent is None else agent.env_kwargs), **argument, **config.env_kwargs}
+    task_with(env_id, env_kwargs)  # says what is wrong with an argument
+    return agent, env_id, env_kwargs
 
 
 def evaluate(config: EvaluateConfig) -> None:

@@ -89,6 +89,18 @@ def env_of_arm(arm: Arm | str | None, env: str | None) -> tuple[str | None, dict
     return env or "viapoint/Obstacles-v0", {"arm": found if isinstance(arm, Arm) else found.file or arm}
 
 
+def task_with(env_id: str, env_kwargs: Mapping[str, Any]) -> Task:
+    """Return the task of an environment with arguments; an unknown or wrong one raises ValueError."""
+    try:
+        return registered_task(env_id, **env_kwargs)
+    except TypeError as error:
+        known = inspect.signature(Task.of).parameters
+        for name in env_kwargs:
+            if name not in (*known, "threads"):
+                raise ValueError(unknown_name("env_kwargs", name, known)) from error
+        raise ValueError(f"env_kwargs of {env_id}: {error}") from error
+
+
 Format = Literal["table", "md", "csv", "json"]  # Form of a table
 BENCHMARK = "motionbenchmaker"  # Name of the scene set that measures planners
 MOTION_FILES = (".csv", ".yaml", ".yml")  # Suffixes of files of movements
@@ -202,14 +214,7 @@ class TrainConfig(Config):
     @functools.cached_property
     def task(self) -> Task:
         """Task of the environment; an unknown or wrong argument of it raises ValueError."""
-        try:
-            return registered_task(self.env, **self.env_kwargs)
-        except TypeError as error:
-            known = inspect.signature(Task.of).parameters
-            for name in self.env_kwargs:
-                if name not in (*known, "threads"):
-                    raise ValueError(unknown_name("env_kwargs", name, known)) from error
-            raise ValueError(f"env_kwargs of {self.env}: {error}") from error
+        return task_with(self.env, self.env_kwargs)
 
     @property
     def algorithm(self) -> Algorithm:
@@ -273,6 +278,8 @@ class AgentConfig(Config):
     pretrained: Annotated[str | None, PRETRAINED] = None  # as if the id were given as agent
     env: Annotated[str | None, ENV] = None  # default: that of the agent
     arm: Annotated[str | None, ARM] = None  # in place of that of the agent, if any
+    env_kwargs: NamedValues = field(default_factory=dict)
+    """Arguments of the environment, values in YAML: sensor=hand_rays decide_at=[sight,clearance]."""
 
     @property
     def unnamed(self) -> bool:
@@ -282,6 +289,7 @@ class AgentConfig(Config):
     def _check(self) -> None:
         if self.env is not None:
             check_registered(self.env)
+        check_env_kwargs(self.env_kwargs)
         if self.pretrained is None:
             return
         if self.agent not in (None, self.pretrained):
