@@ -55,12 +55,7 @@ class Decision(NamedTuple):
 
 
 class Episodes:
-    """Running episodes of n environments of a task.
-
-    Args:
-        task: Task.
-        number: Number of environments n.
-    """
+    """Running episodes of n environments of a task."""
 
     def __init__(self, task: Task, number: int) -> None:
         self.task = task
@@ -101,12 +96,9 @@ class Episodes:
         return np.asarray(self.executor.state.steps * self.simulator.timestep)
 
     def start(self, rows: Int, scenes: Scenes, *, keep: bool = False) -> None:
-        """Start episodes with the arms at rest at the start and the obstacles in place.
+        """Start episodes at indices (n,) with the arms at rest at the start and the obstacles in place.
 
-        Args:
-            rows: Indices of the environments, shape (n,).
-            scenes: Their scenes.
-            keep: True to keep the records of the episodes before.
+        The records of the episodes before are kept if `keep`, for pictures.
         """
         self._finished = None
         if keep:
@@ -172,11 +164,9 @@ class Episodes:
         )
 
     def decide(self, actions: Float, active: Bool) -> Decision:
-        """Make one decision in each environment and execute it until it ends.
+        """Make one decision for actions (n, m) in [-1, 1] and execute it until it ends.
 
-        Args:
-            actions: Shape (n, m), in [-1, 1].
-            active: True for environments that take part, shape (n,). Results of others mean nothing.
+        Results of environments that are not `active`, shape (n,), mean nothing.
         """
         if self.task.stepwise:
             return self._steer(actions, active)

@@ -42,13 +42,7 @@ Pieces = list[tuple[Float, Float, Bool]]
 
 
 class Executor:
-    """Executor of references in the simulations of one thread.
-
-    Args:
-        simulator: Simulations.
-        space: Space in which references are given.
-        tolerance: Bounds of rest at the goal.
-    """
+    """Executor of references in a space, in the simulations of one thread; the tolerance bounds rest at the goal."""
 
     def __init__(self, simulator: Simulator, space: Space, tolerance: Tolerance) -> None:
         self.simulator, self.space, self.tolerance = simulator, space, tolerance

@@ -22,14 +22,7 @@ MOST_BETWEEN = 64
 
 
 class Simulator:
-    """Simulations of an arm among obstacles, on one thread.
-
-    Args:
-        arm: Arm.
-        n_obstacles: Greatest number of obstacles in a simulation.
-        num_envs: Number of simulations.
-        meshes: Names of registered meshes that obstacles may be.
-    """
+    """Simulations of an arm among up to `n_obstacles`, which may be some registered meshes, on one thread."""
 
     def __init__(self, arm: Arm, *, n_obstacles: int, num_envs: int, meshes: Sequence[str] = ()) -> None:
         self.arm = arm

@@ -183,8 +183,7 @@ def arm_from_xml(
     data.qpos[model.jnt_qposadr[[model.joint(each).id for each in joints]]] = home
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
-    bodies = [model.body(i).name for i in range(1, model.nbody) if model.body(i).name in links]
-    touching = touching_at_home(model, data, bodies)
+    touching = touching_at_home(model, data, links)
     names, spheres, left_out, excess = cover(chain, capsules, links, home, touching, exclude or {})
     # Pairs that touch in none of many configurations are not compared, either.
     ranges = np.array([model.joint(each).range for each in joints])

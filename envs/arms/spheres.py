@@ -76,26 +76,22 @@ def cover(
     )
 
 
-def touching_at_home(model: mujoco.MjModel, data: mujoco.MjData, names: Sequence[str]) -> set[frozenset[str]]:
+def touching_at_home(
+    model: mujoco.MjModel, data: mujoco.MjData, names: Collection[str]
+) -> set[frozenset[str]]:
     """Return the pairs of bodies whose geoms are in contact in the present configuration."""
-    geoms = {name: _collision_geoms(model, name) for name in names}
+    bodies: dict[int, str] = {}
+    for geom in range(model.ngeom):
+        name = model.body(model.geom_bodyid[geom]).name
+        if name in names and (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+            bodies[geom] = name
     found = set()
-    for first, second in itertools.combinations(names, 2):
-        for one, other in itertools.product(geoms[first], geoms[second]):
-            if mujoco.mj_geomDistance(model, data, one, other, 0.01, None) <= 0.0:
-                found.add(frozenset((first, second)))
-                break
+    for one, other in itertools.combinations(bodies, 2):
+        pair = frozenset((bodies[one], bodies[other]))
+        apart = len(pair) == 1 or mujoco.mj_geomDistance(model, data, one, other, 0.01, None) > 0.0
+        if not apart:
+            found.add(pair)
     return found
-
-
-def _collision_geoms(model: mujoco.MjModel, body: str) -> list[int]:
-    """Return the geoms of a body that take part in contacts."""
-    number = model.body(body).id
-    return [
-        geom
-        for geom in range(model.ngeom)
-        if model.geom_bodyid[geom] == number and (model.geom_contype[geom] or model.geom_conaffinity[geom])
-    ]
 
 
 def _pairs(

@@ -47,9 +47,7 @@ class Urdf(NamedTuple):
 
 
 def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
-    """Return the content of a URDF file; paths of meshes become absolute ones.
-
-    See :func:`_places` for where meshes are looked for.
+    """Return the content of a URDF file; paths of meshes, which :func:`_places` looks for, become absolute ones.
 
     Raises:
         ValueError: The file is no URDF, or a mesh for collisions is missing.

@@ -99,11 +99,9 @@ class Obstacles(NamedTuple):
         return wide._replace(meshes=self.meshes, clouds=self.clouds)
 
     def put(self, scenes: Any, others: Obstacles) -> Obstacles:
-        """Return the obstacles after scenes were overwritten in place; only tables of shapes are new.
+        """Return the obstacles after scenes, by indices, mask or slice, were overwritten in place; only tables are new.
 
-        Args:
-            scenes: Indices, mask or slice of the scenes.
-            others: Obstacles of the new scenes, with as many rows.
+        The others have as many rows.
         """
         for mine, theirs in zip(self[:5], others[:5], strict=True):
             mine[scenes] = theirs

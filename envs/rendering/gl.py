@@ -37,8 +37,8 @@ class Canvas:
     def __init__(self, model: mujoco.MjModel, width: int, height: int, supersampling: int = 1) -> None:
         """Open a renderer for pictures of a size in pixels, independent of the model's own offscreen size.
 
-        Pictures are rendered larger in both directions by the factor `supersampling`, and then averaged. The samples
-        per pixel, `vis.quality.offsamples` of the model, smooth the edges of bodies, but not those of shadows.
+        Pictures are rendered larger by the factor `supersampling`, and then averaged: the samples per pixel of the
+        model smooth the edges of bodies, but not those of shadows.
 
         Raises:
             GLUnavailableError: No OpenGL library can be used.

@@ -61,12 +61,9 @@ class Picture(NamedTuple):
 
 
 class SceneView:
-    """Writer of MuJoCo scenes with the arm, its surroundings and a movement.
+    """Writer of MuJoCo scenes with the arm, its surroundings and a movement, for pictures of a size in pixels.
 
-    Args:
-        simulator: Simulator with one simulation, which the view alone uses.
-        width: Width of the pictures, [pixels].
-        height: Height of the pictures, [pixels].
+    It uses a simulator of one simulation alone.
     """
 
     scene: mujoco.MjvScene

@@ -108,12 +108,9 @@ class SceneSampler:
         scenes: Scenes | None = None,
         given: Collection[str] = (),
     ) -> Scenes:
-        """Draw one scene from each of N random generators.
+        """Draw one scene from each of N random generators, without the `given` parts, which are those of `scenes`.
 
-        Args:
-            generators: N random generators.
-            scenes: Scenes with parts that are not drawn.
-            given: Names of these parts: `start`, `goal`, `obstacles`, `jumps`, `turns`.
+        Parts are `start`, `goal`, `obstacles`, `jumps` and `turns`.
 
         Raises:
             RuntimeError: No scene was found in many attempts.

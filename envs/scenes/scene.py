@@ -114,7 +114,7 @@ class Scenes(NamedTuple):
     def goals(self, time: Float) -> Float:
         """Return the targets, shape (N, J), at one time for each scene, shape (N,), [s]; a jump counts at once."""
         if not self.jumps.any():
-            return self.goal
+            return self.goal.copy()
         number = (self.jump_times <= time[:, None] + ROUNDING).sum(axis=-1)
         targets = np.concatenate((self.goal[:, None], self.jumps[..., 1:]), axis=1)
         return np.asarray(targets[np.arange(len(targets)), number])
