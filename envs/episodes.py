@@ -344,14 +344,17 @@ class Episodes:
             def references(some: Int, count: int) -> Motion:
                 return steering.follow(take(self._motion, some), velocity[some], count)
 
-            scenes = self.scenes.take(rows)
-            obstacles, goal = scenes.obstacles_at(self.time[rows]), task.space.coordinates(scenes.goal)
+            scenes, now = self.scenes.take(rows), self.time[rows]
+            obstacles = scenes.obstacles_at(now)
+            goal = task.space.coordinates(scenes.goals(now + number * self.simulator.timestep))
             steps = np.full(len(rows), number)
             self.executor.run(rows, steps, obstacles, goal, references, resume=True, moving=self._moving)
             state.jerk_cost[rows] += steering.jerk_cost(motion, velocity[rows])
             put(self._motion, rows, Motion(*(part[rows, -1] for part in ahead)))
         self.begun[:] = True
-        settled = state.rest * self.simulator.timestep >= SETTLING - 1e-9
+        jumps = self._events.steps(self.scenes.jump_times)
+        still = ((jumps <= state.steps[:, None]) | (jumps == NEVER)).all(axis=1)  # the target jumps no more
+        settled = still & (state.rest * self.simulator.timestep >= SETTLING - 1e-9)
         event = np.where(settled, Event.ARRIVAL, Event.HORIZON)
         event = np.where(state.steps >= self._events.limit, Event.TIME_LIMIT, event)
         return self._decision(before, begin, first, settled, event)

@@ -9,6 +9,7 @@ from episodes import GOAL, START, STEP, WALL, given
 
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import Motion
+from viapoint.envs.scenes.scene import NEVER
 from viapoint.envs.steering import Steering
 
 
@@ -113,6 +114,23 @@ def test_the_way_round_succeeds_where_the_straight_line_crashes():
     assert 0.0 < info["min_clearance"] < 0.1
     progress = sum(step[-1]["reward_progress"] for step in around)
     assert progress == pytest.approx(1.0 - info["goal_error"] / 0.4)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_hand_that_follows_a_jumping_target_arrives_at_the_last_place(seed):
+    env = gym.make("viapoint/PlanarTargetJumpStep-v0").unwrapped
+    seen, _ = env.reset(seed=seed)
+    start, times, over = seen["hand"][:2], env.batch.scenes.jump_times, False
+    while not over:
+        velocity = 8.0 * (seen["goal"] - seen["hand"])[:2] - 0.3 * seen["velocity"]
+        # Components of actions are along and across the line from the start to the present goal.
+        along = (seen["goal"][:2] - start) / np.linalg.norm(seen["goal"][:2] - start)
+        action = np.array([along @ velocity, along[0] * velocity[1] - along[1] * velocity[0]])
+        action = np.clip(action / np.array(env.task.steering.top_speed), -1.0, 1.0)
+        seen, _, terminated, truncated, info = env.step(action.astype(np.float32))
+        over = terminated or truncated
+    assert info["is_success"]
+    assert info["time"] > times[times < NEVER].max()
 
 
 def test_time_runs_out():
