@@ -62,7 +62,7 @@ class Config:
     n_scenes: int | None = None
     """Number of scenes of each set; default: all of them."""
     only: Literal["everything", "runs", "looking"] = "everything"
-    """What is measured: the trainings in `runs`, or searches that look again; other numbers stay."""
+    """Part that is measured: the trainings in `runs`, or searches that look again; other numbers stay."""
     runs: Path = Path("runs/sb3")
     """Folder of trainings of algorithms of Stable-Baselines3 by benchmarks/sb3.py, which get a row each."""
 

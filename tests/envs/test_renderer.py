@@ -59,10 +59,10 @@ def test_contact_is_red_and_nothing_else_is(make, name):
 def test_a_half_space_below_the_table_is_hidden_by_it(make):
     # MuJoCo would draw a plane that the compiled model did not have as something else.
     env = make("viapoint.envs:viapoint/PandaObstacles-v0", side=120)
-    ball = Sphere(0.05, position=(0.5, 0.4, 0.6))
+    ball, home = Sphere(0.05, position=(0.5, 0.4, 0.6)), arm_of("panda").home
     frames = []
     for obstacles in ([ball], [ball, HalfSpace(position=(0.0, 0.0, -0.01))]):
-        env.reset(options={"obstacles": obstacles})
+        env.reset(options={"start": home, "goal": home + 0.2, "obstacles": obstacles})
         frames.append(env.render().astype(int))
     assert (np.abs(frames[0] - frames[1]).max(axis=-1) > 20).mean() < 0.15
 

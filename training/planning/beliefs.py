@@ -50,7 +50,7 @@ class Sight(NamedTuple):
     rotation: Float
     """Present axes of the sensor as columns, shape (B, 3, 3)."""
     ranges: Float
-    """Those of R rays, or of all rays of the looks that are remembered, shape (B, R), [m]."""
+    """Ranges of R rays, or of all rays of the looks that are remembered, shape (B, R), [m]."""
     points: Float
     """Ends of the rays, shape (B, R, 3), [m]."""
     eyes: Float

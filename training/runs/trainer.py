@@ -91,8 +91,14 @@ def train_or_resume(config: TrainConfig, callback: Callbacks = None) -> Run:
         BadFileError: The folder holds a training with other settings, or something else.
         ValueError, TrainingStoppedError, TrainingFailedError: As for :func:`train`.
     """
-    if not (config.folder / "config.json").is_file():
-        return train(config, callback)
+    begun = config.folder / "config.json"
+    if not begun.is_file():
+        try:
+            return train(config, callback)
+        except BadFileError:
+            if not begun.is_file():
+                raise
+            # A worker of a study that was killed has begun it meanwhile; it ends soon.
     run = Run(config.folder)
     check_unchanged(run, resolved(dataclasses.replace(config, n_timesteps=run.config.total_timesteps)))
     if run.ended and run.config.total_timesteps == config.total_timesteps:
