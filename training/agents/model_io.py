@@ -43,21 +43,19 @@ from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments
 ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     each.__name__: each for each in (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
 }
-FORMAT = 1
-"""Version of the two files."""
+FORMAT = 1  # Version of the two files
+# Learning algorithms by their names on the command line; the modules that define them add them
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {}
-"""Learning algorithms by their names on the command line; the modules that define them add them."""
+# Arguments of algorithms that model files do not hold
 NOT_STORED = frozenset(
     {"self", "policy", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
     | {"stats_window_size", "monitor_wrapper", "sde_support", "support_multi_env", "supported_action_spaces"}
     | {"replay_buffer_class", "replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"}
 )
-"""Arguments of algorithms that model files do not hold."""
 
-LARGEST_MODEL_JSON = 1 << 20
-"""Greatest size of `model.json`, [bytes]."""
-LARGEST_WEIGHTS = 1 << 30
-"""Greatest size of `weights.safetensors`, [bytes]."""
+LARGEST_MODEL_JSON = 1 << 20  # Greatest size of `model.json`, [bytes]
+LARGEST_WEIGHTS = 1 << 30  # Greatest size of `weights.safetensors`, [bytes]
+# Greatest values in a file of those arguments of an environment that memory and time grow with
 LARGEST_ARGUMENTS = {
     "n_via": MOST_VIAS,
     "n_obstacles": MOST_OBSTACLES,
@@ -65,11 +63,9 @@ LARGEST_ARGUMENTS = {
     "height": 8192,
     "threads": 1024,
 }
-"""Greatest values in a file of those arguments of an environment that memory and time grow with."""
-ANY_TASK = "viapoint/Obstacles-v0"
-"""Id of an environment that can be any task."""
+ANY_TASK = "viapoint/Obstacles-v0"  # Id of an environment that can be any task
+# Number of parameters beyond its weights up to which a model is built, so that the error names the tensor
 SPARE_PARAMETERS = 100_000
-"""Number of parameters beyond its weights up to which a model is built, so that the error names the tensor."""
 
 
 def save_model(model: BaseAlgorithm, folder: Path) -> None:

@@ -28,41 +28,30 @@ from viapoint.envs.task import Task
 from viapoint.training.planning.movements import INSTANTS, Setting, place_arm
 from viapoint.training.planning.problem import Moves, Problem, setting_of
 
-SCALE = 8.0
-"""Scale of lengths at the input of the network, [1/m]."""
-UNIT = 0.05
-"""Length of one output unit of the network, [m]."""
+SCALE = 8.0  # Scale of lengths at the input of the network, [1/m]
+UNIT = 0.05  # Length of one output unit of the network, [m]
+# Number of the nearest pairs whose closest approach is found between the instants that are looked at
 REFINED = 6
-"""Number of the nearest pairs whose closest approach is found between the instants that are looked at."""
-STEPS = 2
-"""Greatest number of instants by which it may lie beside the nearest of them."""
-PARTS = 8
-"""Parts in which the way to the next instant is looked at."""
-NEAREST = 16
-"""Number of pairs of a movement that the network sees."""
-CLEAR = 0.1
-"""Greatest clearance of the arm from itself that matters, [m]."""
-NO_OBSTACLE = 1.0
-"""Margin in a scene without obstacles, [m]."""
-NOWHERE = 1e6
-"""Gap of a pair that does not exist, [m]."""
+STEPS = 2  # Greatest number of instants by which it may lie beside the nearest of them
+PARTS = 8  # Parts in which the way to the next instant is looked at
+NEAREST = 16  # Number of pairs of a movement that the network sees
+CLEAR = 0.1  # Greatest clearance of the arm from itself that matters, [m]
+NO_OBSTACLE = 1.0  # Margin in a scene without obstacles, [m]
+NOWHERE = 1e6  # Gap of a pair that does not exist, [m]
+# Lengths that describe a pair: centre of the sphere 3, half lengths of the obstacle 3, radius of the sphere 1
 LENGTHS = 7
-"""Lengths that describe a pair: centre of the sphere 3, half lengths of the obstacle 3, radius of the sphere 1."""
 
 
 class Pairs(NamedTuple):
     """Nearest pairs of H movements in each of B scenes."""
 
-    features: Tensor
-    """Lengths and kind of the obstacle, shape (B, H, P, LENGTHS + number of kinds)."""
+    features: Tensor  # Lengths and kind of the obstacle, shape (B, H, P, LENGTHS + number of kinds)
+    # Signed distances of the spheres' centres from the obstacles' bounding boxes, shape (B, H, P), [m]
     distance: Tensor
-    """Signed distances of the spheres' centres from the obstacles' bounding boxes, shape (B, H, P), [m]."""
-    present: Tensor
-    """True for pairs that exist, shape (B, H, P)."""
+    present: Tensor  # True for pairs that exist, shape (B, H, P)
+    # Computed clearance of the arm from itself, shape (B, H), at most CLEAR, [m]
     self_clearance: Tensor
-    """Computed clearance of the arm from itself, shape (B, H), at most CLEAR, [m]."""
-    inside: Tensor
-    """True for movements within reach and joint ranges, shape (B, H)."""
+    inside: Tensor  # True for movements within reach and joint ranges, shape (B, H)
 
     def to(self, device: torch.device) -> Pairs:
         """Return the same pairs on a device."""
@@ -111,28 +100,22 @@ class Given(NamedTuple):
     """Movements and obstacles, as compiled functions take them."""
 
     setting: Setting
-    start: Float
-    """Present references, shape (B, D)."""
+    start: Float  # Present references, shape (B, D)
     moves: Moves
     obstacles: Obstacles
-    centre: Float
-    """Centres of the obstacles' bounding boxes, shape (B, n, 3), [m]."""
-    half: Float
-    """Their half lengths, shape (B, n, 3), [m]."""
+    centre: Float  # Centres of the obstacles' bounding boxes, shape (B, n, 3), [m]
+    half: Float  # Their half lengths, shape (B, n, 3), [m]
 
 
 class Memory(NamedTuple):
     """Memory of compiled functions."""
 
-    position: Float
-    """Shape (D,)."""
-    joints: Float
-    """Shape (J,)."""
+    position: Float  # Shape (D,)
+    joints: Float  # Shape (J,)
     placed: Placed
+    # Places of a sphere in the frame of an obstacle: before, at and after its closest instant, shape (3, 3), [m]
     places: Float
-    """Places of a sphere in the frame of an obstacle: before, at and after its closest instant, shape (3, 3), [m]."""
-    local: Float
-    """Shape (3,), [m]."""
+    local: Float  # Shape (3,), [m]
 
 
 @kernel

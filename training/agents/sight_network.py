@@ -25,27 +25,21 @@ from viapoint.training.planning.places import OUT_OF_VIEW, instants_of, places_o
 from viapoint.training.planning.problem import Numbers, Problem, moves_of, worth_of
 from viapoint.training.planning.search import plan_clearances
 
-DEEP, SHALLOW = 0.4, 0.05
-"""Depths behind a surface at which two of the inputs saturate, [m]."""
+DEEP, SHALLOW = 0.4, 0.05  # Depths behind a surface at which two of the inputs saturate, [m]
+# Pixels in whose square a place is compared with the nearest surface, to find the places that matter
 NEIGHBOURS = 7
-"""Pixels in whose square a place is compared with the nearest surface, to find the places that matter."""
-CLEAR = 0.05
-"""Clearance at which its input saturates, [m]."""
-FEATURES = 9
-"""Inputs of a place besides the features of its pixel."""
+CLEAR = 0.05  # Clearance at which its input saturates, [m]
+FEATURES = 9  # Inputs of a place besides the features of its pixel
 
 
 class SightInputs(NamedTuple):
     """Inputs of the network for H movements in each of B scenes."""
 
+    # Ranges relative to the greatest, hits, and places of the pixels in the image, shape (B, 4, rows, columns)
     image: Tensor
-    """Ranges relative to the greatest, hits, and places of the pixels in the image, shape (B, 4, rows, columns)."""
-    pixel: Tensor
-    """Pixels in whose direction P places lie, shape (B, H, P), int64."""
-    places: Tensor
-    """Other inputs of these places, shape (B, H, P, FEATURES)."""
-    plans: Tensor
-    """Inputs of whole movements: clearance by the belief, reach, shape (B, H, 2)."""
+    pixel: Tensor  # Pixels in whose direction P places lie, shape (B, H, P), int64
+    places: Tensor  # Other inputs of these places, shape (B, H, P, FEATURES)
+    plans: Tensor  # Inputs of whole movements: clearance by the belief, reach, shape (B, H, 2)
 
     def take(self, chosen: Tensor) -> SightInputs:
         """Return the inputs of some of the movements, by indices of shape (B, h)."""

@@ -28,16 +28,15 @@ from viapoint.training.agents.viaq_policy import KEEP, ViaQPolicy
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.problem import Problem
 
+# Parts of the task that agent and environment must share, because the policy plans with them
 FIXED_PARTS = ("arm", "space", "n_via", "timing", "duration_range", "shapes")
-"""Parts of the task that agent and environment must share, because the policy plans with them."""
+# Unit of errors of the clearance term, as a share of the weight of the term: 2 cm
 CLEARANCE_SCALE = 0.4
-"""Unit of errors of the clearance term, as a share of the weight of the term: 2 cm."""
+# Share of the weight of the clearance term by which the obstacles must be nearer than the arm itself: 1 mm
 OWN_SHARE = 0.02
-"""Share of the weight of the clearance term by which the obstacles must be nearer than the arm itself: 1 mm."""
-KEEP_PROBABILITY = 0.5
-"""Probability that a random decision in a replanning task keeps the plan."""
+KEEP_PROBABILITY = 0.5  # Probability that a random decision in a replanning task keeps the plan
+# Weight of the contact loss; the clearance loss carries finer information on the same event
 CONTACT_WEIGHT = 0.1
-"""Weight of the contact loss; the clearance loss carries finer information on the same event."""
 
 
 class ViaQ(PlanAlgorithm):

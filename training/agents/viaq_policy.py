@@ -25,20 +25,15 @@ from viapoint.training.planning.movements import FINE_INSTANTS, INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import INFEASIBLE, VERIFIED, best_of, merits, refined_actions
 
-KEEP = 0.1
-"""Minimum gain of Q for which a running plan is revised."""
-N_ELITES = 8
-"""Number of candidates around which each round of refinement samples."""
+KEEP = 0.1  # Minimum gain of Q for which a running plan is revised
+N_ELITES = 8  # Number of candidates around which each round of refinement samples
+# Standard deviation of the first round of refinement, in the action space; each round halves it
 SPREAD = 0.15
-"""Standard deviation of the first round of refinement, in the action space; each round halves it."""
+# Greatest number of proposals that are checked; all further checks are of plans around the best of them
 PROPOSALS = 32
-"""Greatest number of proposals that are checked; all further checks are of plans around the best of them."""
-LOCAL_ROUNDS = 4
-"""Rounds of checks around the best checked plans."""
-BLOCK = 64
-"""Scenes that are decided together."""
-MOTION_SCALES = (1.0, 0.1)
-"""Scales of velocity and acceleration at the input of the critic."""
+LOCAL_ROUNDS = 4  # Rounds of checks around the best checked plans
+BLOCK = 64  # Scenes that are decided together
+MOTION_SCALES = (1.0, 0.1)  # Scales of velocity and acceleration at the input of the critic
 
 
 class ViaQPolicy(PlanPolicy):

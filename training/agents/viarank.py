@@ -40,14 +40,11 @@ from viapoint.training.planning.search import (
     refined_actions,
 )
 
-EFFORT_WEIGHT = 0.05
-"""Weight of the reward of a successful plan beside its probability of success."""
+EFFORT_WEIGHT = 0.05  # Weight of the reward of a successful plan beside its probability of success
+# First part of the seeds of scenes for the calibration, far from those of training, and their number
 CALIBRATION, CALIBRATION_SCENES = 3_000_017, 320
-"""First part of the seeds of scenes for the calibration, far from those of training, and their number."""
-SAME_RAY = 0.02
-"""Greatest distance of a point from the ray of the sensor, [m]."""
-BLOCK = 16
-"""Scenes that are decided together."""
+SAME_RAY = 0.02  # Greatest distance of a point from the ray of the sensor, [m]
+BLOCK = 16  # Scenes that are decided together
 
 
 class ViaRankPolicy(PlanPolicy):

@@ -216,26 +216,24 @@ def refined_search(simulation: SceneSimulation, checks: int) -> Method:
     return GeometrySearch(simulation.task, checks - rounds * each, refinements=rounds, per_round=each)
 
 
+# Factories of baselines whose names end in the number of plans that they check, such as `search512`
 COUNTED: dict[str, Callable[[SceneSimulation, int], Method]] = {
     "search": refined_search,
     "sobol": lambda simulation, checks: GeometrySearch(simulation.task, checks),
     "cautious": lambda simulation, checks: CautiousSearch(simulation.task, checks),
 }
-"""Factories of baselines whose names end in the number of plans that they check, such as `search512`."""
 FEWEST_CHECKS = {"search": 4, "sobol": 1, "cautious": 1}
-SENSED = ("cautious",)
-"""Counted baselines that need a sensor."""
-WITH_BELIEFS = ("search", "sobol")
-"""Counted baselines that plan with any belief."""
-DEFAULT_BELIEF = "thick"
-"""Belief of planners where none is named."""
+SENSED = ("cautious",)  # Counted baselines that need a sensor
+WITH_BELIEFS = ("search", "sobol")  # Counted baselines that plan with any belief
+DEFAULT_BELIEF = "thick"  # Belief of planners where none is named
 
+# Factories of the planners for known obstacles
 PLANNERS: dict[str, Callable[[SceneSimulation], PlannerMethod]] = {
     "plan_motion": lambda simulation: PlannerMethod(simulation, "plan_motion", plan_motion),
     "ompl": ompl_method,
 }
-"""Factories of the planners for known obstacles."""
 
+# Factories of baselines by their names on the command line
 METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "straight": Straight,
     "random": lambda simulation: RandomVias(simulation, 1),
@@ -243,14 +241,13 @@ METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "random80": lambda simulation: RandomVias(simulation, 80),
     **PLANNERS,
 }
-"""Factories of baselines by their names on the command line."""
 
+# Factories of baselines for replanning tasks
 REPLANNING_METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "straight": Straight,
     "random": lambda simulation: RandomVias(simulation, 1),
     "unrevised": lambda simulation: OpenLoopBaseline(Straight(simulation), simulation),
 }
-"""Factories of baselines for replanning tasks."""
 
 
 def check_method(name: str, task: Task) -> None:

@@ -22,45 +22,33 @@ from viapoint.envs.geometry.shapes import Box, PointCloud, Shape
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 
-ROUNDING = 1e-4
-"""Distance from the greatest range within which nothing was met, [m]."""
-POINT_RADIUS = 0.01
-"""Radius of the spheres around points, [m]."""
+ROUNDING = 1e-4  # Distance from the greatest range within which nothing was met, [m]
+POINT_RADIUS = 0.01  # Radius of the spheres around points, [m]
+# Depth to which the space behind a seen surface is believed to be occupied, [m]
 THICKNESS = {"hand": 0.06, "joints": 0.05}
-"""Depth to which the space behind a seen surface is believed to be occupied, [m]."""
+# Distance of points behind a surface, and edge of the cubes of which each holds one point, [m]
 SPACING = 0.015
-"""Distance of points behind a surface, and edge of the cubes of which each holds one point, [m]."""
+# Clearance that is believed at start and goal, which are known to be free, [m]
 END_CLEARANCE = 0.01
-"""Clearance that is believed at start and goal, which are known to be free, [m]."""
-CUBES = 1 << 16
-"""Greatest number of cubes along an axis."""
-CONNECTED = 0.06
-"""Distance of points of one obstacle, [m]."""
-LEAST_HALF = 0.01
-"""Least half length of a fitted box, [m]."""
-CURVED = 0.12
-"""Depth of a front relative to its width from which on it is believed to be curved."""
+CUBES = 1 << 16  # Greatest number of cubes along an axis
+CONNECTED = 0.06  # Distance of points of one obstacle, [m]
+LEAST_HALF = 0.01  # Least half length of a fitted box, [m]
+CURVED = 0.12  # Depth of a front relative to its width from which on it is believed to be curved
 
 
 class Sight(NamedTuple):
     """Readings of a sensor in B scenes, as an observation tells them."""
 
-    origin: Float
-    """Present places of the sensor, shape (B, 3), [m]."""
-    rotation: Float
-    """Present axes of the sensor as columns, shape (B, 3, 3)."""
+    origin: Float  # Present places of the sensor, shape (B, 3), [m]
+    rotation: Float  # Present axes of the sensor as columns, shape (B, 3, 3)
+    # Those of R rays, or of all rays of the looks that are remembered, shape (B, R), [m]
     ranges: Float
-    """Those of R rays, or of all rays of the looks that are remembered, shape (B, R), [m]."""
-    points: Float
-    """Ends of the rays, shape (B, R, 3), [m]."""
-    eyes: Float
-    """Places from which they were seen, shape (B, R, 3), [m]."""
-    hit: Bool
-    """True for rays that met something, shape (B, R)."""
+    points: Float  # Ends of the rays, shape (B, R, 3), [m]
+    eyes: Float  # Places from which they were seen, shape (B, R, 3), [m]
+    hit: Bool  # True for rays that met something, shape (B, R)
+    # Centres of the arm's spheres at start and goal, where nothing can be, shape (B, E, 3), [m]
     free: Float
-    """Centres of the arm's spheres at start and goal, where nothing can be, shape (B, E, 3), [m]."""
-    free_radius: Float
-    """Radii of these spheres, shape (E,), [m]."""
+    free_radius: Float  # Radii of these spheres, shape (E,), [m]
 
     def take(self, rows: Any) -> Sight:
         """Return the readings of some of the scenes, by indices, mask or slice."""

@@ -24,6 +24,7 @@ from viapoint.envs.arms.registry import PANDA_HOME
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.shapes import Box, Cylinder, Shape, as_obstacle
 
+# Names of the sets
 SETS = (
     "bookshelf_small",
     "bookshelf_tall",
@@ -33,16 +34,15 @@ SETS = (
     "table_pick",
     "table_under_pick",
 )
-"""Names of the sets."""
-JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))
-"""Names of the joints in the files."""
+JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))  # Names of the joints in the files
 LOWEST = (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671)
+# Ranges of the joints in the published description, [rad]
 HIGHEST = (2.9671, 1.8326, 2.9671, 0.0873, 2.9671, 3.8223, 2.9671)
-"""Ranges of the joints in the published description, [rad]."""
+# Bodies of the fingers, and the directions in which they open along y
 FINGERS = {"leftfinger": 1.0, "rightfinger": -1.0}
-"""Bodies of the fingers, and the directions in which they open along y."""
+# Opening of a finger, and height of the fingers' frames over that of the hand, [m]
 OPEN, FINGER_HEIGHT = 0.065, 0.0584
-"""Opening of a finger, and height of the fingers' frames over that of the hand, [m]."""
+# Pairs of bodies, besides neighbours, that the published description does not compare (panda.srdf)
 NEVER_TOUCH = {
     "link0": ("link2", "link3", "link4"),
     "link1": ("link3", "link4"),
@@ -52,22 +52,16 @@ NEVER_TOUCH = {
     "link6": ("gripper", "leftfinger", "rightfinger"),
     "link7": ("leftfinger", "rightfinger"),
 }
-"""Pairs of bodies, besides neighbours, that the published description does not compare (panda.srdf)."""
 
 
 class BenchmarkProblem(NamedTuple):
     """One problem."""
 
-    set: str
-    """Name of its set."""
-    number: int
-    """Number within the set, from 1."""
-    start: Float
-    """Joint positions, shape (7,), [rad]."""
-    goal: Float
-    """Joint positions, shape (7,), [rad]."""
-    obstacles: tuple[Shape, ...]
-    """Obstacles."""
+    set: str  # Name of its set
+    number: int  # Number within the set, from 1
+    start: Float  # Joint positions, shape (7,), [rad]
+    goal: Float  # Joint positions, shape (7,), [rad]
+    obstacles: tuple[Shape, ...]  # Obstacles
 
     @property
     def name(self) -> str:

@@ -25,13 +25,11 @@ from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import GeometrySearch
 
 Planner = Callable[[Arm, BenchmarkProblem], MotionPlan]
+# Function of the planner's name, the number of finished problems and the number of all
 Progress = Callable[[str, int, int], None]
-"""Function of the planner's name, the number of finished problems and the number of all."""
 
-TOGETHER = 20
-"""Number of plans that are simulated together."""
-PATH_INSTANTS = 200
-"""Instants between which the length of a movement is measured."""
+TOGETHER = 20  # Number of plans that are simulated together
+PATH_INSTANTS = 200  # Instants between which the length of a movement is measured
 NOTES = (
     "Solved: touches nothing and keeps all limits, by computed geometry; physics: success in MuJoCo, too; both without "
     "problems whose ends are in contact. Times include all checks. Motion time, jerk (relative to the straight "

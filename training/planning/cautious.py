@@ -28,18 +28,15 @@ from viapoint.training.planning.search import (
     refined_actions,
 )
 
+# Number of instants at which the way through unseen space is measured
 INSTANTS = {"hand": 32, "joints": 16}
-"""Number of instants at which the way through unseen space is measured."""
+# Depth behind a seen surface that is avoided like the surface, [m]
 BEHIND = {"hand": 0.04, "joints": 0.04}
-"""Depth behind a seen surface that is avoided like the surface, [m]."""
-UNSEEN_WEIGHT = 50.0
-"""Reward that a mean depth of 1 m in unseen space costs, [1/m]."""
-MARGIN = 0.03
-"""Distance in front of unseen space at which the penalty begins, [m]."""
-DEEPEST = 0.1
-"""Depth in unseen space at which the penalty of an instant saturates, [m]."""
+UNSEEN_WEIGHT = 50.0  # Reward that a mean depth of 1 m in unseen space costs, [1/m]
+MARGIN = 0.03  # Distance in front of unseen space at which the penalty begins, [m]
+DEEPEST = 0.1  # Depth in unseen space at which the penalty of an instant saturates, [m]
+# Number of best candidates that are refined around what is seen. The settings were tuned on `validation` scenes.
 REFINED = {"hand": 0, "joints": 8}
-"""Number of best candidates that are refined around what is seen. The settings were tuned on `validation` scenes."""
 
 
 def known(task: Task, sight: Sight, truth: Obstacles) -> Obstacles:
@@ -67,6 +64,7 @@ def one_look(task: Task, name: str) -> Sensor:
     return sensor
 
 
+# Obstacles that are believed to be there, by name; the first two need the truth
 BELIEFS: dict[str, Callable[[Task, Sight, Obstacles], Obstacles]] = {
     "known": known,
     "seen": seen,
@@ -74,7 +72,6 @@ BELIEFS: dict[str, Callable[[Task, Sight, Obstacles], Obstacles]] = {
     "points": lambda task, sight, truth: points_alone(task, sight),
     "thick": lambda task, sight, truth: thick_points(task, sight),
 }
-"""Obstacles that are believed to be there, by name; the first two need the truth."""
 
 
 class BeliefMethod:

@@ -35,14 +35,12 @@ from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import SHORTEST_DURATION
 
-INSTANTS = 64
-"""Instants of a movement that are checked; a power of two."""
+INSTANTS = 64  # Instants of a movement that are checked; a power of two
+# Instants of a movement that is checked once more before it is executed; a power of two
 FINE_INSTANTS = 256
-"""Instants of a movement that is checked once more before it is executed; a power of two."""
-NOWHERE = 1e9
-"""Clearance that nothing limits, [m]."""
-OUTSIDE = -2.0
-"""Clearance of movements that leave the reach or the joint ranges, [m]."""
+NOWHERE = 1e9  # Clearance that nothing limits, [m]
+OUTSIDE = -2.0  # Clearance of movements that leave the reach or the joint ranges, [m]
+# Passage times in unit time by the number of via-points; more via-points are passed at even times
 TABLES: dict[int, list[tuple[float, ...]]] = {
     0: [()],
     1: [(float(t),) for t in np.linspace(0.1, 0.9, 161)],
@@ -53,46 +51,36 @@ TABLES: dict[int, list[tuple[float, ...]]] = {
     ],
     3: list(itertools.combinations([float(t) for t in np.linspace(0.1, 0.9, 13)], 3)),
 }
-"""Passage times in unit time by the number of via-points; more via-points are passed at even times."""
+# Step between the passage times whose cost is computed first, with one via-point; those beside the best follow
 STRIDE = 4
-"""Step between the passage times whose cost is computed first, with one via-point; those beside the best follow."""
 
 
+# Nodes and weights of Gauss-Legendre quadrature in [-1, 1]
 NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(3)
-"""Nodes and weights of Gauss-Legendre quadrature in [-1, 1]."""
 
 
 class MovementTable(NamedTuple):
     """Movements through K via-points in unit time at N instants, with M sets of passage times."""
 
-    durations: Float
-    """Durations of the segments, shape (M, K + 1)."""
-    basis: Float
-    """Influence of each offset on the position at each instant, shape (M, N, K + 3)."""
-    rate: Float
-    """Influence of each offset on the velocity at each instant, shape (M, N, K + 3)."""
-    bend: Float
-    """Influence of each offset on the acceleration at each instant, shape (M, N, K + 3)."""
+    durations: Float  # Durations of the segments, shape (M, K + 1)
+    basis: Float  # Influence of each offset on the position at each instant, shape (M, N, K + 3)
+    rate: Float  # Influence of each offset on the velocity at each instant, shape (M, N, K + 3)
+    bend: Float  # Influence of each offset on the acceleration at each instant, shape (M, N, K + 3)
+    # Matrices of the jerk cost, half the integral of the squared jerk, shape (M, K + 3, K + 3)
     cost: Float
-    """Matrices of the jerk cost, half the integral of the squared jerk, shape (M, K + 3, K + 3)."""
-    order: Int
-    """Instants in an order that looks everywhere soon, shape (N,)."""
+    order: Int  # Instants in an order that looks everywhere soon, shape (N,)
 
 
 class Setting(NamedTuple):
     """Arm and space of movements, as compiled functions take them."""
 
     chain: Chain
-    spheres: Spheres
-    """Spheres that can touch the obstacles at all."""
-    joint_range: Float
-    """Shape (J, 2), [rad]."""
-    of_hand: bool
-    """True if movements are of the hand in the plane, False if they are of the joints."""
+    spheres: Spheres  # Spheres that can touch the obstacles at all
+    joint_range: Float  # Shape (J, 2), [rad]
+    of_hand: bool  # True if movements are of the hand in the plane, False if they are of the joints
+    # Reach of the joints, see :func:`~viapoint.envs.geometry.clearance.travel`, shape (J,), [m]
     reach: Float
-    """Reach of the joints, see :func:`~viapoint.envs.geometry.clearance.travel`, shape (J,), [m]."""
-    hand_alone: bool
-    """True if the only sphere is the one around the hand of an arm in the plane."""
+    hand_alone: bool  # True if the only sphere is the one around the hand of an arm in the plane
 
 
 @functools.cache
@@ -343,16 +331,12 @@ def place_hand(position: Float, placed: Placed) -> None:
 class Memory(NamedTuple):
     """Memory of :func:`least_clearance`, which it uses again and again."""
 
-    position: Float
-    """Position of a movement, shape (D,)."""
-    path: Float
-    """Joints at each instant, or positions if the hand is alone, shape (N, J)."""
-    bound: Float
-    """Lower bounds of the clearance at each instant, shape (N,), [m]."""
-    placed: Placed
-    """Places of the arm's parts."""
+    position: Float  # Position of a movement, shape (D,)
+    path: Float  # Joints at each instant, or positions if the hand is alone, shape (N, J)
+    bound: Float  # Lower bounds of the clearance at each instant, shape (N,), [m]
+    placed: Placed  # Places of the arm's parts
+    # Limits of an arm in the plane, see :func:`~viapoint.envs.arms.inverse_kinematics.planar_limits`
     limits: Float
-    """Limits of an arm in the plane, see :func:`~viapoint.envs.arms.inverse_kinematics.planar_limits`."""
 
 
 @compiled

@@ -19,10 +19,8 @@ from viapoint.envs.geometry.clearance import memory, obstacle_clearance, place, 
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
 
-CHECK_SPACING = 0.05
-"""Spacing of collision checks along a line, [rad]."""
-VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12)
-"""Numbers of via-points, tried in this order."""
+CHECK_SPACING = 0.05  # Spacing of collision checks along a line, [rad]
+VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12)  # Numbers of via-points, tried in this order
 
 
 @functools.cache

@@ -17,10 +17,9 @@ from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, path_around, points_on
 from viapoint.training.planning.plan_motion import checked_motion
 
+# Required clearances of a path in each attempt, until one can be made smooth, [m]
 MARGINS = (0.010, 0.004, 0.001, 0.001)
-"""Required clearances of a path in each attempt, until one can be made smooth, [m]."""
-PATIENCE = 1.0
-"""Time limit for each path, [s]."""
+PATIENCE = 1.0  # Time limit for each path, [s]
 
 
 def ompl_motion(

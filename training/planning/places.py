@@ -16,23 +16,18 @@ from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.movements import INSTANTS, Setting, place_arm
 from viapoint.training.planning.problem import Moves, Problem, setting_of
 
-OUT_OF_VIEW = -1
-"""Ray of a place that is outside the field of view."""
+OUT_OF_VIEW = -1  # Ray of a place that is outside the field of view
 
 
 class Places(NamedTuple):
     """Places of S spheres at T instants of H movements in each of B scenes."""
 
+    # Number of the ray that passes nearest to the centre, or OUT_OF_VIEW, shape (B, H, T, S)
     ray: NDArray[np.int32]
-    """Number of the ray that passes nearest to the centre, or OUT_OF_VIEW, shape (B, H, T, S)."""
-    distance: Single
-    """Distance of the centre from the sensor, shape (B, H, T, S), [m]."""
-    centre: Single
-    """Centre in the world, shape (B, H, T, S, 3), [m]."""
-    radius: Single
-    """Radius of each sphere, shape (S,), [m]."""
-    inside: Bool
-    """True for movements within reach and joint ranges, shape (B, H)."""
+    distance: Single  # Distance of the centre from the sensor, shape (B, H, T, S), [m]
+    centre: Single  # Centre in the world, shape (B, H, T, S, 3), [m]
+    radius: Single  # Radius of each sphere, shape (S,), [m]
+    inside: Bool  # True for movements within reach and joint ranges, shape (B, H)
 
     def depth(self, sight: Sight) -> Single:
         """Return how far centres lie behind the surface that is seen in their direction, shape (B, H, T, S), [m].

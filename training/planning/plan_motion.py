@@ -49,36 +49,24 @@ from viapoint.training.planning.refine import (
     unit_of_jerk,
 )
 
+# Relative jerk cost above which more seeds are tried after a free movement, and how many of them
 ROUGH, MORE = 4.0, 4
-"""Relative jerk cost above which more seeds are tried after a free movement, and how many of them."""
+# Spread of the first random seeds around the straight line, and of later ones, [rad]
 SPREADS = 0.8, 1.0
-"""Spread of the first random seeds around the straight line, and of later ones, [rad]."""
-HAND_SPREADS = 0.15, 0.3
-"""Spreads of the same seeds in hand space, [m]."""
-NARROW = 8
-"""Number of seeds with the first spread."""
-SEEDS = 256
-"""Greatest number of random seeds."""
-CHUNKS = 1, 1, 2, 4
-"""Numbers of seeds between two looks at the clock; the last one repeats."""
-LONGEST_SEARCH = 1.0
-"""Default of the time limit, [s]."""
-RANGE_TOLERANCE = 1e-6
-"""Way beyond a joint limit that counts as rounding, [rad]."""
-UNLIMITED = 0.85
-"""Shortest duration that is chosen for an arm without velocity limits, [s]."""
-LIMIT_STRIDE = 4
-"""Step between the instants at which limits are looked at."""
-ROUNDS = 6
-"""Greatest number of times that a movement is planned again because it must take longer."""
+HAND_SPREADS = 0.15, 0.3  # Spreads of the same seeds in hand space, [m]
+NARROW = 8  # Number of seeds with the first spread
+SEEDS = 256  # Greatest number of random seeds
+CHUNKS = 1, 1, 2, 4  # Numbers of seeds between two looks at the clock; the last one repeats
+LONGEST_SEARCH = 1.0  # Default of the time limit, [s]
+RANGE_TOLERANCE = 1e-6  # Way beyond a joint limit that counts as rounding, [rad]
+UNLIMITED = 0.85  # Shortest duration that is chosen for an arm without velocity limits, [s]
+LIMIT_STRIDE = 4  # Step between the instants at which limits are looked at
+ROUNDS = 6  # Greatest number of times that a movement is planned again because it must take longer
+# Duration relative to that of the straight movement with which planning among moving obstacles begins
 LONGER = 1.3
-"""Duration relative to that of the straight movement with which planning among moving obstacles begins."""
-SPARE = 1e-3
-"""Clearance that movements keep beyond the margin where their ends have it, [m]."""
-ROUNDING = 1e-6
-"""Rounding error of clearances, [m]."""
-GOALS = 8
-"""Greatest number of configurations that are tried for a pose."""
+SPARE = 1e-3  # Clearance that movements keep beyond the margin where their ends have it, [m]
+ROUNDING = 1e-6  # Rounding error of clearances, [m]
+GOALS = 8  # Greatest number of configurations that are tried for a pose
 
 
 class _Problem(NamedTuple):
@@ -117,18 +105,12 @@ class _Problem(NamedTuple):
 class _Movement(NamedTuple):
     """Movement with passage times from a table."""
 
-    vias: Float
-    """Via-points relative to the start, shape (K, D)."""
-    table: MovementTable
-    """Table with many instants."""
-    times: int
-    """Index of the passage times."""
-    duration: float
-    """Duration for which it was planned, [s]."""
-    source: str
-    """Origin of the via-points."""
-    clearance: float | None = None
-    """Its least clearance, [m]; None if it is not known yet."""
+    vias: Float  # Via-points relative to the start, shape (K, D)
+    table: MovementTable  # Table with many instants
+    times: int  # Index of the passage times
+    duration: float  # Duration for which it was planned, [s]
+    source: str  # Origin of the via-points
+    clearance: float | None = None  # Its least clearance, [m]; None if it is not known yet
 
 
 def plan_motion(
@@ -575,14 +557,10 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
 class _Timed(NamedTuple):
     """Duration of a movement, and what it needs of the limits."""
 
-    duration: float
-    """Duration, [s]."""
-    limits: Limits
-    """Shares of the limits that the movement uses."""
-    joint: int
-    """Index of the joint that is nearest to a limit, or the farthest beyond it."""
-    shortest: float
-    """Shortest duration that keeps the limits, for a movement from rest, [s]."""
+    duration: float  # Duration, [s]
+    limits: Limits  # Shares of the limits that the movement uses
+    joint: int  # Index of the joint that is nearest to a limit, or the farthest beyond it
+    shortest: float  # Shortest duration that keeps the limits, for a movement from rest, [s]
 
 
 def _timed(problem: _Problem, movement: _Movement, least: float | None) -> _Timed:

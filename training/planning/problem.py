@@ -37,34 +37,27 @@ from viapoint.training.planning.movements import (
 
 Numbers = NDArray[np.floating[Any]]
 
+# Vertical distance from obstacles beyond which spheres of an arm in the plane never matter, [m]
 NEAR = 0.05
-"""Vertical distance from obstacles beyond which spheres of an arm in the plane never matter, [m]."""
 
+# Angle that a straight elbow turns when the hand is 0.3 mm from its place, the usual error of tracking, [rad]
 ELBOW_ROOM = 0.04
-"""Angle that a straight elbow turns when the hand is 0.3 mm from its place, the usual error of tracking, [rad]."""
+# Greatest factor by which a plan in motion is prolonged to keep the velocity limits of the joints
 PROLONGED = 1.5
-"""Greatest factor by which a plan in motion is prolonged to keep the velocity limits of the joints."""
 
 
 class Problem(NamedTuple):
     """B planning problems in coordinates of the task's space."""
 
-    start: Float
-    """Present reference, shape (B, D)."""
-    velocity: Float
-    """Its velocity, shape (B, D)."""
-    acceleration: Float
-    """Its acceleration, shape (B, D)."""
-    goal: Float
-    """Goal, shape (B, D)."""
-    obstacles: Obstacles
-    """Obstacles now, with their velocities."""
+    start: Float  # Present reference, shape (B, D)
+    velocity: Float  # Its velocity, shape (B, D)
+    acceleration: Float  # Its acceleration, shape (B, D)
+    goal: Float  # Goal, shape (B, D)
+    obstacles: Obstacles  # Obstacles now, with their velocities
+    # Via-points of the plan of a zero action, shape (B, K, D); None where no plan is under way
     vias: Float | None = None
-    """Via-points of the plan of a zero action, shape (B, K, D); None where no plan is under way."""
-    remaining: Float | None = None
-    """Remaining time of this plan, shape (B,), [s]."""
-    time_left: Float | None = None
-    """Time until the end of the episode, shape (B,), [s]."""
+    remaining: Float | None = None  # Remaining time of this plan, shape (B,), [s]
+    time_left: Float | None = None  # Time until the end of the episode, shape (B,), [s]
 
     @classmethod
     def of_observation(cls, observation: Mapping[str, Any], task: Task) -> Problem:
@@ -114,20 +107,15 @@ class Problem(NamedTuple):
 class Moves(NamedTuple):
     """Plans of H actions in each of B problems, as products of a table."""
 
-    table: MovementTable
-    """Table of movements."""
+    table: MovementTable  # Table of movements
+    # Offsets from the start, see :mod:`viapoint.training.planning.movements`, shape (B, H, K + 3, D)
     offsets: Float
-    """Offsets from the start, see :mod:`viapoint.training.planning.movements`, shape (B, H, K + 3, D)."""
-    times: Int
-    """Indices of the passage times, shape (B, H)."""
-    duration: Float
-    """Durations, shape (B, H), [s]."""
-    rough: Float
-    """Logarithm of 1 + jerk cost relative to that of the zero action, shape (B, H)."""
-    relative: Float
-    """Durations relative to that of the zero action, shape (B, H)."""
+    times: Int  # Indices of the passage times, shape (B, H)
+    duration: Float  # Durations, shape (B, H), [s]
+    rough: Float  # Logarithm of 1 + jerk cost relative to that of the zero action, shape (B, H)
+    relative: Float  # Durations relative to that of the zero action, shape (B, H)
+    # True for plans beyond the velocity limits of the joints, shape (B, H); the environment would prolong them
     fast: Bool
-    """True for plans beyond the velocity limits of the joints, shape (B, H); the environment would prolong them."""
 
 
 class _Layout(NamedTuple):
@@ -135,14 +123,11 @@ class _Layout(NamedTuple):
 
     of_hand: bool
     via_scale: Float
-    rate_limit: Float
-    """Velocity limits of the joints, shape (D,), [rad/s]; unused in hand space."""
+    rate_limit: Float  # Velocity limits of the joints, shape (D,), [rad/s]; unused in hand space
     centre: float
     log_half_range: float
-    shortest: float
-    """Shortest duration of a revised movement, [s]."""
-    longest: float
-    """Longest duration in hand space, [s], unless more is left of the plan under way."""
+    shortest: float  # Shortest duration of a revised movement, [s]
+    longest: float  # Longest duration in hand space, [s], unless more is left of the plan under way
 
 
 class _Nominal(NamedTuple):
@@ -152,16 +137,12 @@ class _Nominal(NamedTuple):
     velocity: Float
     acceleration: Float
     goal: Float
-    line: Float
-    """Line along which offsets are measured in hand space, shape (B, D)."""
-    vias: Float
-    """Shape (B, K, D)."""
-    remaining: Float
-    """Shape (B,), [s]; unused in joint space at rest."""
+    line: Float  # Line along which offsets are measured in hand space, shape (B, D)
+    vias: Float  # Shape (B, K, D)
+    remaining: Float  # Shape (B,), [s]; unused in joint space at rest
+    # Durations of the straight movements that rewards are relative to, shape (B,), [s]
     whole: Float
-    """Durations of the straight movements that rewards are relative to, shape (B,), [s]."""
-    straight: Float
-    """Their jerk costs, shape (B,)."""
+    straight: Float  # Their jerk costs, shape (B,)
 
 
 def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = False) -> Moves:

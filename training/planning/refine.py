@@ -39,79 +39,63 @@ from viapoint.training.planning.movements import (
     memory_of,
 )
 
-CONTACT_WEIGHT = 400.0
-"""Weight of the square of a missing distance, [1/m^2] and [1/rad^2]."""
+CONTACT_WEIGHT = 400.0  # Weight of the square of a missing distance, [1/m^2] and [1/rad^2]
+# Wanted clearance of the arm from itself, [m]; some bodies are never much farther from one another
 OWN_CLEARANCE = 0.01
-"""Wanted clearance of the arm from itself, [m]; some bodies are never much farther from one another."""
-RANGE_MARGIN = 0.01
-"""Wanted distance of joints from their limits, [rad]."""
-DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-4, 1e3
-"""Damping at first, and its bounds."""
+RANGE_MARGIN = 0.01  # Wanted distance of joints from their limits, [rad]
+DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-4, 1e3  # Damping at first, and its bounds
+# Instants near the ends in which a movement from rest or to rest goes less than a hundredth of its way
 SLOW = 4
-"""Instants near the ends in which a movement from rest or to rest goes less than a hundredth of its way."""
+# Least clearance at the instants that are looked at with which a refinement may end early, [m] and [rad]
 FREE = 0.005
-"""Least clearance at the instants that are looked at with which a refinement may end early, [m] and [rad]."""
+# Factors on the damping after a step that was better, and after one that was not
 EASIER, HARDER = 0.3, 5.0
-"""Factors on the damping after a step that was better, and after one that was not."""
-FLAT = 0.02
-"""Share of CONTACT_WEIGHT that damps directions in which nothing is known."""
+FLAT = 0.02  # Share of CONTACT_WEIGHT that damps directions in which nothing is known
+# Longest step of a coordinate in joint space, [rad], and in hand space, [m]
 LONGEST_STEP = 0.6, 0.15
-"""Longest step of a coordinate in joint space, [rad], and in hand space, [m]."""
-STRAIGHT_COST = 360.0
-"""Jerk cost of a straight minimum-jerk movement of the way 1 in unit time."""
+STRAIGHT_COST = 360.0  # Jerk cost of a straight minimum-jerk movement of the way 1 in unit time
+# Way of a straight movement whose jerk cost is the unit for shorter ones, too, in joint space, [rad], and in hand
+# space, [m].
 SHORT = 2.0, 0.2
-"""Way of a straight movement whose jerk cost is the unit for shorter ones, too, in joint space, [rad], and in hand
-space, [m]."""
-SINGULAR = 1e-3
-"""Least determinant of the arm's Jacobian in the plane that is believed, [m^2]."""
+SINGULAR = 1e-3  # Least determinant of the arm's Jacobian in the plane that is believed, [m^2]
 
 
 class Aim(NamedTuple):
     """Aim of a refinement."""
 
-    clearance: float
-    """Wanted clearance from obstacles, [m]."""
-    jerk: float
-    """Weight of the jerk cost in units of `unit`."""
-    iterations: int
-    """Greatest number of iterations."""
-    gain: float
-    """Relative gain of the objective below which a free movement is good enough."""
-    stride: int
-    """Step between the instants that are looked at."""
+    clearance: float  # Wanted clearance from obstacles, [m]
+    jerk: float  # Weight of the jerk cost in units of `unit`
+    iterations: int  # Greatest number of iterations
+    gain: float  # Relative gain of the objective below which a free movement is good enough
+    stride: int  # Step between the instants that are looked at
 
 
+# Aims of the refinements. The first one, of a seed, has little weight of jerk, and ends as soon as the movement is
+# free; the others polish free movements.
 AIMS = (
     Aim(clearance=0.04, jerk=0.1, iterations=20, gain=1.0, stride=2),
     Aim(clearance=0.02, jerk=1.0, iterations=20, gain=0.02, stride=2),
     Aim(clearance=0.02, jerk=0.3, iterations=20, gain=0.01, stride=2),
     Aim(clearance=0.015, jerk=1.5, iterations=20, gain=0.01, stride=2),
 )
-"""Aims of the refinements. The first one, of a seed, has little weight of jerk, and ends as soon as the movement is
-free; the others polish free movements."""
+# Aim of a second refinement of movements that are nearly free: in a narrow passage, a wide clearance on one side is
+# paid for with contact on the other.
 NARROW = Aim(clearance=0.008, jerk=0.02, iterations=20, gain=1.0, stride=2)
-"""Aim of a second refinement of movements that are nearly free: in a narrow passage, a wide clearance on one side is
-paid for with contact on the other."""
-NEARLY = -0.03
-"""Least clearance of movements that are nearly free, [m]."""
+NEARLY = -0.03  # Least clearance of movements that are nearly free, [m]
+# Clearance beyond the margin that is asked for: distances of point clouds that are cut off there are rounded, [m]
 ROUNDING = 1e-6
-"""Clearance beyond the margin that is asked for: distances of point clouds that are cut off there are rounded, [m]."""
-SMOOTH = 1.5
-"""Relative jerk cost with which a movement is polished no more."""
+SMOOTH = 1.5  # Relative jerk cost with which a movement is polished no more
 
 
 class Found(NamedTuple):
     """Movements that were found from S seeds."""
 
-    vias: Float
-    """Via-points as offsets from the start, shape (S, K, D)."""
-    times: Int
-    """Indices of passage times in the table, shape (S,)."""
-    cost: Float
-    """Jerk cost in unit time, shape (S,); infinite for movements that are not free."""
+    vias: Float  # Via-points as offsets from the start, shape (S, K, D)
+    times: Int  # Indices of passage times in the table, shape (S,)
+    cost: Float  # Jerk cost in unit time, shape (S,); infinite for movements that are not free
+    # Least clearance at many instants, shape (S,), [m]; -1 for movements in contact. It is less than the margin for
+    # movements in narrow passages, which are not polished and do not count as free.
     clearance: Float
-    """Least clearance at many instants, shape (S,), [m]; -1 for movements in contact. It is less than the margin for
-    movements in narrow passages, which are not polished and do not count as free."""
 
 
 class _Work(NamedTuple):
@@ -120,20 +104,15 @@ class _Work(NamedTuple):
     position: Float
     joints: Float
     placed: Placed
-    pull: Float
-    """Derivative of a residual by the joints, shape (J,)."""
-    row: Float
-    """Derivative of a residual by the coordinates, shape (D,)."""
+    pull: Float  # Derivative of a residual by the joints, shape (J,)
+    row: Float  # Derivative of a residual by the coordinates, shape (D,)
     jacobian: Float
-    square: Float
-    """Sum of the products of rows at one instant, shape (D, D)."""
-    force: Float
-    """Sum of residual times row at one instant, shape (D,)."""
+    square: Float  # Sum of the products of rows at one instant, shape (D, D)
+    force: Float  # Sum of residual times row at one instant, shape (D,)
     gram: Float
+    # Place of the ball of each group at the last look for obstacles, its clearance, and the time, shape (G, 5)
     seen: Float
-    """Place of the ball of each group at the last look for obstacles, its clearance, and the time, shape (G, 5)."""
-    speed: float
-    """Greatest speed of an obstacle, [m/s]."""
+    speed: float  # Greatest speed of an obstacle, [m/s]
 
 
 @compiled

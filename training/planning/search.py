@@ -39,20 +39,17 @@ from viapoint.training.planning.problem import (
 )
 from viapoint.training.planning.refine import AIMS, SMOOTH, refine_seeds, unit_of_jerk
 
+# Least planned clearance of a movement that the search prefers, [m]; 1 to 8 mm make no difference
 CLEARANCE_MARGIN = 0.001
-"""Least planned clearance of a movement that the search prefers, [m]; 1 to 8 mm make no difference."""
+# Reward by which another plan must be better than the present one, as each change of plan costs jerk
 KEEP_BONUS = 0.1
-"""Reward by which another plan must be better than the present one, as each change of plan costs jerk."""
+# Times for which a plan is checked, shorter ones where none is clear for longer, [s]: obstacles may change course
 HORIZONS = (1e9, 1.2, 0.9, 0.6, 0.3)
-"""Times for which a plan is checked, shorter ones where none is clear for longer, [s]: obstacles may change course."""
-VERIFIED = 8
-"""Number of best candidates that are checked once more before one is taken."""
-N_CENTRES = 4
-"""Number of best candidates that a round of refinement samples around."""
+VERIFIED = 8  # Number of best candidates that are checked once more before one is taken
+N_CENTRES = 4  # Number of best candidates that a round of refinement samples around
+# Half the side of the cube that the first round samples around each centre; each further round halves it
 SPREAD = 0.25
-"""Half the side of the cube that the first round samples around each centre; each further round halves it."""
-INFEASIBLE = -1e6
-"""Merit of plans that are not clear, less their depth."""
+INFEASIBLE = -1e6  # Merit of plans that are not clear, less their depth
 
 
 class GeometrySearch:
