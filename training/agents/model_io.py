@@ -132,15 +132,9 @@ def build(
     *,
     seed: int | None = None,
 ) -> BaseAlgorithm:
-    """Build a new model from plain values.
+    """Build a new model from the names of an algorithm and its policy, and hyperparameters as JSON values.
 
-    Args:
-        algorithm: Name of the algorithm, one of ALGORITHMS.
-        policy: Name of the policy.
-        env: Environment to learn on.
-        hyperparameters: Arguments of the algorithm; schedules, noise and activations as :func:`describe`
-            writes them.
-        seed: Seed of the algorithm.
+    Schedules, noise and activations are as :func:`describe` writes them.
 
     Raises:
         ValueError: There is no such algorithm, policy or hyperparameter.

@@ -42,12 +42,7 @@ class OutcomeSamples(NamedTuple):
 
 
 class OutcomeReplayBuffer(DictReplayBuffer):
-    """Replay buffer for dictionary observations that stores the outcome of each decision from `info`.
-
-    Args:
-        *args: Arguments of :class:`stable_baselines3.common.buffers.DictReplayBuffer`.
-        **kwargs: Keyword arguments of the same class.
-    """
+    """Replay buffer for dictionary observations that stores the outcome of each decision from `info`."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -100,10 +95,7 @@ class OutcomeReplayBuffer(DictReplayBuffer):
 def outcome_of(info: Mapping[str, Any], reward: float, before: float = np.nan) -> tuple[float, ...]:
     """Return the outcome that `info` reports, or NaN if its terms do not sum to the reward.
 
-    Args:
-        info: Info of the decision.
-        reward: Reward of the decision.
-        before: Sum of the clearance terms of earlier decisions in the episode; NaN for the first decision.
+    The clearance terms of earlier decisions in the episode sum up to `before`; NaN for the first decision.
     """
     unknown = (np.nan,) * len(Outcomes._fields)
     if not all(name in info for name in TERMS):

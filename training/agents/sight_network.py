@@ -56,15 +56,10 @@ class SightInputs(NamedTuple):
 def sight_inputs(
     task: Task, problem: Problem, sight: Sight, actions: Numbers, instants: int, nearest: int
 ) -> tuple[SightInputs, Single]:
-    """Return the inputs of the network for actions, and the rewards of actions that succeed, shape (B, H).
+    """Return the inputs of the network for actions, shape (B, H, m), and the rewards of those that succeed, (B, H).
 
-    Args:
-        task: Task with a sensor.
-        problem: B problems with the obstacles that are believed to be there.
-        sight: Readings of B scenes.
-        actions: Actions, shape (B, H, m).
-        instants: Number of instants that are looked at.
-        nearest: Number P of places that the network sees: those nearest to surfaces, or deepest behind them.
+    The problems have the obstacles that are believed to be there. Of all places at some instants, the network sees the
+    ones that are nearest to surfaces, or deepest behind them.
     """
     sensor = task.sensor
     assert sensor is not None
@@ -132,12 +127,7 @@ def _image(sensor: Sensor, sight: Sight) -> Tensor:
 
 
 class SightNetwork(nn.Module):
-    """Network of the logit of success, see :mod:`viapoint.training.agents.sight_network`.
-
-    Args:
-        sensor: Sensor of the task.
-        width: Number of features of a pixel, and of outputs of a place.
-    """
+    """Network of the logit of success; `width` is the number of features of a pixel, and of outputs of a place."""
 
     DILATIONS = (2, 4, 8, 1)
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
+from viapoint.envs.task import Task
 from viapoint.training.agents.pairs import PairNetwork, Pairs
-
-if TYPE_CHECKING:
-    from viapoint.envs.task import Task
 
 # Number of effort features: log jerk, duration, log duration, and spare time if time is limited
 EFFORT = 4

@@ -31,6 +31,7 @@ from viapoint.envs.task import Task
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.plan_agent import Observation, PlanAlgorithm, PlanPolicy
 from viapoint.training.agents.sight_network import SightInputs, SightNetwork, sight_inputs
+from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.problem import Numbers, Problem
@@ -62,11 +63,7 @@ class ViaRankPolicy(PlanPolicy):
         refine: Number of best candidates that the planner refines around what is seen; they are ranked, too.
     """
 
-    width: int
-    instants: int
-    nearest: int
-    candidates: int
-    refine: int
+    OWN = "width", "instants", "nearest", "candidates", "refine"
 
     def __init__(
         self,
@@ -80,25 +77,15 @@ class ViaRankPolicy(PlanPolicy):
         nearest: int = 16,
         candidates: int = 512,
         refine: int = 0,
-        optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
-        optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        super().__init__(
-            observation_space,
-            action_space,
-            task=task,
-            own={
-                "width": width,
-                "instants": instants,
-                "nearest": nearest,
-                "candidates": candidates,
-                "refine": refine,
-            },
-            optimizer_class=optimizer_class,
-            optimizer_kwargs=optimizer_kwargs,
-            **kwargs,
-        )
+        super().__init__(observation_space, action_space, task=task, **kwargs)
+        self.width = width
+        self.instants = instants
+        self.nearest = nearest
+        self.candidates = candidates
+        self.refine = refine
+        check_arguments(type(self), self._own())
         if self.task.sensor is None or not self.task.whole_movement:
             raise ValueError(
                 "viarank needs a task with a sensor whose actions are whole movements, such as viapoint/PlanarSensed-v0"
@@ -113,12 +100,9 @@ class ViaRankPolicy(PlanPolicy):
 
     @torch.no_grad()
     def rank(self, problem: Problem, sight: Sight, actions: Numbers) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return ranking criterion and probability of success of actions, shape (B, H) each.
+        """Return ranking criterion and probability of success of actions of shape (B, H, m), shape (B, H) each.
 
-        Args:
-            problem: B problems with the obstacles that are believed to be there.
-            sight: Their readings.
-            actions: Actions, shape (B, H, m).
+        The problems have the obstacles that are believed to be there.
         """
         inputs, worth = sight_inputs(self.task, problem, sight, actions, self.instants, self.nearest)
         # Geometry is computed on the processor, the network may be on another device.
@@ -130,14 +114,9 @@ class ViaRankPolicy(PlanPolicy):
         return self.assess(observation)[0]
 
     def assess(self, observation: Observation) -> tuple[Float, Float]:
-        """Return the best actions of B observations, shape (B, m), and their predicted success, shape (B,).
-
-        Args:
-            observation: Parts of shape (B, .) each.
-        """
-        actions, success = self.best(
-            Problem.of_observation(observation, self.task), Sight.of(observation, self.task)
-        )
+        """Return the best actions of B observations, shape (B, m), and their predicted success, shape (B,)."""
+        problem, sight = Problem.of_observation(observation, self.task), Sight.of(observation, self.task)
+        actions, success = self.best(problem, sight)
         slope, offset = self.network.calibration.tolist()
         return actions, expit(slope * logit(success) + offset)
 

@@ -31,6 +31,7 @@ from viapoint.envs.geometry.distance import point_distance, point_distance_and_n
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.training.planning.movements import (
     OUTSIDE,
+    Movement,
     MovementTable,
     Setting,
     best_times,
@@ -279,11 +280,7 @@ def _add_ranges(setting: Setting, reached: bool, work: _Work) -> tuple[float, fl
 @kernel
 def _assemble(
     setting: Setting,
-    table: MovementTable,
-    times: int,
-    start: Float,
-    offsets: Float,
-    duration: float,
+    movement: Movement,
     obstacles: Obstacles,
     scene: int,
     aim: Aim,
@@ -293,6 +290,7 @@ def _assemble(
     work: _Work,
 ) -> tuple[float, float]:
     """Fill in matrix and gradient of the objective; return the objective, and the least clearance, [m] or [rad]."""
+    table, times, offsets = movement.table, movement.times, movement.offsets
     columns, dimension = offsets.shape
     vias = columns - 3
     weight = aim.jerk * 2.0 / (aim.stride * unit)
@@ -315,11 +313,11 @@ def _assemble(
     begin = aim.stride // 2 + (SLOW if resting else 0)
     work.seen[:] = -1e9
     for k in range(begin, last + 1 - SLOW, aim.stride):
-        reached = joints_at(setting, table, times, k, start, offsets, work.position, work.joints)
+        reached = joints_at(setting, movement, k, work.position, work.joints)
         place(setting.chain, setting.spheres, work.joints, work.placed)
         work.square[:] = 0.0
         work.force[:] = 0.0
-        time = duration * k / last
+        time = movement.duration * k / last
         from_obstacles, first = _add_obstacles(setting, obstacles, scene, time, aim.clearance, work)
         from_itself, second = 0.0, OWN_CLEARANCE
         if (k - begin) % (2 * aim.stride) == 0:  # bodies of the arm are less often near one another
@@ -348,18 +346,10 @@ def _assemble(
 
 @compiled
 def _refine(
-    setting: Setting,
-    table: MovementTable,
-    start: Float,
-    offsets: Float,
-    duration: float,
-    obstacles: Obstacles,
-    scene: int,
-    aim: Aim,
-    unit: float,
-    work: _Work,
+    setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, aim: Aim, unit: float, work: _Work
 ) -> int:
     """Move the via-points of a movement, the first rows of its offsets, and return the index of its passage times."""
+    table, _, start, offsets, duration = movement
     columns, dimension = offsets.shape
     vias = columns - 3
     size = vias * dimension
@@ -368,9 +358,8 @@ def _refine(
     system, step, trial = np.empty((size, size)), np.empty(size), offsets.copy()
     longest = LONGEST_STEP[1] if setting.of_hand else LONGEST_STEP[0]
     times, _ = best_times(table, offsets, work.gram)
-    objective, _ = _assemble(
-        setting, table, times, start, offsets, duration, obstacles, scene, aim, unit, hessian, gradient, work
-    )
+    movement = Movement(table, times, start, offsets, duration)
+    objective, _ = _assemble(setting, movement, obstacles, scene, aim, unit, hessian, gradient, work)
     damping = DAMPING
     for _ in range(aim.iterations):
         largest = 0.0
@@ -390,10 +379,10 @@ def _refine(
                     low, high = setting.joint_range[d, 0] - start[d], setting.joint_range[d, 1] - start[d]
                     trial[a, d] = min(max(trial[a, d], low), high)
         other, _ = best_times(table, trial, work.gram)
+        movement = Movement(table, other, start, trial, duration)
         value, nearest = _assemble(
-            setting, table, other, start, trial, duration, obstacles, scene, aim, unit,
-            other_hessian, other_gradient, work,
-        )  # fmt: skip
+            setting, movement, obstacles, scene, aim, unit, other_hessian, other_gradient, work
+        )
         if value < objective:
             done = objective - value < aim.gain * objective and nearest >= FREE
             offsets[:vias] = trial[:vias]
@@ -437,15 +426,15 @@ def refine_seeds(
     Args:
         setting: Arm and space.
         table: Table of movements.
-        fine: The same with more instants, for the last check.
+        fine: Table with more instants, for the last check.
         start: Start, shape (D,).
         fixed: Offsets of the goal, initial velocity and acceleration, shape (3, D).
         seeds: Via-points as offsets from the start, shape (S, K, D).
         duration: Duration during which obstacles move, [s].
-        obstacles: Obstacles of some scenes.
+        obstacles: Obstacles, of which those of the scene `scene` count.
         scene: Index of the scene.
         margin: Least clearance of movements that count as free, [m].
-        aims: What the first refinement of each seed aims at, and those that polish a free movement.
+        aims: Aims of the first refinement of each seed, and of those that polish a free movement.
         unit: Unit of jerk costs in unit time.
         smooth: Jerk cost in this unit with which a movement that was polished once is smooth enough.
         enough: Number of free movements after which to stop.
@@ -462,24 +451,19 @@ def refine_seeds(
     for each in range(number):
         tried += 1
         offsets[0, :vias] = seeds[each]
-        times[0] = _refine(setting, table, start, offsets[0], duration, obstacles, scene, aims[0], unit, work)
-        apart = _clearance(
-            setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin, NEARLY
-        )
-        if NEARLY < apart < margin:
-            times[0] = _refine(
-                setting, table, start, offsets[0], duration, obstacles, scene, NARROW, unit, work
-            )
-            apart = _clearance(
-                setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin, NEARLY
-            )
+        for aim in (aims[0], NARROW):
+            movement = Movement(table, 0, start, offsets[0], duration)
+            times[0] = _refine(setting, movement, obstacles, scene, aim, unit, work)
+            movement = Movement(table, times[0], start, offsets[0], duration)
+            apart = _clearance(setting, movement, obstacles, scene, margin, NEARLY)
+            if not NEARLY < apart < margin:
+                break
         found.vias[each] = offsets[0, :vias]
         found.times[each] = times[0]
         if apart < margin:
             if apart >= 0.0:
-                exact = exact_clearance(
-                    setting, fine, times[0], start, offsets[0], duration, obstacles, scene
-                )
+                movement = Movement(fine, times[0], start, offsets[0], duration)
+                exact = exact_clearance(setting, movement, obstacles, scene)
                 found.clearance[each] = min(exact, apart)
             continue
         stage = 0
@@ -488,18 +472,17 @@ def refine_seeds(
             if later > 1 and cost < smooth * unit:
                 break
             trial[:] = offsets[stage]
-            other = _refine(setting, table, start, trial, duration, obstacles, scene, aims[later], unit, work)
+            movement = Movement(table, 0, start, trial, duration)
+            other = _refine(setting, movement, obstacles, scene, aims[later], unit, work)
             _, less = best_times(table, trial, work.gram)
-            if less < cost and is_free(
-                setting, table, other, start, trial, duration, obstacles, scene, margin
-            ):
+            movement = Movement(table, other, start, trial, duration)
+            if less < cost and is_free(setting, movement, obstacles, scene, margin):
                 stage += 1
                 offsets[stage] = trial
                 times[stage], cost = other, less
         while stage >= 0:
-            clearance = exact_clearance(
-                setting, fine, times[stage], start, offsets[stage], duration, obstacles, scene
-            )
+            movement = Movement(fine, times[stage], start, offsets[stage], duration)
+            clearance = exact_clearance(setting, movement, obstacles, scene)
             if clearance >= margin:
                 break
             stage -= 1
@@ -517,60 +500,29 @@ def refine_seeds(
 
 @compiled
 def _clearance(
-    setting: Setting,
-    table: MovementTable,
-    times: int,
-    start: Float,
-    offsets: Float,
-    duration: float,
-    obstacles: Obstacles,
-    scene: int,
-    margin: float,
-    floor: float,
+    setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, margin: float, floor: float
 ) -> float:
     """Return the least clearance of a movement at the instants of a table, [m]; exact from `floor` to `margin`."""
-    return least_clearance(
-        setting, table, times, start, offsets, duration, obstacles, scene, margin + ROUNDING, floor, 1e9,
-        memory_of(setting, table, len(start)),
-    )  # fmt: skip
+    memory = memory_of(setting, movement.table, len(movement.start))
+    return least_clearance(setting, movement, obstacles, scene, margin + ROUNDING, floor, 1e9, memory)
 
 
 @compiled
-def is_free(
-    setting: Setting,
-    table: MovementTable,
-    times: int,
-    start: Float,
-    offsets: Float,
-    duration: float,
-    obstacles: Obstacles,
-    scene: int,
-    margin: float,
-) -> bool:
+def is_free(setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, margin: float) -> bool:
     """Return True if a movement keeps a margin at the instants of a table; it stops at the first that does not."""
-    apart = _clearance(setting, table, times, start, offsets, duration, obstacles, scene, margin, margin)
-    return bool(apart >= margin)
+    return bool(_clearance(setting, movement, obstacles, scene, margin, margin) >= margin)
 
 
 @compiled
-def exact_clearance(
-    setting: Setting,
-    table: MovementTable,
-    times: int,
-    start: Float,
-    offsets: Float,
-    duration: float,
-    obstacles: Obstacles,
-    scene: int,
-) -> float:
+def exact_clearance(setting: Setting, movement: Movement, obstacles: Obstacles, scene: int) -> float:
     """Return the least clearance of a movement at the instants of a table, at most 1, [m]; OUTSIDE out of reach."""
-    number = len(table.order)
-    position, path = np.empty(len(start)), np.empty((number, len(setting.joint_range)))
+    number = len(movement.table.order)
+    position, path = np.empty(len(movement.start)), np.empty((number, len(setting.joint_range)))
     for k in range(number):
-        if not joints_at(setting, table, times, k, start, offsets, position, path[k]):
+        if not joints_at(setting, movement, k, position, path[k]):
             return OUTSIDE
     placed = memory(setting.chain, setting.spheres)
-    step = duration / (number - 1)
+    step = movement.duration / (number - 1)
     apart, own = movement_clearance(
         setting.chain, setting.spheres, setting.reach, path, obstacles, scene, 0.0, step, placed
     )

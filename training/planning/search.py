@@ -21,7 +21,6 @@ from viapoint.envs.task import Task
 from viapoint.training.planning.candidates import candidate_actions, sobol_actions
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.movements import (
-    MovementTable,
     Setting,
     fine_table,
     least_clearance,
@@ -33,6 +32,7 @@ from viapoint.training.planning.problem import (
     Moves,
     Numbers,
     Problem,
+    movement_of,
     moves_of,
     setting_of,
     worth_of,
@@ -226,18 +226,14 @@ def merits(
     setting = setting or setting_of(task, problem.obstacles)
     horizons = np.array(HORIZONS if replanning else HORIZONS[:1])
     gain = task.weights.clearance / CLEARANCE_UNIT
-    return _merits(setting, moves.table, problem.start, moves, worth, problem.obstacles, horizons, gain)
+    return _merits(setting, moves, worth, problem.obstacles, horizons, gain)
 
 
 def refined_actions(task: Task, problem: Problem, actions: Numbers) -> Numbers:
     """Return actions of shape (B, H, m) after a refinement of their via-points by the gradient of clearance and jerk.
 
-    Durations relative to the shortest movement stay as they are, and what lies outside the action space is clipped.
-
-    Args:
-        task: Task whose movements begin at rest.
-        problem: B problems.
-        actions: Actions.
+    Movements begin at rest. Durations relative to the shortest movement stay as they are, and what lies outside the
+    action space is clipped.
     """
     table, fine = movement_table(task.n_via), fine_table(task.n_via)
     setting = setting_of(task, problem.obstacles, exact=True)
@@ -265,57 +261,35 @@ def plan_clearances(
 ) -> Float:
     """Return the planned clearances of actions of shape (B, H, m), shape (B, H), [m].
 
-    Args:
-        task: Task.
-        problem: B problems.
-        actions: Actions.
-        most: Greatest clearance of interest, [m].
-        least: Clearance below which the exact value does not matter, [m].
-        exact: True for movements as they are executed, at many instants; they take longer.
+    They are at most `most`, and below `least` the exact value does not matter, [m]. With `exact`, movements are those
+    that are executed, and looked at in many instants, which takes longer.
     """
     moves = moves_of(task, problem, actions, exact=exact)
     setting = setting_of(task, problem.obstacles, exact=exact)
-    return np.asarray(_clearances(setting, moves.table, problem.start, moves, problem.obstacles, most, least))
+    return np.asarray(_clearances(setting, moves, problem.obstacles, most, least))
 
 
 @compiled
-def _clearances(
-    setting: Setting,
-    table: MovementTable,
-    start: Float,
-    moves: Moves,
-    obstacles: Obstacles,
-    most: float,
-    least: float,
-) -> Float:
+def _clearances(setting: Setting, moves: Moves, obstacles: Obstacles, most: float, least: float) -> Float:
     """Return the clearances of H plans in each of B problems, see :func:`plan_clearances`."""
     number, plans = moves.duration.shape
     found = np.empty((number, plans))
-    memory = memory_of(setting, table, start.shape[1])
+    memory = memory_of(setting, moves.table, moves.start.shape[1])
     for b in range(number):
         for h in range(plans):
-            found[b, h] = least_clearance(
-                setting, table, moves.times[b, h], start[b], moves.offsets[b, h], moves.duration[b, h],
-                obstacles, b, most, least, HORIZONS[0], memory,
-            )  # fmt: skip
+            movement = movement_of(moves, b, h)
+            found[b, h] = least_clearance(setting, movement, obstacles, b, most, least, HORIZONS[0], memory)
     return found
 
 
 @compiled
 def _merits(
-    setting: Setting,
-    table: MovementTable,
-    start: Float,
-    moves: Moves,
-    worth: Float,
-    obstacles: Obstacles,
-    horizons: Float,
-    gain: float,
+    setting: Setting, moves: Moves, worth: Float, obstacles: Obstacles, horizons: Float, gain: float
 ) -> Float:
     """Return the merits of H plans in each of B problems, see :func:`merits`."""
     number, plans = worth.shape
     found = np.full((number, plans), 3.0 * INFEASIBLE)
-    memory = memory_of(setting, table, start.shape[1])
+    memory = memory_of(setting, moves.table, moves.start.shape[1])
     high = CLEARANCE_RANGE[1]
     for b in range(number):
         order = np.argsort(-worth[b])
@@ -325,10 +299,10 @@ def _merits(
                 if worth[b, h] + gain * high - rank <= best:
                     break
                 floor = CLEARANCE_MARGIN if best > INFEASIBLE else min(deepest, CLEARANCE_MARGIN)
+                movement = movement_of(moves, b, h)
                 clearance = least_clearance(
-                    setting, table, moves.times[b, h], start[b], moves.offsets[b, h], moves.duration[b, h],
-                    obstacles, b, high, floor, horizons[rank], memory,
-                )  # fmt: skip
+                    setting, movement, obstacles, b, high, floor, horizons[rank], memory
+                )
                 if clearance >= CLEARANCE_MARGIN:
                     value = worth[b, h] + gain * clearance - rank
                     best = max(best, value)
