@@ -131,7 +131,3 @@ def _rows_of(box: spaces.Box) -> int:
 def _turned(axes: Tensor, vectors: Tensor) -> Tensor:
     """Return vectors of shape (..., D) in a frame of shape (..., D, D)."""
     return (axes * vectors.unsqueeze(-2)).sum(dim=-1)
-
-
-# Feature extractors by the name that model files use
-EXTRACTORS: dict[str, type[BaseFeaturesExtractor]] = {"SceneExtractor": SceneExtractor}

@@ -35,13 +35,16 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.stored import keep_arm, with_kept_arm
 from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES
-from viapoint.training.agents.extractors import EXTRACTORS
+from viapoint.training.agents.extractors import SceneExtractor
 from viapoint.training.config.checks import check_arguments
 from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
 from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments
 
-ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
-    each.__name__: each for each in (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
+ACTIVATIONS = (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
+# Classes that model files name, by kind and name
+CLASSES: dict[str, dict[str, type[torch.nn.Module]]] = {
+    "activation": {each.__name__: each for each in ACTIVATIONS},
+    "extractor": {"SceneExtractor": SceneExtractor},
 }
 FORMAT = 1  # Version of the two files
 # Learning algorithms by their names on the command line; the modules that define them add them
@@ -103,10 +106,10 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
             hyperparameters["policy_kwargs"] = {**policy, "task": task}
         with warnings.catch_warnings(), parameter_budget(arrays):
             warnings.simplefilter("ignore", UserWarning)  # PPO's batches do not fill one environment
+            own = own_environment(record["env"], folder)
             if env is None:
                 hyperparameters = _to_decide(hyperparameters)
-            own = own_environment(record["env"], folder)
-            if env is not None:
+            else:
                 check_for_correct_spaces(env, own.observation_space, own.action_space)
             model = build(record["algorithm"], record["policy"], env or own, hyperparameters)
         model.num_timesteps = int(record["num_timesteps"])
@@ -314,10 +317,9 @@ def _encode(value: Any) -> Any:
         return _encode(value.base_noise)
     if isinstance(value, NormalActionNoise):
         return {"kind": "normal", "sigma": float(np.max(value._sigma))}
-    if isinstance(value, type) and value in ACTIVATIONS.values():
-        return {"kind": "activation", "name": value.__name__}
-    if isinstance(value, type) and value in EXTRACTORS.values():
-        return {"kind": "extractor", "name": value.__name__}
+    for kind, classes in CLASSES.items():
+        if isinstance(value, type) and value in classes.values():
+            return {"kind": kind, "name": value.__name__}
     if isinstance(value, Mapping):
         return {str(name): _encode(each) for name, each in value.items()}
     if hasattr(value, "frequency"):  # SB3's TrainFreq
@@ -344,10 +346,8 @@ def _decode(value: Any, size: int) -> Any:
             if not sigma >= 0.0:
                 raise ValueError(f"sigma of action_noise must be 0 or more, got {sigma}")
             return NormalActionNoise(np.zeros(size), np.full(size, sigma))
-        if kind == "activation":
-            return ACTIVATIONS[value["name"]]
-        if kind == "extractor":
-            return EXTRACTORS[value["name"]]
+        if kind in CLASSES:
+            return CLASSES[kind][value["name"]]
         if kind is not None:
             raise ValueError(f"kind must be linear, normal, activation or extractor, got {kind!r}")
         return {name: _decode(each, size) for name, each in value.items()}

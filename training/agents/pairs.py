@@ -24,8 +24,8 @@ from viapoint.envs.geometry.clearance import place_group, self_clearance
 from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.obstacles import ABSENT, KINDS, MESH, Obstacles, bounding_boxes
 from viapoint.envs.task import Task
-from viapoint.training.planning.movements import INSTANTS, Memory, Setting, memory_of, place_arm
-from viapoint.training.planning.problem import Moves, Problem, movement_of, setting_of
+from viapoint.training.planning.movements import INSTANTS, Memory, Setting, memory_of
+from viapoint.training.planning.problem import Moves, Problem, place_at, setting_of
 
 SCALE = 8.0  # Scale of lengths at the input of the network, [1/m]
 UNIT = 0.05  # Length of one output unit of the network, [m]
@@ -114,6 +114,12 @@ class Work(NamedTuple):
 
 
 @kernel
+def _place(given: Given, b: int, h: int, instant: int, work: Work) -> bool:
+    """Place the arm at an instant of a movement, and return True within reach and joint ranges."""
+    return bool(place_at(given.setting, given.moves, b, h, instant, work.arm))
+
+
+@kernel
 def _local(given: Given, b: int, row: int, point: Float, time: float, local: Float) -> None:
     """Fill in a point in the frame of an obstacle at a time, shape (3,), [m]."""
     obstacles = given.obstacles
@@ -143,7 +149,7 @@ def _place_sphere(
 ) -> bool:
     """Fill in a sphere's centre in the frame of an obstacle at an instant, and return True within reach."""
     moves, placed = given.moves, work.arm.placed
-    if not place_arm(given.setting, movement_of(moves, b, h), instant, work.arm):
+    if not _place(given, b, h, instant, work):
         return False
     place_group(given.setting.spheres, group, placed)
     _local(given, b, row, placed.centre[sphere], moves.duration[b, h] * instant / (INSTANTS - 1), local)
@@ -225,10 +231,11 @@ def _gather(
     inside: Bool,
 ) -> None:
     """Fill in the nearest pairs of movements, see :func:`pairs_of`."""
-    moves, obstacles, spheres = given.moves, given.obstacles, given.setting.spheres
+    setting, moves, obstacles = given.setting, given.moves, given.obstacles
+    spheres = setting.spheres
     number, plans = moves.duration.shape
     rows, groups = obstacles.kind.shape[1], len(spheres.link)
-    memory = memory_of(given.setting, moves.table, moves.start.shape[1])
+    memory = memory_of(setting, moves.table, moves.start.shape[1])
     work = Work(memory, np.empty((3, 3)), np.empty(3))
     placed, local = memory.placed, work.local
     gap = np.empty((2, rows, groups))
@@ -242,7 +249,7 @@ def _gather(
                 time = moves.duration[b, h] * instant / (INSTANTS - 1)
                 if k > 0 and time > until[b, h]:
                     break
-                if not place_arm(given.setting, movement_of(moves, b, h), instant, memory):
+                if not _place(given, b, h, instant, work):
                     inside[b, h] = False
                     break
                 last = instant

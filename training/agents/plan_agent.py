@@ -119,6 +119,9 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
     `own` names the attributes of the subclass that are hyperparameters.
     """
 
+    LARGEST_GRADIENT: float  # Norm to which gradients are clipped
+    policy: Any
+
     def __init__(
         self,
         policy: Any,
@@ -172,6 +175,33 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
         self._check_env(wrapped)
         super().set_env(wrapped, force_reset)
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Update the network `gradient_steps` times."""
+        policy = self.policy
+        policy.set_training_mode(True)
+        self._update_learning_rate(policy.optimizer)
+        rows = []
+        for _ in range(gradient_steps):
+            losses = self._sampled_losses(batch_size)
+            total: Any = sum(losses.values())
+            policy.optimizer.zero_grad()
+            total.backward()
+            torch.nn.utils.clip_grad_norm_(policy.network.parameters(), self.LARGEST_GRADIENT)
+            policy.optimizer.step()
+            self._after_update()
+            rows.append([float(loss.detach()) for loss in losses.values()])
+            self._n_updates += 1
+        for name, value in zip(losses, np.mean(rows, axis=0), strict=True):
+            self.logger.record(f"train/{name}", float(value))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    @abstractmethod
+    def _sampled_losses(self, batch_size: int) -> dict[str, Tensor]:
+        """Return the losses of sampled decisions or scenes, by their names in the log."""
+
+    def _after_update(self) -> None:
+        """Follow an update of the network."""
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor"]

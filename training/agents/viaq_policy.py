@@ -91,6 +91,11 @@ class ViaQPolicy(PlanPolicy):
             self.critic_target.requires_grad_(False)
         self._make_optimizer(self.critic, lr_schedule)
 
+    @property
+    def network(self) -> ViaQCritic:
+        """Network that is trained."""
+        return self.critic
+
     def make_critic(self) -> ViaQCritic:
         """Return a new critic for the task."""
         return ViaQCritic(self.task, width=self.width)

@@ -23,6 +23,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
 from torch.nn import functional
 
 from viapoint.envs.common.types import Float
@@ -198,6 +199,7 @@ class ViaRank(PlanAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ViaRankPolicy": ViaRankPolicy}
+    LARGEST_GRADIENT = 5.0
     policy: ViaRankPolicy
 
     def __init__(
@@ -275,37 +277,29 @@ class ViaRank(PlanAlgorithm):
         self.calibrate()
         return trained
 
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Update the network `gradient_steps` times."""
+    def _sampled_losses(self, batch_size: int) -> dict[str, Tensor]:
         policy, task = self.policy, self.policy.task
-        policy.set_training_mode(True)
-        self._update_learning_rate(policy.optimizer)
-        losses = []
-        for _ in range(gradient_steps):
-            # New scenes for each update: the network cannot learn them by heart.
-            seeds = np.random.randint(0, 2**31, size=batch_size)  # noqa: NPY002 - seeded by SB3
-            scenes = self._sampler([np.random.default_rng(seed) for seed in seeds])
-            truth, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
-            believed = truth._replace(obstacles=thick_points(task, sight))
-            # Some plans are labelled: those that the network would choose, and others.
-            plans = self._candidates(batch_size)
-            inputs, worth = sight_inputs(task, believed, sight, plans, policy.instants, policy.nearest)
-            inputs = inputs.to(policy.device)
-            chosen = self._chosen(inputs, worth)
-            some = np.take_along_axis(plans, chosen[..., None], axis=1)
-            # The labels are privileged: they need the true obstacles, which the inputs do not tell.
-            clearance = plan_clearances(task, truth, some, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
-            labels = torch.from_numpy((clearance >= CLEARANCE_MARGIN).astype(np.float32)).to(policy.device)
-            logits = policy.network(inputs.take(torch.from_numpy(chosen).to(policy.device)))
-            loss = functional.binary_cross_entropy_with_logits(logits, labels)
-            policy.optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            torch.nn.utils.clip_grad_norm_(policy.network.parameters(), 5.0)
-            policy.optimizer.step()
-            losses.append(float(loss.detach()))
-            self._n_updates += 1
-        self.logger.record("train/loss", float(np.mean(losses)))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        # New scenes for each update: the network cannot learn them by heart.
+        seeds = np.random.randint(0, 2**31, size=batch_size)  # noqa: NPY002 - seeded by SB3
+        truth, believed, sight = self._drawn(list(seeds))
+        # Some plans are labelled: those that the network would choose, and others.
+        plans = self._candidates(batch_size)
+        inputs, worth = sight_inputs(task, believed, sight, plans, policy.instants, policy.nearest)
+        inputs = inputs.to(policy.device)
+        chosen = self._chosen(inputs, worth)
+        some = np.take_along_axis(plans, chosen[..., None], axis=1)
+        # The labels are privileged: they need the true obstacles, which the inputs do not tell.
+        clearance = plan_clearances(task, truth, some, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
+        labels = torch.from_numpy((clearance >= CLEARANCE_MARGIN).astype(np.float32)).to(policy.device)
+        logits = policy.network(inputs.take(torch.from_numpy(chosen).to(policy.device)))
+        return {"loss": functional.binary_cross_entropy_with_logits(logits, labels)}
+
+    def _drawn(self, seeds: list[Any]) -> tuple[Problem, Problem, Sight]:
+        """Return new scenes as they are, as they are believed to be, and what is seen of them."""
+        scenes = self._sampler([np.random.default_rng(seed) for seed in seeds])
+        task = self.policy.task
+        truth, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
+        return truth, truth._replace(obstacles=thick_points(task, sight)), sight
 
     @torch.no_grad()
     def _chosen(self, inputs: SightInputs, worth: NDArray[Any]) -> NDArray[np.int64]:
@@ -327,11 +321,8 @@ class ViaRank(PlanAlgorithm):
         policy.set_training_mode(False)
         chances, labels = [], []
         for first in range(0, number, BLOCK):
-            scenes = self._sampler(
-                [np.random.default_rng((CALIBRATION, first + each)) for each in range(BLOCK)]
-            )
-            truth, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
-            actions, success = policy.best(truth._replace(obstacles=thick_points(task, sight)), sight)
+            truth, believed, sight = self._drawn([(CALIBRATION, first + each) for each in range(BLOCK)])
+            actions, success = policy.best(believed, sight)
             clearance = plan_clearances(task, truth, actions[:, None], 0.0, 0.0, exact=True)[:, 0]
             chances.append(logit(success))
             labels.append(clearance >= 0.0)

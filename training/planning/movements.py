@@ -311,18 +311,6 @@ def joints_at(setting: Setting, movement: Movement, instant: int, position: Floa
     return True
 
 
-@kernel
-def place_arm(setting: Setting, movement: Movement, instant: int, memory: Memory) -> bool:
-    """Place the arm at an instant of a movement, and return True within reach and joint ranges."""
-    if not joints_at(setting, movement, instant, memory.position, memory.joints):
-        return False
-    if setting.hand_alone:
-        place_hand(memory.position, memory.placed)
-    else:
-        place(setting.chain, setting.spheres, memory.joints, memory.placed)
-    return True
-
-
 @inlined
 def place_hand(position: Float, placed: Placed) -> None:
     """Place the only sphere, that around the hand of an arm in the plane."""

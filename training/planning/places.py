@@ -12,8 +12,8 @@ from viapoint.envs.geometry.clearance import place_group
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.task import Task
 from viapoint.training.planning.beliefs import Sight
-from viapoint.training.planning.movements import INSTANTS, Setting, memory_of, place_arm
-from viapoint.training.planning.problem import Moves, Problem, movement_of, setting_of
+from viapoint.training.planning.movements import INSTANTS, Setting, memory_of
+from viapoint.training.planning.problem import Moves, Problem, place_at, setting_of
 
 OUT_OF_VIEW = -1  # Ray of a place that is outside the field of view
 
@@ -80,7 +80,7 @@ def _centres(setting: Setting, moves: Moves, instants: Int, some: Int, centre: S
     for b in range(number):
         for h in range(plans):
             for k in range(len(instants)):
-                if not place_arm(setting, movement_of(moves, b, h), instants[k], memory):
+                if not place_at(setting, moves, b, h, instants[k], memory):
                     inside[b, h] = False
                     break
                 for group in range(len(spheres.link)):

@@ -14,6 +14,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.chain import Spheres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.geometry.clearance import place
 from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
@@ -25,12 +26,15 @@ from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.movements import (
     FINE_INSTANTS,
     INSTANTS,
+    Memory,
     Movement,
     MovementTable,
     Setting,
     best_times,
     jerk_cost,
+    joints_at,
     movement_table,
+    place_hand,
     products,
     shortest_duration,
     table_with,
@@ -126,8 +130,24 @@ class Moves(NamedTuple):
 
 @inlined
 def movement_of(moves: Moves, b: int, h: int) -> Movement:
-    """Return one of the plans."""
+    """Return one of the plans; for kernels, as elsewhere Numba counts references to each array."""
     return Movement(moves.table, moves.times[b, h], moves.start[b], moves.offsets[b, h], moves.duration[b, h])
+
+
+# A call takes longer than the few products of an instant.
+_joints_at = inlined(joints_at.py_func)  # type: ignore[attr-defined]
+
+
+@kernel
+def place_at(setting: Setting, moves: Moves, b: int, h: int, instant: int, memory: Memory) -> bool:
+    """Place the arm at an instant of a plan, and return True within reach and joint ranges."""
+    if not _joints_at(setting, movement_of(moves, b, h), instant, memory.position, memory.joints):
+        return False
+    if setting.hand_alone:
+        place_hand(memory.position, memory.placed)
+    else:
+        place(setting.chain, setting.spheres, memory.joints, memory.placed)
+    return True
 
 
 class _Given(NamedTuple):

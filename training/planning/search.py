@@ -11,7 +11,7 @@ import numpy as np
 
 from viapoint.envs.common.types import Bool, Float, Single
 from viapoint.envs.common.validation import whole_number
-from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import Plan
 from viapoint.envs.registration import check_registered
@@ -21,6 +21,7 @@ from viapoint.envs.task import Task
 from viapoint.training.planning.candidates import candidate_actions, sobol_actions
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.movements import (
+    Memory,
     Setting,
     fine_table,
     least_clearance,
@@ -269,6 +270,22 @@ def plan_clearances(
     return np.asarray(_clearances(setting, moves, problem.obstacles, most, least))
 
 
+@kernel
+def _clearance(
+    setting: Setting,
+    moves: Moves,
+    b: int,
+    h: int,
+    obstacles: Obstacles,
+    most: float,
+    least: float,
+    until: float,
+    memory: Memory,
+) -> float:
+    """Return the clearance of one plan, see :func:`~viapoint.training.planning.movements.least_clearance`."""
+    return least_clearance(setting, movement_of(moves, b, h), obstacles, b, most, least, until, memory)
+
+
 @compiled
 def _clearances(setting: Setting, moves: Moves, obstacles: Obstacles, most: float, least: float) -> Float:
     """Return the clearances of H plans in each of B problems, see :func:`plan_clearances`."""
@@ -277,8 +294,7 @@ def _clearances(setting: Setting, moves: Moves, obstacles: Obstacles, most: floa
     memory = memory_of(setting, moves.table, moves.start.shape[1])
     for b in range(number):
         for h in range(plans):
-            movement = movement_of(moves, b, h)
-            found[b, h] = least_clearance(setting, movement, obstacles, b, most, least, HORIZONS[0], memory)
+            found[b, h] = _clearance(setting, moves, b, h, obstacles, most, least, HORIZONS[0], memory)
     return found
 
 
@@ -299,10 +315,7 @@ def _merits(
                 if worth[b, h] + gain * high - rank <= best:
                     break
                 floor = CLEARANCE_MARGIN if best > INFEASIBLE else min(deepest, CLEARANCE_MARGIN)
-                movement = movement_of(moves, b, h)
-                clearance = least_clearance(
-                    setting, movement, obstacles, b, high, floor, horizons[rank], memory
-                )
+                clearance = _clearance(setting, moves, b, h, obstacles, high, floor, horizons[rank], memory)
                 if clearance >= CLEARANCE_MARGIN:
                     value = worth[b, h] + gain * clearance - rank
                     best = max(best, value)
