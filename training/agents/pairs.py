@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.clearance import place_group, self_clearance
+from viapoint.envs.geometry.clearance import Placed, place_group, self_clearance
 from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.obstacles import ABSENT, KINDS, MESH, Obstacles, bounding_boxes
 from viapoint.envs.task import Task
-from viapoint.training.planning.movements import INSTANTS, Memory, Setting, memory_of
+from viapoint.training.planning.movements import INSTANTS, Setting, memory_of
 from viapoint.training.planning.problem import Moves, Problem, place_at, setting_of
 
 SCALE = 8.0  # Scale of lengths at the input of the network, [1/m]
@@ -108,7 +108,9 @@ class Given(NamedTuple):
 class Work(NamedTuple):
     """Memory of compiled functions."""
 
-    arm: Memory
+    position: Float  # Shape (D,)
+    joints: Float  # Shape (J,)
+    placed: Placed
     places: Float  # A sphere in the frame of an obstacle before, at and after its closest instant, shape (3, 3), [m]
     local: Float  # Shape (3,), [m]
 
@@ -116,7 +118,8 @@ class Work(NamedTuple):
 @kernel
 def _place(given: Given, b: int, h: int, instant: int, work: Work) -> bool:
     """Place the arm at an instant of a movement, and return True within reach and joint ranges."""
-    return bool(place_at(given.setting, given.moves, b, h, instant, work.arm))
+    position, joints, placed = work.position, work.joints, work.placed
+    return bool(place_at(given.setting, given.moves, b, h, instant, position, joints, placed))
 
 
 @kernel
@@ -148,7 +151,7 @@ def _place_sphere(
     given: Given, b: int, h: int, row: int, group: int, sphere: int, instant: int, work: Work, local: Float
 ) -> bool:
     """Fill in a sphere's centre in the frame of an obstacle at an instant, and return True within reach."""
-    moves, placed = given.moves, work.arm.placed
+    moves, placed = given.moves, work.placed
     if not _place(given, b, h, instant, work):
         return False
     place_group(given.setting.spheres, group, placed)
@@ -236,7 +239,7 @@ def _gather(
     number, plans = moves.duration.shape
     rows, groups = obstacles.kind.shape[1], len(spheres.link)
     memory = memory_of(setting, moves.table, moves.start.shape[1])
-    work = Work(memory, np.empty((3, 3)), np.empty(3))
+    work = Work(memory.position, memory.joints, memory.placed, np.empty((3, 3)), np.empty(3))
     placed, local = memory.placed, work.local
     gap = np.empty((2, rows, groups))
     nearest_sphere, nearest_instant = np.empty(gap.shape, np.int64), np.empty(gap.shape, np.int64)

@@ -77,14 +77,15 @@ def _centres(setting: Setting, moves: Moves, instants: Int, some: Int, centre: S
     number, plans = moves.duration.shape
     spheres = setting.spheres
     memory = memory_of(setting, moves.table, moves.start.shape[1])
+    position, joints, placed = memory.position, memory.joints, memory.placed
     for b in range(number):
         for h in range(plans):
             for k in range(len(instants)):
-                if not place_at(setting, moves, b, h, instants[k], memory):
+                if not place_at(setting, moves, b, h, instants[k], position, joints, placed):
                     inside[b, h] = False
                     break
                 for group in range(len(spheres.link)):
-                    place_group(spheres, group, memory.placed)
+                    place_group(spheres, group, placed)
                 for i in range(len(some)):
                     for axis in range(3):
-                        centre[b, h, k, i, axis] = memory.placed.centre[some[i], axis]
+                        centre[b, h, k, i, axis] = placed.centre[some[i], axis]

@@ -14,7 +14,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.chain import Spheres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.clearance import place
+from viapoint.envs.geometry.clearance import Placed, place
 from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
@@ -26,7 +26,6 @@ from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.movements import (
     FINE_INSTANTS,
     INSTANTS,
-    Memory,
     Movement,
     MovementTable,
     Setting,
@@ -139,14 +138,23 @@ _joints_at = inlined(joints_at.py_func)  # type: ignore[attr-defined]
 
 
 @kernel
-def place_at(setting: Setting, moves: Moves, b: int, h: int, instant: int, memory: Memory) -> bool:
+def place_at(
+    setting: Setting,
+    moves: Moves,
+    b: int,
+    h: int,
+    instant: int,
+    position: Float,
+    joints: Float,
+    placed: Placed,
+) -> bool:
     """Place the arm at an instant of a plan, and return True within reach and joint ranges."""
-    if not _joints_at(setting, movement_of(moves, b, h), instant, memory.position, memory.joints):
+    if not _joints_at(setting, movement_of(moves, b, h), instant, position, joints):
         return False
     if setting.hand_alone:
-        place_hand(memory.position, memory.placed)
+        place_hand(position, placed)
     else:
-        place(setting.chain, setting.spheres, memory.joints, memory.placed)
+        place(setting.chain, setting.spheres, joints, placed)
     return True
 
 
