@@ -8,7 +8,8 @@ import pytest
 from viapoint.envs import Box
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.planning import ompl_paths, ompl_planner
+from viapoint.training.planning import ompl_paths
+from viapoint.training.planning import plan_motion as module
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems
 from viapoint.training.planning.ompl_paths import points_on
@@ -54,8 +55,8 @@ def test_every_link_of_the_whole_arm_clears():
 def test_where_there_is_no_way_it_gives_up(monkeypatch):
     """A ring of bars around the start."""
     pytest.importorskip("ompl")
-    monkeypatch.setattr(ompl_planner, "MARGINS", ompl_planner.MARGINS[:1])
-    monkeypatch.setattr(ompl_planner, "PATIENCE", 0.05)
+    monkeypatch.setattr(module, "OMPL_MARGINS", module.OMPL_MARGINS[:1])
+    monkeypatch.setattr(module, "OMPL_PATIENCE", 0.05)
     x, y = -0.25, 0.35
     across = [Box((0.01, 0.08, 0.04), position=(x + side, y, 0.0)) for side in (-0.07, 0.07)]
     along = [Box((0.08, 0.01, 0.04), position=(x, y + side, 0.0)) for side in (-0.07, 0.07)]

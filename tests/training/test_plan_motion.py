@@ -18,7 +18,7 @@ from viapoint.training.planning import refine
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems, read_problems
 from viapoint.training.planning.export import read_motion, write_motion
 from viapoint.training.planning.motion_plan import UnsafePlanError, execute_plans
-from viapoint.training.planning.movements import OUTSIDE, movement_table
+from viapoint.training.planning.movements import OUTSIDE, Movement, movement_table
 from viapoint.training.planning.search import registered_task
 from viapoint.training.scene_sets.scene_set import BANDS, scenes_for
 
@@ -161,10 +161,11 @@ def test_objective_does_not_depend_on_the_direction_of_time(kwargs) -> None:
             offsets = np.concatenate(((other - one)[None], nothing))
             found.append(
                 refine._assemble(
-                    setting._replace(spheres=spheres), table, 0, np.ascontiguousarray(one), offsets, 1.0, scene, 0,
-                    aim, 360.0, np.empty((0, 0)), np.empty(0), work,
+                    setting._replace(spheres=spheres),
+                    Movement(table, 0, np.ascontiguousarray(one), offsets, 1.0),
+                    *(scene, 0, aim, 360.0, np.empty((0, 0)), np.empty(0), work),
                 )[0]
-            )  # fmt: skip
+            )
     assert np.ptp(found) > 1.0
     np.testing.assert_allclose(found[::2], found[1::2], rtol=1e-9)
 
@@ -240,9 +241,8 @@ def test_gradient_of_the_objective(kwargs) -> None:
 
     def objective(problem, offsets) -> float:
         start, scene = problem
-        return refine._assemble(
-            setting, table, 80, start, offsets, 1.0, scene, 0, aim, 360.0, hessian, gradient, work
-        )[0]
+        movement = Movement(table, 80, start, offsets, 1.0)
+        return refine._assemble(setting, movement, scene, 0, aim, 360.0, hessian, gradient, work)[0]
 
     for start, goal, scene in zip(starts, goals, obstacles, strict=True):
         line = goal - start

@@ -13,12 +13,10 @@ from torch import Tensor, nn
 
 from viapoint.envs.geometry.obstacles import POSE_SIZE
 
+# Scale of positions, [1/m]: obstacles lie within a few decimetres of the line from start to goal
 POSITION_SCALE = 5.0
-"""Scale of positions, [1/m]: obstacles lie within a few decimetres of the line from start to goal."""
-MOST_POINTS = 256
-"""Greatest number of points of a sensor that are encoded."""
-SHORTEST = 1e-6
-"""Length below which the line from hand to goal has no direction, [m]."""
+MOST_POINTS = 256  # Greatest number of points of a sensor that are encoded
+SHORTEST = 1e-6  # Length below which the line from hand to goal has no direction, [m]
 
 
 class SceneExtractor(BaseFeaturesExtractor):
@@ -133,7 +131,3 @@ def _rows_of(box: spaces.Box) -> int:
 def _turned(axes: Tensor, vectors: Tensor) -> Tensor:
     """Return vectors of shape (..., D) in a frame of shape (..., D, D)."""
     return (axes * vectors.unsqueeze(-2)).sum(dim=-1)
-
-
-EXTRACTORS: dict[str, type[BaseFeaturesExtractor]] = {"SceneExtractor": SceneExtractor}
-"""Feature extractors by the name that model files use."""

@@ -35,29 +35,30 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.stored import keep_arm, with_kept_arm
 from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES
-from viapoint.training.agents.extractors import EXTRACTORS
+from viapoint.training.agents.extractors import SceneExtractor
 from viapoint.training.config.checks import check_arguments
 from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
 from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments
 
-ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
-    each.__name__: each for each in (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
+ACTIVATIONS = (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
+# Classes that model files name, by kind and name
+CLASSES: dict[str, dict[str, type[torch.nn.Module]]] = {
+    "activation": {each.__name__: each for each in ACTIVATIONS},
+    "extractor": {"SceneExtractor": SceneExtractor},
 }
-FORMAT = 1
-"""Version of the two files."""
+FORMAT = 1  # Version of the two files
+# Learning algorithms by their names on the command line; the modules that define them add them
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {}
-"""Learning algorithms by their names on the command line; the modules that define them add them."""
+# Arguments of algorithms that model files do not hold
 NOT_STORED = frozenset(
     {"self", "policy", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
     | {"stats_window_size", "monitor_wrapper", "sde_support", "support_multi_env", "supported_action_spaces"}
     | {"replay_buffer_class", "replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"}
 )
-"""Arguments of algorithms that model files do not hold."""
 
-LARGEST_MODEL_JSON = 1 << 20
-"""Greatest size of `model.json`, [bytes]."""
-LARGEST_WEIGHTS = 1 << 30
-"""Greatest size of `weights.safetensors`, [bytes]."""
+LARGEST_MODEL_JSON = 1 << 20  # Greatest size of `model.json`, [bytes]
+LARGEST_WEIGHTS = 1 << 30  # Greatest size of `weights.safetensors`, [bytes]
+# Greatest values in a file of those arguments of an environment that memory and time grow with
 LARGEST_ARGUMENTS = {
     "n_via": MOST_VIAS,
     "n_obstacles": MOST_OBSTACLES,
@@ -65,11 +66,9 @@ LARGEST_ARGUMENTS = {
     "height": 8192,
     "threads": 1024,
 }
-"""Greatest values in a file of those arguments of an environment that memory and time grow with."""
-ANY_TASK = "viapoint/Obstacles-v0"
-"""Id of an environment that can be any task."""
+ANY_TASK = "viapoint/Obstacles-v0"  # Id of an environment that can be any task
+# Number of parameters beyond its weights up to which a model is built, so that the error names the tensor
 SPARE_PARAMETERS = 100_000
-"""Number of parameters beyond its weights up to which a model is built, so that the error names the tensor."""
 
 
 def save_model(model: BaseAlgorithm, folder: Path) -> None:
@@ -107,10 +106,10 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
             hyperparameters["policy_kwargs"] = {**policy, "task": task}
         with warnings.catch_warnings(), parameter_budget(arrays):
             warnings.simplefilter("ignore", UserWarning)  # PPO's batches do not fill one environment
+            own = own_environment(record["env"], folder)
             if env is None:
                 hyperparameters = _to_decide(hyperparameters)
-            own = own_environment(record["env"], folder)
-            if env is not None:
+            else:
                 check_for_correct_spaces(env, own.observation_space, own.action_space)
             model = build(record["algorithm"], record["policy"], env or own, hyperparameters)
         model.num_timesteps = int(record["num_timesteps"])
@@ -136,15 +135,9 @@ def build(
     *,
     seed: int | None = None,
 ) -> BaseAlgorithm:
-    """Build a new model from plain values.
+    """Build a new model from the names of an algorithm and its policy, and hyperparameters as JSON values.
 
-    Args:
-        algorithm: Name of the algorithm, one of ALGORITHMS.
-        policy: Name of the policy.
-        env: Environment to learn on.
-        hyperparameters: Arguments of the algorithm; schedules, noise and activations as :func:`describe`
-            writes them.
-        seed: Seed of the algorithm.
+    Schedules, noise and activations are as :func:`describe` writes them.
 
     Raises:
         ValueError: There is no such algorithm, policy or hyperparameter.
@@ -324,10 +317,9 @@ def _encode(value: Any) -> Any:
         return _encode(value.base_noise)
     if isinstance(value, NormalActionNoise):
         return {"kind": "normal", "sigma": float(np.max(value._sigma))}
-    if isinstance(value, type) and value in ACTIVATIONS.values():
-        return {"kind": "activation", "name": value.__name__}
-    if isinstance(value, type) and value in EXTRACTORS.values():
-        return {"kind": "extractor", "name": value.__name__}
+    for kind, classes in CLASSES.items():
+        if isinstance(value, type) and value in classes.values():
+            return {"kind": kind, "name": value.__name__}
     if isinstance(value, Mapping):
         return {str(name): _encode(each) for name, each in value.items()}
     if hasattr(value, "frequency"):  # SB3's TrainFreq
@@ -354,10 +346,8 @@ def _decode(value: Any, size: int) -> Any:
             if not sigma >= 0.0:
                 raise ValueError(f"sigma of action_noise must be 0 or more, got {sigma}")
             return NormalActionNoise(np.zeros(size), np.full(size, sigma))
-        if kind == "activation":
-            return ACTIVATIONS[value["name"]]
-        if kind == "extractor":
-            return EXTRACTORS[value["name"]]
+        if kind in CLASSES:
+            return CLASSES[kind][value["name"]]
         if kind is not None:
             raise ValueError(f"kind must be linear, normal, activation or extractor, got {kind!r}")
         return {name: _decode(each, size) for name, each in value.items()}

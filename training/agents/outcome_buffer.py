@@ -12,27 +12,20 @@ from viapoint.envs.common.types import Single
 from viapoint.primitives.array_api import Array
 from viapoint.training.rollouts.vec_env import ELAPSED, TERMS
 
-LOWER = 1e-6
-"""Smallest decrease of the clearance term that counts as a decrease."""
+LOWER = 1e-6  # Smallest decrease of the clearance term that counts as a decrease
+# Largest difference between the reward and the sum of its terms that counts as rounding
 REWARD_TOLERANCE = 1e-4
-"""Largest difference between the reward and the sum of its terms that counts as rounding."""
 
 
 class Outcomes(NamedTuple):
     """Outcomes of N decisions, shape (N,) each; NaN if the environment reports only the sum of the terms."""
 
-    success: Array
-    """1 for success, otherwise 0."""
-    contact: Array
-    """1 if the arm touched an obstacle, otherwise 0."""
-    clearance: Array
-    """Clearance term of the reward, summed over the episode so far."""
-    lower: Array
-    """1 if this decision lowered that sum, so that no earlier decision accounts for it."""
-    goal_error: Array
-    """Goal-error term of the reward."""
-    effort_terms: Array
-    """Sum of the terms for smoothness and duration."""
+    success: Array  # 1 for success, otherwise 0
+    contact: Array  # 1 if the arm touched an obstacle, otherwise 0
+    clearance: Array  # Clearance term of the reward, summed over the episode so far
+    lower: Array  # 1 if this decision lowered that sum, so that no earlier decision accounts for it
+    goal_error: Array  # Goal-error term of the reward
+    effort_terms: Array  # Sum of the terms for smoothness and duration
 
 
 class OutcomeSamples(NamedTuple):
@@ -43,18 +36,13 @@ class OutcomeSamples(NamedTuple):
     next_observations: dict[str, Single]
     ended: Single
     reward: Single
+    # Duration of the executed part of the plan, [s]; infinite if the plan was executed to its end
     elapsed: Single
-    """Duration of the executed part of the plan, [s]; infinite if the plan was executed to its end."""
     outcomes: Outcomes
 
 
 class OutcomeReplayBuffer(DictReplayBuffer):
-    """Replay buffer for dictionary observations that stores the outcome of each decision from `info`.
-
-    Args:
-        *args: Arguments of :class:`stable_baselines3.common.buffers.DictReplayBuffer`.
-        **kwargs: Keyword arguments of the same class.
-    """
+    """Replay buffer for dictionary observations that stores the outcome of each decision from `info`."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -107,10 +95,7 @@ class OutcomeReplayBuffer(DictReplayBuffer):
 def outcome_of(info: Mapping[str, Any], reward: float, before: float = np.nan) -> tuple[float, ...]:
     """Return the outcome that `info` reports, or NaN if its terms do not sum to the reward.
 
-    Args:
-        info: Info of the decision.
-        reward: Reward of the decision.
-        before: Sum of the clearance terms of earlier decisions in the episode; NaN for the first decision.
+    The clearance terms of earlier decisions in the episode sum up to `before`; NaN for the first decision.
     """
     unknown = (np.nan,) * len(Outcomes._fields)
     if not all(name in info for name in TERMS):

@@ -21,48 +21,36 @@ from torch import Tensor, nn
 
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, place_group, self_clearance
-from viapoint.envs.geometry.clearance import memory as memory_of
 from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.obstacles import ABSENT, KINDS, MESH, Obstacles, bounding_boxes
 from viapoint.envs.task import Task
-from viapoint.training.planning.movements import INSTANTS, Setting, place_arm
-from viapoint.training.planning.problem import Moves, Problem, setting_of
+from viapoint.training.planning.movements import INSTANTS, Setting, memory_of
+from viapoint.training.planning.problem import Moves, Problem, place_at, setting_of
 
-SCALE = 8.0
-"""Scale of lengths at the input of the network, [1/m]."""
-UNIT = 0.05
-"""Length of one output unit of the network, [m]."""
+SCALE = 8.0  # Scale of lengths at the input of the network, [1/m]
+UNIT = 0.05  # Length of one output unit of the network, [m]
+# Number of the nearest pairs whose closest approach is found between the instants that are looked at
 REFINED = 6
-"""Number of the nearest pairs whose closest approach is found between the instants that are looked at."""
-STEPS = 2
-"""Greatest number of instants by which it may lie beside the nearest of them."""
-PARTS = 8
-"""Parts in which the way to the next instant is looked at."""
-NEAREST = 16
-"""Number of pairs of a movement that the network sees."""
-CLEAR = 0.1
-"""Greatest clearance of the arm from itself that matters, [m]."""
-NO_OBSTACLE = 1.0
-"""Margin in a scene without obstacles, [m]."""
-NOWHERE = 1e6
-"""Gap of a pair that does not exist, [m]."""
+STEPS = 2  # Greatest number of instants by which it may lie beside the nearest of them
+PARTS = 8  # Parts in which the way to the next instant is looked at
+NEAREST = 16  # Number of pairs of a movement that the network sees
+CLEAR = 0.1  # Greatest clearance of the arm from itself that matters, [m]
+NO_OBSTACLE = 1.0  # Margin in a scene without obstacles, [m]
+NOWHERE = 1e6  # Gap of a pair that does not exist, [m]
+# Lengths that describe a pair: centre of the sphere 3, half lengths of the obstacle 3, radius of the sphere 1
 LENGTHS = 7
-"""Lengths that describe a pair: centre of the sphere 3, half lengths of the obstacle 3, radius of the sphere 1."""
 
 
 class Pairs(NamedTuple):
     """Nearest pairs of H movements in each of B scenes."""
 
-    features: Tensor
-    """Lengths and kind of the obstacle, shape (B, H, P, LENGTHS + number of kinds)."""
+    features: Tensor  # Lengths and kind of the obstacle, shape (B, H, P, LENGTHS + number of kinds)
+    # Signed distances of the spheres' centres from the obstacles' bounding boxes, shape (B, H, P), [m]
     distance: Tensor
-    """Signed distances of the spheres' centres from the obstacles' bounding boxes, shape (B, H, P), [m]."""
-    present: Tensor
-    """True for pairs that exist, shape (B, H, P)."""
+    present: Tensor  # True for pairs that exist, shape (B, H, P)
+    # Computed clearance of the arm from itself, shape (B, H), at most CLEAR, [m]
     self_clearance: Tensor
-    """Computed clearance of the arm from itself, shape (B, H), at most CLEAR, [m]."""
-    inside: Tensor
-    """True for movements within reach and joint ranges, shape (B, H)."""
+    inside: Tensor  # True for movements within reach and joint ranges, shape (B, H)
 
     def to(self, device: torch.device) -> Pairs:
         """Return the same pairs on a device."""
@@ -78,12 +66,12 @@ def pairs_of(
     *,
     exact: bool = False,
 ) -> Pairs:
-    """Return the nearest pairs of movements.
+    """Return the nearest pairs of H movements in each of B problems.
 
     Args:
         task: Task.
-        problem: B problems.
-        moves: H movements in each of them.
+        problem: Problems.
+        moves: Movements.
         instants: Instants that are looked at, some of 0 to INSTANTS - 1 in increasing order.
         until: Time after which instants do not count, shape (B, H), [s]; the first instant always counts.
         exact: True for movements as they are executed, see :func:`~viapoint.training.planning.problem.moves_of`.
@@ -93,7 +81,7 @@ def pairs_of(
     number, plans = moves.duration.shape
     late = np.full((number, plans), np.inf) if until is None else until
     setting = setting_of(task, obstacles, exact=exact)
-    given = Given(setting, problem.start, moves, obstacles, *bounding_boxes(obstacles))
+    given = Given(setting, moves, obstacles, *bounding_boxes(obstacles))
     features = np.zeros((number, plans, NEAREST, LENGTHS + len(task.shapes)), np.float32)
     gaps = np.full((number, plans, NEAREST), NOWHERE)
     least, inside = np.full((number, plans), CLEAR), np.ones((number, plans), np.bool_)
@@ -111,39 +99,27 @@ class Given(NamedTuple):
     """Movements and obstacles, as compiled functions take them."""
 
     setting: Setting
-    start: Float
-    """Present references, shape (B, D)."""
     moves: Moves
     obstacles: Obstacles
-    centre: Float
-    """Centres of the obstacles' bounding boxes, shape (B, n, 3), [m]."""
-    half: Float
-    """Their half lengths, shape (B, n, 3), [m]."""
+    centre: Float  # Centres of the obstacles' bounding boxes, shape (B, n, 3), [m]
+    half: Float  # Their half lengths, shape (B, n, 3), [m]
 
 
-class Memory(NamedTuple):
+class Work(NamedTuple):
     """Memory of compiled functions."""
 
-    position: Float
-    """Shape (D,)."""
-    joints: Float
-    """Shape (J,)."""
+    position: Float  # Shape (D,)
+    joints: Float  # Shape (J,)
     placed: Placed
-    places: Float
-    """Places of a sphere in the frame of an obstacle: before, at and after its closest instant, shape (3, 3), [m]."""
-    local: Float
-    """Shape (3,), [m]."""
+    places: Float  # A sphere in the frame of an obstacle before, at and after its closest instant, shape (3, 3), [m]
+    local: Float  # Shape (3,), [m]
 
 
 @kernel
-def _arm_at(given: Given, b: int, h: int, instant: int, memory: Memory) -> bool:
+def _place(given: Given, b: int, h: int, instant: int, work: Work) -> bool:
     """Place the arm at an instant of a movement, and return True within reach and joint ranges."""
-    setting, moves = given.setting, given.moves
-    position, joints, placed = memory.position, memory.joints, memory.placed
-    offsets, times = moves.offsets[b, h], moves.times[b, h]
-    return bool(
-        place_arm(setting, moves.table, times, instant, given.start[b], offsets, position, joints, placed)
-    )
+    position, joints, placed = work.position, work.joints, work.placed
+    return bool(place_at(given.setting, given.moves, b, h, instant, position, joints, placed))
 
 
 @kernel
@@ -172,22 +148,14 @@ def _gap(local: Float, half: Float, rounded: int) -> float:
 
 @kernel
 def _place_sphere(
-    given: Given,
-    b: int,
-    h: int,
-    row: int,
-    group: int,
-    sphere: int,
-    instant: int,
-    memory: Memory,
-    local: Float,
+    given: Given, b: int, h: int, row: int, group: int, sphere: int, instant: int, work: Work, local: Float
 ) -> bool:
     """Fill in a sphere's centre in the frame of an obstacle at an instant, and return True within reach."""
-    if not _arm_at(given, b, h, instant, memory):
+    moves, placed = given.moves, work.placed
+    if not _place(given, b, h, instant, work):
         return False
-    place_group(given.setting.spheres, group, memory.placed)
-    time = given.moves.duration[b, h] * instant / (INSTANTS - 1)
-    _local(given, b, row, memory.placed.centre[sphere], time, local)
+    place_group(given.setting.spheres, group, placed)
+    _local(given, b, row, placed.centre[sphere], moves.duration[b, h] * instant / (INSTANTS - 1), local)
     return True
 
 
@@ -202,14 +170,14 @@ def _go_closest(
     instant: int,
     last: int,
     rounded: int,
-    memory: Memory,
+    work: Work,
 ) -> None:
     """Move the middle of the places, a sphere's centre at an instant, to where sphere and obstacle are closest.
 
     The search goes to the nearest instants beside it, up to the last one that counts, and then along a parabola through
     the places at three instants.
     """
-    places, half = memory.places, given.half[b, row]
+    places, half = work.places, given.half[b, row]
     least = _gap(places[1], half, rounded)
     before, after = False, False  # True if the place beside is known
     for step in range(-1, 2, 2):
@@ -217,7 +185,7 @@ def _go_closest(
             other = instant + step
             if other < 0 or other > last:
                 break
-            if not _place_sphere(given, b, h, row, group, sphere, other, memory, places[1 + step]):
+            if not _place_sphere(given, b, h, row, group, sphere, other, work, places[1 + step]):
                 break
             beside = _gap(places[1 + step], half, rounded)
             nearer = beside < least
@@ -236,13 +204,13 @@ def _go_closest(
         return
     best = 0.0
     for k in range(-PARTS, PARTS + 1):
-        _along(places, k / PARTS, memory.local)
-        apart = _gap(memory.local, half, rounded)
+        _along(places, k / PARTS, work.local)
+        apart = _gap(work.local, half, rounded)
         if apart < least:
             least, best = apart, k / PARTS
-    _along(places, best, memory.local)
+    _along(places, best, work.local)
     for axis in range(3):
-        places[1, axis] = memory.local[axis]
+        places[1, axis] = work.local[axis]
 
 
 @kernel
@@ -266,13 +234,13 @@ def _gather(
     inside: Bool,
 ) -> None:
     """Fill in the nearest pairs of movements, see :func:`pairs_of`."""
-    moves, obstacles, spheres = given.moves, given.obstacles, given.setting.spheres
+    setting, moves, obstacles = given.setting, given.moves, given.obstacles
+    spheres = setting.spheres
     number, plans = moves.duration.shape
     rows, groups = obstacles.kind.shape[1], len(spheres.link)
-    placed = memory_of(given.setting.chain, spheres)
-    position, joints = np.empty(given.start.shape[1]), np.empty(len(given.setting.joint_range))
-    memory = Memory(position, joints, placed, np.empty((3, 3)), np.empty(3))
-    local = memory.local
+    memory = memory_of(setting, moves.table, moves.start.shape[1])
+    work = Work(memory.position, memory.joints, memory.placed, np.empty((3, 3)), np.empty(3))
+    placed, local = memory.placed, work.local
     gap = np.empty((2, rows, groups))
     nearest_sphere, nearest_instant = np.empty(gap.shape, np.int64), np.empty(gap.shape, np.int64)
     for b in range(number):
@@ -284,7 +252,7 @@ def _gather(
                 time = moves.duration[b, h] * instant / (INSTANTS - 1)
                 if k > 0 and time > until[b, h]:
                     break
-                if not _arm_at(given, b, h, instant, memory):
+                if not _place(given, b, h, instant, work):
                     inside[b, h] = False
                     break
                 last = instant
@@ -320,14 +288,14 @@ def _gather(
                     break
                 gap[rounded, row, group] = NOWHERE
                 sphere, instant = nearest_sphere[rounded, row, group], nearest_instant[rounded, row, group]
-                _place_sphere(given, b, h, row, group, sphere, instant, memory, memory.places[1])
+                _place_sphere(given, b, h, row, group, sphere, instant, work, work.places[1])
                 if pair < REFINED and inside[b, h]:
-                    _go_closest(given, b, h, row, group, sphere, instant, last, rounded, memory)
+                    _go_closest(given, b, h, row, group, sphere, instant, last, rounded, work)
                 half = given.half[b, row]
-                gaps[b, h, pair] = _gap(memory.places[1], half, 0)
+                gaps[b, h, pair] = _gap(work.places[1], half, 0)
                 kind = obstacles.kind[b, row]
                 for axis in range(3):
-                    there = memory.places[1, axis]
+                    there = work.places[1, axis]
                     # Kinds without a table of vertices or points look the same when an axis is reversed.
                     features[b, h, pair, axis] = abs(there) if kind < MESH else there
                     features[b, h, pair, 3 + axis] = half[axis]
@@ -336,12 +304,7 @@ def _gather(
 
 
 class PairNetwork(nn.Module):
-    """Network of a pair, whose minimum over the pairs of a movement is the learned margin.
-
-    Args:
-        kinds: Number of kinds of obstacles.
-        width: Width of the two hidden layers.
-    """
+    """Network of a pair, whose minimum over the pairs of a movement is the learned margin."""
 
     def __init__(self, kinds: int, width: int) -> None:
         super().__init__()

@@ -27,15 +27,11 @@ Numbers = NDArray[np.floating[Any]]
 class PlanPolicy(BasePolicy):
     """Policy without an actor: :meth:`decide` ranks candidate plans.
 
-    Args:
-        observation_space: Observation space of the environment.
-        action_space: Action space of the environment.
-        task: Task of the environment as plain values, see :meth:`viapoint.envs.task.Task.as_dict`.
-        own: Further arguments of the subclass, which become attributes.
-        optimizer_class: Optimizer of the network.
-        optimizer_kwargs: Its arguments.
-        **kwargs: Arguments of the base class.
+    Subclasses set their attributes and check them. `task` holds plain values, see
+    :meth:`viapoint.envs.task.Task.as_dict`.
     """
+
+    OWN: tuple[str, ...]  # Names of further arguments of the subclass, which become attributes
 
     def __init__(
         self,
@@ -43,23 +39,13 @@ class PlanPolicy(BasePolicy):
         action_space: spaces.Box,
         *,
         task: Mapping[str, Any],
-        own: Mapping[str, Any],
-        optimizer_class: type[torch.optim.Optimizer],
-        optimizer_kwargs: dict[str, Any] | None,
         **kwargs: Any,
     ) -> None:
-        check_arguments(type(self), own)
-        super().__init__(
-            observation_space,
-            action_space,
-            optimizer_class=optimizer_class,
-            optimizer_kwargs=optimizer_kwargs,
-            **kwargs,
-        )
+        super().__init__(observation_space, action_space, **kwargs)
         self.task = Task.from_dict(task)
-        self._own = tuple(own)
-        for name, value in own.items():
-            setattr(self, name, value)
+
+    def _own(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.OWN}
 
     def _make_optimizer(self, network: torch.nn.Module, lr_schedule: Any) -> None:
         """Create the optimizer of the network."""
@@ -70,9 +56,8 @@ class PlanPolicy(BasePolicy):
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        own = {name: getattr(self, name) for name in self._own}
         always = {"task": self.task.as_dict(), "lr_schedule": self._dummy_schedule}
-        return {**super()._get_constructor_parameters(), **own, **always}
+        return {**super()._get_constructor_parameters(), **self._own(), **always}
 
     @abstractmethod
     def decide(self, observation: Observation) -> Numbers:
@@ -131,15 +116,11 @@ class PlanPolicy(BasePolicy):
 class PlanAlgorithm(Agent, OffPolicyAlgorithm):
     """Off-policy algorithm that trains a policy that ranks plans.
 
-    Args:
-        policy: Name or class of the policy.
-        env: Environment or vector environment of this package.
-        learning_rate: Learning rate, or a function of the remaining progress.
-        own: Names of attributes of the subclass that are hyperparameters.
-        policy_kwargs: Arguments of the policy; `env` provides the task.
-        _init_setup_model: False to set up the model later.
-        **kwargs: Arguments of the base class.
+    `own` names the attributes of the subclass that are hyperparameters.
     """
+
+    LARGEST_GRADIENT: float  # Norm to which gradients are clipped
+    policy: Any
 
     def __init__(
         self,
@@ -194,6 +175,33 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
         self._check_env(wrapped)
         super().set_env(wrapped, force_reset)
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Update the network `gradient_steps` times."""
+        policy = self.policy
+        policy.set_training_mode(True)
+        self._update_learning_rate(policy.optimizer)
+        rows = []
+        for _ in range(gradient_steps):
+            losses = self._sampled_losses(batch_size)
+            total: Any = sum(losses.values())
+            policy.optimizer.zero_grad()
+            total.backward()
+            torch.nn.utils.clip_grad_norm_(policy.network.parameters(), self.LARGEST_GRADIENT)
+            policy.optimizer.step()
+            self._after_update()
+            rows.append([float(loss.detach()) for loss in losses.values()])
+            self._n_updates += 1
+        for name, value in zip(losses, np.mean(rows, axis=0), strict=True):
+            self.logger.record(f"train/{name}", float(value))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    @abstractmethod
+    def _sampled_losses(self, batch_size: int) -> dict[str, Tensor]:
+        """Return the losses of sampled decisions or scenes, by their names in the log."""
+
+    def _after_update(self) -> None:
+        """Follow an update of the network."""
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor"]

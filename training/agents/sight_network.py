@@ -25,27 +25,21 @@ from viapoint.training.planning.places import OUT_OF_VIEW, instants_of, places_o
 from viapoint.training.planning.problem import Numbers, Problem, moves_of, worth_of
 from viapoint.training.planning.search import plan_clearances
 
-DEEP, SHALLOW = 0.4, 0.05
-"""Depths behind a surface at which two of the inputs saturate, [m]."""
+DEEP, SHALLOW = 0.4, 0.05  # Depths behind a surface at which two of the inputs saturate, [m]
+# Pixels in whose square a place is compared with the nearest surface, to find the places that matter
 NEIGHBOURS = 7
-"""Pixels in whose square a place is compared with the nearest surface, to find the places that matter."""
-CLEAR = 0.05
-"""Clearance at which its input saturates, [m]."""
-FEATURES = 9
-"""Inputs of a place besides the features of its pixel."""
+CLEAR = 0.05  # Clearance at which its input saturates, [m]
+FEATURES = 9  # Inputs of a place besides the features of its pixel
 
 
 class SightInputs(NamedTuple):
     """Inputs of the network for H movements in each of B scenes."""
 
+    # Ranges relative to the greatest, hits, and places of the pixels in the image, shape (B, 4, rows, columns)
     image: Tensor
-    """Ranges relative to the greatest, hits, and places of the pixels in the image, shape (B, 4, rows, columns)."""
-    pixel: Tensor
-    """Pixels in whose direction P places lie, shape (B, H, P), int64."""
-    places: Tensor
-    """Other inputs of these places, shape (B, H, P, FEATURES)."""
-    plans: Tensor
-    """Inputs of whole movements: clearance by the belief, reach, shape (B, H, 2)."""
+    pixel: Tensor  # Pixels in whose direction P places lie, shape (B, H, P), int64
+    places: Tensor  # Other inputs of these places, shape (B, H, P, FEATURES)
+    plans: Tensor  # Inputs of whole movements: clearance by the belief, reach, shape (B, H, 2)
 
     def take(self, chosen: Tensor) -> SightInputs:
         """Return the inputs of some of the movements, by indices of shape (B, h)."""
@@ -62,15 +56,10 @@ class SightInputs(NamedTuple):
 def sight_inputs(
     task: Task, problem: Problem, sight: Sight, actions: Numbers, instants: int, nearest: int
 ) -> tuple[SightInputs, Single]:
-    """Return the inputs of the network for actions, and the rewards of actions that succeed, shape (B, H).
+    """Return the inputs of the network for actions, shape (B, H, m), and the rewards of those that succeed, (B, H).
 
-    Args:
-        task: Task with a sensor.
-        problem: B problems with the obstacles that are believed to be there.
-        sight: Readings of B scenes.
-        actions: Actions, shape (B, H, m).
-        instants: Number of instants that are looked at.
-        nearest: Number P of places that the network sees: those nearest to surfaces, or deepest behind them.
+    The problems have the obstacles that are believed to be there. Of all places at some instants, the network sees the
+    ones that are nearest to surfaces, or deepest behind them.
     """
     sensor = task.sensor
     assert sensor is not None
@@ -138,12 +127,7 @@ def _image(sensor: Sensor, sight: Sight) -> Tensor:
 
 
 class SightNetwork(nn.Module):
-    """Network of the logit of success, see :mod:`viapoint.training.agents.sight_network`.
-
-    Args:
-        sensor: Sensor of the task.
-        width: Number of features of a pixel, and of outputs of a place.
-    """
+    """Network of the logit of success; `width` is the number of features of a pixel, and of outputs of a place."""
 
     DILATIONS = (2, 4, 8, 1)
 

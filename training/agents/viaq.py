@@ -28,16 +28,15 @@ from viapoint.training.agents.viaq_policy import KEEP, ViaQPolicy
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.problem import Problem
 
+# Parts of the task that agent and environment must share, because the policy plans with them
 FIXED_PARTS = ("arm", "space", "n_via", "timing", "duration_range", "shapes")
-"""Parts of the task that agent and environment must share, because the policy plans with them."""
+# Unit of errors of the clearance term, as a share of the weight of the term: 2 cm
 CLEARANCE_SCALE = 0.4
-"""Unit of errors of the clearance term, as a share of the weight of the term: 2 cm."""
+# Share of the weight of the clearance term by which the obstacles must be nearer than the arm itself: 1 mm
 OWN_SHARE = 0.02
-"""Share of the weight of the clearance term by which the obstacles must be nearer than the arm itself: 1 mm."""
-KEEP_PROBABILITY = 0.5
-"""Probability that a random decision in a replanning task keeps the plan."""
+KEEP_PROBABILITY = 0.5  # Probability that a random decision in a replanning task keeps the plan
+# Weight of the contact loss; the clearance loss carries finer information on the same event
 CONTACT_WEIGHT = 0.1
-"""Weight of the contact loss; the clearance loss carries finer information on the same event."""
 
 
 class ViaQ(PlanAlgorithm):
@@ -75,6 +74,7 @@ class ViaQ(PlanAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ViaQPolicy": ViaQPolicy}
+    LARGEST_GRADIENT = 10.0
     policy: ViaQPolicy
     replay_buffer: OutcomeReplayBuffer | None
 
@@ -127,7 +127,20 @@ class ViaQ(PlanAlgorithm):
         return prepared
 
     def _task_of(self, env: VecEnv) -> Task:
-        return task_of(env)
+        try:
+            task = env.get_attr("task", indices=0)[0]
+        except AttributeError:
+            task = None
+        if not isinstance(task, Task) or task.stepwise:
+            raise ValueError(
+                "ViaQ needs an environment of this package in which an action is a whole movement, such as "
+                f"viapoint/PlanarObstacles-v0; got {env.observation_space} with {env.action_space}"
+            )
+        if task.sensor is not None:
+            raise ValueError(
+                "viaq needs the obstacles; where a sensor sees them, viarank learns to place via-points"
+            )
+        return task
 
     def _check_task(self, mine: Task, theirs: Task) -> None:
         before, after = mine.as_dict(), theirs.as_dict()
@@ -144,36 +157,22 @@ class ViaQ(PlanAlgorithm):
         if normalized is not None and normalized.norm_obs:
             raise ValueError("ViaQ computes with metres: VecNormalize must be made with norm_obs=False")
 
-    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
-        """Update the critic `gradient_steps` times."""
+    def _sampled_losses(self, batch_size: int) -> dict[str, Tensor]:
         assert self.replay_buffer is not None
-        self.policy.set_training_mode(True)
-        self._update_learning_rate(self.policy.optimizer)
-        losses = []
-        for _ in range(gradient_steps):
-            parts = self._losses(self.replay_buffer.sample_outcomes(batch_size))
-            loss: Any = sum(parts.values())
-            self.policy.optimizer.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(self.policy.critic.parameters(), 10.0)
-            self.policy.optimizer.step()
-            if self.policy.critic_target is not None:
-                polyak_update(
-                    self.policy.critic.parameters(), self.policy.critic_target.parameters(), self.tau
-                )
-            losses.append([float(part.detach()) for part in parts.values()])
-            self._n_updates += 1
-        for name, value in zip(parts, np.mean(losses, axis=0), strict=True):
-            self.logger.record(f"train/{name}_loss", float(value))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        losses = self._losses(self.replay_buffer.sample_outcomes(batch_size))
+        return {f"{name}_loss": loss for name, loss in losses.items()}
+
+    def _after_update(self) -> None:
+        target = self.policy.critic_target
+        if target is not None:
+            polyak_update(self.policy.critic.parameters(), target.parameters(), self.tau)
 
     def _losses(self, batch: OutcomeSamples) -> dict[str, Tensor]:
         """Return the losses of the predictions of the critic by name."""
         policy, critic = self.policy, self.policy.critic
         until = None
-        if (
-            policy.replanning
-        ):  # after a contact, the clearance is that of the movement up to the next decision
+        if policy.replanning:
+            # After a contact, the clearance is that of the movement up to the next decision.
             until = batch.elapsed + policy.task.horizon * (batch.outcomes.contact > 0.5)
             until = until[:, None].astype(np.float64)
         problem = Problem.of_observation(batch.observations, policy.task)
@@ -194,18 +193,13 @@ class ViaQ(PlanAlgorithm):
             "clearance": self._clearance_loss(values, outcomes, known),
             "contact": CONTACT_WEIGHT * _mean(_cross_entropy(values.no_contact, 1.0 - contact), carried_out),
             "arrival": _mean(_cross_entropy(values.arrival, arrival), known & (contact < 0.5)),
-            "effort": 10.0
-            * _mean(
-                functional.smooth_l1_loss(values.effort_terms, effort, beta=0.1, reduction="none"), known
-            ),
+            "effort": 10.0 * _mean(_smooth_l1(values.effort_terms, effort, beta=0.1), known),
         }
         if not bool(known.all()):
             target = torch.from_numpy(batch.reward).to(device)
             if following is not None:
                 target = target + goes_on * critic.value(following).detach()
-            losses["reward"] = _mean(
-                functional.smooth_l1_loss(critic.value(values), target, beta=0.2, reduction="none"), ~known
-            )
+            losses["reward"] = _mean(_smooth_l1(critic.value(values), target, beta=0.2), ~known)
         return losses
 
     def _clearance_loss(self, values: Values, outcomes: Outcomes, known: Tensor) -> Tensor:
@@ -220,9 +214,7 @@ class ViaQ(PlanAlgorithm):
         own = critic.clearance_term(values.self_clearance).detach()
         obstacles = (outcomes.lower > 0.5) & (outcomes.clearance < own - OWN_SHARE * weight)
         apart = torch.where(obstacles, apart, apart.clamp(max=0.0))
-        return _mean(
-            functional.smooth_l1_loss(apart, torch.zeros_like(apart), beta=0.2, reduction="none"), known
-        )
+        return _mean(_smooth_l1(apart, torch.zeros_like(apart), beta=0.2), known)
 
     @torch.no_grad()
     def _following(self, batch: OutcomeSamples) -> Values | None:
@@ -266,28 +258,6 @@ class ViaQ(PlanAlgorithm):
         return actions, actions
 
 
-def task_of(env: VecEnv) -> Task:
-    """Return the task of an environment whose actions are whole movements.
-
-    Raises:
-        ValueError: The environment is not of this package, or an action lasts one control step.
-    """
-    try:
-        task = env.get_attr("task", indices=0)[0]
-    except AttributeError:
-        task = None
-    if not isinstance(task, Task) or task.stepwise:
-        raise ValueError(
-            "ViaQ needs an environment of this package in which an action is a whole movement, such as "
-            f"viapoint/PlanarObstacles-v0; got {env.observation_space} with {env.action_space}"
-        )
-    if task.sensor is not None:
-        raise ValueError(
-            "viaq needs the obstacles; where a sensor sees them, viarank learns to place via-points"
-        )
-    return task
-
-
 def _mean(losses: Tensor, counted: Tensor) -> Tensor:
     """Return the mean over all rows, with zero for rows that are not counted."""
     return (losses * counted).mean()
@@ -295,6 +265,10 @@ def _mean(losses: Tensor, counted: Tensor) -> Tensor:
 
 def _cross_entropy(logits: Tensor, target: Tensor) -> Tensor:
     return functional.binary_cross_entropy_with_logits(logits, target, reduction="none")
+
+
+def _smooth_l1(values: Tensor, target: Tensor, beta: float) -> Tensor:
+    return functional.smooth_l1_loss(values, target, beta=beta, reduction="none")
 
 
 ALGORITHMS["viaq"] = ViaQ

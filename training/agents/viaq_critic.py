@@ -3,56 +3,43 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
+from viapoint.envs.task import Task
 from viapoint.training.agents.pairs import PairNetwork, Pairs
 
-if TYPE_CHECKING:
-    from viapoint.envs.task import Task
-
+# Number of effort features: log jerk, duration, log duration, and spare time if time is limited
 EFFORT = 4
-"""Number of effort features: log jerk, duration, log duration, and spare time if time is limited."""
-IN_TIME = 20.0
-"""Logits of arrival for each second of spare time in tasks with a time limit, [1/s]."""
+IN_TIME = 20.0  # Logits of arrival for each second of spare time in tasks with a time limit, [1/s]
+# Logits of arrival that a movement beyond reach or joint ranges loses: it is not executed
 OUTSIDE = 20.0
-"""Logits of arrival that a movement beyond reach or joint ranges loses: it is not executed."""
+# Penalty on the merit of plans that are unlikely to succeed; larger than the range of Q
 UNLIKELY = 10.0
-"""Penalty on the merit of plans that are unlikely to succeed; larger than the range of Q."""
 
 
 class Values(NamedTuple):
     """Predictions of the critic for H plans in each of B scenes, shape (B, H) each."""
 
-    margin: Tensor
-    """Predicted clearance from obstacles, [m]."""
-    self_clearance: Tensor
-    """Computed clearance of the arm from itself, [m]."""
-    no_contact: Tensor
-    """Logit of the probability of no contact."""
-    arrival: Tensor
-    """Logit of the probability of success given no contact."""
-    clearance: Tensor
-    """Predicted clearance term of the reward."""
-    effort_terms: Tensor
-    """Predicted sum of the terms for smoothness and duration."""
+    margin: Tensor  # Predicted clearance from obstacles, [m]
+    self_clearance: Tensor  # Computed clearance of the arm from itself, [m]
+    no_contact: Tensor  # Logit of the probability of no contact
+    arrival: Tensor  # Logit of the probability of success given no contact
+    clearance: Tensor  # Predicted clearance term of the reward
+    effort_terms: Tensor  # Predicted sum of the terms for smoothness and duration
 
 
 class PlanInputs(NamedTuple):
     """Inputs of the critic for H plans in each of B scenes."""
 
-    ends: Tensor
-    """Start, goal and, in replanning tasks, the present motion, shape (B, E)."""
-    actions: Tensor
-    """Shape (B, H, m)."""
-    effort: Tensor
-    """Shape (B, H, EFFORT)."""
-    pairs: Pairs
-    """Nearest pairs of spheres and obstacles."""
+    ends: Tensor  # Start, goal and, in replanning tasks, the present motion, shape (B, E)
+    actions: Tensor  # Shape (B, H, m)
+    effort: Tensor  # Shape (B, H, EFFORT)
+    pairs: Pairs  # Nearest pairs of spheres and obstacles
 
 
 class _Saturated(torch.autograd.Function):

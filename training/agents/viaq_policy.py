@@ -20,25 +20,21 @@ from viapoint.envs.task import Task
 from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.agents.plan_agent import Numbers, Observation, PlanPolicy
 from viapoint.training.agents.viaq_critic import PlanInputs, ViaQCritic
+from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.candidates import candidate_actions, normal_steps
 from viapoint.training.planning.movements import FINE_INSTANTS, INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import INFEASIBLE, VERIFIED, best_of, merits, refined_actions
 
-KEEP = 0.1
-"""Minimum gain of Q for which a running plan is revised."""
-N_ELITES = 8
-"""Number of candidates around which each round of refinement samples."""
+KEEP = 0.1  # Minimum gain of Q for which a running plan is revised
+N_ELITES = 8  # Number of candidates around which each round of refinement samples
+# Standard deviation of the first round of refinement, in the action space; each round halves it
 SPREAD = 0.15
-"""Standard deviation of the first round of refinement, in the action space; each round halves it."""
+# Greatest number of proposals that are checked; all further checks are of plans around the best of them
 PROPOSALS = 32
-"""Greatest number of proposals that are checked; all further checks are of plans around the best of them."""
-LOCAL_ROUNDS = 4
-"""Rounds of checks around the best checked plans."""
-BLOCK = 64
-"""Scenes that are decided together."""
-MOTION_SCALES = (1.0, 0.1)
-"""Scales of velocity and acceleration at the input of the critic."""
+LOCAL_ROUNDS = 4  # Rounds of checks around the best checked plans
+BLOCK = 64  # Scenes that are decided together
+MOTION_SCALES = (1.0, 0.1)  # Scales of velocity and acceleration at the input of the critic
 
 
 class ViaQPolicy(PlanPolicy):
@@ -59,13 +55,7 @@ class ViaQPolicy(PlanPolicy):
             is taken after an exact check; 0 for none. Only for tasks whose actions are whole movements.
     """
 
-    width: int
-    instants: int
-    candidates: int
-    refinements: int
-    per_refinement: int
-    checks: int
-    refine: int
+    OWN = "width", "instants", "candidates", "refinements", "per_refinement", "checks", "refine"
 
     def __init__(
         self,
@@ -81,27 +71,17 @@ class ViaQPolicy(PlanPolicy):
         per_refinement: int = 64,
         checks: int = 0,
         refine: int = 0,
-        optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
-        optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        super().__init__(
-            observation_space,
-            action_space,
-            task=task,
-            own={
-                "width": width,
-                "instants": instants,
-                "candidates": candidates,
-                "refinements": refinements,
-                "per_refinement": per_refinement,
-                "checks": checks,
-                "refine": refine,
-            },
-            optimizer_class=optimizer_class,
-            optimizer_kwargs=optimizer_kwargs,
-            **kwargs,
-        )
+        super().__init__(observation_space, action_space, task=task, **kwargs)
+        self.width = width
+        self.instants = instants
+        self.candidates = candidates
+        self.refinements = refinements
+        self.per_refinement = per_refinement
+        self.checks = checks
+        self.refine = refine
+        check_arguments(type(self), self._own())
         self.replanning = self.task.replanning
         self._check_refine()
         self.critic = self.make_critic()
@@ -110,6 +90,11 @@ class ViaQPolicy(PlanPolicy):
             self.critic_target.load_state_dict(self.critic.state_dict())
             self.critic_target.requires_grad_(False)
         self._make_optimizer(self.critic, lr_schedule)
+
+    @property
+    def network(self) -> ViaQCritic:
+        """Network that is trained."""
+        return self.critic
 
     def make_critic(self) -> ViaQCritic:
         """Return a new critic for the task."""
@@ -132,12 +117,9 @@ class ViaQPolicy(PlanPolicy):
         return np.linspace(0, INSTANTS - 1, min(self.instants, INSTANTS)).round().astype(np.int64)
 
     def inputs(self, problem: Problem, actions: Numbers, until: Float | None = None) -> PlanInputs:
-        """Return the critic's inputs for H actions in each of B problems.
+        """Return the critic's inputs for actions of shape (B, H, m) in B problems.
 
-        Args:
-            problem: B problems.
-            actions: Shape (B, H, m).
-            until: Time after which contact does not count, shape (B, H), [s].
+        After the times `until`, shape (B, H), [s], contact does not count.
         """
         moves = moves_of(self.task, problem, actions)
         spare = np.zeros_like(moves.duration)

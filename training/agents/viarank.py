@@ -23,6 +23,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
 from torch.nn import functional
 
 from viapoint.envs.common.types import Float
@@ -31,6 +32,7 @@ from viapoint.envs.task import Task
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.plan_agent import Observation, PlanAlgorithm, PlanPolicy
 from viapoint.training.agents.sight_network import SightInputs, SightNetwork, sight_inputs
+from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.problem import Numbers, Problem
@@ -40,14 +42,11 @@ from viapoint.training.planning.search import (
     refined_actions,
 )
 
-EFFORT_WEIGHT = 0.05
-"""Weight of the reward of a successful plan beside its probability of success."""
+EFFORT_WEIGHT = 0.05  # Weight of the reward of a successful plan beside its probability of success
+# First part of the seeds of scenes for the calibration, far from those of training, and their number
 CALIBRATION, CALIBRATION_SCENES = 3_000_017, 320
-"""First part of the seeds of scenes for the calibration, far from those of training, and their number."""
-SAME_RAY = 0.02
-"""Greatest distance of a point from the ray of the sensor, [m]."""
-BLOCK = 16
-"""Scenes that are decided together."""
+SAME_RAY = 0.02  # Greatest distance of a point from the ray of the sensor, [m]
+BLOCK = 16  # Scenes that are decided together
 
 
 class ViaRankPolicy(PlanPolicy):
@@ -65,11 +64,7 @@ class ViaRankPolicy(PlanPolicy):
         refine: Number of best candidates that the planner refines around what is seen; they are ranked, too.
     """
 
-    width: int
-    instants: int
-    nearest: int
-    candidates: int
-    refine: int
+    OWN = "width", "instants", "nearest", "candidates", "refine"
 
     def __init__(
         self,
@@ -83,25 +78,15 @@ class ViaRankPolicy(PlanPolicy):
         nearest: int = 16,
         candidates: int = 512,
         refine: int = 0,
-        optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
-        optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        super().__init__(
-            observation_space,
-            action_space,
-            task=task,
-            own={
-                "width": width,
-                "instants": instants,
-                "nearest": nearest,
-                "candidates": candidates,
-                "refine": refine,
-            },
-            optimizer_class=optimizer_class,
-            optimizer_kwargs=optimizer_kwargs,
-            **kwargs,
-        )
+        super().__init__(observation_space, action_space, task=task, **kwargs)
+        self.width = width
+        self.instants = instants
+        self.nearest = nearest
+        self.candidates = candidates
+        self.refine = refine
+        check_arguments(type(self), self._own())
         if self.task.sensor is None or not self.task.whole_movement:
             raise ValueError(
                 "viarank needs a task with a sensor whose actions are whole movements, such as viapoint/PlanarSensed-v0"
@@ -116,12 +101,9 @@ class ViaRankPolicy(PlanPolicy):
 
     @torch.no_grad()
     def rank(self, problem: Problem, sight: Sight, actions: Numbers) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return ranking criterion and probability of success of actions, shape (B, H) each.
+        """Return ranking criterion and probability of success of actions of shape (B, H, m), shape (B, H) each.
 
-        Args:
-            problem: B problems with the obstacles that are believed to be there.
-            sight: Their readings.
-            actions: Actions, shape (B, H, m).
+        The problems have the obstacles that are believed to be there.
         """
         inputs, worth = sight_inputs(self.task, problem, sight, actions, self.instants, self.nearest)
         # Geometry is computed on the processor, the network may be on another device.
@@ -133,14 +115,9 @@ class ViaRankPolicy(PlanPolicy):
         return self.assess(observation)[0]
 
     def assess(self, observation: Observation) -> tuple[Float, Float]:
-        """Return the best actions of B observations, shape (B, m), and their predicted success, shape (B,).
-
-        Args:
-            observation: Parts of shape (B, .) each.
-        """
-        actions, success = self.best(
-            Problem.of_observation(observation, self.task), Sight.of(observation, self.task)
-        )
+        """Return the best actions of B observations, shape (B, m), and their predicted success, shape (B,)."""
+        problem, sight = Problem.of_observation(observation, self.task), Sight.of(observation, self.task)
+        actions, success = self.best(problem, sight)
         slope, offset = self.network.calibration.tolist()
         return actions, expit(slope * logit(success) + offset)
 
@@ -222,6 +199,7 @@ class ViaRank(PlanAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ViaRankPolicy": ViaRankPolicy}
+    LARGEST_GRADIENT = 5.0
     policy: ViaRankPolicy
 
     def __init__(
@@ -299,37 +277,29 @@ class ViaRank(PlanAlgorithm):
         self.calibrate()
         return trained
 
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Update the network `gradient_steps` times."""
+    def _sampled_losses(self, batch_size: int) -> dict[str, Tensor]:
         policy, task = self.policy, self.policy.task
-        policy.set_training_mode(True)
-        self._update_learning_rate(policy.optimizer)
-        losses = []
-        for _ in range(gradient_steps):
-            # New scenes for each update: the network cannot learn them by heart.
-            seeds = np.random.randint(0, 2**31, size=batch_size)  # noqa: NPY002 - seeded by SB3
-            scenes = self._sampler([np.random.default_rng(seed) for seed in seeds])
-            truth, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
-            believed = truth._replace(obstacles=thick_points(task, sight))
-            # Some plans are labelled: those that the network would choose, and others.
-            plans = self._candidates(batch_size)
-            inputs, worth = sight_inputs(task, believed, sight, plans, policy.instants, policy.nearest)
-            inputs = inputs.to(policy.device)
-            chosen = self._chosen(inputs, worth)
-            some = np.take_along_axis(plans, chosen[..., None], axis=1)
-            # The labels are privileged: they need the true obstacles, which the inputs do not tell.
-            clearance = plan_clearances(task, truth, some, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
-            labels = torch.from_numpy((clearance >= CLEARANCE_MARGIN).astype(np.float32)).to(policy.device)
-            logits = policy.network(inputs.take(torch.from_numpy(chosen).to(policy.device)))
-            loss = functional.binary_cross_entropy_with_logits(logits, labels)
-            policy.optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            torch.nn.utils.clip_grad_norm_(policy.network.parameters(), 5.0)
-            policy.optimizer.step()
-            losses.append(float(loss.detach()))
-            self._n_updates += 1
-        self.logger.record("train/loss", float(np.mean(losses)))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        # New scenes for each update: the network cannot learn them by heart.
+        seeds = np.random.randint(0, 2**31, size=batch_size)  # noqa: NPY002 - seeded by SB3
+        truth, believed, sight = self._drawn(list(seeds))
+        # Some plans are labelled: those that the network would choose, and others.
+        plans = self._candidates(batch_size)
+        inputs, worth = sight_inputs(task, believed, sight, plans, policy.instants, policy.nearest)
+        inputs = inputs.to(policy.device)
+        chosen = self._chosen(inputs, worth)
+        some = np.take_along_axis(plans, chosen[..., None], axis=1)
+        # The labels are privileged: they need the true obstacles, which the inputs do not tell.
+        clearance = plan_clearances(task, truth, some, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
+        labels = torch.from_numpy((clearance >= CLEARANCE_MARGIN).astype(np.float32)).to(policy.device)
+        logits = policy.network(inputs.take(torch.from_numpy(chosen).to(policy.device)))
+        return {"loss": functional.binary_cross_entropy_with_logits(logits, labels)}
+
+    def _drawn(self, seeds: list[Any]) -> tuple[Problem, Problem, Sight]:
+        """Return new scenes as they are, as they are believed to be, and what is seen of them."""
+        scenes = self._sampler([np.random.default_rng(seed) for seed in seeds])
+        task = self.policy.task
+        truth, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
+        return truth, truth._replace(obstacles=thick_points(task, sight)), sight
 
     @torch.no_grad()
     def _chosen(self, inputs: SightInputs, worth: NDArray[Any]) -> NDArray[np.int64]:
@@ -351,11 +321,8 @@ class ViaRank(PlanAlgorithm):
         policy.set_training_mode(False)
         chances, labels = [], []
         for first in range(0, number, BLOCK):
-            scenes = self._sampler(
-                [np.random.default_rng((CALIBRATION, first + each)) for each in range(BLOCK)]
-            )
-            truth, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
-            actions, success = policy.best(truth._replace(obstacles=thick_points(task, sight)), sight)
+            truth, believed, sight = self._drawn([(CALIBRATION, first + each) for each in range(BLOCK)])
+            actions, success = policy.best(believed, sight)
             clearance = plan_clearances(task, truth, actions[:, None], 0.0, 0.0, exact=True)[:, 0]
             chances.append(logit(success))
             labels.append(clearance >= 0.0)

@@ -20,8 +20,7 @@ from viapoint.training.live.arena import AGENT, HAND, MOTION, OMPL, SEARCH, STRA
 from viapoint.training.live.state import Movement, Proposal, Scene, State
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.motion_plan import MotionPlan
-from viapoint.training.planning.ompl_planner import ompl_motion
-from viapoint.training.planning.plan_motion import SEEDS, checked_motion, plan_motion
+from viapoint.training.planning.plan_motion import SEEDS, checked_motion, ompl_motion, plan_motion
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import GeometrySearch, merits
 

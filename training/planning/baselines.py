@@ -18,8 +18,7 @@ from viapoint.training.config.checks import unknown_name
 from viapoint.training.planning.cautious import BELIEFS, BeliefMethod, CautiousSearch
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl
-from viapoint.training.planning.ompl_planner import ompl_motion
-from viapoint.training.planning.plan_motion import plan_motion
+from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
 from viapoint.training.planning.search import GeometrySearch, registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults, StepAgentMethod
 from viapoint.training.rollouts.vec_env import env_arguments
@@ -81,12 +80,8 @@ class RandomVias:
 class PlannerMethod:
     """Planner whose movements have as many via-points as they need, and durations of their own.
 
-    A decision is a row: number of via-points, durations of the segments [s], via-points, then zeros.
-
-    Args:
-        simulation: Simulation of the task.
-        name: Name in tables of results.
-        planner: Function of arm, start, goal and obstacles, and `space`, that returns a plan.
+    A decision is a row: number of via-points, durations of the segments [s], via-points, then zeros. A planner is a
+    function of arm, start, goal and obstacles, and `space`.
     """
 
     def __init__(self, simulation: SceneSimulation, name: str, planner: Callable[..., MotionPlan]) -> None:
@@ -158,14 +153,9 @@ class OpenLoopBaseline:
 
 
 class AgentMethod:
-    """Trained agent.
+    """Trained agent, which checks and refines some of its proposals in each decision.
 
-    Args:
-        name: Name in tables of results.
-        model: Model with `predict`.
-        checks: Number of proposals that are checked with computed geometry in each decision; None for the model's own
-            number.
-        refine: Number of proposals that the planner refines in each decision; None for the model's own number.
+    Their numbers are `checks` and `refine`; None for the numbers of the model.
     """
 
     def __init__(self, name: str, model: Any, checks: int | None = None, refine: int | None = None) -> None:
@@ -216,26 +206,23 @@ def refined_search(simulation: SceneSimulation, checks: int) -> Method:
     return GeometrySearch(simulation.task, checks - rounds * each, refinements=rounds, per_round=each)
 
 
+# Factories of baselines whose names end in the number of plans that they check, such as `search512`
 COUNTED: dict[str, Callable[[SceneSimulation, int], Method]] = {
     "search": refined_search,
     "sobol": lambda simulation, checks: GeometrySearch(simulation.task, checks),
     "cautious": lambda simulation, checks: CautiousSearch(simulation.task, checks),
 }
-"""Factories of baselines whose names end in the number of plans that they check, such as `search512`."""
 FEWEST_CHECKS = {"search": 4, "sobol": 1, "cautious": 1}
-SENSED = ("cautious",)
-"""Counted baselines that need a sensor."""
-WITH_BELIEFS = ("search", "sobol")
-"""Counted baselines that plan with any belief."""
-DEFAULT_BELIEF = "thick"
-"""Belief of planners where none is named."""
+SENSED = ("cautious",)  # Counted baselines that need a sensor
+DEFAULT_BELIEF = "thick"  # Belief of planners where none is named
 
+# Factories of the planners for known obstacles
 PLANNERS: dict[str, Callable[[SceneSimulation], PlannerMethod]] = {
     "plan_motion": lambda simulation: PlannerMethod(simulation, "plan_motion", plan_motion),
     "ompl": ompl_method,
 }
-"""Factories of the planners for known obstacles."""
 
+# Factories of baselines by their names on the command line
 METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "straight": Straight,
     "random": lambda simulation: RandomVias(simulation, 1),
@@ -243,14 +230,13 @@ METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "random80": lambda simulation: RandomVias(simulation, 80),
     **PLANNERS,
 }
-"""Factories of baselines by their names on the command line."""
 
+# Factories of baselines for replanning tasks
 REPLANNING_METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "straight": Straight,
     "random": lambda simulation: RandomVias(simulation, 1),
     "unrevised": lambda simulation: OpenLoopBaseline(Straight(simulation), simulation),
 }
-"""Factories of baselines for replanning tasks."""
 
 
 def check_method(name: str, task: Task) -> None:
@@ -272,16 +258,17 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
     """
     known = REPLANNING_METHODS if task.replanning else METHODS
     sensed = task.sensor is not None
+    unsensed = [each for each in COUNTED if each not in SENSED]  # which plan with any belief, too
     belief, _, planner = name.rpartition(":")
     if sensed and name in PLANNERS:  # they take the obstacles that they are given, which are not known here
         belief = DEFAULT_BELIEF
     if sensed and belief in BELIEFS:
-        make = PLANNERS.get(planner) or _counted(planner, WITH_BELIEFS)
+        make = PLANNERS.get(planner) or _counted(planner, unsensed)
         if make is not None:
             return lambda simulation: BeliefMethod(task, belief, make(simulation))
     elif name in known:
         return known[name]
-    counted = [each for each in COUNTED if sensed or each not in SENSED]
+    counted = list(COUNTED) if sensed else unsensed
     found = _counted(name, counted)
     if found is not None:
         return found

@@ -22,45 +22,33 @@ from viapoint.envs.geometry.shapes import Box, PointCloud, Shape
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 
-ROUNDING = 1e-4
-"""Distance from the greatest range within which nothing was met, [m]."""
-POINT_RADIUS = 0.01
-"""Radius of the spheres around points, [m]."""
+ROUNDING = 1e-4  # Distance from the greatest range within which nothing was met, [m]
+POINT_RADIUS = 0.01  # Radius of the spheres around points, [m]
+# Depth to which the space behind a seen surface is believed to be occupied, [m]
 THICKNESS = {"hand": 0.06, "joints": 0.05}
-"""Depth to which the space behind a seen surface is believed to be occupied, [m]."""
+# Distance of points behind a surface, and edge of the cubes of which each holds one point, [m]
 SPACING = 0.015
-"""Distance of points behind a surface, and edge of the cubes of which each holds one point, [m]."""
+# Clearance that is believed at start and goal, which are known to be free, [m]
 END_CLEARANCE = 0.01
-"""Clearance that is believed at start and goal, which are known to be free, [m]."""
-CUBES = 1 << 16
-"""Greatest number of cubes along an axis."""
-CONNECTED = 0.06
-"""Distance of points of one obstacle, [m]."""
-LEAST_HALF = 0.01
-"""Least half length of a fitted box, [m]."""
-CURVED = 0.12
-"""Depth of a front relative to its width from which on it is believed to be curved."""
+CUBES = 1 << 16  # Greatest number of cubes along an axis
+CONNECTED = 0.06  # Distance of points of one obstacle, [m]
+LEAST_HALF = 0.01  # Least half length of a fitted box, [m]
+CURVED = 0.12  # Depth of a front relative to its width from which on it is believed to be curved
 
 
 class Sight(NamedTuple):
     """Readings of a sensor in B scenes, as an observation tells them."""
 
-    origin: Float
-    """Present places of the sensor, shape (B, 3), [m]."""
-    rotation: Float
-    """Present axes of the sensor as columns, shape (B, 3, 3)."""
+    origin: Float  # Present places of the sensor, shape (B, 3), [m]
+    rotation: Float  # Present axes of the sensor as columns, shape (B, 3, 3)
+    # Ranges of R rays, or of all rays of the looks that are remembered, shape (B, R), [m]
     ranges: Float
-    """Ranges of R rays, or of all rays of the looks that are remembered, shape (B, R), [m]."""
-    points: Float
-    """Ends of the rays, shape (B, R, 3), [m]."""
-    eyes: Float
-    """Places from which they were seen, shape (B, R, 3), [m]."""
-    hit: Bool
-    """True for rays that met something, shape (B, R)."""
+    points: Float  # Ends of the rays, shape (B, R, 3), [m]
+    eyes: Float  # Places from which they were seen, shape (B, R, 3), [m]
+    hit: Bool  # True for rays that met something, shape (B, R)
+    # Centres of the arm's spheres at start and goal, where nothing can be, shape (B, E, 3), [m]
     free: Float
-    """Centres of the arm's spheres at start and goal, where nothing can be, shape (B, E, 3), [m]."""
-    free_radius: Float
-    """Radii of these spheres, shape (E,), [m]."""
+    free_radius: Float  # Radii of these spheres, shape (E,), [m]
 
     def take(self, rows: Any) -> Sight:
         """Return the readings of some of the scenes, by indices, mask or slice."""
@@ -71,62 +59,67 @@ class Sight(NamedTuple):
     @classmethod
     def of(cls, observation: Mapping[str, Any], task: Task) -> Sight:
         """Return the readings of B observations, parts of shape (B, .) each."""
-        assert task.sensor is not None
         parts = {name: np.asarray(part, np.float64) for name, part in observation.items()}
         ranges, joints = parts["ranges"], parts["joints"]
         points = parts["points"].reshape(*ranges.shape, 3)
+        eyes = parts["eyes"].reshape(len(joints), -1, 3) if "eyes" in parts else None
         ends = [parts["hand"], parts["goal"]]
         if task.space_name == "joints":
             ends = [joints, parts["goal_joints"]]
-        rotation, origin = task.sensor.pose(task.arm, joints)
-        hit = ranges < task.sensor.range - ROUNDING
-        eyes = parts["eyes"].reshape(len(origin), -1, 3) if "eyes" in parts else origin[:, None]
-        eyes = np.repeat(eyes, task.sensor.n_rays, axis=1)
-        return cls(origin, rotation, ranges, points, eyes, hit, *_spheres_of(task, ends))
+        return _sight(task, joints, ranges, points, ends, eyes)
 
     @classmethod
     def of_scenes(cls, scenes: Scenes, task: Task) -> Sight:
         """Return the readings at the beginning of B scenes."""
-        sensor = task.sensor
-        assert sensor is not None
-        rotation, origin = sensor.pose(task.arm, scenes.start)
-        found = sensor.read(task.arm, scenes.start, scenes.obstacles)
+        assert task.sensor is not None
+        found = task.sensor.read(task.arm, scenes.start, scenes.obstacles)
         ends = [scenes.start, scenes.goal]
         if task.space_name == "hand":
             ends = [task.arm.hand(joints) for joints in ends]
-        hit = found.ranges < sensor.range - ROUNDING
-        eyes = np.repeat(origin[:, None], sensor.n_rays, axis=1)
-        return cls(origin, rotation, found.ranges, found.points, eyes, hit, *_spheres_of(task, ends))
+        return _sight(task, scenes.start, found.ranges, found.points, ends)
 
 
-def _spheres_of(task: Task, ends: list[Float]) -> tuple[Float, Float]:
-    """Return centres and radii of the spheres that are free at both ends, see :class:`Sight`.
+def _sight(
+    task: Task, joints: Float, ranges: Float, points: Float, ends: list[Float], eyes: Float | None = None
+) -> Sight:
+    """Return the readings of a sensor.
 
-    Args:
-        task: Task.
-        ends: Joint positions in joint space, shape (B, J) each; places of the hand in hand space, shape (B, 3) each.
+    The arm is at `joints`, shape (B, J). Both ends are joint positions in joint space, and places of the hand in hand
+    space. Rays begin at `eyes`, shape (B, looks, 3), at the present place of the sensor by default.
     """
-    chain, spheres = task.arm.chain, task.arm.spheres
+    sensor, spheres = task.sensor, task.arm.spheres
+    assert sensor is not None
+    rotation, origin = sensor.pose(task.arm, joints)
+    eyes = np.repeat(origin[:, None] if eyes is None else eyes, sensor.n_rays, axis=1)
+    hit = ranges < sensor.range - ROUNDING
     if task.space_name == "hand":
-        return np.stack(ends, axis=1), np.full(2, float(spheres.radius[-1]))
-    centres = [sphere_centres(chain, spheres, joints) for joints in ends]
-    return np.concatenate(centres, axis=1), np.tile(spheres.radius, 2)
-
-
-def points_alone(task: Task, sight: Sight) -> Obstacles:
-    """Return clouds of the points that were seen."""
-    return _clouds(sight, [points[hit] for points, hit in zip(sight.points, sight.hit, strict=True)])
+        free, radius = np.stack(ends, axis=1), np.full(2, float(spheres.radius[-1]))
+    else:
+        centres = [sphere_centres(task.arm.chain, spheres, each) for each in ends]
+        free, radius = np.concatenate(centres, axis=1), np.tile(spheres.radius, 2)
+    return Sight(origin, rotation, ranges, points, eyes, hit, free, radius)
 
 
 def thick_points(task: Task, sight: Sight, depth: float | None = None) -> Obstacles:
-    """Return clouds of the points that were seen and of the space behind each, THICKNESS or another depth, [m]."""
+    """Return clouds of the points that were seen and of the space behind each, THICKNESS or another depth, [m].
+
+    A cloud has one point in each cube of SPACING, and none at the ends of the movement.
+    """
     steps = np.arange(0.0, (THICKNESS[task.space_name] if depth is None else depth) + 1e-9, SPACING)
-    found = []
-    for eyes, points, hit in zip(sight.eyes, sight.points, sight.hit, strict=True):
-        away = points[hit] - eyes[hit]
+    scenes: list[list[Shape]] = []
+    for b, hit in enumerate(sight.hit):
+        seen = sight.points[b, hit]
+        away = seen - sight.eyes[b, hit]
         away /= np.linalg.norm(away, axis=-1, keepdims=True)
-        found.append((points[hit][:, None] + steps[:, None] * away[:, None]).reshape(-1, 3))
-    return _clouds(sight, found)
+        points = (seen[:, None] + steps[:, None] * away[:, None]).reshape(-1, 3)
+        cubes = np.floor(points / SPACING).astype(np.int64) + CUBES // 2
+        numbers = (cubes[:, 0] * CUBES + cubes[:, 1]) * CUBES + cubes[:, 2]
+        _, first = np.unique(numbers, return_index=True)
+        points = points[first]
+        outside = _outside(points, sight.free[b], sight.free_radius + POINT_RADIUS + END_CLEARANCE)
+        points = points[outside]
+        scenes.append([PointCloud(points, radius=POINT_RADIUS)] if len(points) else [])
+    return pack(scenes, rows=1)
 
 
 def fitted_boxes(task: Task, sight: Sight) -> Obstacles:
@@ -170,19 +163,6 @@ def _box_around(points: Float, origin: Float, deepest: float) -> Box:
     axes = axes * sign
     place = middle + sign * axes @ (0.5 * (high + low))
     return Box(half, position=place, quaternion=quaternions_of(axes))
-
-
-def _clouds(sight: Sight, points: list[Float]) -> Obstacles:
-    """Return one cloud for each scene that has points, with one point in each cube of SPACING, and none at the ends."""
-    scenes: list[list[Shape]] = []
-    for b, each in enumerate(points):
-        cubes = np.floor(each / SPACING).astype(np.int64) + CUBES // 2
-        numbers = (cubes[:, 0] * CUBES + cubes[:, 1]) * CUBES + cubes[:, 2]
-        _, first = np.unique(numbers, return_index=True)
-        each = each[first]
-        each = each[_outside(each, sight.free[b], sight.free_radius + POINT_RADIUS + END_CLEARANCE)]
-        scenes.append([PointCloud(each, radius=POINT_RADIUS)] if len(each) else [])
-    return pack(scenes, rows=1)
 
 
 @compiled

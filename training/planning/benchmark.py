@@ -24,6 +24,7 @@ from viapoint.envs.arms.registry import PANDA_HOME
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.shapes import Box, Cylinder, Shape, as_obstacle
 
+# Names of the sets
 SETS = (
     "bookshelf_small",
     "bookshelf_tall",
@@ -33,16 +34,16 @@ SETS = (
     "table_pick",
     "table_under_pick",
 )
-"""Names of the sets."""
-JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))
-"""Names of the joints in the files."""
+KINDS: dict[type[Shape], int] = {Box: 0, Cylinder: 1}  # Numbers of shapes in the numeric file
+JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))  # Names of the joints in the files
 LOWEST = (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671)
+# Ranges of the joints in the published description, [rad]
 HIGHEST = (2.9671, 1.8326, 2.9671, 0.0873, 2.9671, 3.8223, 2.9671)
-"""Ranges of the joints in the published description, [rad]."""
+# Bodies of the fingers, and the directions in which they open along y
 FINGERS = {"leftfinger": 1.0, "rightfinger": -1.0}
-"""Bodies of the fingers, and the directions in which they open along y."""
+# Opening of a finger, and height of the fingers' frames over that of the hand, [m]
 OPEN, FINGER_HEIGHT = 0.065, 0.0584
-"""Opening of a finger, and height of the fingers' frames over that of the hand, [m]."""
+# Pairs of bodies, besides neighbours, that the published description does not compare (panda.srdf)
 NEVER_TOUCH = {
     "link0": ("link2", "link3", "link4"),
     "link1": ("link3", "link4"),
@@ -52,22 +53,16 @@ NEVER_TOUCH = {
     "link6": ("gripper", "leftfinger", "rightfinger"),
     "link7": ("leftfinger", "rightfinger"),
 }
-"""Pairs of bodies, besides neighbours, that the published description does not compare (panda.srdf)."""
 
 
 class BenchmarkProblem(NamedTuple):
     """One problem."""
 
-    set: str
-    """Name of its set."""
-    number: int
-    """Number within the set, from 1."""
-    start: Float
-    """Joint positions, shape (7,), [rad]."""
-    goal: Float
-    """Joint positions, shape (7,), [rad]."""
-    obstacles: tuple[Shape, ...]
-    """Obstacles."""
+    set: str  # Name of its set
+    number: int  # Number within the set, from 1
+    start: Float  # Joint positions, shape (7,), [rad]
+    goal: Float  # Joint positions, shape (7,), [rad]
+    obstacles: tuple[Shape, ...]  # Obstacles
 
     @property
     def name(self) -> str:
@@ -115,17 +110,17 @@ def benchmark_problems() -> list[BenchmarkProblem]:
         parts = dict(np.load(file))
     problems, first = [], 0
     for k, count in enumerate(parts["count"]):
-        rows = slice(first, first + count)
+        shapes: list[Shape] = []
+        for row in range(first, first + count):
+            size, position, quaternion = parts["size"][row], parts["pose"][row, :3], parts["pose"][row, 3:]
+            quaternion = quaternion / np.linalg.norm(quaternion)
+            if parts["kind"][row] == KINDS[Box]:
+                shapes.append(Box(size, position=position, quaternion=quaternion))
+            else:
+                shapes.append(Cylinder(size[0], size[1], position=position, quaternion=quaternion))
         first += count
-        shapes = [
-            _shape(int(kind), pose[:3], pose[3:], size)
-            for kind, pose, size in zip(
-                parts["kind"][rows], parts["pose"][rows], parts["size"][rows], strict=True
-            )
-        ]
-        name = SETS[parts["set"][k]]
-        ends = parts["start"][k], parts["goal"][k]
-        problems.append(BenchmarkProblem(name, int(parts["number"][k]), *ends, tuple(shapes)))
+        name, number = SETS[parts["set"][k]], int(parts["number"][k])
+        problems.append(BenchmarkProblem(name, number, parts["start"][k], parts["goal"][k], tuple(shapes)))
     return problems
 
 
@@ -196,20 +191,10 @@ def _matrix(pose: Mapping[str, Any] | None) -> Float:
     return matrix
 
 
-def _shape(kind: int, position: Float, quaternion: Float, size: Float) -> Shape:
-    """Return a shape of the numeric file: box 0, cylinder 1."""
-    quaternion = quaternion / np.linalg.norm(quaternion)
-    if kind == 0:
-        return Box(size, position=position, quaternion=quaternion)
-    return Cylinder(size[0], size[1], position=position, quaternion=quaternion)
-
-
 def write_problems(folder: str | Path, path: str | Path) -> None:
     """Write the numeric file of the package from a folder of the original files."""
     problems = read_problems(folder)
-    kinds = {Box: 0, Cylinder: 1}
     shapes = [shape for problem in problems for shape in problem.obstacles]
-    sizes = [shape.packed_size for shape in shapes]
     np.savez_compressed(
         path,
         set=np.array([SETS.index(problem.set) for problem in problems], np.int8),
@@ -217,7 +202,7 @@ def write_problems(folder: str | Path, path: str | Path) -> None:
         start=np.array([problem.start for problem in problems]),
         goal=np.array([problem.goal for problem in problems]),
         count=np.array([len(problem.obstacles) for problem in problems], np.int16),
-        kind=np.array([kinds[type(shape)] for shape in shapes], np.int8),
+        kind=np.array([KINDS[type(shape)] for shape in shapes], np.int8),
         pose=np.array([[*shape.position, *shape.quaternion] for shape in shapes], np.float32),
-        size=np.array(sizes, np.float32),
+        size=np.array([shape.packed_size for shape in shapes], np.float32),
     )

@@ -19,19 +19,16 @@ from viapoint.training.config.checks import unknown_name
 from viapoint.training.planning.benchmark import BenchmarkProblem, benchmark_panda
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
 from viapoint.training.planning.ompl_paths import import_ompl
-from viapoint.training.planning.ompl_planner import ompl_motion
-from viapoint.training.planning.plan_motion import checked_motion, plan_motion
+from viapoint.training.planning.plan_motion import checked_motion, ompl_motion, plan_motion
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import GeometrySearch
 
 Planner = Callable[[Arm, BenchmarkProblem], MotionPlan]
+# Function of the planner's name, the number of finished problems and the number of all
 Progress = Callable[[str, int, int], None]
-"""Function of the planner's name, the number of finished problems and the number of all."""
 
-TOGETHER = 20
-"""Number of plans that are simulated together."""
-PATH_INSTANTS = 200
-"""Instants between which the length of a movement is measured."""
+TOGETHER = 20  # Number of plans that are simulated together
+PATH_INSTANTS = 200  # Instants between which the length of a movement is measured
 NOTES = (
     "Solved: touches nothing and keeps all limits, by computed geometry; physics: success in MuJoCo, too; both without "
     "problems whose ends are in contact. Times include all checks. Motion time, jerk (relative to the straight "
@@ -79,14 +76,7 @@ def _searched(arm: Arm, problem: BenchmarkProblem, checks: int) -> MotionPlan:
 def measure_planner(
     name: str, problems: Sequence[BenchmarkProblem], *, physics: bool = True, progress: Progress | None = None
 ) -> pd.DataFrame:
-    """Return one line for each problem: what a planner found, how long it took, and what physics says.
-
-    Args:
-        name: Name of the planner, see :func:`benchmark_planner`.
-        problems: Problems.
-        physics: True to execute the plans in MuJoCo.
-        progress: Function that is told what is finished.
-    """
+    """Return one line for each problem: what a planner found, how long it took, and what MuJoCo says of it."""
     arm, planner = benchmark_panda(), benchmark_planner(name)
     planner(arm, problems[0])  # compiles what is not compiled yet
     plans, lines = [], []

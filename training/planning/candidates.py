@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from viapoint.envs.common.types import Single
-
-if TYPE_CHECKING:
-    from viapoint.envs.task import Task
+from viapoint.envs.task import Task
 
 
 def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:
@@ -18,11 +16,7 @@ def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:
 
     From rest, clearance and reach do not depend on the duration. So all candidates but the first have the duration of
     the greatest reward, and only their via-points and the split of their duration differ.
-
-    Args:
-        task: Task of the environment.
-        number: Number of candidates, 1 or more.
-        replanning: True where a movement may be under way; then candidates differ in their duration, too.
+    With `replanning`, a movement may be under way; then they differ in their duration, too.
     """
     size, at = task.action.size, task.n_via * task.action.dimension
     if replanning or not at:
@@ -58,7 +52,12 @@ def best_duration(task: Task) -> float:
 @functools.cache
 def sobol_actions(number: int, size: int) -> Single:
     """Return the zero action and points of the Sobol sequence in [-1, 1]^size, shape (number, size)."""
-    points = 2.0 * sobol_points(max(number - 1, 1), size)[: number - 1] - 1.0
+    import torch
+
+    quasirandom: Any = torch.quasirandom
+    engine = quasirandom.SobolEngine(size)
+    engine.fast_forward(2)  # the first points are a corner of the cube and its middle
+    points = 2.0 * engine.draw(max(number - 1, 1)).numpy()[: number - 1] - 1.0
     actions = np.concatenate((np.zeros((1, size)), points)).astype(np.float32)
     actions.flags.writeable = False
     return actions
@@ -69,23 +68,8 @@ def normal_steps(number: int, size: int, seed: int) -> Single:
     """Return evenly spread steps of the standard normal distribution, shape (number, size)."""
     import torch
 
-    engine = _sobol_engine(size, scramble=True, seed=seed)
-    uniform = engine.draw(number).clamp(1e-4, 1.0 - 1e-4)
+    quasirandom: Any = torch.quasirandom
+    uniform = quasirandom.SobolEngine(size, scramble=True, seed=seed).draw(number).clamp(1e-4, 1.0 - 1e-4)
     steps: Single = (2.0**0.5 * torch.erfinv(2.0 * uniform - 1.0)).numpy()
     steps.flags.writeable = False
     return steps
-
-
-def sobol_points(number: int, size: int) -> Single:
-    """Return points of the Sobol sequence in the unit cube, shape (number, size), without its corner and its middle."""
-    engine = _sobol_engine(size)
-    engine.fast_forward(2)
-    points: Single = engine.draw(number).numpy()
-    return points
-
-
-def _sobol_engine(size: int, **kwargs: Any) -> Any:
-    import torch
-
-    kind: Any = torch.quasirandom.SobolEngine
-    return kind(size, **kwargs)

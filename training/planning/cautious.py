@@ -17,7 +17,7 @@ from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
-from viapoint.training.planning.beliefs import Sight, fitted_boxes, points_alone, thick_points
+from viapoint.training.planning.beliefs import Sight, fitted_boxes, thick_points
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.places import instants_of, places_of
 from viapoint.training.planning.problem import Numbers, Problem, moves_of, worth_of
@@ -28,23 +28,15 @@ from viapoint.training.planning.search import (
     refined_actions,
 )
 
+# Number of instants at which the way through unseen space is measured
 INSTANTS = {"hand": 32, "joints": 16}
-"""Number of instants at which the way through unseen space is measured."""
+# Depth behind a seen surface that is avoided like the surface, [m]
 BEHIND = {"hand": 0.04, "joints": 0.04}
-"""Depth behind a seen surface that is avoided like the surface, [m]."""
-UNSEEN_WEIGHT = 50.0
-"""Reward that a mean depth of 1 m in unseen space costs, [1/m]."""
-MARGIN = 0.03
-"""Distance in front of unseen space at which the penalty begins, [m]."""
-DEEPEST = 0.1
-"""Depth in unseen space at which the penalty of an instant saturates, [m]."""
+UNSEEN_WEIGHT = 50.0  # Reward that a mean depth of 1 m in unseen space costs, [1/m]
+MARGIN = 0.03  # Distance in front of unseen space at which the penalty begins, [m]
+DEEPEST = 0.1  # Depth in unseen space at which the penalty of an instant saturates, [m]
+# Number of best candidates that are refined around what is seen. The settings were tuned on `validation` scenes.
 REFINED = {"hand": 0, "joints": 8}
-"""Number of best candidates that are refined around what is seen. The settings were tuned on `validation` scenes."""
-
-
-def known(task: Task, sight: Sight, truth: Obstacles) -> Obstacles:
-    """Return the true obstacles."""
-    return truth
 
 
 def seen(task: Task, sight: Sight, truth: Obstacles) -> Obstacles:
@@ -67,24 +59,18 @@ def one_look(task: Task, name: str) -> Sensor:
     return sensor
 
 
+# Obstacles that are believed to be there, by name; the first two need the truth
 BELIEFS: dict[str, Callable[[Task, Sight, Obstacles], Obstacles]] = {
-    "known": known,
+    "known": lambda task, sight, truth: truth,
     "seen": seen,
     "fitted": lambda task, sight, truth: fitted_boxes(task, sight),
-    "points": lambda task, sight, truth: points_alone(task, sight),
+    "points": lambda task, sight, truth: thick_points(task, sight, 0.0),
     "thick": lambda task, sight, truth: thick_points(task, sight),
 }
-"""Obstacles that are believed to be there, by name; the first two need the truth."""
 
 
 class BeliefMethod:
-    """Method that plans as if a belief were the truth.
-
-    Args:
-        task: Task with a sensor.
-        belief: Name of the belief, one of BELIEFS.
-        method: Search, or planner with `decide(observation, scenes)` and `execute`.
-    """
+    """Search or planner that plans as if a belief, one of BELIEFS, were the truth."""
 
     def __init__(self, task: Task, belief: str, method: Any) -> None:
         self.name = f"{belief}:{method.name}"
@@ -106,10 +92,6 @@ class CautiousSearch:
     """Search that avoids what is seen and some space behind it, and prefers ways through space that is seen to be free.
 
     In joint space the best candidates are refined by the gradient of clearance, and compared with the others.
-
-    Args:
-        task: Task with a sensor.
-        n_checks: Number of candidates.
     """
 
     def __init__(self, task: Task, n_checks: int) -> None:

@@ -15,10 +15,10 @@ from viapoint.envs.common.validation import finite_array
 from viapoint.training.io.files import write_bytes
 from viapoint.training.planning.motion_plan import JointMotion, MotionPlan
 
+# Quantities of a table, each of which has a column for each joint
 PARTS = ("position", "velocity", "acceleration", "torque")
-"""Quantities of a table, each of which has a column for each joint."""
+# Names of the same quantities in a point of `trajectory_msgs/JointTrajectory`
 ROS_PARTS = ("positions", "velocities", "accelerations", "effort")
-"""Names of the same quantities in a point of `trajectory_msgs/JointTrajectory`."""
 
 
 def write_motion(

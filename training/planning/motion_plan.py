@@ -149,7 +149,7 @@ class MotionPlan:
         number_of_at_least("rate", rate, 1e-3)
         last = int(np.floor(self.duration * rate * (1.0 - 1e-12)))
         time = np.append(np.arange(last + 1) / rate, self.duration)
-        motion = _joint_motion(space_of(self.arm, self.space), self.trajectory(), time)
+        motion = joint_motion(space_of(self.arm, self.space), *self.trajectory().sample(time))
         return JointMotion(time, *motion, torques(self.arm.chain, *motion))
 
     def execute(self, *, force: bool = False) -> Outcome:
@@ -173,10 +173,10 @@ class MotionPlan:
             raise UnsafePlanError(f"the plan is not safe: {self.reason}; force=True takes it nevertheless")
 
 
-def _joint_motion(space: Space, trajectory: primitives.Trajectory, time: Float) -> Motion:
-    """Return positions, velocities and accelerations of the joints at instants, shape (N, J) each."""
-    sampled = Motion(*(part[None] for part in trajectory.sample(time)))
-    return Motion(*(np.ascontiguousarray(part[0]) for part in space.joint_motion(sampled)))
+def joint_motion(space: Space, position: Float, velocity: Float, acceleration: Float) -> Motion:
+    """Return the motion of the joints, shape (N, J) each, from coordinates and their derivatives, shape (N, D) each."""
+    motion = space.joint_motion(Motion(position[None], velocity[None], acceleration[None]))
+    return Motion(*(np.ascontiguousarray(part[0]) for part in motion))
 
 
 def execute_plans(plans: Sequence[MotionPlan]) -> Outcome:

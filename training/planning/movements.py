@@ -35,14 +35,12 @@ from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import SHORTEST_DURATION
 
-INSTANTS = 64
-"""Instants of a movement that are checked; a power of two."""
+INSTANTS = 64  # Instants of a movement that are checked; a power of two
+# Instants of a movement that is checked once more before it is executed; a power of two
 FINE_INSTANTS = 256
-"""Instants of a movement that is checked once more before it is executed; a power of two."""
-NOWHERE = 1e9
-"""Clearance that nothing limits, [m]."""
-OUTSIDE = -2.0
-"""Clearance of movements that leave the reach or the joint ranges, [m]."""
+NOWHERE = 1e9  # Clearance that nothing limits, [m]
+OUTSIDE = -2.0  # Clearance of movements that leave the reach or the joint ranges, [m]
+# Passage times in unit time by the number of via-points; more via-points are passed at even times
 TABLES: dict[int, list[tuple[float, ...]]] = {
     0: [()],
     1: [(float(t),) for t in np.linspace(0.1, 0.9, 161)],
@@ -53,46 +51,71 @@ TABLES: dict[int, list[tuple[float, ...]]] = {
     ],
     3: list(itertools.combinations([float(t) for t in np.linspace(0.1, 0.9, 13)], 3)),
 }
-"""Passage times in unit time by the number of via-points; more via-points are passed at even times."""
+# Step between the passage times whose cost is computed first, with one via-point; those beside the best follow
 STRIDE = 4
-"""Step between the passage times whose cost is computed first, with one via-point; those beside the best follow."""
 
 
+# Nodes and weights of Gauss-Legendre quadrature in [-1, 1]
 NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(3)
-"""Nodes and weights of Gauss-Legendre quadrature in [-1, 1]."""
 
 
 class MovementTable(NamedTuple):
     """Movements through K via-points in unit time at N instants, with M sets of passage times."""
 
-    durations: Float
-    """Durations of the segments, shape (M, K + 1)."""
-    basis: Float
-    """Influence of each offset on the position at each instant, shape (M, N, K + 3)."""
-    rate: Float
-    """Influence of each offset on the velocity at each instant, shape (M, N, K + 3)."""
-    bend: Float
-    """Influence of each offset on the acceleration at each instant, shape (M, N, K + 3)."""
+    durations: Float  # Durations of the segments, shape (M, K + 1)
+    basis: Float  # Influence of each offset on the position at each instant, shape (M, N, K + 3)
+    rate: Float  # Influence of each offset on the velocity at each instant, shape (M, N, K + 3)
+    bend: Float  # Influence of each offset on the acceleration at each instant, shape (M, N, K + 3)
+    # Matrices of the jerk cost, half the integral of the squared jerk, shape (M, K + 3, K + 3)
     cost: Float
-    """Matrices of the jerk cost, half the integral of the squared jerk, shape (M, K + 3, K + 3)."""
-    order: Int
-    """Instants in an order that looks everywhere soon, shape (N,)."""
+    order: Int  # Instants in an order that looks everywhere soon, shape (N,)
 
 
 class Setting(NamedTuple):
     """Arm and space of movements, as compiled functions take them."""
 
     chain: Chain
-    spheres: Spheres
-    """Spheres that can touch the obstacles at all."""
-    joint_range: Float
-    """Shape (J, 2), [rad]."""
-    of_hand: bool
-    """True if movements are of the hand in the plane, False if they are of the joints."""
+    spheres: Spheres  # Spheres that can touch the obstacles at all
+    joint_range: Float  # Shape (J, 2), [rad]
+    of_hand: bool  # True if movements are of the hand in the plane, False if they are of the joints
+    # Reach of the joints, see :func:`~viapoint.envs.geometry.clearance.travel`, shape (J,), [m]
     reach: Float
-    """Reach of the joints, see :func:`~viapoint.envs.geometry.clearance.travel`, shape (J,), [m]."""
-    hand_alone: bool
-    """True if the only sphere is the one around the hand of an arm in the plane."""
+    hand_alone: bool  # True if the only sphere is the one around the hand of an arm in the plane
+
+
+class Movement(NamedTuple):
+    """One movement, as compiled functions take it."""
+
+    table: MovementTable
+    times: int  # Index of the passage times
+    start: Float  # Shape (D,)
+    offsets: Float  # Offsets w, shape (K + 3, D)
+    duration: float  # Duration during which obstacles move, [s]
+
+
+class Memory(NamedTuple):
+    """Memory of compiled functions, which they use again and again."""
+
+    position: Float  # Position of a movement, shape (D,)
+    joints: Float  # Joints at an instant, shape (J,)
+    path: Float  # Joints at each instant, or positions if the hand is alone, shape (N, J)
+    bound: Float  # Lower bounds of the clearance at each instant, shape (N,), [m]
+    placed: Placed  # Places of the arm's parts
+    limits: Float  # Limits of an arm in the plane, see `planar_limits`
+
+
+@compiled
+def memory_of(setting: Setting, table: MovementTable, dimension: int) -> Memory:
+    """Return memory for movements in a space of D dimensions."""
+    instants, joints = len(table.order), len(setting.joint_range)
+    return Memory(
+        np.empty(dimension),
+        np.empty(joints),
+        np.empty((instants, joints)),
+        np.empty(instants),
+        memory(setting.chain, setting.spheres),
+        planar_limits(setting.chain, setting.joint_range),
+    )
 
 
 @functools.cache
@@ -225,10 +248,7 @@ def _coefficients(durations: Float, coefficients: Float) -> None:
 def best_times(table: MovementTable, offsets: Float, gram: Float) -> tuple[int, float]:
     """Return the passage times of the least jerk cost, as an index of the table, and this cost in unit time.
 
-    Args:
-        table: Table of movements.
-        offsets: Offsets w, shape (K + 3, D).
-        gram: Memory, shape (K + 3, K + 3).
+    The memory `gram` has the shape (K + 3, K + 3).
     """
     products(offsets, gram)
     least, found = 1e300, 0
@@ -268,66 +288,26 @@ def jerk_cost(table: MovementTable, times: int, gram: Float) -> float:
 
 
 @kernel
-def position_at(
-    table: MovementTable, times: int, instant: int, start: Float, offsets: Float, out: Float
-) -> None:
+def position_at(movement: Movement, instant: int, out: Float) -> None:
     """Fill in the position of a movement at an instant, shape (D,)."""
+    basis, offsets = movement.table.basis, movement.offsets
     for d in range(offsets.shape[1]):
-        value = start[d]
+        value = movement.start[d]
         for i in range(offsets.shape[0]):
-            value += table.basis[times, instant, i] * offsets[i, d]
+            value += basis[movement.times, instant, i] * offsets[i, d]
         out[d] = value
 
 
 @kernel
-def joints_at(
-    setting: Setting,
-    table: MovementTable,
-    times: int,
-    instant: int,
-    start: Float,
-    offsets: Float,
-    position: Float,
-    joints: Float,
-) -> bool:
-    """Fill in position and joints at an instant of a movement, and return True within reach and joint ranges.
-
-    `position`, shape (D,), and `joints`, shape (J,), are filled in; the other arguments are those of
-    :func:`least_clearance`.
-    """
-    position_at(table, times, instant, start, offsets, position)
+def joints_at(setting: Setting, movement: Movement, instant: int, position: Float, joints: Float) -> bool:
+    """Fill in position, shape (D,), and joints, shape (J,), at an instant; return True within reach and ranges."""
+    position_at(movement, instant, position)
     if setting.of_hand:
         return bool(solve_planar(setting.chain, setting.joint_range, position[0], position[1], joints))
     for j in range(len(joints)):
         joints[j] = position[j]
         if joints[j] < setting.joint_range[j, 0] or joints[j] > setting.joint_range[j, 1]:
             return False
-    return True
-
-
-@kernel
-def place_arm(
-    setting: Setting,
-    table: MovementTable,
-    times: int,
-    instant: int,
-    start: Float,
-    offsets: Float,
-    position: Float,
-    joints: Float,
-    placed: Placed,
-) -> bool:
-    """Place the arm at an instant of a movement, and return True within reach and joint ranges.
-
-    `position`, shape (D,), `joints`, shape (J,), and `placed` are memory; the other arguments are those of
-    :func:`least_clearance`.
-    """
-    if not joints_at(setting, table, times, instant, start, offsets, position, joints):
-        return False
-    if setting.hand_alone:
-        place_hand(position, placed)
-    else:
-        place(setting.chain, setting.spheres, joints, placed)
     return True
 
 
@@ -340,38 +320,10 @@ def place_hand(position: Float, placed: Placed) -> None:
     placed.known[0] = True
 
 
-class Memory(NamedTuple):
-    """Memory of :func:`least_clearance`, which it uses again and again."""
-
-    position: Float
-    """Position of a movement, shape (D,)."""
-    path: Float
-    """Joints at each instant, or positions if the hand is alone, shape (N, J)."""
-    bound: Float
-    """Lower bounds of the clearance at each instant, shape (N,), [m]."""
-    placed: Placed
-    """Places of the arm's parts."""
-    limits: Float
-    """Limits of an arm in the plane, see :func:`~viapoint.envs.arms.inverse_kinematics.planar_limits`."""
-
-
-@compiled
-def memory_of(setting: Setting, table: MovementTable, dimension: int) -> Memory:
-    """Return memory for movements in a space of D dimensions."""
-    instants, joints = len(table.order), len(setting.joint_range)
-    placed = memory(setting.chain, setting.spheres)
-    limits = planar_limits(setting.chain, setting.joint_range)
-    return Memory(np.empty(dimension), np.empty((instants, joints)), np.empty(instants), placed, limits)
-
-
 @kernel
 def least_clearance(
     setting: Setting,
-    table: MovementTable,
-    times: int,
-    start: Float,
-    offsets: Float,
-    duration: float,
+    movement: Movement,
     obstacles: Obstacles,
     scene: int,
     least: float,
@@ -384,33 +336,22 @@ def least_clearance(
     The search stops at the first clearance below `floor`. In the plane, instants are skipped whose neighbours have so
     much clearance that they cannot have less than the least so far. (Arms in space move too far between two instants.)
 
-    Args:
-        setting: Arm and space.
-        table: Table of movements.
-        times: Index of the passage times.
-        start: Start, shape (D,).
-        offsets: Offsets w, shape (K + 3, D).
-        duration: Duration, [s], during which obstacles move.
-        obstacles: Obstacles of some scenes.
-        scene: Index of the scene.
-        least: Greatest clearance of interest, [m].
-        floor: Clearance below which the exact value does not matter, [m].
-        until: Time after which clearance does not matter, [s].
-        memory: Memory of :func:`memory_of`.
+    Obstacles are those of the scene `scene`. Clearances above `least` are of no interest, below `floor` the exact value
+    does not matter, [m], and after the time `until` nothing does, [s].
     """
-    alone, last = setting.hand_alone, len(table.order) - 1
+    alone, last = setting.hand_alone, len(movement.table.order) - 1
     path, bound, placed = memory.path, memory.bound, memory.placed
-    drift = fastest(obstacles, scene) * duration / last
+    drift = fastest(obstacles, scene) * movement.duration / last
     for k in range(last + 1):
-        instant = table.order[k]
+        instant = movement.table.order[k]
         here = path[instant]
         if alone:
-            position_at(table, times, instant, start, offsets, here)
+            position_at(movement, instant, here)
             if not in_planar_reach(setting.chain, memory.limits, here[0], here[1]):
                 return OUTSIDE
-        elif not joints_at(setting, table, times, instant, start, offsets, memory.position, here):
+        elif not joints_at(setting, movement, instant, memory.position, here):
             return OUTSIDE
-        time = duration * instant / last
+        time = movement.duration * instant / last
         if time > until:  # obstacles may change course until then, joint ranges do not
             bound[instant] = -NOWHERE
             continue
@@ -441,15 +382,8 @@ def _bound_of_neighbours(
 ) -> float:
     """Return the least clearance that an instant can have, by those of two neighbours and the way from there, [m].
 
-    The neighbours are those that come just before in the order of reversed bits.
-
-    Args:
-        setting: Arm and space.
-        path: Configurations that are known, see :class:`Memory`.
-        bound: Clearances that are known.
-        instant: Instant.
-        last: Last instant.
-        drift: Greatest way of an obstacle between two instants, [m].
+    The neighbours come just before in the order of reversed bits. `drift` is the greatest way of an obstacle between
+    two instants, [m].
     """
     least = -NOWHERE
     distance = instant & -instant if instant else last + 1
@@ -460,23 +394,15 @@ def _bound_of_neighbours(
             if setting.hand_alone:
                 way = math.sqrt((there[0] - here[0]) ** 2 + (there[1] - here[1]) ** 2)
             else:
-                way = 2.0 * travel(
-                    setting.reach, there, here
-                )  # two parts of the arm may approach one another
+                # Two parts of the arm may approach one another.
+                way = 2.0 * travel(setting.reach, there, here)
             least = max(least, bound[neighbour] - way - drift * distance)
     return least
 
 
 @kernel
 def shortest_duration(table: MovementTable, times: int, offsets: Float, rate_limit: Float) -> float:
-    """Return the shortest duration of a movement of joints that keeps velocity limits, [s].
-
-    Args:
-        table: Table of movements.
-        times: Index of the passage times.
-        offsets: Offsets w of a movement from rest, shape (K + 3, D).
-        rate_limit: Velocity limits, shape (D,).
-    """
+    """Return the shortest duration of a movement of joints from rest that keeps velocity limits, shape (D,), [s]."""
     most = 0.0
     for instant in range(1, len(table.order) - 1):
         for d in range(offsets.shape[1]):

@@ -19,10 +19,8 @@ from viapoint.envs.geometry.clearance import memory, obstacle_clearance, place, 
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
 
-CHECK_SPACING = 0.05
-"""Spacing of collision checks along a line, [rad]."""
-VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12)
-"""Numbers of via-points, tried in this order."""
+CHECK_SPACING = 0.05  # Spacing of collision checks along a line, [rad]
+VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12)  # Numbers of via-points, tried in this order
 
 
 @functools.cache
@@ -48,21 +46,45 @@ def import_ompl() -> Any:
 def path_around(arm: Arm, ends: Float, obstacles: Obstacles, margin: float, patience: float) -> Float | None:
     """Return corners of a clear path with start and goal, shape (P, J), [rad]; None if none is found in time.
 
-    Args:
-        arm: Arm.
-        ends: Joint positions of start and goal, shape (2, J).
-        obstacles: Obstacles of one scene, at rest.
-        margin: Clearance of the path, [m].
-        patience: Time limit of the search, [s].
+    `ends` are the joint positions of start and goal, shape (2, J). The path keeps a margin, [m], to obstacles at rest,
+    and is found within `patience`, [s].
     """
+    ompl, number = import_ompl(), ends.shape[-1]
+    base, geometric = ompl.base, ompl.geometric
 
-    def is_clear(first: Float, second: Float) -> bool:
-        count = max(2, int(np.ceil(np.abs(second - first).max() / CHECK_SPACING)) + 1)
-        line = np.ascontiguousarray(np.linspace(first, second, count))
-        return bool(line_is_clear(arm.chain, arm.spheres, line, obstacles, margin))
+    def joints(state: Any) -> Float:
+        return np.array([state[i] for i in range(number)])
 
-    corners = _search(import_ompl(), ends, arm.joint_range, is_clear, patience)
-    return corners if corners is None else np.concatenate((ends[:1], corners[1:-1], ends[1:]))
+    class Lines(base.MotionValidator):  # type: ignore[misc, name-defined]
+        def checkMotion(self, first: Any, second: Any) -> bool:  # noqa: N802 - OMPL's name
+            one, other = joints(first), joints(second)
+            count = max(2, int(np.ceil(np.abs(other - one).max() / CHECK_SPACING)) + 1)
+            line = np.ascontiguousarray(np.linspace(one, other, count))
+            return bool(line_is_clear(arm.chain, arm.spheres, line, obstacles, margin))
+
+    space, bounds = base.RealVectorStateSpace(number), base.RealVectorBounds(number)
+    for i, (low, high) in enumerate(arm.joint_range):
+        bounds.setLow(i, float(low))
+        bounds.setHigh(i, float(high))
+    space.setBounds(bounds)
+    information = base.SpaceInformation(space)
+    information.setStateValidityChecker(lambda state: True)  # the motion validator checks whole lines
+    information.setMotionValidator(Lines(information))
+    information.setup()
+    problem = base.ProblemDefinition(information)
+    start, goal = space.allocState(), space.allocState()
+    for i in range(number):
+        start[i], goal[i] = float(ends[0, i]), float(ends[1, i])
+    problem.setStartAndGoalStates(start, goal)
+    planner = geometric.RRTConnect(information)
+    planner.setProblemDefinition(problem)
+    planner.setup()
+    if not planner.solve(patience) or not problem.hasExactSolution():
+        return None
+    path = problem.getSolutionPath()
+    geometric.PathSimplifier(information).simplify(path, patience)
+    corners = [joints(path.getState(i)) for i in range(1, path.getStateCount() - 1)]
+    return np.stack((ends[0], *corners, ends[1]))
 
 
 @compiled
@@ -93,38 +115,3 @@ def points_on(path: Float, count: int) -> Float:
             places[np.abs(places - corner).argmin()] = corner
     places = np.concatenate(([0.0], np.sort(places), along[-1:]))
     return np.stack([np.interp(places, along, path[:, i]) for i in range(path.shape[1])], axis=-1)
-
-
-def _search(ompl: Any, ends: Float, joint_range: Float, is_clear: Any, patience: float) -> Float | None:
-    """Run RRT-Connect and shortcuts within the joint ranges; return corners, shape (P, J), or None."""
-    base, geometric, number = ompl.base, ompl.geometric, ends.shape[-1]
-
-    def place(state: Any) -> Float:
-        return np.array([state[i] for i in range(number)])
-
-    class Lines(base.MotionValidator):  # type: ignore[misc, name-defined]
-        def checkMotion(self, first: Any, second: Any) -> bool:  # noqa: N802 - OMPL's name
-            return bool(is_clear(place(first), place(second)))
-
-    space, bounds = base.RealVectorStateSpace(number), base.RealVectorBounds(number)
-    for i in range(number):
-        bounds.setLow(i, float(joint_range[i, 0]))
-        bounds.setHigh(i, float(joint_range[i, 1]))
-    space.setBounds(bounds)
-    information = base.SpaceInformation(space)
-    information.setStateValidityChecker(lambda state: True)  # the motion validator checks whole lines
-    information.setMotionValidator(Lines(information))
-    information.setup()
-    problem = base.ProblemDefinition(information)
-    start, goal = space.allocState(), space.allocState()
-    for i in range(number):
-        start[i], goal[i] = float(ends[0, i]), float(ends[1, i])
-    problem.setStartAndGoalStates(start, goal)
-    planner = geometric.RRTConnect(information)
-    planner.setProblemDefinition(problem)
-    planner.setup()
-    if not planner.solve(patience) or not problem.hasExactSolution():
-        return None
-    path = problem.getSolutionPath()
-    geometric.PathSimplifier(information).simplify(path, patience)
-    return np.stack([place(path.getState(i)) for i in range(path.getStateCount())])

@@ -7,32 +7,26 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.common.types import Bool, Float, Int, Single
-from viapoint.envs.geometry.clearance import memory as memory_of
+from viapoint.envs.common.types import Bool, Int, Single
 from viapoint.envs.geometry.clearance import place_group
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.task import Task
 from viapoint.training.planning.beliefs import Sight
-from viapoint.training.planning.movements import INSTANTS, Setting, place_arm
-from viapoint.training.planning.problem import Moves, Problem, setting_of
+from viapoint.training.planning.movements import INSTANTS, Setting, memory_of
+from viapoint.training.planning.problem import Moves, Problem, place_at, setting_of
 
-OUT_OF_VIEW = -1
-"""Ray of a place that is outside the field of view."""
+OUT_OF_VIEW = -1  # Ray of a place that is outside the field of view
 
 
 class Places(NamedTuple):
     """Places of S spheres at T instants of H movements in each of B scenes."""
 
+    # Number of the ray that passes nearest to the centre, or OUT_OF_VIEW, shape (B, H, T, S)
     ray: NDArray[np.int32]
-    """Number of the ray that passes nearest to the centre, or OUT_OF_VIEW, shape (B, H, T, S)."""
-    distance: Single
-    """Distance of the centre from the sensor, shape (B, H, T, S), [m]."""
-    centre: Single
-    """Centre in the world, shape (B, H, T, S, 3), [m]."""
-    radius: Single
-    """Radius of each sphere, shape (S,), [m]."""
-    inside: Bool
-    """True for movements within reach and joint ranges, shape (B, H)."""
+    distance: Single  # Distance of the centre from the sensor, shape (B, H, T, S), [m]
+    centre: Single  # Centre in the world, shape (B, H, T, S, 3), [m]
+    radius: Single  # Radius of each sphere, shape (S,), [m]
+    inside: Bool  # True for movements within reach and joint ranges, shape (B, H)
 
     def depth(self, sight: Sight) -> Single:
         """Return how far centres lie behind the surface that is seen in their direction, shape (B, H, T, S), [m].
@@ -49,14 +43,9 @@ class Places(NamedTuple):
 
 
 def places_of(task: Task, problem: Problem, moves: Moves, sight: Sight, instants: Int) -> Places:
-    """Return where the spheres of the arm are during movements.
+    """Return where the spheres of the arm are at some instants of H movements in each of B problems.
 
-    Args:
-        task: Task with a sensor.
-        problem: B problems; their obstacles tell which spheres of an arm in the plane matter.
-        moves: H movements in each of them.
-        sight: Readings of B scenes.
-        instants: Instants that are looked at.
+    The obstacles of the problems tell which spheres of an arm in the plane matter.
     """
     setting = setting_of(task, problem.obstacles)
     number, plans = moves.duration.shape
@@ -65,7 +54,7 @@ def places_of(task: Task, problem: Problem, moves: Moves, sight: Sight, instants
     shape = number, plans, len(instants), len(some)
     centre = np.zeros((*shape, 3), np.float32)
     inside = np.ones((number, plans), np.bool_)
-    _centres(setting, moves, problem.start, instants, some, centre, inside)
+    _centres(setting, moves, instants, some, centre, inside)
     sensor = task.sensor
     assert sensor is not None
     away = centre.reshape(number, -1, 3) - sight.origin[:, None].astype(np.float32)
@@ -83,27 +72,16 @@ def instants_of(task: Task, number: int) -> Int:
 
 
 @compiled
-def _centres(
-    setting: Setting,
-    moves: Moves,
-    start: Float,
-    instants: Int,
-    some: Int,
-    centre: Single,
-    inside: Bool,
-) -> None:
+def _centres(setting: Setting, moves: Moves, instants: Int, some: Int, centre: Single, inside: Bool) -> None:
     """Fill in the centres of some spheres, see :func:`places_of`."""
     number, plans = moves.duration.shape
     spheres = setting.spheres
-    placed = memory_of(setting.chain, spheres)
-    position, joints = np.empty(start.shape[1]), np.empty(len(setting.joint_range))
+    memory = memory_of(setting, moves.table, moves.start.shape[1])
+    position, joints, placed = memory.position, memory.joints, memory.placed
     for b in range(number):
         for h in range(plans):
             for k in range(len(instants)):
-                offsets, times = moves.offsets[b, h], moves.times[b, h]
-                if not place_arm(
-                    setting, moves.table, times, instants[k], start[b], offsets, position, joints, placed
-                ):
+                if not place_at(setting, moves, b, h, instants[k], position, joints, placed):
                     inside[b, h] = False
                     break
                 for group in range(len(spheres.link)):

@@ -23,14 +23,15 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least, whole_number
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape
-from viapoint.envs.plans import SHORTEST_DURATION, Motion, Plan, SpaceName
+from viapoint.envs.plans import SHORTEST_DURATION, Plan, SpaceName
 from viapoint.envs.scenes.options import Pose
 from viapoint.envs.scenes.scene import row_clearances
 from viapoint.envs.spaces import Space, space_of
-from viapoint.training.planning.motion_plan import Limits, MotionPlan
+from viapoint.training.planning.motion_plan import Limits, MotionPlan, joint_motion
 from viapoint.training.planning.movements import (
     FINE_INSTANTS,
     OUTSIDE,
+    Movement,
     MovementTable,
     Setting,
     fine_table,
@@ -49,36 +50,27 @@ from viapoint.training.planning.refine import (
     unit_of_jerk,
 )
 
+# Relative jerk cost above which more seeds are tried after a free movement, and how many of them
 ROUGH, MORE = 4.0, 4
-"""Relative jerk cost above which more seeds are tried after a free movement, and how many of them."""
+# Spread of the first random seeds around the straight line, and of later ones, [rad]
 SPREADS = 0.8, 1.0
-"""Spread of the first random seeds around the straight line, and of later ones, [rad]."""
-HAND_SPREADS = 0.15, 0.3
-"""Spreads of the same seeds in hand space, [m]."""
-NARROW = 8
-"""Number of seeds with the first spread."""
-SEEDS = 256
-"""Greatest number of random seeds."""
-CHUNKS = 1, 1, 2, 4
-"""Numbers of seeds between two looks at the clock; the last one repeats."""
-LONGEST_SEARCH = 1.0
-"""Default of the time limit, [s]."""
-RANGE_TOLERANCE = 1e-6
-"""Way beyond a joint limit that counts as rounding, [rad]."""
-UNLIMITED = 0.85
-"""Shortest duration that is chosen for an arm without velocity limits, [s]."""
-LIMIT_STRIDE = 4
-"""Step between the instants at which limits are looked at."""
-ROUNDS = 6
-"""Greatest number of times that a movement is planned again because it must take longer."""
+HAND_SPREADS = 0.15, 0.3  # Spreads of the same seeds in hand space, [m]
+NARROW = 8  # Number of seeds with the first spread
+SEEDS = 256  # Greatest number of random seeds
+CHUNKS = 1, 1, 2, 4  # Numbers of seeds between two looks at the clock; the last one repeats
+LONGEST_SEARCH = 1.0  # Default of the time limit, [s]
+RANGE_TOLERANCE = 1e-6  # Way beyond a joint limit that counts as rounding, [rad]
+UNLIMITED = 0.85  # Shortest duration that is chosen for an arm without velocity limits, [s]
+LIMIT_STRIDE = 4  # Step between the instants at which limits are looked at
+ROUNDS = 6  # Greatest number of times that a movement is planned again because it must take longer
+# Duration relative to that of the straight movement with which planning among moving obstacles begins
 LONGER = 1.3
-"""Duration relative to that of the straight movement with which planning among moving obstacles begins."""
-SPARE = 1e-3
-"""Clearance that movements keep beyond the margin where their ends have it, [m]."""
-ROUNDING = 1e-6
-"""Rounding error of clearances, [m]."""
-GOALS = 8
-"""Greatest number of configurations that are tried for a pose."""
+SPARE = 1e-3  # Clearance that movements keep beyond the margin where their ends have it, [m]
+ROUNDING = 1e-6  # Rounding error of clearances, [m]
+# Required clearances of a path of OMPL in each attempt, until one can be made smooth, [m]
+OMPL_MARGINS = (0.010, 0.004, 0.001, 0.001)
+OMPL_PATIENCE = 1.0  # Time limit for each path of OMPL as a baseline, [s]
+GOALS = 8  # Greatest number of configurations that are tried for a pose
 
 
 class _Problem(NamedTuple):
@@ -114,21 +106,32 @@ class _Problem(NamedTuple):
         return offsets
 
 
+class _Effort(NamedTuple):
+    """Bounds of the search for a movement to one goal."""
+
+    n_via: int
+    given: Float  # Via-points that are tried first, shape (S, K, D)
+    seeds: int  # Greatest number of random seeds
+    enough: int  # Number of free movements
+    until: float  # Time after which no further seed is tried, [s]
+    generator: np.random.Generator
+    ompl: bool  # True to try a path of OMPL in the end
+
+
 class _Movement(NamedTuple):
     """Movement with passage times from a table."""
 
-    vias: Float
-    """Via-points relative to the start, shape (K, D)."""
-    table: MovementTable
-    """Table with many instants."""
-    times: int
-    """Index of the passage times."""
-    duration: float
-    """Duration for which it was planned, [s]."""
-    source: str
-    """Origin of the via-points."""
-    clearance: float | None = None
-    """Its least clearance, [m]; None if it is not known yet."""
+    vias: Float  # Via-points relative to the start, shape (K, D)
+    table: MovementTable  # Table with many instants
+    times: int  # Index of the passage times
+    duration: float  # Duration for which it was planned, [s]
+    source: str  # Origin of the via-points
+    clearance: float | None = None  # Its least clearance, [m]; None if it is not known yet
+
+    def compiled(self, problem: _Problem) -> Movement:
+        """Return the movement as compiled functions take it."""
+        offsets = problem.offsets(self.vias, self.duration)
+        return Movement(self.table, self.times, problem.start, offsets, self.duration)
 
 
 def plan_motion(
@@ -221,15 +224,19 @@ def plan_motion(
         margin=margin,
     )
     goals = _goals(problem, goal)
-    given, number = _seeds(seeds, n_via, where.dimension)
-    generator = np.random.default_rng(rng if rng is not None else 0)
+    given, number = np.zeros((0, n_via, where.dimension)), SEEDS
+    if np.ndim(seeds) == 0:
+        number = whole_number("seeds", seeds, 0)
+    else:
+        given = finite_array("seeds", seeds, (None, n_via, where.dimension))
     number = -(-number // len(goals))
+    generator = np.random.default_rng(rng if rng is not None else 0)
     until = time.perf_counter() + time_limit
     # Straight movements are cheap, and the first goal that is reached bounds what others may cost.
-    straight = [
-        _plan(problem._replace(goal=each), n_via, given[:0], 0, enough, 0.0, generator, False)
-        for each in (goals if len(goals) > 1 else goals[:0])
-    ]
+    little = _Effort(n_via, given[:0], 0, enough, 0.0, generator, False)
+    straight = []
+    if len(goals) > 1:
+        straight = [_plan(problem._replace(goal=each), little) for each in goals]
     plans = list(straight)
     for rank, each in enumerate(goals):
         least = min((plan.duration for plan in plans if plan.success), default=np.inf)
@@ -240,7 +247,8 @@ def plan_motion(
         share = now + (until - now) / (len(goals) - rank)
         few = number if np.isinf(least) else min(number, NARROW)
         tree = ompl and bool(np.isinf(least))
-        plans.append(_plan(problem._replace(goal=each), n_via, given, few, enough, share, generator, tree))
+        effort = _Effort(n_via, given, few, enough, share, generator, tree)
+        plans.append(_plan(problem._replace(goal=each), effort))
     best = max(plans, key=_worth)
     return dataclasses.replace(best, milliseconds=1e3 * (time.perf_counter() - began))
 
@@ -295,16 +303,10 @@ def plan_motions(
 def checked_motion(
     arm: Arm, space: SpaceName, plan: Plan, obstacles: Obstacles, source: str, *, shortest: bool = False
 ) -> MotionPlan:
-    """Return a plan of any planner, of one movement, with its clearance and its limits.
+    """Return a plan of any planner, of one movement in one scene, with its clearance and its limits.
 
-    Args:
-        arm: Arm.
-        space: Space of its coordinates.
-        plan: Plan of one movement.
-        obstacles: Obstacles of one scene.
-        source: Name of the planner.
-        shortest: True for the shortest duration that the limits allow; False for that of the plan, or a longer one if
-            the limits need it.
+    Its duration is the shortest that the limits allow with `shortest`, otherwise that of the plan, or a longer one if
+    the limits need it. `source` is the name of the planner.
     """
     waypoints, durations = np.asarray(plan.waypoints), np.asarray(plan.durations)
     duration = float(durations.sum())
@@ -325,6 +327,37 @@ def checked_motion(
     return _known(problem, movement, _fault(problem)[0], 0.0 if shortest else 1.0)
 
 
+def ompl_motion(
+    arm: Arm, start: Float, goal: Float, obstacles: Obstacles, *, space: SpaceName = "joints"
+) -> MotionPlan:
+    """Return the smooth movement along a path of RRT-Connect, or the one with the most clearance if none is free.
+
+    The minimum-jerk movement through as few points of the path as stay clear makes it smooth, the usual method of
+    robotics. OMPL has one random generator for all its planners, so that results depend on those before. Start and goal
+    are coordinates of the space in which the movement is smooth; the path is one of joints. Obstacles are at rest.
+    """
+    where = space_of(arm, space)
+
+    def smooth(configurations: Float) -> MotionPlan:
+        points = where.coordinates(configurations)
+        plan = Plan(points, np.asarray(primitives.passage_durations(points, 1.0)))
+        return checked_motion(arm, space, plan, obstacles, "ompl", shortest=True)
+
+    ends = np.ascontiguousarray(where.joints(np.stack((start, goal))))
+    best = smooth(ends)
+    for margin in OMPL_MARGINS:
+        path = path_around(arm, ends, obstacles, margin, OMPL_PATIENCE)
+        if path is None:
+            continue
+        for count in VIA_COUNTS:
+            plan = smooth(points_on(path, count))
+            if plan.clearance > best.clearance:
+                best = plan
+            if plan.success and plan.clearance >= 0.5 * margin:
+                return plan
+    return best
+
+
 @functools.lru_cache(maxsize=64)
 def _setting(arm: Arm, of_hand: bool) -> Setting:
     """Return arm and space for compiled functions; rounding errors at the joint limits do not count."""
@@ -340,10 +373,9 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     still = np.zeros_like(start)
     problem = _Problem(arm, space, start, still, still, start + 0.01, pack([[]]), None, 0.0)
     straight = _straight(problem)
-    _is_free(problem, straight, 0.0)
+    is_free(problem.setting, straight.compiled(problem), problem.obstacles, 0, 0.0)
     _result(problem, straight, _fault(problem)[0])
-    nothing = np.zeros((0, n_via, len(start)))
-    _refined(problem, 0.0, movement_table(n_via), fine_table(n_via), nothing, 1.0, smooth=SMOOTH, enough=1)
+    _refined(problem, 0.0, movement_table(n_via), fine_table(n_via), np.zeros((0, n_via, len(start))), 1.0)
 
 
 def _goals(problem: _Problem, goal: Any) -> Float:
@@ -369,13 +401,6 @@ def _goals(problem: _Problem, goal: Any) -> Float:
     away = np.abs(goals - problem.start).max(axis=-1)
     # Copies are contiguous and writable, which compiled functions depend on.
     return np.array(goals[np.argsort(away, kind="stable")])
-
-
-def _seeds(seeds: Any, n_via: int, dimension: int) -> tuple[Float, int]:
-    """Return the via-points that are given, shape (S, K, D), and the number of random seeds."""
-    if np.ndim(seeds) == 0:
-        return np.zeros((0, n_via, dimension)), whole_number("seeds", seeds, 0)
-    return finite_array("seeds", seeds, (None, n_via, dimension)), SEEDS
 
 
 def _worth(plan: MotionPlan) -> tuple[bool, float]:
@@ -422,31 +447,21 @@ def _fault(problem: _Problem) -> tuple[str, float]:
     return "", max(problem.margin, min(most, nearest - ROUNDING))
 
 
-def _plan(
-    problem: _Problem,
-    n_via: int,
-    given: Float,
-    number: int,
-    enough: int,
-    until: float,
-    generator: np.random.Generator,
-    ompl: bool,
-) -> MotionPlan:
+def _plan(problem: _Problem, effort: _Effort) -> MotionPlan:
     """Return the best movement to one goal."""
     fault, kept = _fault(problem)
     straight = _straight(problem)
-    coarse = straight._replace(table=movement_table(0))
-    if fault or _is_free(problem, coarse, kept):
+    coarse = straight._replace(table=movement_table(0)).compiled(problem)
+    if fault or is_free(problem.setting, coarse, problem.obstacles, 0, kept):
         plan = _result(problem, straight, fault)
         if plan.success or fault or problem.duration is not None:
             return plan
     duration, tried, found = straight.duration, 0, straight
-    seeds = given
     for _ in range(ROUNDS):
-        best, more = _search(problem, kept, n_via, seeds, number, enough, until, generator, duration)
+        best, more = _search(problem, effort, kept, duration)
         tried += more
-        if best is None and ompl and not problem.moves:
-            best = _along_path(problem, kept, duration, until)
+        if best is None and effort.ompl and not problem.moves:
+            best = _along_path(problem, kept, duration, effort.until)
         if best is None:
             break
         found = best
@@ -455,9 +470,9 @@ def _plan(
             return dataclasses.replace(plan, seeds=tried)
         # In motion, and among moving obstacles, a longer movement is another one.
         duration *= LONGER
-        seeds = (found.vias + problem.start)[None]
+        effort = effort._replace(given=(found.vias + problem.start)[None])
     plan = _result(problem, found, "")
-    ended = "the time limit was reached" if time.perf_counter() >= until else "no free one was found"
+    ended = "the time limit was reached" if time.perf_counter() >= effort.until else "no free one was found"
     reason = f"{plan.reason}; {ended} from {tried} seeds"
     return dataclasses.replace(plan, success=False, seeds=tried, reason=reason)
 
@@ -469,23 +484,14 @@ def _straight(problem: _Problem) -> _Movement:
     if problem.duration is None and problem.moves:
         still = np.zeros_like(problem.start)
         resting = problem._replace(velocity=still, acceleration=still)
-        duration = _timed(resting, movement, 0.0).duration
+        duration, _, _ = _timed(resting, movement, 0.0)
         movement = movement._replace(duration=LONGER * duration)
     return movement
 
 
-def _search(
-    problem: _Problem,
-    kept: float,
-    n_via: int,
-    given: Float,
-    number: int,
-    enough: int,
-    until: float,
-    generator: np.random.Generator,
-    duration: float,
-) -> tuple[_Movement | None, int]:
+def _search(problem: _Problem, effort: _Effort, kept: float, duration: float) -> tuple[_Movement | None, int]:
     """Refine seeds until enough movements are free; return the one with the least jerk, and the number of seeds."""
+    n_via, given, enough = effort.n_via, effort.given, effort.enough
     share = np.arange(1, n_via + 1)[:, None] / (n_via + 1)
     straight = share * (problem.goal - problem.start)
     unit = unit_of_jerk(problem.goal - problem.start, problem.space.of_hand)
@@ -494,8 +500,8 @@ def _search(
     best, least = None, np.inf
     tight, widest = None, problem.margin  # the best of those that keep the margin and nothing more
     tried = free = 0
-    total = len(given) + 1 + number
-    while tried < total and time.perf_counter() < until:
+    total = len(given) + 1 + effort.seeds
+    while tried < total and time.perf_counter() < effort.until:
         if free >= enough and least <= ROUGH * unit:
             break
         seeds = np.empty((min(CHUNKS[min(tried, len(CHUNKS) - 1)], total - tried), *straight.shape))
@@ -505,9 +511,9 @@ def _search(
                 seeds[k] = given[tried + k] - problem.start
                 continue
             spread = 0.0 if rank == 0 else near if rank < NARROW else far
-            seeds[k] = straight + spread * generator.uniform(-1.0, 1.0, straight.shape)
+            seeds[k] = straight + spread * effort.generator.uniform(-1.0, 1.0, straight.shape)
         wanted = max(enough - free, 1)
-        done, found = _refined(problem, kept, table, fine, seeds, duration, smooth=SMOOTH, enough=wanted)
+        done, found = _refined(problem, kept, table, fine, seeds, duration, enough=wanted)
         for k in range(done):
             clearance = float(found.clearance[k])
             if clearance < kept:
@@ -535,8 +541,8 @@ def _refined(
     seeds: Float,
     duration: float,
     *,
-    smooth: float,
-    enough: int,
+    smooth: float = SMOOTH,
+    enough: int = 1,
 ) -> tuple[int, Found]:
     """Refine seeds, shape (S, K, D); see :func:`~viapoint.training.planning.refine.refine_seeds`."""
     n_via = seeds.shape[1]
@@ -566,40 +572,23 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
         durations = np.asarray(primitives.passage_durations(points, 1.0))[None]
         table, fine = table_with(durations), table_with(durations, FINE_INSTANTS)
         vias = points[None, 1:-1] - problem.start
-        _, found = _refined(problem, kept, table, fine, vias, duration, smooth=0.0, enough=1)
+        _, found = _refined(problem, kept, table, fine, vias, duration, smooth=0.0)
         if found.clearance[0] >= kept:
             return _Movement(found.vias[0], fine, 0, duration, "ompl", float(found.clearance[0]))
     return None
 
 
-class _Timed(NamedTuple):
-    """Duration of a movement, and what it needs of the limits."""
+def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple[float, Limits, str]:
+    """Return the duration of a movement, the shares of the limits that it uses, and how it fails to keep them.
 
-    duration: float
-    """Duration, [s]."""
-    limits: Limits
-    """Shares of the limits that the movement uses."""
-    joint: int
-    """Index of the joint that is nearest to a limit, or the farthest beyond it."""
-    shortest: float
-    """Shortest duration that keeps the limits, for a movement from rest, [s]."""
-
-
-def _timed(problem: _Problem, movement: _Movement, least: float | None) -> _Timed:
-    """Return the duration of a movement and what it needs of the limits.
-
-    Args:
-        problem: Problem.
-        movement: Movement.
-        least: Least factor on its duration; limits may need a greater one. None to keep the duration as it is.
+    `least` is the least factor on its duration; limits may need a greater one. None keeps the duration as it is.
     """
     arm, duration = problem.arm, movement.duration
     offsets = problem.offsets(movement.vias, duration)
     position = problem.start + movement.table.basis[movement.times, ::LIMIT_STRIDE] @ offsets
     velocity = movement.table.rate[movement.times, ::LIMIT_STRIDE] @ offsets / duration
     acceleration = movement.table.bend[movement.times, ::LIMIT_STRIDE] @ offsets / duration**2
-    sampled = Motion(position[None], velocity[None], acceleration[None])
-    motion = Motion(*(np.ascontiguousarray(part[0]) for part in problem.space.joint_motion(sampled)))
+    motion = joint_motion(problem.space, position, velocity, acceleration)
     needed = slowdown(arm.chain, arm.velocity_limit, arm.torque_limit, *motion)
     factor = 1.0 if least is None else max(needed, least)
     if least == 0.0:  # a start that is the goal needs a duration, too
@@ -609,21 +598,13 @@ def _timed(problem: _Problem, movement: _Movement, least: float | None) -> _Time
     torque = torques(arm.chain, motion.position, rate, change)
     shares = np.stack((np.abs(rate) / arm.velocity_limit, np.abs(torque) / arm.torque_limit)).max(axis=1)
     limits = Limits(float(shares[0].max()), float(shares[1].max()))
-    return _Timed(factor * duration, limits, int(shares.max(axis=0).argmax()), needed * duration)
-
-
-def _is_free(problem: _Problem, movement: _Movement, kept: float) -> bool:
-    """Return True if a movement keeps a clearance at the instants of its table."""
-    return is_free(*_arguments(problem, movement), kept)
-
-
-def _arguments(
-    problem: _Problem, movement: _Movement
-) -> tuple[Setting, MovementTable, int, Float, Float, float, Obstacles, int]:
-    """Return the arguments of :func:`~viapoint.training.planning.refine.exact_clearance` and `is_free`."""
-    offsets = problem.offsets(movement.vias, movement.duration)
-    start, duration = problem.start, movement.duration
-    return problem.setting, movement.table, movement.times, start, offsets, duration, problem.obstacles, 0
+    kind = "velocity" if limits.velocity > limits.torque else "torque"
+    worst = arm.joint_names[int(shares.max(axis=0).argmax())]
+    beyond = (
+        f"joint {worst!r} needs {max(limits):.2f} times its {kind} limit in {factor * duration:.2f} s; "
+        f"the shortest duration is {needed * duration:.2f} s"
+    )
+    return factor * duration, limits, beyond
 
 
 def _result(problem: _Problem, movement: _Movement, fault: str) -> MotionPlan:
@@ -633,12 +614,11 @@ def _result(problem: _Problem, movement: _Movement, fault: str) -> MotionPlan:
 
 def _known(problem: _Problem, movement: _Movement, fault: str, least: float | None) -> MotionPlan:
     """Return a movement with what is known of it; see :func:`_timed` for its duration."""
-    timed = _timed(problem, movement, least)
-    duration, limits = timed.duration, timed.limits
+    duration, limits, beyond = _timed(problem, movement, least)
     movement = movement._replace(duration=duration)
     clearance = movement.clearance
     if clearance is None:
-        clearance = exact_clearance(*_arguments(problem, movement))
+        clearance = exact_clearance(problem.setting, movement.compiled(problem), problem.obstacles, 0)
     offsets = problem.offsets(movement.vias, duration)
     cost = np.einsum("ij,id,jd->", movement.table.cost[movement.times], offsets, offsets)
     line = problem.goal - problem.start
@@ -648,11 +628,7 @@ def _known(problem: _Problem, movement: _Movement, fault: str, least: float | No
     elif not reason and clearance < problem.margin:
         reason = f"its clearance is {1e3 * clearance:.1f} mm, less than {1e3 * problem.margin:g} mm"
     elif not reason and max(limits) > 1.0:
-        kind = "velocity" if limits.velocity > limits.torque else "torque"
-        reason = (
-            f"joint {problem.arm.joint_names[timed.joint]!r} needs {max(limits):.2f} times its {kind} limit "
-            f"in {timed.duration:.2f} s; the shortest duration is {timed.shortest:.2f} s"
-        )
+        reason = beyond
     return MotionPlan(
         arm=problem.arm,
         space=problem.space.name,

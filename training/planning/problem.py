@@ -14,7 +14,8 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.chain import Spheres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.compiled import compiled, kernel
+from viapoint.envs.geometry.clearance import Placed, place
+from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
 from viapoint.envs.plans import SHORTEST_DURATION
@@ -25,11 +26,14 @@ from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.movements import (
     FINE_INSTANTS,
     INSTANTS,
+    Movement,
     MovementTable,
     Setting,
     best_times,
     jerk_cost,
+    joints_at,
     movement_table,
+    place_hand,
     products,
     shortest_duration,
     table_with,
@@ -37,34 +41,27 @@ from viapoint.training.planning.movements import (
 
 Numbers = NDArray[np.floating[Any]]
 
+# Vertical distance from obstacles beyond which spheres of an arm in the plane never matter, [m]
 NEAR = 0.05
-"""Vertical distance from obstacles beyond which spheres of an arm in the plane never matter, [m]."""
 
+# Angle that a straight elbow turns when the hand is 0.3 mm from its place, the usual error of tracking, [rad]
 ELBOW_ROOM = 0.04
-"""Angle that a straight elbow turns when the hand is 0.3 mm from its place, the usual error of tracking, [rad]."""
+# Greatest factor by which a plan in motion is prolonged to keep the velocity limits of the joints
 PROLONGED = 1.5
-"""Greatest factor by which a plan in motion is prolonged to keep the velocity limits of the joints."""
 
 
 class Problem(NamedTuple):
     """B planning problems in coordinates of the task's space."""
 
-    start: Float
-    """Present reference, shape (B, D)."""
-    velocity: Float
-    """Its velocity, shape (B, D)."""
-    acceleration: Float
-    """Its acceleration, shape (B, D)."""
-    goal: Float
-    """Goal, shape (B, D)."""
-    obstacles: Obstacles
-    """Obstacles now, with their velocities."""
+    start: Float  # Present reference, shape (B, D)
+    velocity: Float  # Its velocity, shape (B, D)
+    acceleration: Float  # Its acceleration, shape (B, D)
+    goal: Float  # Goal, shape (B, D)
+    obstacles: Obstacles  # Obstacles now, with their velocities
+    # Via-points of the plan of a zero action, shape (B, K, D); None where no plan is under way
     vias: Float | None = None
-    """Via-points of the plan of a zero action, shape (B, K, D); None where no plan is under way."""
-    remaining: Float | None = None
-    """Remaining time of this plan, shape (B,), [s]."""
-    time_left: Float | None = None
-    """Time until the end of the episode, shape (B,), [s]."""
+    remaining: Float | None = None  # Remaining time of this plan, shape (B,), [s]
+    time_left: Float | None = None  # Time until the end of the episode, shape (B,), [s]
 
     @classmethod
     def of_observation(cls, observation: Mapping[str, Any], task: Task) -> Problem:
@@ -107,7 +104,12 @@ class Problem(NamedTuple):
 
     def take(self, rows: Any) -> Problem:
         """Return some of the problems, by indices, mask or slice."""
-        parts: list[Any] = [None if part is None else _some(part, rows) for part in self]
+        parts: list[Any] = []
+        for part in self:
+            if isinstance(part, Obstacles):
+                parts.append(part.take(rows))
+            else:
+                parts.append(None if part is None else part[rows])
         return Problem(*parts)
 
 
@@ -115,53 +117,66 @@ class Moves(NamedTuple):
     """Plans of H actions in each of B problems, as products of a table."""
 
     table: MovementTable
-    """Table of movements."""
-    offsets: Float
-    """Offsets from the start, see :mod:`viapoint.training.planning.movements`, shape (B, H, K + 3, D)."""
-    times: Int
-    """Indices of the passage times, shape (B, H)."""
-    duration: Float
-    """Durations, shape (B, H), [s]."""
-    rough: Float
-    """Logarithm of 1 + jerk cost relative to that of the zero action, shape (B, H)."""
-    relative: Float
-    """Durations relative to that of the zero action, shape (B, H)."""
+    start: Float  # Present references, shape (B, D)
+    offsets: Float  # Offsets of via-points, goal and present motion, shape (B, H, K + 3, D)
+    times: Int  # Indices of the passage times, shape (B, H)
+    duration: Float  # Durations, shape (B, H), [s]
+    rough: Float  # Logarithm of 1 + jerk cost relative to that of the zero action, shape (B, H)
+    relative: Float  # Durations relative to that of the zero action, shape (B, H)
+    # True for plans beyond the velocity limits of the joints, shape (B, H); the environment would prolong them
     fast: Bool
-    """True for plans beyond the velocity limits of the joints, shape (B, H); the environment would prolong them."""
 
 
-class _Layout(NamedTuple):
-    """Meaning of actions, as compiled functions take it; see :class:`~viapoint.envs.plans.ActionLayout`."""
-
-    of_hand: bool
-    via_scale: Float
-    rate_limit: Float
-    """Velocity limits of the joints, shape (D,), [rad/s]; unused in hand space."""
-    centre: float
-    log_half_range: float
-    shortest: float
-    """Shortest duration of a revised movement, [s]."""
-    longest: float
-    """Longest duration in hand space, [s], unless more is left of the plan under way."""
+@inlined
+def movement_of(moves: Moves, b: int, h: int) -> Movement:
+    """Return one of the plans; for kernels, as elsewhere Numba counts references to each array."""
+    return Movement(moves.table, moves.times[b, h], moves.start[b], moves.offsets[b, h], moves.duration[b, h])
 
 
-class _Nominal(NamedTuple):
-    """Plans of zero actions in B problems, as compiled functions take them."""
+# A call takes longer than the few products of an instant.
+_joints_at = inlined(joints_at.py_func)  # type: ignore[attr-defined]
+
+
+@kernel
+def place_at(
+    setting: Setting,
+    moves: Moves,
+    b: int,
+    h: int,
+    instant: int,
+    position: Float,
+    joints: Float,
+    placed: Placed,
+) -> bool:
+    """Place the arm at an instant of a plan, and return True within reach and joint ranges."""
+    if not _joints_at(setting, movement_of(moves, b, h), instant, position, joints):
+        return False
+    if setting.hand_alone:
+        place_hand(position, placed)
+    else:
+        place(setting.chain, setting.spheres, joints, placed)
+    return True
+
+
+class _Given(NamedTuple):
+    """Plans of zero actions in B problems, and the meaning of other actions, see `ActionLayout`."""
 
     start: Float
     velocity: Float
     acceleration: Float
     goal: Float
-    line: Float
-    """Line along which offsets are measured in hand space, shape (B, D)."""
-    vias: Float
-    """Shape (B, K, D)."""
-    remaining: Float
-    """Shape (B,), [s]; unused in joint space at rest."""
-    whole: Float
-    """Durations of the straight movements that rewards are relative to, shape (B,), [s]."""
-    straight: Float
-    """Their jerk costs, shape (B,)."""
+    line: Float  # Line along which offsets are measured in hand space, shape (B, D)
+    vias: Float  # Shape (B, K, D)
+    remaining: Float  # Shape (B,), [s]; unused in joint space at rest
+    whole: Float  # Durations of the straight movements that rewards are relative to, shape (B,), [s]
+    straight: Float  # Their jerk costs, shape (B,)
+    of_hand: bool
+    via_scale: Float
+    rate_limit: Float  # Velocity limits of the joints, shape (D,), [rad/s]; unused in hand space
+    centre: float
+    log_half_range: float
+    shortest: float  # Shortest duration of a revised movement, [s]
+    longest: float  # Longest duration in hand space, [s], unless more is left of the plan under way
 
 
 def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = False) -> Moves:
@@ -172,15 +187,37 @@ def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = Fa
     """
     layout, table = task.action, movement_table(task.n_via)
     vectors = np.ascontiguousarray(actions, dtype=np.float64)
-    resting = problem.remaining is None
-    given = (exact or layout.timing == "learned") and resting
-    if given:  # each plan has passage times of its own
+    own_times = (exact or layout.timing == "learned") and problem.remaining is None
+    if own_times:  # each plan has passage times of its own
         start, goal = problem.start[:, None], problem.goal[:, None]
         start = np.broadcast_to(start, (*vectors.shape[:2], layout.dimension))
         shares = layout.shares(layout.waypoints(vectors, start, goal), vectors)
         table = table_with(shares.reshape(-1, task.n_via + 1), FINE_INSTANTS if exact else INSTANTS)
-    numbers = _Layout(
-        of_hand=layout.space == "hand",
+    given = _given(task, problem)
+    return Moves(table, given.start, *_expand(given, table, vectors, own_times))
+
+
+def _given(task: Task, problem: Problem) -> _Given:
+    """Return the plans of zero actions."""
+    layout, line, remaining = task.action, problem.goal - problem.start, problem.remaining
+    shares = np.arange(1, task.n_via + 1)[:, None] / (task.n_via + 1)
+    vias = problem.start[:, None] + line[:, None] * shares if problem.vias is None else problem.vias
+    length, whole = _straight_movement(task, problem)
+    if remaining is None:
+        remaining = np.full(len(line), layout.centre)
+    elif task.space.of_hand:
+        line = np.where((norm(line) < NEARBY["hand"])[:, None], np.eye(1, line.shape[-1]), line)
+    return _Given(
+        np.ascontiguousarray(problem.start),
+        np.ascontiguousarray(problem.velocity),
+        np.ascontiguousarray(problem.acceleration),
+        np.ascontiguousarray(problem.goal),
+        np.ascontiguousarray(line),
+        np.ascontiguousarray(vias),
+        np.ascontiguousarray(remaining),
+        whole,
+        straight_jerk_cost(length, whole),
+        of_hand=task.space.of_hand,
         via_scale=np.array(layout.via_scale),
         rate_limit=np.array(layout.rate_limit),
         centre=layout.centre,
@@ -188,46 +225,19 @@ def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = Fa
         shortest=least_remaining(layout),
         longest=layout.duration_range[1],
     )
-    return Moves(table, *_expand(numbers, table, _nominal(task, problem), vectors, given))
-
-
-def _nominal(task: Task, problem: Problem) -> _Nominal:
-    """Return the plans of zero actions."""
-    line = problem.goal - problem.start
-    shares = np.arange(1, task.n_via + 1)[:, None] / (task.n_via + 1)
-    vias = problem.start[:, None] + line[:, None] * shares if problem.vias is None else problem.vias
-    remaining = problem.remaining
-    if remaining is None:
-        remaining = np.full(len(line), task.action.centre)
-    elif task.space.of_hand:
-        line = np.where((norm(line) < NEARBY["hand"])[:, None], np.eye(1, line.shape[-1]), line)
-    length, whole = _straight_movement(task, problem)
-    cost = straight_jerk_cost(length, whole)
-    parts = (
-        problem.start,
-        problem.velocity,
-        problem.acceleration,
-        problem.goal,
-        line,
-        vias,
-        remaining,
-        whole,
-        cost,
-    )
-    return _Nominal(*(np.ascontiguousarray(part) for part in parts))
 
 
 @compiled
 def _expand(
-    layout: _Layout, table: MovementTable, nominal: _Nominal, actions: Float, given: bool
+    given: _Given, table: MovementTable, actions: Float, own_times: bool
 ) -> tuple[Float, Int, Float, Float, Float, Bool]:
     """Return offsets, passage times, durations, `rough`, `relative` and `fast` of plans, see :class:`Moves`.
 
     The meaning of an action is that of :meth:`~viapoint.envs.plans.ActionLayout.decode` and
-    :func:`~viapoint.envs.replanning.revise`. With `given`, each plan has a row of the table as passage times.
+    :func:`~viapoint.envs.replanning.revise`. With `own_times`, each plan has a row of the table as passage times.
     """
     number, plans, _ = actions.shape
-    _, vias, dimension = nominal.vias.shape
+    _, vias, dimension = given.vias.shape
     columns = vias + 3
     every = np.empty((number, plans, columns, dimension))
     times, duration = np.empty((number, plans), np.int64), np.empty((number, plans))
@@ -237,61 +247,55 @@ def _expand(
     for b in range(number):
         moving = False
         for d in range(dimension):
-            moving = moving or nominal.velocity[b, d] != 0.0 or nominal.acceleration[b, d] != 0.0
+            moving = moving or given.velocity[b, d] != 0.0 or given.acceleration[b, d] != 0.0
         for h in range(plans):
             offsets, action = every[b, h], actions[b, h]
-            _place_vias(layout, nominal, b, action, offsets)
-            factor = math.exp(layout.log_half_range * action[vias * dimension])
-            left = max(nominal.remaining[b], layout.shortest)
-            time = max(left * factor, layout.shortest)
-            if layout.of_hand:
-                time = min(time, max(left, layout.longest))
-            row = b * plans + h if given else -1
-            chosen, cost = _timed(table, offsets, nominal, b, row, time, gram)
-            if not layout.of_hand:
-                shortest = shortest_duration(table, chosen, offsets, layout.rate_limit)
+            _place_vias(given, b, action, offsets)
+            factor = math.exp(given.log_half_range * action[vias * dimension])
+            left = max(given.remaining[b], given.shortest)
+            time = max(left * factor, given.shortest)
+            if given.of_hand:
+                time = min(time, max(left, given.longest))
+            row = b * plans + h if own_times else -1
+            chosen, cost = _timed(table, offsets, given, b, row, time, gram)
+            if not given.of_hand:
+                shortest = shortest_duration(table, chosen, offsets, given.rate_limit)
                 if moving:
                     # The environment prolongs plans in motion beyond the limits.
                     time *= min(max(shortest / time, 1.0), PROLONGED)
-                    chosen, cost = _timed(table, offsets, nominal, b, row, time, gram)
-                    shortest = shortest_duration(table, chosen, offsets, layout.rate_limit)
+                    chosen, cost = _timed(table, offsets, given, b, row, time, gram)
+                    shortest = shortest_duration(table, chosen, offsets, given.rate_limit)
                     fast[b, h] = shortest > 1.02 * time
                 else:
-                    time = layout.centre * factor * shortest
+                    time = given.centre * factor * shortest
             times[b, h], duration[b, h] = chosen, time
-            rough[b, h] = math.log1p(cost / time**5 / nominal.straight[b])
-            relative[b, h] = time / nominal.whole[b]
+            rough[b, h] = math.log1p(cost / time**5 / given.straight[b])
+            relative[b, h] = time / given.whole[b]
     return every, times, duration, rough, relative, fast
 
 
 @kernel
-def _place_vias(layout: _Layout, nominal: _Nominal, b: int, action: Float, offsets: Float) -> None:
+def _place_vias(given: _Given, b: int, action: Float, offsets: Float) -> None:
     """Fill in the offsets of via-points and goal from the start."""
-    _, vias, dimension = nominal.vias.shape
-    line, start = nominal.line[b], nominal.start[b]
+    _, vias, dimension = given.vias.shape
+    line, start = given.line[b], given.start[b]
     for k in range(vias):
         for d in range(dimension):
-            step = action[k * dimension + d] * layout.via_scale[d]
-            offsets[k, d] = nominal.vias[b, k, d] - start[d] + (0.0 if layout.of_hand else step)
-        if layout.of_hand:  # offsets along and across the line
+            step = action[k * dimension + d] * given.via_scale[d]
+            offsets[k, d] = given.vias[b, k, d] - start[d] + (0.0 if given.of_hand else step)
+        if given.of_hand:  # offsets along and across the line
             length = math.sqrt(line[0] * line[0] + line[1] * line[1])
             x, y = line[0] / length, line[1] / length
-            along, across = action[2 * k] * layout.via_scale[0], action[2 * k + 1] * layout.via_scale[1]
+            along, across = action[2 * k] * given.via_scale[0], action[2 * k + 1] * given.via_scale[1]
             offsets[k, 0] += along * x - across * y
             offsets[k, 1] += along * y + across * x
     for d in range(dimension):
-        offsets[vias, d] = nominal.goal[b, d] - start[d]
+        offsets[vias, d] = given.goal[b, d] - start[d]
 
 
 @kernel
 def _timed(
-    table: MovementTable,
-    offsets: Float,
-    nominal: _Nominal,
-    b: int,
-    row: int,
-    duration: float,
-    gram: Float,
+    table: MovementTable, offsets: Float, given: _Given, b: int, row: int, duration: float, gram: Float
 ) -> tuple[int, float]:
     """Fill in the present motion of a plan of some duration; return its passage times and jerk cost in unit time.
 
@@ -299,8 +303,8 @@ def _timed(
     """
     last = len(offsets)
     for d in range(offsets.shape[1]):
-        offsets[last - 2, d] = nominal.velocity[b, d] * duration
-        offsets[last - 1, d] = nominal.acceleration[b, d] * duration * duration
+        offsets[last - 2, d] = given.velocity[b, d] * duration
+        offsets[last - 1, d] = given.acceleration[b, d] * duration * duration
     if row >= 0:
         products(offsets, gram)
         return row, jerk_cost(table, row, gram)
@@ -383,8 +387,3 @@ def _some_groups(arm: Arm, wanted: tuple[bool, ...]) -> Spheres:
         ball_radius=spheres.ball_radius[kept],
         pairs=np.zeros((0, 2), np.int64),
     )
-
-
-def _some(part: Any, rows: Any) -> Any:
-    """Return some rows of an array or of obstacles."""
-    return part.take(rows) if isinstance(part, Obstacles) else part[rows]

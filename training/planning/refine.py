@@ -31,6 +31,7 @@ from viapoint.envs.geometry.distance import point_distance, point_distance_and_n
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.training.planning.movements import (
     OUTSIDE,
+    Movement,
     MovementTable,
     Setting,
     best_times,
@@ -39,79 +40,63 @@ from viapoint.training.planning.movements import (
     memory_of,
 )
 
-CONTACT_WEIGHT = 400.0
-"""Weight of the square of a missing distance, [1/m^2] and [1/rad^2]."""
+CONTACT_WEIGHT = 400.0  # Weight of the square of a missing distance, [1/m^2] and [1/rad^2]
+# Wanted clearance of the arm from itself, [m]; some bodies are never much farther from one another
 OWN_CLEARANCE = 0.01
-"""Wanted clearance of the arm from itself, [m]; some bodies are never much farther from one another."""
-RANGE_MARGIN = 0.01
-"""Wanted distance of joints from their limits, [rad]."""
-DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-4, 1e3
-"""Damping at first, and its bounds."""
+RANGE_MARGIN = 0.01  # Wanted distance of joints from their limits, [rad]
+DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-4, 1e3  # Damping at first, and its bounds
+# Instants near the ends in which a movement from rest or to rest goes less than a hundredth of its way
 SLOW = 4
-"""Instants near the ends in which a movement from rest or to rest goes less than a hundredth of its way."""
+# Least clearance at the instants that are looked at with which a refinement may end early, [m] and [rad]
 FREE = 0.005
-"""Least clearance at the instants that are looked at with which a refinement may end early, [m] and [rad]."""
+# Factors on the damping after a step that was better, and after one that was not
 EASIER, HARDER = 0.3, 5.0
-"""Factors on the damping after a step that was better, and after one that was not."""
-FLAT = 0.02
-"""Share of CONTACT_WEIGHT that damps directions in which nothing is known."""
+FLAT = 0.02  # Share of CONTACT_WEIGHT that damps directions in which nothing is known
+# Longest step of a coordinate in joint space, [rad], and in hand space, [m]
 LONGEST_STEP = 0.6, 0.15
-"""Longest step of a coordinate in joint space, [rad], and in hand space, [m]."""
-STRAIGHT_COST = 360.0
-"""Jerk cost of a straight minimum-jerk movement of the way 1 in unit time."""
+STRAIGHT_COST = 360.0  # Jerk cost of a straight minimum-jerk movement of the way 1 in unit time
+# Way of a straight movement whose jerk cost is the unit for shorter ones, too, in joint space, [rad], and in hand
+# space, [m].
 SHORT = 2.0, 0.2
-"""Way of a straight movement whose jerk cost is the unit for shorter ones, too, in joint space, [rad], and in hand
-space, [m]."""
-SINGULAR = 1e-3
-"""Least determinant of the arm's Jacobian in the plane that is believed, [m^2]."""
+SINGULAR = 1e-3  # Least determinant of the arm's Jacobian in the plane that is believed, [m^2]
 
 
 class Aim(NamedTuple):
     """Aim of a refinement."""
 
-    clearance: float
-    """Wanted clearance from obstacles, [m]."""
-    jerk: float
-    """Weight of the jerk cost in units of `unit`."""
-    iterations: int
-    """Greatest number of iterations."""
-    gain: float
-    """Relative gain of the objective below which a free movement is good enough."""
-    stride: int
-    """Step between the instants that are looked at."""
+    clearance: float  # Wanted clearance from obstacles, [m]
+    jerk: float  # Weight of the jerk cost in units of `unit`
+    iterations: int  # Greatest number of iterations
+    gain: float  # Relative gain of the objective below which a free movement is good enough
+    stride: int  # Step between the instants that are looked at
 
 
+# Aims of the refinements. The first one, of a seed, has little weight of jerk, and ends as soon as the movement is
+# free; the others polish free movements.
 AIMS = (
     Aim(clearance=0.04, jerk=0.1, iterations=20, gain=1.0, stride=2),
     Aim(clearance=0.02, jerk=1.0, iterations=20, gain=0.02, stride=2),
     Aim(clearance=0.02, jerk=0.3, iterations=20, gain=0.01, stride=2),
     Aim(clearance=0.015, jerk=1.5, iterations=20, gain=0.01, stride=2),
 )
-"""Aims of the refinements. The first one, of a seed, has little weight of jerk, and ends as soon as the movement is
-free; the others polish free movements."""
+# Aim of a second refinement of movements that are nearly free: in a narrow passage, a wide clearance on one side is
+# paid for with contact on the other.
 NARROW = Aim(clearance=0.008, jerk=0.02, iterations=20, gain=1.0, stride=2)
-"""Aim of a second refinement of movements that are nearly free: in a narrow passage, a wide clearance on one side is
-paid for with contact on the other."""
-NEARLY = -0.03
-"""Least clearance of movements that are nearly free, [m]."""
+NEARLY = -0.03  # Least clearance of movements that are nearly free, [m]
+# Clearance beyond the margin that is asked for: distances of point clouds that are cut off there are rounded, [m]
 ROUNDING = 1e-6
-"""Clearance beyond the margin that is asked for: distances of point clouds that are cut off there are rounded, [m]."""
-SMOOTH = 1.5
-"""Relative jerk cost with which a movement is polished no more."""
+SMOOTH = 1.5  # Relative jerk cost with which a movement is polished no more
 
 
 class Found(NamedTuple):
     """Movements that were found from S seeds."""
 
-    vias: Float
-    """Via-points as offsets from the start, shape (S, K, D)."""
-    times: Int
-    """Indices of passage times in the table, shape (S,)."""
-    cost: Float
-    """Jerk cost in unit time, shape (S,); infinite for movements that are not free."""
+    vias: Float  # Via-points as offsets from the start, shape (S, K, D)
+    times: Int  # Indices of passage times in the table, shape (S,)
+    cost: Float  # Jerk cost in unit time, shape (S,); infinite for movements that are not free
+    # Least clearance at many instants, shape (S,), [m]; -1 for movements in contact. It is less than the margin for
+    # movements in narrow passages, which are not polished and do not count as free.
     clearance: Float
-    """Least clearance at many instants, shape (S,), [m]; -1 for movements in contact. It is less than the margin for
-    movements in narrow passages, which are not polished and do not count as free."""
 
 
 class _Work(NamedTuple):
@@ -120,20 +105,15 @@ class _Work(NamedTuple):
     position: Float
     joints: Float
     placed: Placed
-    pull: Float
-    """Derivative of a residual by the joints, shape (J,)."""
-    row: Float
-    """Derivative of a residual by the coordinates, shape (D,)."""
+    pull: Float  # Derivative of a residual by the joints, shape (J,)
+    row: Float  # Derivative of a residual by the coordinates, shape (D,)
     jacobian: Float
-    square: Float
-    """Sum of the products of rows at one instant, shape (D, D)."""
-    force: Float
-    """Sum of residual times row at one instant, shape (D,)."""
+    square: Float  # Sum of the products of rows at one instant, shape (D, D)
+    force: Float  # Sum of residual times row at one instant, shape (D,)
     gram: Float
+    # Place of the ball of each group at the last look for obstacles, its clearance, and the time, shape (G, 5)
     seen: Float
-    """Place of the ball of each group at the last look for obstacles, its clearance, and the time, shape (G, 5)."""
-    speed: float
-    """Greatest speed of an obstacle, [m/s]."""
+    speed: float  # Greatest speed of an obstacle, [m/s]
 
 
 @compiled
@@ -300,11 +280,7 @@ def _add_ranges(setting: Setting, reached: bool, work: _Work) -> tuple[float, fl
 @kernel
 def _assemble(
     setting: Setting,
-    table: MovementTable,
-    times: int,
-    start: Float,
-    offsets: Float,
-    duration: float,
+    movement: Movement,
     obstacles: Obstacles,
     scene: int,
     aim: Aim,
@@ -314,6 +290,7 @@ def _assemble(
     work: _Work,
 ) -> tuple[float, float]:
     """Fill in matrix and gradient of the objective; return the objective, and the least clearance, [m] or [rad]."""
+    table, times, offsets = movement.table, movement.times, movement.offsets
     columns, dimension = offsets.shape
     vias = columns - 3
     weight = aim.jerk * 2.0 / (aim.stride * unit)
@@ -336,11 +313,11 @@ def _assemble(
     begin = aim.stride // 2 + (SLOW if resting else 0)
     work.seen[:] = -1e9
     for k in range(begin, last + 1 - SLOW, aim.stride):
-        reached = joints_at(setting, table, times, k, start, offsets, work.position, work.joints)
+        reached = joints_at(setting, movement, k, work.position, work.joints)
         place(setting.chain, setting.spheres, work.joints, work.placed)
         work.square[:] = 0.0
         work.force[:] = 0.0
-        time = duration * k / last
+        time = movement.duration * k / last
         from_obstacles, first = _add_obstacles(setting, obstacles, scene, time, aim.clearance, work)
         from_itself, second = 0.0, OWN_CLEARANCE
         if (k - begin) % (2 * aim.stride) == 0:  # bodies of the arm are less often near one another
@@ -369,18 +346,10 @@ def _assemble(
 
 @compiled
 def _refine(
-    setting: Setting,
-    table: MovementTable,
-    start: Float,
-    offsets: Float,
-    duration: float,
-    obstacles: Obstacles,
-    scene: int,
-    aim: Aim,
-    unit: float,
-    work: _Work,
+    setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, aim: Aim, unit: float, work: _Work
 ) -> int:
     """Move the via-points of a movement, the first rows of its offsets, and return the index of its passage times."""
+    table, _, start, offsets, duration = movement
     columns, dimension = offsets.shape
     vias = columns - 3
     size = vias * dimension
@@ -389,9 +358,8 @@ def _refine(
     system, step, trial = np.empty((size, size)), np.empty(size), offsets.copy()
     longest = LONGEST_STEP[1] if setting.of_hand else LONGEST_STEP[0]
     times, _ = best_times(table, offsets, work.gram)
-    objective, _ = _assemble(
-        setting, table, times, start, offsets, duration, obstacles, scene, aim, unit, hessian, gradient, work
-    )
+    movement = Movement(table, times, start, offsets, duration)
+    objective, _ = _assemble(setting, movement, obstacles, scene, aim, unit, hessian, gradient, work)
     damping = DAMPING
     for _ in range(aim.iterations):
         largest = 0.0
@@ -411,10 +379,10 @@ def _refine(
                     low, high = setting.joint_range[d, 0] - start[d], setting.joint_range[d, 1] - start[d]
                     trial[a, d] = min(max(trial[a, d], low), high)
         other, _ = best_times(table, trial, work.gram)
+        movement = Movement(table, other, start, trial, duration)
         value, nearest = _assemble(
-            setting, table, other, start, trial, duration, obstacles, scene, aim, unit,
-            other_hessian, other_gradient, work,
-        )  # fmt: skip
+            setting, movement, obstacles, scene, aim, unit, other_hessian, other_gradient, work
+        )
         if value < objective:
             done = objective - value < aim.gain * objective and nearest >= FREE
             offsets[:vias] = trial[:vias]
@@ -458,15 +426,15 @@ def refine_seeds(
     Args:
         setting: Arm and space.
         table: Table of movements.
-        fine: The same with more instants, for the last check.
+        fine: Table with more instants, for the last check.
         start: Start, shape (D,).
         fixed: Offsets of the goal, initial velocity and acceleration, shape (3, D).
         seeds: Via-points as offsets from the start, shape (S, K, D).
         duration: Duration during which obstacles move, [s].
-        obstacles: Obstacles of some scenes.
+        obstacles: Obstacles, of which those of the scene `scene` count.
         scene: Index of the scene.
         margin: Least clearance of movements that count as free, [m].
-        aims: What the first refinement of each seed aims at, and those that polish a free movement.
+        aims: Aims of the first refinement of each seed, and of those that polish a free movement.
         unit: Unit of jerk costs in unit time.
         smooth: Jerk cost in this unit with which a movement that was polished once is smooth enough.
         enough: Number of free movements after which to stop.
@@ -483,24 +451,19 @@ def refine_seeds(
     for each in range(number):
         tried += 1
         offsets[0, :vias] = seeds[each]
-        times[0] = _refine(setting, table, start, offsets[0], duration, obstacles, scene, aims[0], unit, work)
-        apart = _clearance(
-            setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin, NEARLY
-        )
-        if NEARLY < apart < margin:
-            times[0] = _refine(
-                setting, table, start, offsets[0], duration, obstacles, scene, NARROW, unit, work
-            )
-            apart = _clearance(
-                setting, table, times[0], start, offsets[0], duration, obstacles, scene, margin, NEARLY
-            )
+        for aim in (aims[0], NARROW):
+            movement = Movement(table, 0, start, offsets[0], duration)
+            times[0] = _refine(setting, movement, obstacles, scene, aim, unit, work)
+            movement = Movement(table, times[0], start, offsets[0], duration)
+            apart = _clearance(setting, movement, obstacles, scene, margin, NEARLY)
+            if not NEARLY < apart < margin:
+                break
         found.vias[each] = offsets[0, :vias]
         found.times[each] = times[0]
         if apart < margin:
             if apart >= 0.0:
-                exact = exact_clearance(
-                    setting, fine, times[0], start, offsets[0], duration, obstacles, scene
-                )
+                movement = Movement(fine, times[0], start, offsets[0], duration)
+                exact = exact_clearance(setting, movement, obstacles, scene)
                 found.clearance[each] = min(exact, apart)
             continue
         stage = 0
@@ -509,18 +472,17 @@ def refine_seeds(
             if later > 1 and cost < smooth * unit:
                 break
             trial[:] = offsets[stage]
-            other = _refine(setting, table, start, trial, duration, obstacles, scene, aims[later], unit, work)
+            movement = Movement(table, 0, start, trial, duration)
+            other = _refine(setting, movement, obstacles, scene, aims[later], unit, work)
             _, less = best_times(table, trial, work.gram)
-            if less < cost and is_free(
-                setting, table, other, start, trial, duration, obstacles, scene, margin
-            ):
+            movement = Movement(table, other, start, trial, duration)
+            if less < cost and is_free(setting, movement, obstacles, scene, margin):
                 stage += 1
                 offsets[stage] = trial
                 times[stage], cost = other, less
         while stage >= 0:
-            clearance = exact_clearance(
-                setting, fine, times[stage], start, offsets[stage], duration, obstacles, scene
-            )
+            movement = Movement(fine, times[stage], start, offsets[stage], duration)
+            clearance = exact_clearance(setting, movement, obstacles, scene)
             if clearance >= margin:
                 break
             stage -= 1
@@ -538,60 +500,29 @@ def refine_seeds(
 
 @compiled
 def _clearance(
-    setting: Setting,
-    table: MovementTable,
-    times: int,
-    start: Float,
-    offsets: Float,
-    duration: float,
-    obstacles: Obstacles,
-    scene: int,
-    margin: float,
-    floor: float,
+    setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, margin: float, floor: float
 ) -> float:
     """Return the least clearance of a movement at the instants of a table, [m]; exact from `floor` to `margin`."""
-    return least_clearance(
-        setting, table, times, start, offsets, duration, obstacles, scene, margin + ROUNDING, floor, 1e9,
-        memory_of(setting, table, len(start)),
-    )  # fmt: skip
+    memory = memory_of(setting, movement.table, len(movement.start))
+    return least_clearance(setting, movement, obstacles, scene, margin + ROUNDING, floor, 1e9, memory)
 
 
 @compiled
-def is_free(
-    setting: Setting,
-    table: MovementTable,
-    times: int,
-    start: Float,
-    offsets: Float,
-    duration: float,
-    obstacles: Obstacles,
-    scene: int,
-    margin: float,
-) -> bool:
+def is_free(setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, margin: float) -> bool:
     """Return True if a movement keeps a margin at the instants of a table; it stops at the first that does not."""
-    apart = _clearance(setting, table, times, start, offsets, duration, obstacles, scene, margin, margin)
-    return bool(apart >= margin)
+    return bool(_clearance(setting, movement, obstacles, scene, margin, margin) >= margin)
 
 
 @compiled
-def exact_clearance(
-    setting: Setting,
-    table: MovementTable,
-    times: int,
-    start: Float,
-    offsets: Float,
-    duration: float,
-    obstacles: Obstacles,
-    scene: int,
-) -> float:
+def exact_clearance(setting: Setting, movement: Movement, obstacles: Obstacles, scene: int) -> float:
     """Return the least clearance of a movement at the instants of a table, at most 1, [m]; OUTSIDE out of reach."""
-    number = len(table.order)
-    position, path = np.empty(len(start)), np.empty((number, len(setting.joint_range)))
+    number = len(movement.table.order)
+    position, path = np.empty(len(movement.start)), np.empty((number, len(setting.joint_range)))
     for k in range(number):
-        if not joints_at(setting, table, times, k, start, offsets, position, path[k]):
+        if not joints_at(setting, movement, k, position, path[k]):
             return OUTSIDE
     placed = memory(setting.chain, setting.spheres)
-    step = duration / (number - 1)
+    step = movement.duration / (number - 1)
     apart, own = movement_clearance(
         setting.chain, setting.spheres, setting.reach, path, obstacles, scene, 0.0, step, placed
     )

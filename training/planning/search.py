@@ -11,7 +11,7 @@ import numpy as np
 
 from viapoint.envs.common.types import Bool, Float, Single
 from viapoint.envs.common.validation import whole_number
-from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import Plan
 from viapoint.envs.registration import check_registered
@@ -21,7 +21,7 @@ from viapoint.envs.task import Task
 from viapoint.training.planning.candidates import candidate_actions, sobol_actions
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.movements import (
-    MovementTable,
+    Memory,
     Setting,
     fine_table,
     least_clearance,
@@ -33,26 +33,24 @@ from viapoint.training.planning.problem import (
     Moves,
     Numbers,
     Problem,
+    movement_of,
     moves_of,
     setting_of,
     worth_of,
 )
 from viapoint.training.planning.refine import AIMS, SMOOTH, refine_seeds, unit_of_jerk
 
+# Least planned clearance of a movement that the search prefers, [m]; 1 to 8 mm make no difference
 CLEARANCE_MARGIN = 0.001
-"""Least planned clearance of a movement that the search prefers, [m]; 1 to 8 mm make no difference."""
+# Reward by which another plan must be better than the present one, as each change of plan costs jerk
 KEEP_BONUS = 0.1
-"""Reward by which another plan must be better than the present one, as each change of plan costs jerk."""
+# Times for which a plan is checked, shorter ones where none is clear for longer, [s]: obstacles may change course
 HORIZONS = (1e9, 1.2, 0.9, 0.6, 0.3)
-"""Times for which a plan is checked, shorter ones where none is clear for longer, [s]: obstacles may change course."""
-VERIFIED = 8
-"""Number of best candidates that are checked once more before one is taken."""
-N_CENTRES = 4
-"""Number of best candidates that a round of refinement samples around."""
+VERIFIED = 8  # Number of best candidates that are checked once more before one is taken
+N_CENTRES = 4  # Number of best candidates that a round of refinement samples around
+# Half the side of the cube that the first round samples around each centre; each further round halves it
 SPREAD = 0.25
-"""Half the side of the cube that the first round samples around each centre; each further round halves it."""
-INFEASIBLE = -1e6
-"""Merit of plans that are not clear, less their depth."""
+INFEASIBLE = -1e6  # Merit of plans that are not clear, less their depth
 
 
 class GeometrySearch:
@@ -229,18 +227,14 @@ def merits(
     setting = setting or setting_of(task, problem.obstacles)
     horizons = np.array(HORIZONS if replanning else HORIZONS[:1])
     gain = task.weights.clearance / CLEARANCE_UNIT
-    return _merits(setting, moves.table, problem.start, moves, worth, problem.obstacles, horizons, gain)
+    return _merits(setting, moves, worth, problem.obstacles, horizons, gain)
 
 
 def refined_actions(task: Task, problem: Problem, actions: Numbers) -> Numbers:
     """Return actions of shape (B, H, m) after a refinement of their via-points by the gradient of clearance and jerk.
 
-    Durations relative to the shortest movement stay as they are, and what lies outside the action space is clipped.
-
-    Args:
-        task: Task whose movements begin at rest.
-        problem: B problems.
-        actions: Actions.
+    Movements begin at rest. Durations relative to the shortest movement stay as they are, and what lies outside the
+    action space is clipped.
     """
     table, fine = movement_table(task.n_via), fine_table(task.n_via)
     setting = setting_of(task, problem.obstacles, exact=True)
@@ -268,57 +262,50 @@ def plan_clearances(
 ) -> Float:
     """Return the planned clearances of actions of shape (B, H, m), shape (B, H), [m].
 
-    Args:
-        task: Task.
-        problem: B problems.
-        actions: Actions.
-        most: Greatest clearance of interest, [m].
-        least: Clearance below which the exact value does not matter, [m].
-        exact: True for movements as they are executed, at many instants; they take longer.
+    They are at most `most`, and below `least` the exact value does not matter, [m]. With `exact`, movements are those
+    that are executed, and looked at in many instants, which takes longer.
     """
     moves = moves_of(task, problem, actions, exact=exact)
     setting = setting_of(task, problem.obstacles, exact=exact)
-    return np.asarray(_clearances(setting, moves.table, problem.start, moves, problem.obstacles, most, least))
+    return np.asarray(_clearances(setting, moves, problem.obstacles, most, least))
 
 
-@compiled
-def _clearances(
+@kernel
+def _clearance(
     setting: Setting,
-    table: MovementTable,
-    start: Float,
     moves: Moves,
+    b: int,
+    h: int,
     obstacles: Obstacles,
     most: float,
     least: float,
-) -> Float:
+    until: float,
+    memory: Memory,
+) -> float:
+    """Return the clearance of one plan, see :func:`~viapoint.training.planning.movements.least_clearance`."""
+    return least_clearance(setting, movement_of(moves, b, h), obstacles, b, most, least, until, memory)
+
+
+@compiled
+def _clearances(setting: Setting, moves: Moves, obstacles: Obstacles, most: float, least: float) -> Float:
     """Return the clearances of H plans in each of B problems, see :func:`plan_clearances`."""
     number, plans = moves.duration.shape
     found = np.empty((number, plans))
-    memory = memory_of(setting, table, start.shape[1])
+    memory = memory_of(setting, moves.table, moves.start.shape[1])
     for b in range(number):
         for h in range(plans):
-            found[b, h] = least_clearance(
-                setting, table, moves.times[b, h], start[b], moves.offsets[b, h], moves.duration[b, h],
-                obstacles, b, most, least, HORIZONS[0], memory,
-            )  # fmt: skip
+            found[b, h] = _clearance(setting, moves, b, h, obstacles, most, least, HORIZONS[0], memory)
     return found
 
 
 @compiled
 def _merits(
-    setting: Setting,
-    table: MovementTable,
-    start: Float,
-    moves: Moves,
-    worth: Float,
-    obstacles: Obstacles,
-    horizons: Float,
-    gain: float,
+    setting: Setting, moves: Moves, worth: Float, obstacles: Obstacles, horizons: Float, gain: float
 ) -> Float:
     """Return the merits of H plans in each of B problems, see :func:`merits`."""
     number, plans = worth.shape
     found = np.full((number, plans), 3.0 * INFEASIBLE)
-    memory = memory_of(setting, table, start.shape[1])
+    memory = memory_of(setting, moves.table, moves.start.shape[1])
     high = CLEARANCE_RANGE[1]
     for b in range(number):
         order = np.argsort(-worth[b])
@@ -328,10 +315,7 @@ def _merits(
                 if worth[b, h] + gain * high - rank <= best:
                     break
                 floor = CLEARANCE_MARGIN if best > INFEASIBLE else min(deepest, CLEARANCE_MARGIN)
-                clearance = least_clearance(
-                    setting, table, moves.times[b, h], start[b], moves.offsets[b, h], moves.duration[b, h],
-                    obstacles, b, high, floor, horizons[rank], memory,
-                )  # fmt: skip
+                clearance = _clearance(setting, moves, b, h, obstacles, high, floor, horizons[rank], memory)
                 if clearance >= CLEARANCE_MARGIN:
                     value = worth[b, h] + gain * clearance - rank
                     best = max(best, value)
