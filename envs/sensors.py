@@ -49,6 +49,8 @@ class Readings(NamedTuple):
     """Ends of the rays in the world, shape (N, R, 3), [m]."""
     seen: Int
     """Row of the obstacle that a ray meets, -1 for none, shape (N, R); not part of the observation."""
+    eye: Float
+    """Place of the sensor, shape (N, 3), [m]."""
 
 
 class Looks(NamedTuple):
@@ -80,7 +82,7 @@ class Looks(NamedTuple):
         for part in self:
             part[rows, 1:] = part[rows, :-1]
         readings = sensor.read(arm, joints, obstacles)
-        self.eyes[rows, 0] = sensor.pose(arm, joints)[1]
+        self.eyes[rows, 0] = readings.eye
         self.ranges[rows, 0], self.points[rows, 0] = readings.ranges, readings.points
 
 
@@ -246,7 +248,7 @@ class Sensor:
         ranges, seen, rays = self._cast(rotation, origin, obstacles)
         if self.noise or self.dropped:
             ranges = self._disturbed(ranges, seen)
-        return Readings(ranges, origin[:, None] + ranges[..., None] * rays, seen)
+        return Readings(ranges, origin[:, None] + ranges[..., None] * rays, seen, origin)
 
     def hidden(self, rotation: Float, origin: Float, obstacles: Obstacles) -> Bool:
         """Return True for obstacles that no ray meets, shape (N, n), for poses of the sensor, see :meth:`pose`."""

@@ -146,7 +146,7 @@ def cover_points(points: Float, tolerance: float) -> list[FittedCapsule]:
     Their excess is at most the tolerance, if MOST_CAPSULES suffice for that.
     """
     body = _body(points)
-    found = [fit_capsule(np.asarray(body.shape.vertices), body)]
+    found = [_fit_capsule(np.asarray(body.shape.vertices), body)]
     while len(found) < MOST_CAPSULES:
         worst = max(range(len(found)), key=lambda index: found[index].excess)
         if found[worst].excess <= tolerance:
@@ -162,7 +162,7 @@ def _body(points: Float) -> Body:
     return Body(shape, np.ascontiguousarray(equations[:, :3]), -equations[:, 3])
 
 
-def fit_capsule(corners: Float, body: Body, last_step: float = LAST_STEP) -> FittedCapsule:
+def _fit_capsule(corners: Float, body: Body, last_step: float = LAST_STEP) -> FittedCapsule:
     """Return a capsule that contains points, shape (n, 3), [m], with little excess over a convex body around them."""
     centre, axes, low, high = _principal_frame(corners)
     size = high - low
@@ -265,12 +265,12 @@ def _best_halves(corners: Float, body: Body, tolerance: float) -> list[FittedCap
         for share in CUTS:
             level = float(centre @ axes[:, i] + low[i] + share * size[i])
             pieces = _cut(corners, hull.simplices, axes[:, i], level)
-            halves = [fit_capsule(piece, body, COARSE_STEP) for piece in pieces]
+            halves = [_fit_capsule(piece, body, COARSE_STEP) for piece in pieces]
             excess = [capsule.excess for capsule in halves]
             merit = sum(each > tolerance for each in excess), max(excess)
             if not best or merit < least:
                 best, least = halves, merit
-    return [fit_capsule(half.corners, body) for half in best]
+    return [_fit_capsule(half.corners, body) for half in best]
 
 
 def _cut(corners: Float, triangles: Float, normal: Float, offset: float) -> tuple[Float, Float]:

@@ -136,7 +136,7 @@ def _spheres(
                 centres += list(points)
                 radii += [radius] * len(points)
         some = slice(first[-1], len(centres))
-        balls.append(bounding_ball(np.array(centres[some]), np.array(radii[some])))
+        balls.append(_bounding_ball(np.array(centres[some]), np.array(radii[some])))
         first.append(len(centres))
     return Spheres(
         centre=np.array(centres),
@@ -165,7 +165,7 @@ def _along(capsule: Capsule, excess: float) -> tuple[Float, float]:
     return capsule.first + share * (capsule.second - capsule.first), float(radius)
 
 
-def bounding_ball(centre: Float, radius: Float) -> tuple[Float, float]:
+def _bounding_ball(centre: Float, radius: Float) -> tuple[Float, float]:
     """Return a ball around spheres that is hardly larger than the smallest one: its centre and radius, [m].
 
     In each round the centre moves towards the farthest sphere, by less and less (M. Badoiu and K. L. Clarkson, Smaller

@@ -96,7 +96,7 @@ class SceneSampler:
         most = min(most, max(fewest, MOST_DRAWN))
         self.room = room_of(arm, kinds, (fewest, most), tall)
         self.changes = Changes(*jumps, moving, *durations)
-        self._mover = mover_of(arm, space, self.plane)
+        self._mover = _mover_of(arm, space, self.plane)
         self._builds = [scene_families(self.plane)[name].build for name in self.families]
         self._bare = families_plane.clutter if self.plane else families_space.clutter
         self._width = max(most_rows(most), rows)
@@ -252,7 +252,7 @@ def is_planar(arm: Arm) -> bool:
     return bool((np.abs(rotation[1:, 2, 2]) > 1.0 - 1e-6).all())
 
 
-def mover_of(arm: Arm, space: SpaceName, plane: bool) -> Mover:
+def _mover_of(arm: Arm, space: SpaceName, plane: bool) -> Mover:
     """Return what compiled functions know of an arm."""
     width = arm.joint_range[:, 1] - arm.joint_range[:, 0]
     margin = np.minimum(LIMIT_MARGIN, 0.1 * width)

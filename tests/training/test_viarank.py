@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from stable_baselines3.common.env_util import make_vec_env
 
 from viapoint.envs import Task
 from viapoint.training import ViaQ, ViaRank, ViaVecEnv, evaluate, load_agent
@@ -94,12 +95,19 @@ def test_sets_of_scenes_are_solvable_and_partly_hidden() -> None:
     [
         ("viapoint/PlanarObstacles-v0", ViaRank, "ViaRankPolicy", {}),
         (ENV, ViaRank, "ViaRankPolicy", {"labels": 100}),
+        (ENV, ViaRank, "ViaRankPolicy", {"labels": "all"}),
         (ENV, ViaQ, "ViaQPolicy", {}),
     ],
 )
 def test_other_tasks_are_refused(env_id, algorithm, policy, arguments) -> None:
     with pytest.raises(ValueError):
         algorithm(policy, ViaVecEnv(env_id, 1), **arguments)
+
+
+@pytest.mark.parametrize("algorithm", [ViaQ, ViaRank])
+def test_environments_of_others_are_refused(algorithm) -> None:
+    with pytest.raises(ValueError):
+        algorithm(f"{algorithm.__name__}Policy", make_vec_env("Pendulum-v1"))
 
 
 @pytest.mark.parametrize(

@@ -113,6 +113,15 @@ class PlanPolicy(BasePolicy):
             raise ValueError("start and goal must differ: no movement leads from a point to itself")
 
 
+def task_in(env: VecEnv) -> Task | None:
+    """Return the task of a vector environment of this package; None for others."""
+    try:
+        (task,) = env.get_attr("task", indices=[0])
+    except AttributeError:
+        return None
+    return task if isinstance(task, Task) else None
+
+
 class PlanAlgorithm(Agent, OffPolicyAlgorithm):
     """Off-policy algorithm that trains a policy that ranks plans.
 

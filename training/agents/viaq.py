@@ -22,7 +22,7 @@ from torch.nn import functional
 from viapoint.envs.task import Task
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.outcome_buffer import OutcomeReplayBuffer, Outcomes, OutcomeSamples
-from viapoint.training.agents.plan_agent import PlanAlgorithm
+from viapoint.training.agents.plan_agent import PlanAlgorithm, task_in
 from viapoint.training.agents.viaq_critic import Values
 from viapoint.training.agents.viaq_policy import KEEP, ViaQPolicy
 from viapoint.training.planning.candidates import candidate_actions
@@ -127,11 +127,8 @@ class ViaQ(PlanAlgorithm):
         return prepared
 
     def _task_of(self, env: VecEnv) -> Task:
-        try:
-            task = env.get_attr("task", indices=0)[0]
-        except AttributeError:
-            task = None
-        if not isinstance(task, Task) or task.stepwise:
+        task = task_in(env)
+        if task is None or task.stepwise:
             raise ValueError(
                 "ViaQ needs an environment of this package in which an action is a whole movement, such as "
                 f"viapoint/PlanarObstacles-v0; got {env.observation_space} with {env.action_space}"

@@ -30,7 +30,7 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.task import Task
 from viapoint.training.agents.model_io import ALGORITHMS
-from viapoint.training.agents.plan_agent import Observation, PlanAlgorithm, PlanPolicy
+from viapoint.training.agents.plan_agent import Observation, PlanAlgorithm, PlanPolicy, task_in
 from viapoint.training.agents.sight_network import SightInputs, SightNetwork, sight_inputs
 from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.beliefs import Sight, thick_points
@@ -219,8 +219,6 @@ class ViaRank(PlanAlgorithm):
         **kwargs: Any,
     ) -> None:
         self.explore_candidates, self.labels = explore_candidates, labels
-        if labels > explore_candidates:
-            raise ValueError(f"labels must be at most explore_candidates, {explore_candidates}, got {labels}")
         super().__init__(
             policy,
             env,
@@ -237,13 +235,15 @@ class ViaRank(PlanAlgorithm):
             _init_setup_model=_init_setup_model,
             **kwargs,
         )
+        if labels > explore_candidates:
+            raise ValueError(f"labels must be at most explore_candidates, {explore_candidates}, got {labels}")
 
     def _task_of(self, env: VecEnv) -> Task:
-        task: Task = env.get_attr("task", indices=0)[0]
-        if task.sensor is None or not task.whole_movement:
+        task = task_in(env)
+        if task is None or task.sensor is None or not task.whole_movement:
             raise ValueError(
-                "viarank needs an environment with a sensor in which an action is a whole movement, such as "
-                f"viapoint/PlanarSensed-v0; this one has sensor={task.sensor}, decide_at={task.decide_at!r}"
+                "viarank needs an environment of this package with a sensor in which an action is a whole movement, "
+                f"such as viapoint/PlanarSensed-v0; got {env.observation_space} with {env.action_space}"
             )
         return task
 

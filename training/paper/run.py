@@ -119,14 +119,14 @@ NOTE = (
 )
 
 
-def summary_of(claims: list[Claim]) -> str:
+def _summary_of(claims: list[Claim]) -> str:
     """Return a sentence with the number of claims that hold."""
     return f"{sum(claim.holds for claim in claims)} of {len(claims)} claims hold."
 
 
 def write(claims: list[Claim], pictures: Pictures, out: Path) -> None:
     """Write the tables and the page to a folder."""
-    summary = summary_of(claims)
+    summary = _summary_of(claims)
     table = pd.DataFrame([cells(claim) for claim in claims], columns=HEADINGS)
     aligned = ["left"] * 4 + ["right"] * 5 + ["left"]
     text = table.replace("|", r"\|").to_markdown(index=False, disable_numparse=True, colalign=aligned)
@@ -179,6 +179,6 @@ def run(config: PaperConfig) -> None:
         claims, pictures = reproduce(config.out, config.agent)
     write(claims, pictures, config.out)
     failed = [f"row {claim.row}, {claim.claim}" for claim in claims if not claim.holds]
-    print(f"{summary_of(claims)} The page: {config.out / PAGES[-1]}")
+    print(f"{_summary_of(claims)} The page: {config.out / PAGES[-1]}")
     if failed:
         raise ClaimsFailedError(f"{len(failed)} of {len(claims)} claims fail: {'; '.join(failed)}")

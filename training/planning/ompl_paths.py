@@ -60,7 +60,7 @@ def path_around(arm: Arm, ends: Float, obstacles: Obstacles, margin: float, pati
             one, other = joints(first), joints(second)
             count = max(2, int(np.ceil(np.abs(other - one).max() / CHECK_SPACING)) + 1)
             line = np.ascontiguousarray(np.linspace(one, other, count))
-            return bool(line_is_clear(arm.chain, arm.spheres, line, obstacles, margin))
+            return bool(_line_is_clear(arm.chain, arm.spheres, line, obstacles, margin))
 
     space, bounds = base.RealVectorStateSpace(number), base.RealVectorBounds(number)
     for i, (low, high) in enumerate(arm.joint_range):
@@ -88,7 +88,7 @@ def path_around(arm: Arm, ends: Float, obstacles: Obstacles, margin: float, pati
 
 
 @compiled
-def line_is_clear(chain: Chain, spheres: Spheres, line: Float, obstacles: Obstacles, margin: float) -> bool:
+def _line_is_clear(chain: Chain, spheres: Spheres, line: Float, obstacles: Obstacles, margin: float) -> bool:
     """Return True if all configurations of shape (T, J) have more than a margin in scene 0."""
     placed = memory(chain, spheres)
     for k in range(len(line)):

@@ -105,7 +105,7 @@ def _tour_claims() -> list[Claim]:
     ]  # fmt: skip
 
 
-def free_acceleration() -> float:
+def _free_acceleration() -> float:
     """Return the start acceleration of minimum jerk between two reversals, in A / t_f^2; that at the end is free."""
     none, one, two = (_swing(acceleration).cost() for acceleration in (0.0, 1.0, 2.0))
     square = (two - 2.0 * one + none) / 2.0  # the cost is a parabola in the acceleration
@@ -129,7 +129,7 @@ def relative_swing_speed(motion: SimulatedMovements) -> Float:
 
 
 def _repetitive_claims() -> list[Claim]:
-    swing, rest = _swing(free_acceleration()), point_to_point([0.0], [1.0], 1.0)
+    swing, rest = _swing(_free_acceleration()), point_to_point([0.0], [1.0], 1.0)
     hit = point_to_point([0.0], [1.0], 1.0, goal_velocity=FREE, goal_acceleration=FREE)
     motion = simulate(swings())
     middle = (motion.time >= SWING * (SWINGS // 2)) & (motion.time <= SWING * (SWINGS // 2 + 1))

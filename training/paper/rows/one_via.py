@@ -76,7 +76,7 @@ def passage_claims() -> list[Claim]:
     formula = 1e3 * np.abs(closed_form(waypoints, share, time) - movement(time)).max()
     motion = simulate(movement)
     passed = 1e3 * np.linalg.norm(motion.at(np.array([share]))[0, 0] - waypoints[1])
-    (arm_share,) = closest_approach(motion, waypoints[None, 1])
+    (arm_share,) = _closest_approach(motion, waypoints[None, 1])
     return [
         Claim(4, f"Eq. C16 has one root in (0, 1): vias with another count, of {N_VIAS} (exact arithmetic)", "App. C",
               "only one acceptable root", (wrong, near(0.0, 0.0))),
@@ -105,7 +105,7 @@ def _count_and_compare() -> tuple[int, float]:
     return wrong, difference
 
 
-def closest_approach(motion: SimulatedMovements, vias: Float) -> Float:
+def _closest_approach(motion: SimulatedMovements, vias: Float) -> Float:
     """Return the times at which hands are nearest to via-points (N, 2), as fractions of the durations, shape (N,)."""
     distance = np.linalg.norm(motion.hand - vias[:, None], axis=-1)
     rows, nearest = np.arange(len(vias)), np.clip(distance.argmin(axis=1), 1, distance.shape[1] - 2)
@@ -164,7 +164,7 @@ def _threshold_claim(along: float, exact: str, expected: float, tolerance: float
         (profile,) = movements.arm_profiles(simulate(curved(*ENDS, along, -height)))
         return bool(np.isfinite(profile.valley))
 
-    arm = first_place(arm_has_valley, 0.2, 0.5, halvings=12)
+    arm = _first_place(arm_has_valley, 0.2, 0.5, halvings=12)
     return Claim(
         5, f"Not every curved movement has a valley: for d1/(d1+d2) = {along} only if d3/(d1+d2) exceeds", "1B",
         f"two peaks and a valley{exact}", (valley_threshold(along), near(expected, tolerance)),
@@ -174,12 +174,12 @@ def _threshold_claim(along: float, exact: str, expected: float, tolerance: float
 
 def valley_threshold(along: float) -> float:
     """Return the least d3 / (d1 + d2) for which the model's speed has a valley."""
-    return first_place(
+    return _first_place(
         lambda d3: speed_valleys(curved(*ENDS, along, -d3)).time.size > 0, 0.2, 0.5, halvings=30
     )
 
 
-def first_place(holds: Callable[[float], bool], low: float, high: float, halvings: int) -> float:
+def _first_place(holds: Callable[[float], bool], low: float, high: float, halvings: int) -> float:
     """Return where in an interval a condition begins to hold, by bisection; it holds at `high`, not at `low`."""
     for _ in range(halvings):
         middle = (low + high) / 2.0
@@ -216,7 +216,7 @@ def arm_shares(along: ArrayLike, height: ArrayLike) -> tuple[Float, float]:
     """Return the times of closest approach to each via-point, as fractions of the duration, and the deviation [mm]."""
     motion = simulate(curved(*ENDS, along, height))
     vias = movements.via_waypoints(TARGETS[ENDS[0]], TARGETS[ENDS[1]], along, height)[:, 1]
-    return closest_approach(motion, vias), motion.worst
+    return _closest_approach(motion, vias), motion.worst
 
 
 def isochrony_claims() -> list[Claim]:
