@@ -25,8 +25,8 @@ from viapoint.training.config.configs import (
     PlayConfig,
     StudyConfig,
     TrainConfig,
+    from_words,
 )
-from viapoint.training.config.words import from_words
 from viapoint.training.evaluation import statistics
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError

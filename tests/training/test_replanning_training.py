@@ -8,8 +8,8 @@ from viapoint.envs.scenes.options import scene_from_json, scene_to_json
 from viapoint.training.agents.model_io import build
 from viapoint.training.config.presets import STEP_PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.planning.baselines import Straight, agent_method, make_method
-from viapoint.training.rollouts.rollout import SceneSimulation, StepAgentMethod, whole_task
+from viapoint.training.planning.baselines import StepAgentMethod, Straight, agent_method, make_method
+from viapoint.training.rollouts.rollout import SceneSimulation, whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.scene_sets.scene_set import scenes_for
 

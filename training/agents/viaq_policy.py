@@ -17,10 +17,10 @@ from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import turned
 from viapoint.envs.task import Task
+from viapoint.training.agents.model_io import check_arguments
 from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.agents.plan_agent import Numbers, Observation, PlanPolicy
 from viapoint.training.agents.viaq_critic import PlanInputs, ViaQCritic
-from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.candidates import candidate_actions, normal_steps
 from viapoint.training.planning.movements import FINE_INSTANTS, INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of

@@ -17,7 +17,7 @@ import tyro
 from viapoint.training.cli.doctor import explain_import_error
 from viapoint.training.config import configs
 from viapoint.training.config.checks import unknown_name
-from viapoint.training.config.words import REGISTRY
+from viapoint.training.config.configs import REGISTRY
 
 
 class UsageError(ValueError):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,7 +20,7 @@ from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl
 from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
 from viapoint.training.planning.search import GeometrySearch, registered_task
-from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults, StepAgentMethod
+from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
 from viapoint.training.rollouts.vec_env import env_arguments
 
 
@@ -175,6 +175,29 @@ class AgentMethod:
             for name, number in own.items():
                 setattr(policy, name, number)
         return np.asarray(actions, dtype=np.float64)
+
+
+class StepAgentMethod:
+    """Trained agent that acts in every control step, in environments of its own.
+
+    A decision is the first action; the others follow during the simulation. The decision time is that of one control
+    step, of which a movement has about twenty.
+    """
+
+    def __init__(self, name: str, model: Any, env_id: str, env_kwargs: Mapping[str, Any]) -> None:
+        self.name, self._model = name, model
+        self._simulation = SceneSimulation(env_id, 250, **env_kwargs)
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """Return actions for the next step, shape (N, D), from observations of the step-wise task or its twin."""
+        if "time_left" not in observation or "remaining" in observation:  # that of the twin
+            observation = self._simulation.observe(scenes)
+        actions, _ = self._model.predict(observation, deterministic=True)
+        return np.asarray(actions, dtype=np.float64)
+
+    def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
+        """Play every episode to its end, beginning with the given actions."""
+        return self._simulation.episodes(scenes, decisions, self.decide)
 
 
 def agent_method(name: str, model: Any, checks: int | None = None, refine: int | None = None) -> Method:

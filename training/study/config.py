@@ -18,8 +18,8 @@ from typing import Any
 
 from viapoint.envs.common.validation import is_number
 from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
-from viapoint.training.agents.model_io import check_hyperparameters
-from viapoint.training.config.checks import check_arguments, check_env_kwargs, check_whole, unknown_name
+from viapoint.training.agents.model_io import check_arguments, check_hyperparameters
+from viapoint.training.config.checks import check_env_kwargs, check_whole, unknown_name
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import read_json, read_yaml
 from viapoint.training.planning.baselines import check_method
