@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
 from viapoint.training.config.configs import (
     EvaluateConfig,
     TrainConfig,

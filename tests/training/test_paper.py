@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
 from viapoint.training.paper import run
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.movements import Profile, construction, via_waypoints

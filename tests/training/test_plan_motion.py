@@ -12,7 +12,7 @@ from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import pack
 from viapoint.envs.plans import Plan
 from viapoint.training import plan_motion, plan_motions
-from viapoint.training.cli.main import main
+from viapoint.training.cli.entry import main
 from viapoint.training.planning import plan_motion as module
 from viapoint.training.planning import refine
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems, read_problems

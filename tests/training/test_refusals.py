@@ -15,7 +15,7 @@ from viapoint.training import evaluate, load_agent
 from viapoint.training.agents.agent import SAC, find_model
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.viaq import ViaQ
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
 from viapoint.training.config.checks import ELSEWHERE
 from viapoint.training.config.configs import (
     DemoConfig,

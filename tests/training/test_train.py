@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from viapoint.training.agents.model_io import load_model
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods

@@ -28,6 +28,7 @@ from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, scenes_f
 
 CHECKS = 16  # Proposals that the agent checks in the second row of the table
 BASELINES = ("search16", "search512", "straight", "random")
+# Files besides those of the run, and what they show
 FILES = {
     "table.md": "the table",
     "table.json": "the table with every outcome",
@@ -36,7 +37,6 @@ FILES = {
     "gallery.png": "test scenes, planned and executed",
     "movements.mp4": "movements",
 }
-"""Files besides those of the run, and what they show."""
 PICTURES = 12  # Number of movements in the gallery
 MOVEMENTS = 4  # Number of movements in the video
 

@@ -21,8 +21,8 @@ TABLE, FIGURE = "fit.csv", "fit.png"  # Files that are written
 DRAWN = 6  # Greatest number of movements in the figure
 
 Fits = dict[str, ViaPointFit]  # Fits by the names of the movements
+# Times of the samples, shape (N,), [s], and positions, shape (N, D), [m], by the names of the movements
 Movements = dict[str, tuple[Float, Float]]
-"""Times of the samples, shape (N,), [s], and positions, shape (N, D), [m], by the names of the movements."""
 
 
 def run(config: FitConfig) -> None:

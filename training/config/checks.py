@@ -18,6 +18,7 @@ SHIPPED = Path(str(files("viapoint.training") / "pretrained"))  # Agents of the 
 # Ids of environments with a shipped agent
 SHIPPED_IDS = tuple(f"viapoint/{path.parent.name}" for path in sorted(SHIPPED.glob("*/model.json")))
 
+# Arguments that a training's environment does not take, and what to use instead
 ELSEWHERE = {
     "num_envs": "--n-envs says how many environments are stepped together",
     "seed": "--seed is that of everything",
@@ -28,7 +29,6 @@ ELSEWHERE = {
     "vector_kwargs": "the environments are native vector environments",
     "wrappers": "the environments are trained on as they are",
 }
-"""Arguments that a training's environment does not take, and what to use instead."""
 # Least and greatest values of whole numbers, by the names of arguments and fields
 RANGES: dict[str, tuple[int, int | None]] = {
     "seed": (0, 2**32 - 1),  # that of NumPy's legacy generator

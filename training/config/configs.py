@@ -38,13 +38,13 @@ from viapoint.training.io.files import parse_yaml
 from viapoint.training.planning.search import registered_task
 
 REGISTRY = ConstructorRegistry()  # Ways in which the command line reads numbers and paths
+# Name in helps and in errors of the types of values.
 KINDS = {
     int: ("INT", "a whole number"),
     float: ("FLOAT", "a number"),
     Path: ("PATH", "a path"),
     str: ("TEXT", ""),
 }
-"""Name in helps and in errors of the types of values."""
 
 
 @REGISTRY.primitive_rule
@@ -384,16 +384,14 @@ class EvaluateConfig(AgentConfig):
     unrevised (the first plan alone)."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
-    refine: tuple[int, ...] = ()
-    """Numbers of proposals that the planner refines, one further row each."""
+    refine: tuple[int, ...] = ()  # Numbers of proposals that the planner refines, one further row each.
     scenes: str = "test"
     """Scene set: validation, test, hard, uniform, or a scene file; motionbenchmaker for the problems of that benchmark,
     on which planners are measured: straight, plan_motion, plan_motion+ompl, ompl, search512."""
     problems: Path | None = None
     """Folder of MotionBenchMaker's own files, in place of the problems that are shipped."""
     n_scenes: int | None = None  # Number of scenes, evenly spread over the set; all if not given.
-    format: Format = "table"
-    """Form in which the table is printed: for the terminal, Markdown, CSV or JSON."""
+    format: Format = "table"  # Form in which the table is printed: for the terminal, Markdown, CSV or JSON.
     json: Path | None = None  # JSON file for all results, scene by scene.
 
     @property
@@ -476,8 +474,7 @@ class PlanConfig(Config):
     arm: str = "panda"  # Name of an arm, or MJCF or URDF file of one.
     start: tuple[float, ...] = ()
     """Joint positions at the start, [rad]; by default those of the scene file, or home."""
-    goal: tuple[float, ...] = ()
-    """Joint positions at the goal, [rad]; by default those of the scene file."""
+    goal: tuple[float, ...] = ()  # Joint positions at the goal, [rad]; by default those of the scene file.
     position: tuple[float, ...] = ()
     """Place of the tool at the goal, x y z, [m], in place of joint positions."""
     quaternion: tuple[float, ...] = ()  # Orientation of the tool there, w x y z; any if not given.
@@ -488,8 +485,7 @@ class PlanConfig(Config):
     """Names of its joints from the base to the tool; by default all of the chain."""
     base: str = ""  # Body that the chain begins at, where a file has two arms.
     packages: tuple[Path, ...] = ()  # Folders for package:// in a URDF.
-    velocity_limit: float | None = None
-    """Velocity limit of its joints, [rad/s]; by default that of the file."""
+    velocity_limit: float | None = None  # Velocity limit of its joints, [rad/s]; by default that of the file.
     n_via: int = 2  # Number of via-points, 1 to 3.
     margin: float = 0.0  # Least clearance, [m].
     duration: float | None = None  # Duration, [s]; by default the shortest that the limits allow.
@@ -579,8 +575,7 @@ class DemoConfig(Config):
     out: Path = Path("runs/demo")  # Folder for all files; existing results are kept.
     env: Annotated[str, ENV] = DEFAULT_ENV  # Id of the environment.
     n_timesteps: int | None = None  # Decisions in total; default: a quarter of those of the preset.
-    n_scenes: int | None = None
-    """Number of test scenes, evenly spread over the set; all if not given."""
+    n_scenes: int | None = None  # Number of test scenes, evenly spread over the set; all if not given.
 
     def _check(self) -> None:
         check_registered(self.env)

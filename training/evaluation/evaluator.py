@@ -49,22 +49,17 @@ class MethodResult:
     """Outcomes of one method in the first n of N scenes."""
 
     name: str
-    outcomes: Mapping[str, NDArray[Any]]
-    """Scalars of the environment's info by name, shape (n,) each."""
-    actions: Float
-    """Actions, shape (n, m)."""
+    outcomes: Mapping[str, NDArray[Any]]  # Scalars of the environment's info by name, shape (n,) each
+    actions: Float  # Actions, shape (n, m)
     decision_times: Float
     """Wall times of single decisions, [s]; one number, the mean of a batch, for a slow method."""
-    band: NDArray[np.int64]
-    """Index into BANDS of each scene, -1 if the share is unknown, shape (n,)."""
-    family: NDArray[np.str_]
-    """Scene family of each scene, '' for the training distribution, shape (n,)."""
+    band: NDArray[np.int64]  # Index into BANDS of each scene, -1 if the share is unknown, shape (n,)
+    family: NDArray[np.str_]  # Scene family of each scene, '' for the training distribution, shape (n,)
     distance: Float
     """Distance from start to goal, shape (n,), [m]; NaN if the target jumps, as the shortest path is unknown."""
     interrupted: bool
     """Mark of an evaluation that Ctrl-C ended; decision times, and scenes if it is partial, are missing."""
-    partial: bool
-    """Mark of an evaluation that was interrupted before the last scene."""
+    partial: bool  # Mark of an evaluation that was interrupted before the last scene
 
     @property
     def success(self) -> NDArray[np.bool_]:

@@ -23,6 +23,7 @@ from viapoint.training.paper.claim import Claim, Number
 from viapoint.training.paper.rows import alternatives, double_step, obstacles, one_via, straight
 from viapoint.training.paper.rows.one_via import ENDS, FAST, SLOW, THREE_POINTS
 
+# Titles and functions of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991
 ROWS: dict[int, tuple[str, Callable[..., list[Claim]]]] = {
     1: ("Point to point", straight.point_to_point_claims),
     2: ("Invariance of hand paths", straight.invariance_claims),
@@ -38,9 +39,9 @@ ROWS: dict[int, tuple[str, Callable[..., list[Claim]]]] = {
     12: ("Obstacle avoidance", obstacles.obstacle_claims),
     13: ("A target that jumps on the way (Flash & Henis 1991)", double_step.double_step_claims),
 }
-"""Titles and functions of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991."""
 
 
+# Captions and functions of the figures by their file names, in the order of the paper
 DRAWINGS: dict[str, tuple[str, Callable[..., Figure]]] = {
     "fig01_model": ("The model (Fig. 1). A: straight movement, speed T relative to its peak V_M. B: through a "
         "via-point; path with d1, d2, d3, speed, curvature C (valley of the speed dotted) and velocities.",
@@ -79,7 +80,6 @@ DRAWINGS: dict[str, tuple[str, Callable[..., Figure]]] = {
         "plan's and greatest distance from it, for three durations of the second movement. D: peak speeds.",
         figures.comparison),
 }  # fmt: skip
-"""Captions and functions of the figures by their file names, in the order of the paper."""
 # Functions of them that take the movements around obstacles
 AROUND_LIGHTS = (obstacles.obstacle_claims, figures.around_lights, figures.isochrony)
 

@@ -25,6 +25,7 @@ from viapoint.training.io.files import BadFileError, read_bytes, write_bytes
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 FORMAT = 3
+# Counters of Stable-Baselines3's algorithms
 COUNTERS = (
     "seed",
     "num_timesteps",
@@ -33,7 +34,6 @@ COUNTERS = (
     "_n_updates",
     "_current_progress_remaining",
 )
-"""Counters of Stable-Baselines3's algorithms."""
 ARRAYS = ("_last_obs", "_last_episode_starts")
 DEQUES = ("ep_info_buffer", "ep_success_buffer")
 # Errors of content that is none of a checkpoint, or that does not fit the model

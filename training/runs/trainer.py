@@ -21,10 +21,10 @@ from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, wri
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
 
+# Errors of libraries for networks or buffers that cannot be built
 UNFIT = (
     ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError,
 )  # fmt: skip
-"""Errors of libraries for networks or buffers that cannot be built."""
 
 
 class TrainingFailedError(Exception):

@@ -33,13 +33,13 @@ from viapoint.training.scene_sets.scene_set import FrozenScenes, scenes_for
 from viapoint.training.study.config import Search, Study, Trial, Values
 
 RETRIES = 2  # Number of times that a trial whose worker died is begun again
+# Environment variables of Ray, which reads them when it is imported
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",  # Ray sends nothing to its authors
     "RAY_AIR_NEW_OUTPUT": "0",  # Ray Tune's own tables
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
     "TUNE_GLOBAL_CHECKPOINT_S": "5",  # a killed search loses at most its last seconds
 }
-"""Environment variables of Ray, which reads them when it is imported."""
 Record = dict[str, Any]
 KEYS = ["environment", "set", "method"]
 # Columns that are medians over seeds; `decisions` are those of a training

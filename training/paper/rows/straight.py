@@ -14,10 +14,10 @@ from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, minimum_jerk_through, simulate
 
+# Ends of the straight movements of Figs. 3 and 4, shape (3, 2, 2), [m].
 DIAGONALS = np.array(
     [[TARGETS["T3"], TARGETS["T6"]], [TARGETS["T1"], TARGETS["T4"]], [TARGETS["T2"], TARGETS["T5"]]]
 )
-"""Ends of the straight movements of Figs. 3 and 4, shape (3, 2, 2), [m]."""
 LENGTHS = np.linalg.norm(DIAGONALS[:, 1] - DIAGONALS[:, 0], axis=-1)  # Shape (3,), [m]
 DURATION = 0.8  # Their duration, within the paper's 0.5 to 1 s, [s]
 
