@@ -23,7 +23,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.load import load_arm
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
-from viapoint.training.planning.benchmark_report import succeeding
+from viapoint.training.planning.benchmark import succeeding
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
 from viapoint.training.planning.plan_motion import plan_motion
 

@@ -6,7 +6,7 @@ import pytest
 
 from viapoint.training.cli import demo
 from viapoint.training.config.configs import DemoConfig
-from viapoint.training.runs.callback import RunCallback, TrainingStoppedError
+from viapoint.training.runs.trainer import RunCallback, TrainingStoppedError
 
 
 @pytest.fixture

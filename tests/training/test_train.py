@@ -21,11 +21,10 @@ from viapoint.training.config.presets import PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError, read_arrays
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.runs import callback
-from viapoint.training.runs.callback import TrainingStoppedError
+from viapoint.training.runs import trainer
 from viapoint.training.runs.checkpoints import read_state
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import TrainingFailedError, train
+from viapoint.training.runs.trainer import TrainingFailedError, TrainingStoppedError, train
 from viapoint.training.scene_sets.scene_set import scenes_for
 
 OFF_POLICY = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16}
@@ -127,7 +126,7 @@ def test_what_a_run_leaves(tmp_path, capsys):
         assert (np.diff([record[name] for record in run.curve]) > 0.0).all()
     best = max(record["success"]["rate"] for record in run.curve)
     assert run.best.name == "best"
-    method = callback.agent_method("agent", load_model(run.best))
+    method = trainer.agent_method("agent", load_model(run.best))
     scenes = scenes_for("validation", run.config.task, 8)
     (again,) = evaluate_methods([method], scenes, WHOLE, time_decisions=False).results
     assert again.success.mean() == best
@@ -175,7 +174,7 @@ def with_success(monkeypatch, rates):
     """Let validations at 0, 64, 128, ... decisions find these rates of success; presets are of 128 decisions."""
     for algo, preset in PRESETS.items():
         monkeypatch.setitem(PRESETS, algo, dataclasses.replace(preset, n_timesteps=128))
-    evaluate = callback.evaluate_methods
+    evaluate = trainer.evaluate_methods
 
     def measured(methods, *args, **kwargs):
         result = evaluate(methods, *args, **kwargs)
@@ -185,7 +184,7 @@ def with_success(monkeypatch, rates):
         only.outcomes["is_success"][:] = np.arange(number) < round(rate * number)
         return result
 
-    monkeypatch.setattr(callback, "evaluate_methods", measured)
+    monkeypatch.setattr(trainer, "evaluate_methods", measured)
 
 
 @pytest.mark.parametrize("algo", ["viaq", "ppo"])

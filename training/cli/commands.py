@@ -24,9 +24,8 @@ from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate as measure
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.io.progress import scene_progress
-from viapoint.training.planning import benchmark_report
+from viapoint.training.planning import benchmark
 from viapoint.training.planning.baselines import agent_method, make_method
-from viapoint.training.planning.benchmark import benchmark_problems, read_problems
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.datasets import dataset_folder, record_dataset
 from viapoint.training.runs import trainer as training
@@ -96,20 +95,24 @@ def _notes(config: EvaluateConfig) -> TextIO:
 
 def _measure_planners(config: EvaluateConfig) -> None:
     """Measure planners on the problems of MotionBenchMaker, print the table, and write one line for each problem."""
-    problems = benchmark_problems() if config.problems is None else read_problems(config.problems)
+    problems = (
+        benchmark.benchmark_problems()
+        if config.problems is None
+        else benchmark.read_problems(config.problems)
+    )
     problems = [problems[row] for row in evenly_spread(len(problems), config.n_scenes)]
     names = ("plan_motion",) if config.baselines == USUAL_BASELINES else config.baselines
     for name in names:
-        benchmark_report.benchmark_planner(name)  # an unknown name is told before anything is measured
+        benchmark.benchmark_planner(name)  # an unknown name is told before anything is measured
     with scene_progress() as progress:
-        lines = [benchmark_report.measure_planner(name, problems, progress=progress) for name in names]
+        lines = [benchmark.measure_planner(name, problems, progress=progress) for name in names]
     table = pd.concat(lines)
     if config.format == "csv":
         print(table.to_csv(index=False).rstrip())
     elif config.format == "json":
         print(table.to_json(orient="records", indent=1))
     else:
-        print(f"{benchmark_report.markdown(table)}\n\n{benchmark_report.NOTES}")
+        print(f"{benchmark.markdown(table)}\n\n{benchmark.NOTES}")
     if config.json is not None:
         write_json(config.json, table.to_dict("records"))
         print(f"results, problem by problem: {config.json}", file=_notes(config))

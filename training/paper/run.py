@@ -20,21 +20,21 @@ from viapoint.training.io.files import MARK, check_ours, versions, write_bytes, 
 from viapoint.training.io.progress import progress_bar
 from viapoint.training.paper import figures
 from viapoint.training.paper.claim import Claim, Number
-from viapoint.training.paper.rows import alternatives, double_step, obstacles, one_via, straight
+from viapoint.training.paper.rows import double_step, obstacles, one_via, point_to_point
 from viapoint.training.paper.rows.one_via import ENDS, FAST, SLOW, THREE_POINTS
 
 # Titles and functions of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991
 ROWS: dict[int, tuple[str, Callable[..., list[Claim]]]] = {
-    1: ("Point to point", straight.point_to_point_claims),
-    2: ("Invariance of hand paths", straight.invariance_claims),
-    3: ("Joints and torques", straight.joint_claims),
+    1: ("Point to point", point_to_point.point_to_point_claims),
+    2: ("Invariance of hand paths", point_to_point.invariance_claims),
+    3: ("Joints and torques", point_to_point.joint_claims),
     4: ("Free passage time", one_via.passage_claims),
     5: ("Speed valley and curvature", one_via.valley_claims),
     6: ("Place of the via-point", one_via.place_claims),
     7: ("Isochrony", one_via.isochrony_claims),
     8: ("Scaling with time", one_via.scaling_claims),
-    9: ("Alternatives to minimum jerk", alternatives.alternative_claims),
-    10: ("Repetitive and performance-limited movements", alternatives.limit_claims),
+    9: ("Alternatives to minimum jerk", point_to_point.alternative_claims),
+    10: ("Repetitive and performance-limited movements", point_to_point.limit_claims),
     11: ("The primer and its replanned version", double_step.replanning_claims),
     12: ("Obstacle avoidance", obstacles.obstacle_claims),
     13: ("A target that jumps on the way (Flash & Henis 1991)", double_step.double_step_claims),
