@@ -20,7 +20,7 @@ from viapoint.training.planning.export import read_motion, write_motion
 from viapoint.training.planning.motion_plan import UnsafePlanError, execute_plans
 from viapoint.training.planning.movements import OUTSIDE, Movement, movement_table
 from viapoint.training.planning.search import registered_task
-from viapoint.training.scene_sets.scene_set import BANDS, scenes_for
+from viapoint.training.scene_sets import BANDS, scenes_for
 
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 PANDA = arm_of("panda")

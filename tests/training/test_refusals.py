@@ -38,7 +38,7 @@ from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
-from viapoint.training.scene_sets.scene_set import load, scenes_for, shipped_path
+from viapoint.training.scene_sets import load, scenes_for, shipped_path
 
 ENV, REACH, STEP = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarReach", "PlanarObstaclesStep")

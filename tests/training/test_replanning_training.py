@@ -11,7 +11,7 @@ from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planning.baselines import StepAgentMethod, Straight, agent_method, make_method
 from viapoint.training.rollouts.rollout import SceneSimulation, whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.scene_sets import scenes_for
 
 MOVING, JUMPS = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarTargetJump-v0"
 STEP = "viapoint/PlanarObstaclesStep-v0"

@@ -25,7 +25,7 @@ from viapoint.training.runs import trainer
 from viapoint.training.runs.checkpoints import read_state
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import TrainingFailedError, TrainingStoppedError, train
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.scene_sets import scenes_for
 
 OFF_POLICY = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16}
 TINY = {

@@ -30,7 +30,7 @@ from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.datasets import dataset_folder, record_dataset
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.scene_sets.scene_set import evenly_spread, scenes_for
+from viapoint.training.scene_sets import evenly_spread, scenes_for
 
 
 def train(config: TrainConfig) -> None:

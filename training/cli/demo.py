@@ -24,7 +24,7 @@ from viapoint.training.plotting import plots
 from viapoint.training.plotting.video import gallery, record_video
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
-from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, scenes_for
+from viapoint.training.scene_sets import BANDS, FrozenScenes, scenes_for
 
 CHECKS = 16  # Proposals that the agent checks in the second row of the table
 BASELINES = ("search16", "search512", "straight", "random")

@@ -35,7 +35,7 @@ from viapoint.training.planning.baselines import (
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults, whole_task
 from viapoint.training.rollouts.vec_env import env_arguments
-from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes, scenes_for
+from viapoint.training.scene_sets import BANDS, DRAWN, FrozenScenes, scenes_for
 
 Progress = Callable[[str, int, int], None]  # Method's name, scenes done, all scenes
 

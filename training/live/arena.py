@@ -22,7 +22,7 @@ from viapoint.training.agents.agent import Agent
 from viapoint.training.live.state import Scene, State
 from viapoint.training.paper.movements import TARGETS, rows_of_lights
 from viapoint.training.planning.search import registered_task
-from viapoint.training.scene_sets.scene_set import load, shipped_set
+from viapoint.training.scene_sets import load, shipped_set
 
 MOTION, AGENT, SEARCH = "motion planner", "agent", "geometry search"
 STRAIGHT, OMPL, HAND = "straight movement", "OMPL", "by hand"  # Names of methods

@@ -17,12 +17,11 @@ from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import unpack
 from viapoint.training.io.files import MARK
-from viapoint.training.paper import movements
+from viapoint.training.paper import double_step, movements, one_via, point_to_point
 from viapoint.training.paper.movements import TARGETS, Profile, curved, passage_share, simulate, straight
-from viapoint.training.paper.rows import double_step, one_via, point_to_point
-from viapoint.training.paper.rows.obstacles import ObstacleMovements, features
-from viapoint.training.paper.rows.one_via import ENDS
-from viapoint.training.paper.rows.point_to_point import DIAGONALS, DURATION, diagonals
+from viapoint.training.paper.obstacles import ObstacleMovements, features
+from viapoint.training.paper.one_via import ENDS
+from viapoint.training.paper.point_to_point import DIAGONALS, DURATION, diagonals
 
 WIDTH = 8.5  # Width of a column, [cm]
 STYLE = Path(__file__).with_name("paper.mplstyle")  # Matplotlib's style of all figures

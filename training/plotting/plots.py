@@ -15,7 +15,7 @@ from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
 from viapoint.primitives import ViaPointFit
 from viapoint.training.io.files import MARK
-from viapoint.training.scene_sets.scene_set import BANDS
+from viapoint.training.scene_sets import BANDS
 
 BLUE = "#1f5fa8"
 DOTS_PER_INCH = 130

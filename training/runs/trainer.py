@@ -27,7 +27,7 @@ from viapoint.training.planning.baselines import agent_method
 from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.rollouts.vec_env import LOGGED, ViaVecEnv
 from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, write_config
-from viapoint.training.scene_sets.scene_set import FrozenScenes, scenes_for
+from viapoint.training.scene_sets import FrozenScenes, scenes_for
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
 

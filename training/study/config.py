@@ -24,7 +24,7 @@ from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import read_json, read_yaml
 from viapoint.training.planning.baselines import check_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.scene_sets.scene_set import SEEDS, SETS, shipped_set
+from viapoint.training.scene_sets import SEEDS, SETS, shipped_set
 
 Values = Mapping[str, Any]
 # Fields of a training that an agent may set

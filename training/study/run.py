@@ -29,7 +29,7 @@ from viapoint.training.plotting.plots import success_of_rows
 from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
-from viapoint.training.scene_sets.scene_set import FrozenScenes, scenes_for
+from viapoint.training.scene_sets import FrozenScenes, scenes_for
 from viapoint.training.study.config import Search, Study, Trial, Values
 
 RETRIES = 2  # Number of times that a trial whose worker died is begun again
