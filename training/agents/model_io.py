@@ -345,7 +345,7 @@ def parameter_budget(arrays: Mapping[str, Any]) -> Iterator[None]:
     try:
         yield
     finally:
-        handle.remove()
+        handle.remove()  # other networks may have any size
 
 
 def argument_names(kind: type[BaseAlgorithm]) -> set[str]:

@@ -85,7 +85,7 @@ def evaluate(config: EvaluateConfig) -> None:
         print(f"results, scene by scene: {config.json}", file=_notes(config))
     if result.partial:
         print("the results are partial", file=_notes(config))
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt  # after all that is there has been written
 
 
 def _notes(config: EvaluateConfig) -> TextIO:

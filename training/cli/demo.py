@@ -60,7 +60,7 @@ def run(config: DemoConfig) -> None:
         report.write(record, folder)
         plots.learning_curve(folder / "learning_curve.png", trained.curve)
         plots.success_by_band(folder / "success_by_band.png", record)
-        (folder / "movements.mp4").unlink(missing_ok=True)
+        (folder / "movements.mp4").unlink(missing_ok=True)  # they are of another agent
     if not (folder / "movements.mp4").exists():
         try:
             _show_movements(folder, agent, frozen)

@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         _leave("stopped", 130)
     except BrokenPipeError:  # nobody reads the output any more, as in `viapoint --help | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes the rest at its exit
         raise SystemExit(141) from None
     except Exception as error:
         if isinstance(error, ImportError) and words[:1] == ["doctor"]:

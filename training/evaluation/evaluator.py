@@ -368,11 +368,11 @@ def _decision_times(method: Method, scenes: Scenes, simulation: SceneSimulation,
             if replanning:
                 alone.episodes(one, decided, decide)
             usual = float(np.median(times[1:] or [times[0] / 20.0]))  # the first may warm up
-            if usual > SLOW_DECISION:
+            if usual > SLOW_DECISION:  # a look at each scene would take too long
                 return np.array([in_batch])
             if len(times) > TIMED_DECISIONS or time.perf_counter() - began > TIMING_BUDGET:
                 break
-    return np.array(times[1:] or times)
+    return np.array(times[1:] or times)  # without the first one, which may warm up
 
 
 @contextmanager

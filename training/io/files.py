@@ -78,7 +78,7 @@ def write_bytes(path: Path, content: bytes) -> None:
         with temporary.open("wb") as file:
             file.write(content)
             file.flush()
-            os.fsync(file.fileno())
+            os.fsync(file.fileno())  # a rename may reach the disk before the content
         temporary.replace(path)
         _sync_folder(path.parent)
     except BaseException as error:

@@ -57,7 +57,7 @@ class RandomVias:
 
     def __init__(self, simulation: SceneSimulation, count: int) -> None:
         self._simulation, self._count = simulation, count
-        self._generator = np.random.default_rng(0)
+        self._generator = np.random.default_rng(0)  # the same actions in every evaluation
         self.name = "random" if count == 1 else f"random{count}"
 
     @functools.cached_property
@@ -71,7 +71,7 @@ class RandomVias:
         actions = self._generator.uniform(-1.0, 1.0, (number, self._count, size))
         if self._count == 1:
             return actions[:, 0]
-        every = scenes.take(np.repeat(np.arange(number), self._count))
+        every = scenes.take(np.repeat(np.arange(number), self._count))  # each scene with each action
         simulation = self._for_one_scene if number == 1 else self._simulation
         reward = simulation(every, actions.reshape(-1, size)).reward.reshape(number, self._count)
         return np.asarray(actions[np.arange(number), reward.argmax(axis=-1)])

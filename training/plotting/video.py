@@ -110,7 +110,7 @@ def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
                     output_params=["-crf", "20", "-movflags", "+faststart", "-metadata", f"comment={MARK.decode()}"],
                     macro_block_size=1, ffmpeg_log_level="error",
                 )  # fmt: skip
-                writer.send(None)
+                writer.send(None)  # the generator opens the file
             writer.send(np.ascontiguousarray(frame))
             count += 1
         if writer is not None:
@@ -119,7 +119,7 @@ def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
     finally:
         if writer is not None:
             writer.close()
-        part.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)  # what is left of a film that failed
     return count
 
 

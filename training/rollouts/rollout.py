@@ -109,7 +109,11 @@ class SceneSimulation:
         number = len(scenes.start)
         for first in range(0, number, self._capacity):
             rows = np.arange(first, min(first + self._capacity, number))
-            sizes = [1, min(64, self._capacity), self._capacity]
+            sizes = [
+                1,
+                min(64, self._capacity),
+                self._capacity,
+            ]  # each has an environment, which is made once
             size = next(each for each in sizes if each >= len(rows))
             if size not in self._envs:
                 made: Any = gym.make_vec(self.env_id, num_envs=size, **self.kwargs)
@@ -141,15 +145,15 @@ def _episodes(
         decisions += now
         for name, values in decision.info.items():
             last[name] = np.where(now, values[:number], last.get(name, values[:number]))
-        running &= ~(decision.terminated | decision.truncated | single_decision)
-        actions[:] = 0.0
+        running &= ~(decision.terminated | decision.truncated | single_decision)  # which must not go on
+        actions[:] = 0.0  # which keeps the plan under way
         rows = np.flatnonzero(running)
         if decide is not None and rows.size:
             seen = {name: part[rows] for name, part in decision.observation.items()}
             actions[rows] = decide(seen, scenes.take(rows))
     last["decisions"] = decisions
     if not env.task.whole_movement:
-        last["duration"] = last["time"]
+        last["duration"] = last["time"]  # of the episode, not of its last decision
     return SimulationResults(reward, last)
 
 

@@ -100,7 +100,7 @@ def read_state(path: Path) -> dict[str, Any]:
             torn = archive.testzip()
         if torn is not None:
             raise ValueError(f"the sum of {torn} is another one")
-        content.seek(0)
+        content.seek(0)  # for a second reader
         state = torch.load(content, weights_only=True)
         if state["format"] != FORMAT or not isinstance(state["model"], dict):
             raise ValueError(f"format must be {FORMAT}")

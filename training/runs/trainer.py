@@ -209,7 +209,7 @@ def _learn(model: BaseAlgorithm, steps: int, callbacks: list[BaseCallback], *, f
     try:
         model.learn(steps, callbacks, None, reset_num_timesteps=fresh)  # type: ignore[arg-type]
     except TrainingStalledError:
-        for each in callbacks[1:]:
+        for each in callbacks[1:]:  # which `learn` has not told that it ends
             each.on_training_end()
 
 
@@ -276,7 +276,7 @@ class RunCallback(BaseCallback):
             desc=f"{self.config.algo} on {task}",
             disable=None if self.config.progress else True,
         )
-        self._listens = threading.current_thread() is threading.main_thread()
+        self._listens = threading.current_thread() is threading.main_thread()  # others get no signals
         if self._listens:
             self._handler = signal.signal(signal.SIGINT, self._on_interrupt)
         return self
@@ -287,7 +287,7 @@ class RunCallback(BaseCallback):
         self._bar.close()
 
     def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # for the second Ctrl-C
         self._stop = True
         self._bar.write("saving and leaving; Ctrl-C again leaves at once", file=sys.stderr)
 
@@ -337,7 +337,7 @@ class RunCallback(BaseCallback):
         """Evaluate the policy, extend the learning curve, and save the model if it is the best so far."""
         if self._validation is None or (self.curve and self.curve[-1]["decisions"] == self.num_timesteps):
             return
-        seconds = self.seconds
+        seconds = self.seconds  # before the validation, which is no training
         began = time.monotonic()
         if hasattr(self.model, "calibrate"):  # of agents that predict their success
             self.model.calibrate()
@@ -348,7 +348,7 @@ class RunCallback(BaseCallback):
             env_kwargs=whole_task(self.config.env, self.config.env_kwargs),
             time_decisions=False,
         ).results[0]
-        if result.partial:
+        if result.partial:  # Ctrl-C has ended it: some scenes say nothing of all
             return
         record = self._record(result, seconds)
         self.curve.append(record)
@@ -365,7 +365,7 @@ class RunCallback(BaseCallback):
         if record is best:
             self.run.save("best", self.model)
         self._show_progress()
-        self._began += time.monotonic() - began
+        self._began += time.monotonic() - began  # the time of a validation does not count
 
     def _record(self, result: MethodResult, seconds: float) -> dict[str, Any]:
         """Return the record of a validation for the learning curve, and log it."""

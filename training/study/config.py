@@ -184,7 +184,7 @@ def _study(
         for row, fields in _entries(given or {}):
             if row in rows:
                 raise ValueError(f"rows must have different names, {row} is there twice")
-            rows.add(row)
+            rows.add(row)  # rows are folders, which must not be shared
             for env in fields.pop("environments", list(known)):
                 if env not in known:
                     raise ValueError(unknown_name(f"{row}: environments", env, known))

@@ -296,7 +296,7 @@ def _connected(address: str | None, workers: int | None) -> Iterator[None]:
 def _run_trials(trials: list[Trial], folder: Path, told: Told) -> list[str]:
     """Run trials as tasks of Ray, and return a line for each that failed."""
     ray, _ = _import_libraries()
-    task = ray.remote(num_cpus=1, max_retries=RETRIES)(run_trial)
+    task = ray.remote(num_cpus=1, max_retries=RETRIES)(run_trial)  # each trial computes on one core
     running: dict[Any, Trial] = {task.remote(trial, folder): trial for trial in trials}
     failed = []
     while running:
