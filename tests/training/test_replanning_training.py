@@ -36,7 +36,7 @@ def test_a_jumping_target_is_reached_by_revision_only():
 
 def test_an_episode_is_the_same_alone_and_among_others():
     simulation = SceneSimulation(MOVING, 8)
-    scenes = simulation.draw(11, seed=4)
+    scenes = simulation.task.sampler()([np.random.default_rng((4, each)) for each in range(11)])
     actions = np.random.default_rng(0).uniform(-0.5, 0.5, (11, simulation.task.action.size))
     together = simulation(scenes, actions)
     for row in (0, 7, 10):
@@ -71,7 +71,7 @@ def test_an_agent_of_steps_is_measured_where_the_task_changes_during_an_episode(
     step = "viapoint/PlanarMovingObstaclesStep-v0"
     twin = SceneSimulation(step, 2, **whole_task(step, {}))
     assert twin.task.replanning
-    scenes = twin.draw(2, seed=0)
+    scenes = twin.task.sampler()([np.random.default_rng((0, each)) for each in range(2)])
     method = StepAgentMethod("forwards", Forwards(), step, {})
     decided = method.decide(twin.observe(scenes), scenes)
     assert decided.shape == (2, 2)
@@ -81,7 +81,7 @@ def test_an_agent_of_steps_is_measured_where_the_task_changes_during_an_episode(
 def test_what_a_method_carries_out_is_what_the_single_environment_does():
     method = StepAgentMethod("forwards", Forwards(), STEP, {})
     simulation = SceneSimulation(STEP, 6)
-    scenes = simulation.draw(6, seed=1)
+    scenes = simulation.task.sampler()([np.random.default_rng((1, each)) for each in range(6)])
     together = method.execute(scenes, method.decide(simulation.observe(scenes), scenes))
     env = gym.make(STEP)
     for i in range(6):

@@ -163,7 +163,7 @@ class AgentMethod:
         given = {"checks": checks, "refine": refine}
         self._settings = {name: number for name, number in given.items() if number is not None}
 
-    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+    def decide(self, observation: Observation, scenes: Any = None) -> Float:
         """Return actions of the agent, see :class:`Method`; the scenes are unused."""
         policy = self._model.policy
         own = {name: getattr(policy, name) for name in self._settings if hasattr(policy, name)}

@@ -54,10 +54,6 @@ class SceneSimulation:
         self._envs: dict[int, ReachVectorEnv] = {}
         self.task = registered_task(env_id, **kwargs)
 
-    def draw(self, number: int, seed: int) -> Scenes:
-        """Sample scenes of the task, the same ones for the same seed."""
-        return self.task.sampler()([np.random.default_rng((seed, each)) for each in range(number)])
-
     def observe(self, scenes: Scenes) -> Observation:
         """Return first observations in N scenes."""
         pieces = []
