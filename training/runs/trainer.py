@@ -20,11 +20,9 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
 from viapoint.training.agents.model_io import build
 from viapoint.training.config.configs import TrainConfig
-from viapoint.training.evaluation.evaluator import MethodResult, evaluate_methods, one_thread
+from viapoint.training.evaluation.evaluator import MethodResult, evaluate, one_thread
 from viapoint.training.io.files import BadFileError, versions
 from viapoint.training.io.progress import progress_bar
-from viapoint.training.planning.baselines import agent_method
-from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.rollouts.vec_env import LOGGED, ViaVecEnv
 from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, write_config
 from viapoint.training.scene_sets import FrozenScenes, scenes_for
@@ -341,13 +339,7 @@ class RunCallback(BaseCallback):
         began = time.monotonic()
         if hasattr(self.model, "calibrate"):  # of agents that predict their success
             self.model.calibrate()
-        result = evaluate_methods(
-            [agent_method("agent", self.model)],
-            self._validation,
-            self.config.env,
-            env_kwargs=whole_task(self.config.env, self.config.env_kwargs),
-            time_decisions=False,
-        ).results[0]
+        (result,) = evaluate(self.model, scenes=self._validation, time_decisions=False).results
         if result.partial:  # Ctrl-C has ended it: some scenes say nothing of all
             return
         record = self._record(result, seconds)
