@@ -94,7 +94,6 @@ def save_model(model: BaseAlgorithm, folder: Path) -> None:
     Raises:
         ValueError: Its class is not in ALGORITHMS, or it has no environment of this package.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / "weights.safetensors"
     write_arrays(path, weights(model))
     keep_arm(folder, model.get_env().get_attr("task", [0])[0].arm)  # type: ignore[union-attr]

@@ -123,14 +123,12 @@ def play(config: PlayConfig) -> None:
     from viapoint.training.plotting.video import record_video
 
     agent, env_id, env_kwargs = _named(config)
-    task = registered_task(env_id, **env_kwargs)
-    scenes = scenes_for(config.scenes, task, config.n_scenes).scenes
+    scenes = scenes_for(config.scenes, registered_task(env_id, **env_kwargs), config.n_scenes).scenes
     env = gym.make(env_id, render_mode="rgb_array_list", **env_kwargs)
     if agent is None:
         method = make_method("search512", env_id, **env_kwargs)
     else:
         method = agent_method("agent", agent, config.checks)
-    config.video.parent.mkdir(parents=True, exist_ok=True)
     record_video(config.video, env, scenes, method.decide, name=method.name)
     env.close()
     print(f"{len(scenes.start)} movements: {config.video}")

@@ -252,7 +252,6 @@ class TrainConfig(Config):
     def _check(self) -> None:
         if not isinstance(self.env, str):
             raise ValueError(f"env must be the id of an environment, got {self.env!r}")
-        check_registered(self.env)
         if self.algo is not None and self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
         check_env_kwargs(self.env_kwargs)
@@ -578,7 +577,6 @@ class DemoConfig(Config):
     n_scenes: int | None = None  # Number of test scenes, evenly spread over the set; all if not given.
 
     def _check(self) -> None:
-        check_registered(self.env)
         if not registered_task(self.env).whole_movement:
             raise ValueError(f"env must have whole movements as actions, as {DEFAULT_ENV}, got {self.env!r}")
         check_folder(f"out {self.out}", self.out)

@@ -17,7 +17,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.outcome import Outcome
-from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import NEVER, Scenes
 from viapoint.training.agents.agent import load_agent
 from viapoint.training.agents.model_io import untrained
@@ -29,7 +28,6 @@ from viapoint.training.planning.baselines import (
     Method,
     OpenLoopBaseline,
     agent_method,
-    check_method,
     make_method,
 )
 from viapoint.training.planning.search import registered_task
@@ -223,24 +221,21 @@ def evaluate(
         agent = load_agent(agent)
     env_id, kwargs = _environment_of(agent, env, env_kwargs)
     task = registered_task(env_id, **kwargs)
-    for each in baselines:
-        if isinstance(each, str) and not (each == "untrained" and isinstance(agent, BaseAlgorithm)):
-            check_method(each, task)
-    frozen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(scenes, task, n_scenes)
-    chosen = frozen.spread(n_scenes)
-    if n_scenes is not None and n_scenes > len(chosen.share):
-        print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
     methods = _rows_of(agent, settings)
     for each in baselines:
         if not isinstance(each, str):
             methods.append(each)
         elif each == "untrained" and isinstance(agent, BaseAlgorithm):
             methods += _rows_of(untrained(agent), settings, each)
-        elif each == "unrevised" and isinstance(agent, BaseAlgorithm):
+        elif each == "unrevised" and isinstance(agent, BaseAlgorithm) and task.replanning:
             first = agent_method("agent", agent, checks=0 if settings[0] else None)
             methods.append(OpenLoopBaseline(first, SceneSimulation(env_id, 250, **kwargs)))
         else:
             methods.append(make_method(each, env_id, **kwargs))
+    frozen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(scenes, task, n_scenes)
+    chosen = frozen.spread(n_scenes)
+    if n_scenes is not None and n_scenes > len(chosen.share):
+        print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
     return evaluate_methods(
         methods, chosen, env_id, env_kwargs=kwargs, time_decisions=time_decisions, progress=progress
     )
@@ -253,7 +248,6 @@ def _environment_of(
     if not isinstance(agent, BaseAlgorithm):
         if env is None:
             raise ValueError("env must be the id of an environment where no trained agent is given")
-        check_registered(env)
         return env, whole_task(env, env_kwargs or {})
     mine, kwargs = env_arguments(agent.get_env())
     if env not in (None, mine):

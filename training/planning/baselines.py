@@ -262,11 +262,6 @@ REPLANNING_METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
 }
 
 
-def check_method(name: str, task: Task) -> None:
-    """Check that a baseline of this name exists for a task."""
-    factory(name, task)
-
-
 def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
     """Return a baseline for an environment made with `kwargs`."""
     simulation = SceneSimulation(env_id, **kwargs)

@@ -44,7 +44,7 @@ def record_video(
     """Record one episode in each scene as an MP4, and return the number of frames.
 
     Args:
-        path: MP4 file; its folder must exist.
+        path: MP4 file; its folder is created.
         env: Environment made with `render_mode="rgb_array_list"`.
         scenes: Scenes with as many rows for obstacles as the environment has.
         decide: Function from observation and scene, of one row each, to actions, shape (1, m).
@@ -69,7 +69,7 @@ def record_plan(path: str | Path, plan: MotionPlan) -> int:
     """Record the execution of a plan as an MP4, and return the number of frames.
 
     Args:
-        path: MP4 file; its folder must exist.
+        path: MP4 file; its folder is created.
         plan: Plan.
 
     Raises:
@@ -99,6 +99,7 @@ def _scenes(env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, name: str, f
 
 def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
     """Encode frames of equal size, at least one, as a slow MP4 file (H.264), and return their number."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part.mp4")
     count, writer = 0, None
     try:

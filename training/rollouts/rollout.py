@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Int, Observation
 from viapoint.envs.plans import Plan
-from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planning.search import registered_task
 
@@ -48,7 +47,6 @@ class SceneSimulation:
     """
 
     def __init__(self, env_id: str, num_envs: int = 512, **kwargs: Any) -> None:
-        check_registered(env_id)
         self.env_id, self.kwargs = env_id, kwargs
         self._capacity = num_envs
         self._envs: dict[int, ReachVectorEnv] = {}

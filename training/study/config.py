@@ -22,7 +22,7 @@ from viapoint.training.agents.model_io import check_arguments, check_hyperparame
 from viapoint.training.config.checks import check_env_kwargs, check_whole, unknown_name
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import read_json, read_yaml
-from viapoint.training.planning.baselines import check_method
+from viapoint.training.planning.baselines import factory
 from viapoint.training.planning.search import registered_task
 from viapoint.training.scene_sets import SEEDS, SETS, shipped_set
 
@@ -297,7 +297,7 @@ def _agent(
 
 def _baseline(env: Values, row: str, *, method: str = "") -> list[Trial]:
     """Return the trial of a baseline that exists in its environment."""
-    check_method(method or row, registered_task(env["env_id"], **env["env_kwargs"]))
+    factory(method or row, registered_task(env["env_id"], **env["env_kwargs"]))  # an unknown name is told now
     return [Trial(**env, row=row, method=method or row)]
 
 
