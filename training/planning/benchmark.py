@@ -316,7 +316,7 @@ def succeeding(plans: Sequence[MotionPlan]) -> list[int]:
         rows = [row for row, plan in enumerate(plans) if plan.success and len(plan.durations) == count]
         for first in range(0, len(rows), TOGETHER):
             some = rows[first : first + TOGETHER]
-            outcome = execute_plans([plans[row] for row in some])
+            outcome, _ = execute_plans([plans[row] for row in some])
             found += [row for row, success in zip(some, outcome.is_success, strict=True) if success]
     return found
 

@@ -24,7 +24,7 @@ from viapoint.envs.rendering.renderer import EpisodeRenderer
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.config.checks import check_file
 from viapoint.training.io.files import MARK
-from viapoint.training.planning.motion_plan import MotionPlan, executed
+from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
 from viapoint.training.rollouts.rollout import Decide
 
 CAPTION = 48  # Height of the caption below the picture, [pixels]
@@ -78,7 +78,7 @@ def record_plan(path: str | Path, plan: MotionPlan) -> int:
     """
     path = Path(path).expanduser()
     check_file("path", path, ".mp4")
-    outcome, episodes = executed([plan])
+    outcome, episodes = execute_plans([plan])
     info = {name: value[0] for name, value in outcome._asdict().items()}
     film = EpisodeRenderer(episodes, 0, "rgb_array_list", *PLAN_SIZE, PLAN_FPS)
     left = f"{plan.source}   {plan.duration:.2f} s   planned in {plan.milliseconds:.0f} ms"
