@@ -21,7 +21,7 @@ from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training import load_agent
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.scene_sets import scenes_for
 
 ENV_ID, SCENES = "viapoint/PlanarSensed-v0", (300, 420, 450)
 """Environment, and rows of its `validation` set."""

@@ -29,10 +29,9 @@ from torch.nn import functional
 from viapoint.envs.common.types import Float
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.task import Task
-from viapoint.training.agents.model_io import ALGORITHMS
+from viapoint.training.agents.model_io import ALGORITHMS, check_arguments
 from viapoint.training.agents.plan_agent import Observation, PlanAlgorithm, PlanPolicy, task_in
 from viapoint.training.agents.sight_network import SightInputs, SightNetwork, sight_inputs
-from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.problem import Numbers, Problem
