@@ -322,8 +322,9 @@ class ViaRank(PlanAlgorithm):
         for first in range(0, number, BLOCK):
             truth, believed, sight = self._drawn([(CALIBRATION, first + each) for each in range(BLOCK)])
             actions, success = policy.best(believed, sight)
-            # Not exact: that would count movements near a straight elbow as failures, which the physics can follow.
-            clearance = plan_clearances(task, truth, actions[:, None], 0.0, 0.0)[:, 0]
+            # In hand space, exact geometry keeps room at a straight elbow that successful movements need not keep.
+            exact = not task.space.of_hand
+            clearance = plan_clearances(task, truth, actions[:, None], 0.0, 0.0, exact=exact)[:, 0]
             chances.append(logit(success))
             labels.append(clearance >= 0.0)
         x, y = np.concatenate(chances), np.concatenate(labels)
