@@ -29,14 +29,10 @@ def test_it_learns_in_seconds(agent) -> None:
 
 
 def test_predicted_success_is_calibrated(agent) -> None:
-    task = registered_task(ENV)
-    scenes = task.sampler()([np.random.default_rng((9, i)) for i in range(300)])
-    problem = Problem.of_scenes(scenes, task)
-    hand, goals = task.arm.hand(scenes.start), (scenes.goal, task.arm.hand(scenes.goal))
-    seen = task.observation.observe(scenes.start, hand, goals, scenes.obstacles)
-    actions, predicted = agent.policy.assess(seen)
-    clear = plan_clearances(task, problem, actions[:, None], 0.0, 0.0, exact=True)[:, 0] >= 0.0
-    assert abs(predicted.mean() - clear.mean()) < 0.08
+    simulation = SceneSimulation(ENV)
+    scenes = simulation.task.sampler()([np.random.default_rng((9, i)) for i in range(300)])
+    actions, predicted = agent.policy.assess(simulation.observe(scenes))
+    assert abs(predicted.mean() - simulation(scenes, actions).success.mean()) < 0.08
 
 
 def test_models_are_saved_and_loaded(agent, tmp_path) -> None:
