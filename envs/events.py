@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.arms.kinematics import Chain, Spheres
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import memory, obstacle_clearance, place
 from viapoint.envs.geometry.compiled import compiled
@@ -125,7 +125,7 @@ class EventPredictor:
         arrival = np.maximum(began + self.steps(plan.duration + SETTLING), now + 1)
         away = np.abs(plan.waypoints[:, -1] - goal(arrival * self.timestep)).max(axis=-1)
         there = away < MAX_START_OFFSET  # a plan of a user may have rounded its end
-        after_jump, after_turn = _next(jump, arrival), _next(turn, arrival)
+        after_jump, after_turn = next_step(jump, arrival), next_step(turn, arrival)
         # At rest at the goal, the arm waits for what is still to come.
         waits = there & (np.minimum(after_jump, after_turn) < NEVER) & (len(self.triggers) > 0)
         ends = {Event.TIME_LIMIT: np.maximum(np.full(len(now), self.limit), now + 1)}
@@ -133,7 +133,7 @@ class EventPredictor:
             (Event.TARGET, "target", jump, after_jump),
             (Event.COURSE, "course", turn, after_turn),
         ):
-            ends[event] = _next(steps, now) if trigger in self.triggers else np.where(waits, later, NEVER)
+            ends[event] = next_step(steps, now) if trigger in self.triggers else np.where(waits, later, NEVER)
         horizon = now + self.horizon
         ends[Event.HORIZON] = np.where(
             ("horizon" in self.triggers) & (horizon < moving_until), horizon, NEVER
@@ -293,6 +293,6 @@ def _first_falls(
             below = will_be
 
 
-def _next(steps: Int, now: Int) -> Int:
+def next_step(steps: Int, now: Int) -> Int:
     """Return the first of some steps, shape (N, n), after the present one, NEVER without one, shape (N,)."""
     return np.asarray(np.where(steps > now[:, None], steps, NEVER).min(axis=1, initial=NEVER))

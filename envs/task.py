@@ -274,20 +274,7 @@ class Task:
 
     def sampler(self) -> SceneSampler:
         """Return a sampler of scenes of the task."""
-        low, high = self.duration_range
-        return SceneSampler(
-            self.arm,
-            space=self.space_name,
-            n_obstacles=self.n_obstacles,
-            kinds=self.shapes,
-            families=self.families,
-            rows=self.n_obstacles[1],
-            tall=self.whole_arm,
-            jumps=self.n_jumps,
-            moving=self.moving_obstacles,
-            durations=(low, self.action.centre, high),
-            viewpoint=None if self.sensor is None else self.sensor.viewpoint,
-        )
+        return SceneSampler(self)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the task as plain values for JSON; the arm by its name."""

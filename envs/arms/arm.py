@@ -10,11 +10,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.chain import Chain, FirstTwo, Spheres
-from viapoint.envs.arms.kinematics import forward, inverse_dynamics
-from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, touching_at_home
-from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.geometry.clearance import memory, nearest_spheres, place
+from viapoint.envs.arms.kinematics import Chain, FirstTwo, Spheres, forward, inverse_dynamics
+from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, overlapping, touching_at_home
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import add_to_model
 from viapoint.envs.geometry.shapes import as_obstacle
@@ -189,7 +187,7 @@ def arm_from_xml(
     ranges = np.array([model.joint(each).range for each in joints])
     low, high = ranges.T
     drawn = np.random.default_rng(0).uniform(low, high, (COMPARED, len(ranges)))
-    touch = _touching(chain, spheres, drawn)
+    touch = overlapping(chain, spheres, drawn)
     for first, second in spheres.pairs[~touch]:
         reason = f"in contact in none of {COMPARED:,} configurations"
         left_out.append(LeftOut(names[first], names[second], reason))
@@ -215,20 +213,6 @@ def arm_from_xml(
         space=space,
         timestep=float(model.opt.timestep),
     )
-
-
-@compiled
-def _touching(chain: Chain, spheres: Spheres, joints: Float) -> Bool:
-    """Return True for pairs of groups that overlap in one of N configurations, shape (P,)."""
-    found = np.zeros(len(spheres.pairs), np.bool_)
-    placed = memory(chain, spheres)
-    for n in range(len(joints)):
-        place(chain, spheres, joints[n], placed)
-        for pair in range(len(found)):
-            if not found[pair]:
-                least, _, _ = nearest_spheres(spheres, placed, pair, 0.0, 0.0)
-                found[pair] = least < 0.0
-    return found
 
 
 def asset(file: str) -> str:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.chain import Chain
-from viapoint.envs.arms.kinematics import link_frames, tool_jacobian, transform
+from viapoint.envs.arms.kinematics import Chain, link_frames, tool_jacobian, transform
+from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.compiled import compiled, kernel
@@ -306,13 +305,13 @@ def inverse_kinematics(
         [0.5, 0.2, 0.4]
     """
     position = finite_array("position", position, (3,))
-    axes = np.zeros(9)
+    axes = np.eye(3)
     if quaternion is not None:
         quaternion = finite_array("quaternion", quaternion, (4,))
         length = float(np.linalg.norm(quaternion))
         if abs(length - 1.0) > 1e-3:
             raise ValueError(f"quaternion must have the length 1, got {quaternion.tolist()}")
-        mujoco.mju_quat2Mat(axes, quaternion / length)
+        axes = frame_matrices(quaternion / length)
     number = whole_number("n_seeds", n_seeds, 1)
     first = arm.home if seed is None else finite_array("seed", seed, arm.home.shape)
     rng = np.random.default_rng(0) if rng is None else rng
@@ -326,7 +325,7 @@ def inverse_kinematics(
             arm.chain,
             arm.joint_range,
             position,
-            axes.reshape(3, 3),
+            axes,
             quaternion is not None,
             configuration,
             rotation,

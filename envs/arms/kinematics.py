@@ -1,4 +1,4 @@
-"""Forward kinematics, Jacobians, inverse dynamics and limits of movements of a chain of joints.
+"""Forward kinematics, Jacobians, inverse dynamics and limits of movements of a chain of joints with spheres.
 
 Compiled functions work on one configuration and fill arrays of the caller. The functions at the end of the module are
 batched over leading axes; they check their arguments and return new arrays.
@@ -7,11 +7,11 @@ batched over leading axes; they check their arguments and return new arrays.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.chain import Chain, Spheres
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 
@@ -23,6 +23,87 @@ LEAST_TORQUE_SHARE = 0.01
 """Least share of a joint's torque limit that counts as available for motion, however heavy the arm is."""
 TORQUE_STRIDE = 2
 """Torques are looked at in every second configuration: they change slowly."""
+
+
+class FirstTwo(NamedTuple):
+    """Angles and lengths of an arm of two hinges with vertical axes."""
+
+    upper_angle: float
+    """Angle of the upper arm in the frame of the shoulder, [rad]."""
+    fore_angle: float
+    """Angle of the forearm in the frame of the elbow, [rad]."""
+    elbow: float
+    """Angle of the frame of the elbow in that of the shoulder, [rad]."""
+    base: float
+    """Angle of the frame of the shoulder in the world, [rad]."""
+    upper: float
+    """Length of the upper arm, [m]."""
+    fore: float
+    """Length of the forearm, [m]."""
+
+    @classmethod
+    def of(cls, origin: Float, rotation: Float, tool_origin: Float) -> FirstTwo:
+        """Return the numbers of a chain; see :class:`Chain` for the arguments."""
+        return cls(
+            upper_angle=math.atan2(origin[1, 1], origin[1, 0]),
+            fore_angle=math.atan2(tool_origin[1], tool_origin[0]),
+            elbow=math.atan2(rotation[1, 1, 0], rotation[1, 0, 0]),
+            base=math.atan2(rotation[0, 1, 0], rotation[0, 0, 0]),
+            upper=math.hypot(origin[1, 0], origin[1, 1]),
+            fore=math.hypot(tool_origin[0], tool_origin[1]),
+        )
+
+
+class Chain(NamedTuple):
+    """Serial chain of J joints with one link each.
+
+    Link 0 is the base, which does not move; link j moves with joints 1 to j. The frame of a link is that of its joint;
+    its z axis is the axis of the joint.
+    """
+
+    origin: Float
+    """Origin of the frame of each joint at 0, in the frame of the link before, shape (J, 3), [m]."""
+    rotation: Float
+    """Axes of this frame as columns, in the frame of the link before, shape (J, 3, 3)."""
+    sliding: Bool
+    """True for joints that slide along their z axis, False for hinges about it, shape (J,)."""
+    tool_origin: Float
+    """Origin of the tool's frame in that of the last link, shape (3,), [m]."""
+    tool_rotation: Float
+    """Axes of the tool's frame as columns, shape (3, 3)."""
+    mass: Float
+    """Mass of each moving link with all that is fixed to it, shape (J,), [kg]."""
+    centre: Float
+    """Centre of mass in the link's frame, shape (J, 3), [m]."""
+    inertia: Float
+    """Rotational inertia about the centre of mass, in the link's frame, shape (J, 3, 3), [kg m^2]."""
+    armature: Float
+    """Inertia of the motors seen at the joints, shape (J,), [kg m^2] or [kg]."""
+    damping: Float
+    """Viscous friction of the joints, shape (J,), [N m s/rad] or [N s/m]."""
+    gravity: Float
+    """Gravitational acceleration, shape (3,), [m/s^2]."""
+    first_two: FirstTwo
+    """Angles and lengths of the first two links, for the inverse kinematics of an arm in the plane."""
+
+
+class Spheres(NamedTuple):
+    """Spheres that cover an arm, in G groups; a group is rigid and belongs to one body of the model."""
+
+    centre: Float
+    """Centres in the frame of the link, shape (S, 3), [m]."""
+    radius: Float
+    """Radii, shape (S,), [m]."""
+    first: Int
+    """Index of the first sphere of each group, and the number of spheres, shape (G + 1,)."""
+    link: Int
+    """Link that each group moves with, shape (G,); 0 for the base."""
+    ball_centre: Float
+    """Centre of a bounding sphere of each group, in the frame of the link, shape (G, 3), [m]."""
+    ball_radius: Float
+    """Radius of this sphere, shape (G,), [m]."""
+    pairs: Int
+    """Pairs of groups that must not touch one another, shape (P, 2)."""
 
 
 @kernel
@@ -313,19 +394,6 @@ def _all_torques(chain: Chain, q: Float, v: Float, a: Float, torque: Float) -> N
         inverse_dynamics(chain, q[n], v[n], a[n], torque[n])
 
 
-@compiled
-def _all_centres(chain: Chain, spheres: Spheres, joints: Float, centre: Float) -> None:
-    n_joints = joints.shape[1]
-    rotation, origin = np.empty((n_joints + 1, 3, 3)), np.empty((n_joints + 1, 3))
-    for n in range(joints.shape[0]):
-        link_frames(chain, joints[n], rotation, origin)
-        for group in range(spheres.link.shape[0]):
-            link = spheres.link[group]
-            for s in range(spheres.first[group], spheres.first[group + 1]):
-                x, y, z = transform(rotation, origin, link, spheres.centre[s])
-                centre[n, s, 0], centre[n, s, 1], centre[n, s, 2] = x, y, z
-
-
 def _flat(name: str, chain: Chain, joints: Float) -> tuple[Float, tuple[int, ...]]:
     """Return checked configurations as (N, J), contiguous, and the leading axes."""
     array = finite_array(name, joints, (..., len(chain.mass)))
@@ -361,7 +429,7 @@ def torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
 
 def sphere_centres(chain: Chain, spheres: Spheres, joints: Float) -> Float:
     """Return the world positions of all S spheres, shape (..., S, 3), [m]."""
-    flat, batch = _flat("joints", chain, joints)
-    centre = np.empty((len(flat), len(spheres.radius), 3))
-    _all_centres(chain, spheres, flat, centre)
-    return centre.reshape(*batch, len(spheres.radius), 3)
+    rotation, origin = link_poses(chain, joints)
+    link = np.repeat(spheres.link, np.diff(spheres.first))
+    turned = rotation[..., link, :, :] @ spheres.centre[..., None]
+    return np.asarray(origin[..., link, :] + turned[..., 0])

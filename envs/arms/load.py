@@ -21,6 +21,7 @@ from viapoint.envs.arms.choices import (
     KNOWN_TORQUES,
     KNOWN_VELOCITIES,
     LEAST_GAP,
+    MOVES,
     Tool,
     ancestors,
     arm_joints,
@@ -32,8 +33,10 @@ from viapoint.envs.arms.choices import (
 from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.arms.stored import cached_path, read_cached, write_cached
 from viapoint.envs.arms.urdf import Urdf, read_urdf
+from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least
+from viapoint.envs.geometry.obstacles import quaternions_of
 
 DEFAULT_VELOCITY_LIMIT = 2.0
 """Velocity limit of joints without one, [rad/s] or [m/s]."""
@@ -65,8 +68,6 @@ INERTIA_MARGIN = 2e-5
 """Relative margin of the triangle inequality of principal moments; the text of a model keeps six digits."""
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 """Transmissions of actuators that drive a joint directly."""
-JOINT_TYPES = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-"""Types of joints that an arm may have."""
 RESERVED = ("", "world", "meshes")
 """Names that bodies of the arm cannot have, beside those of obstacles."""
 
@@ -342,7 +343,7 @@ def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: l
     found, endless = [], []
     for name in joints:
         joint = model.joint(name).id
-        if not np.isin(model.jnt_type[joint], JOINT_TYPES):
+        if not np.isin(model.jnt_type[joint], MOVES):
             raise ValueError(f"joint {name!r} is neither a hinge nor a slide; leave it out to fix it")
         limited = bool(model.jnt_limited[joint])
         if given is None and not limited and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
@@ -670,7 +671,7 @@ def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[Fi
         written[body] = parent.add_body(
             name=parsed.names[body],
             pos=axes.T @ (rest.xpos[body] - start),
-            quat=_quaternion(axes.T @ rest.xmat[body].reshape(3, 3)),
+            quat=quaternions_of(axes.T @ rest.xmat[body].reshape(3, 3)),
         )
         if link:
             _add_inertia(written[body], model, body)
@@ -726,18 +727,10 @@ def _add_joint(written: Any, parsed: Parsed, index: int, ranges: Float) -> None:
 
 def _add_capsule(written: Any, model: mujoco.MjModel, capsule: FittedCapsule) -> None:
     """Add a capsule that covers a geom, or a part of it, to the body."""
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[capsule.geom])
-    first, second = model.geom_pos[capsule.geom] + capsule.ends @ turn.reshape(3, 3).T
+    turn = frame_matrices(model.geom_quat[capsule.geom])
+    first, second = model.geom_pos[capsule.geom] + capsule.ends @ turn.T
     size = (capsule.radius, 0.0, 0.0)
     if np.array_equal(capsule.ends[0], capsule.ends[1]):
         written.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=first, size=size)
     else:
         written.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(*first, *second), size=size)
-
-
-def _quaternion(matrix: Float) -> Float:
-    """Return the quaternion of a rotation matrix."""
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, matrix.flatten())
-    return quaternion

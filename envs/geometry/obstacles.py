@@ -92,10 +92,12 @@ class Obstacles(NamedTuple):
         return Obstacles(kind, centre, rotation, size, velocity, self.meshes, self.clouds)
 
     def with_rows(self, rows: int) -> Obstacles:
-        """Return the obstacles with room for more of them in each scene."""
+        """Return the obstacles with another number of rows in each scene; those behind are left out."""
         wide = no_obstacles(len(self.kind), rows)
+        kept = min(rows, self.kind.shape[1])
+        present = self.present[:, :kept]
         for mine, theirs in zip(wide[:5], self[:5], strict=True):
-            mine[:, : theirs.shape[1]] = theirs
+            mine[:, :kept][present] = theirs[:, :kept][present]
         return wide._replace(meshes=self.meshes, clouds=self.clouds)
 
     def put(self, scenes: Any, others: Obstacles) -> Obstacles:
