@@ -170,8 +170,9 @@ class EventPredictor:
         obstacles = scenes.take(rows).obstacles_at(begin * self.timestep)
         interval = every * self.timestep
         chain, spheres = self.arm.chain, self.arm.spheres
-        low = _low_clearances(chain, spheres, path, obstacles, looks + ahead, interval, self.margin)
-        _first_falls(low, rows, steps, looks, ahead, now, latest, found)
+        _first_falls(
+            chain, spheres, path, obstacles, rows, steps, looks, ahead, interval, self.margin, latest, found
+        )
         return found
 
     def _sight(
@@ -205,13 +206,9 @@ class EventPredictor:
 
 @compiled
 def _count_new(points: Float, hit: Bool, known: Float, known_hit: Bool) -> Int:
-    """Return how many points of each scene are NEW_DISTANCE or more from all known ones, at most NEW_POINTS.
+    """Return how many points, shape (N, R, 3), are NEW_DISTANCE or more from all known ones, (N, M, 3).
 
-    Args:
-        points: Shape (N, R, 3), [m].
-        hit: True for those that count, shape (N, R).
-        known: Shape (N, M, 3), [m].
-        known_hit: True for those that count, shape (N, M).
+    It is at most NEW_POINTS in each scene. Points count where `hit`, shape (N, R) and (N, M).
     """
     found = np.zeros(len(points), np.int64)
     for scene in range(len(points)):
@@ -231,65 +228,48 @@ def _count_new(points: Float, hit: Bool, known: Float, known_hit: Bool) -> Int:
 
 
 @compiled
-def _low_clearances(
+def _first_falls(
     chain: Chain,
     spheres: Spheres,
     path: Float,
     obstacles: Obstacles,
-    number: Int,
+    rows: Int,
+    steps: Int,
+    looks: Int,
+    ahead: int,
     interval: float,
     margin: float,
-) -> Bool:
-    """Return True where the clearance from obstacles is below a margin, shape (M, T).
+    latest: Int,
+    found: Int,
+) -> None:
+    """Fill in the first step of each of N episodes at which the clearance ahead falls below a margin, [m].
 
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        path: Configurations of M movements, shape (M, T, J).
-        obstacles: Obstacles of M scenes at the first configuration.
-        number: Number of configurations of each movement that are looked at, shape (M,).
-        interval: Time between two configurations, [s].
-        margin: Margin, [m].
+    M pieces of the episodes `rows`, in order, have configurations, shape (M, T, J), at an interval, [s], from the
+    beginning on, where the obstacles are. A prediction at each of a number of `looks` sees `ahead` more of them.
     """
     placed = memory(chain, spheres)
-    low = np.zeros(path.shape[:2], np.bool_)
-    for scene in range(len(path)):
-        for k in range(number[scene]):
-            place(chain, spheres, path[scene, k], placed)
-            time = k * interval
-            clearance = obstacle_clearance(spheres, placed, obstacles, scene, time, margin, margin)
-            low[scene, k] = clearance < margin
-    return low
-
-
-@compiled
-def _first_falls(
-    low: Bool, rows: Int, steps: Int, looks: Int, ahead: int, now: Int, latest: Int, found: Int
-) -> None:
-    """Fill in the first step of each episode at which the clearance ahead falls below the margin.
-
-    Args:
-        low: True where the clearance is below the margin, shape (M, T).
-        rows: Episodes of M pieces, in order, shape (M,).
-        steps: Physics steps, shape (M, T).
-        looks: Number of predictions in each piece, shape (M,).
-        ahead: Number of further configurations of a prediction.
-        now: Present steps, shape (N,).
-        latest: Steps from which on the result does not matter, shape (N,).
-        found: Result, shape (N,).
-    """
-    below = True  # a clearance that is below the margin already does not fall
+    low = np.zeros(path.shape[1], np.bool_)
+    below = True
     for piece in range(len(rows)):
         row = rows[piece]
         if piece == 0 or row != rows[piece - 1]:
-            below = True
+            below = True  # a clearance that is below the margin already does not fall
+        if found[row] < NEVER:
+            continue
+        for k in range(looks[piece] + ahead):
+            place(chain, spheres, path[piece, k], placed)
+            time = k * interval
+            clearance = obstacle_clearance(spheres, placed, obstacles, piece, time, margin, margin)
+            low[k] = clearance < margin
         for look in range(looks[piece]):
             step = steps[piece, look]
-            if step >= latest[row] or found[row] < NEVER:
+            if step >= latest[row]:
                 break
-            will_be = bool(low[piece, look : look + ahead + 1].any())
-            if will_be and not below and step > now[row]:
+            will_be = bool(low[look : look + ahead + 1].any())
+            # The first prediction is that of the present step, which no decision can end at.
+            if will_be and not below:
                 found[row] = step
+                break
             below = will_be
 
 

@@ -191,12 +191,13 @@ def in_planar_reach(chain: Chain, limits: Float, x: float, y: float) -> bool:
 
 
 @compiled
-def planar_solutions(chain: Chain, joint_range: Float, places: Float, joints: Float) -> Bool:
-    """Fill in the joints for places of the hand in the plane, (N, 2), [m], and return True where it gets there."""
+def planar_solutions(chain: Chain, joint_range: Float, places: Float) -> tuple[Float, Bool]:
+    """Return the joints for places of the hand in the plane, (N, 2), [m], and True where it gets there, (N,)."""
+    joints = np.empty_like(places)
     found = np.empty(len(places), np.bool_)
     for i in range(len(places)):
         found[i] = solve_planar(chain, joint_range, places[i, 0], places[i, 1], joints[i])
-    return found
+    return joints, found
 
 
 @compiled
@@ -206,16 +207,17 @@ def _planar_motion(
     position: Float,
     velocity: Float,
     acceleration: Float,
-    out: tuple[Float, Float, Float],
-) -> None:
-    """Fill in joints, rates and accelerations for N states of the hand.
+) -> tuple[Float, Float, Float]:
+    """Return joints, rates and accelerations for N states of the hand.
 
     With unit vectors u along the links and n across them, the velocity is l1 a1' n1 + l2 a2' n2 for the angles a of the
     links in the world, and n1 . u2 = sin(a2 - a1), so its components along u2 and u1 give the rates. Accelerations
     follow alike after the centripetal terms are taken away.
     """
     first, second, turn, base, upper, fore = chain.first_two
-    joints, rates, changes = out
+    joints = np.empty_like(position)
+    rates = np.empty_like(position)
+    changes = np.empty_like(position)
     for i in range(len(position)):
         solve_planar(chain, joint_range, position[i, 0], position[i, 1], joints[i])
         one = base + joints[i, 0] + first
@@ -232,6 +234,7 @@ def _planar_motion(
         change_2 = -(x * c1 + y * s1) / (fore * sine)
         rates[i, 0], rates[i, 1] = rate_1, rate_2 - rate_1
         changes[i, 0], changes[i, 1] = change_1, change_2 - change_1
+    return joints, rates, changes
 
 
 def planar_joints(arm: Arm, places: Any) -> Float:
@@ -240,10 +243,8 @@ def planar_joints(arm: Arm, places: Any) -> Float:
     Out of reach, the elbow is as straight or as bent as it can be.
     """
     places = np.asarray(places, dtype=np.float64)
-    flat = places.reshape(-1, 2)
-    out = np.empty((len(flat), 2))
-    planar_solutions(arm.chain, arm.joint_range, flat, out)
-    return out.reshape(places.shape)
+    joints, _ = planar_solutions(arm.chain, arm.joint_range, places.reshape(-1, 2))
+    return joints.reshape(places.shape)
 
 
 def planar_motion(
@@ -251,10 +252,9 @@ def planar_motion(
 ) -> tuple[Float, Float, Float]:
     """Return joint positions, rates and accelerations for motions of the hand in the plane, shape (..., 2) each."""
     flat = [np.ascontiguousarray(part.reshape(-1, 2)) for part in (position, velocity, acceleration)]
-    out = (np.empty_like(flat[0]), np.empty_like(flat[0]), np.empty_like(flat[0]))
-    _planar_motion(arm.chain, arm.joint_range, flat[0], flat[1], flat[2], out)
+    joints, rates, changes = _planar_motion(arm.chain, arm.joint_range, *flat)
     shape = position.shape
-    return out[0].reshape(shape), out[1].reshape(shape), out[2].reshape(shape)
+    return joints.reshape(shape), rates.reshape(shape), changes.reshape(shape)
 
 
 def _least_distance(arm: Arm, position: Float, begin: Float) -> float:

@@ -367,31 +367,41 @@ def slowdowns(
 
 
 @compiled
-def _all_frames(chain: Chain, joints: Float, rotation: Float, origin: Float) -> None:
-    for n in range(joints.shape[0]):
+def _all_frames(chain: Chain, joints: Float) -> tuple[Float, Float]:
+    """Return the frames of the links for N configurations, see :func:`link_poses`."""
+    number, links = len(joints), len(chain.mass) + 1
+    rotation = np.empty((number, links, 3, 3))
+    origin = np.empty((number, links, 3))
+    for n in range(number):
         link_frames(chain, joints[n], rotation[n], origin[n])
+    return rotation, origin
 
 
 @compiled
-def _all_tools(chain: Chain, joints: Float, tool_rotation: Float, tool_origin: Float) -> None:
-    n_joints = joints.shape[1]
-    rotation, origin = np.empty((n_joints + 1, 3, 3)), np.empty((n_joints + 1, 3))
-    for n in range(joints.shape[0]):
-        x, y, z = tool_position(chain, joints[n], rotation, origin)
-        tool_origin[n, 0], tool_origin[n, 1], tool_origin[n, 2] = x, y, z
+def _all_tools(chain: Chain, joints: Float) -> tuple[Float, Float]:
+    """Return places and axes of the tool for N configurations, see :func:`forward`."""
+    number, last = joints.shape
+    rotation, origin = np.empty((last + 1, 3, 3)), np.empty((last + 1, 3))
+    places, axes = np.empty((number, 3)), np.empty((number, 3, 3))
+    for n in range(number):
+        places[n, 0], places[n, 1], places[n, 2] = tool_position(chain, joints[n], rotation, origin)
         for row in range(3):
             for column in range(3):
-                tool_rotation[n, row, column] = (
-                    rotation[n_joints, row, 0] * chain.tool_rotation[0, column]
-                    + rotation[n_joints, row, 1] * chain.tool_rotation[1, column]
-                    + rotation[n_joints, row, 2] * chain.tool_rotation[2, column]
+                axes[n, row, column] = (
+                    rotation[last, row, 0] * chain.tool_rotation[0, column]
+                    + rotation[last, row, 1] * chain.tool_rotation[1, column]
+                    + rotation[last, row, 2] * chain.tool_rotation[2, column]
                 )
+    return places, axes
 
 
 @compiled
-def _all_torques(chain: Chain, q: Float, v: Float, a: Float, torque: Float) -> None:
+def _all_torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
+    """Return the torques of N motions, see :func:`torques`."""
+    torque = np.empty_like(q)
     for n in range(q.shape[0]):
         inverse_dynamics(chain, q[n], v[n], a[n], torque[n])
+    return torque
 
 
 def _flat(name: str, chain: Chain, joints: Float) -> tuple[Float, tuple[int, ...]]:
@@ -403,18 +413,15 @@ def _flat(name: str, chain: Chain, joints: Float) -> tuple[Float, tuple[int, ...
 def forward(chain: Chain, joints: Float) -> tuple[Float, Float]:
     """Return places of the tool, (..., 3), [m], and its axes as columns, (..., 3, 3), for joints (..., J)."""
     flat, batch = _flat("joints", chain, joints)
-    position, rotation = np.empty((len(flat), 3)), np.empty((len(flat), 3, 3))
-    _all_tools(chain, flat, rotation, position)
-    return position.reshape(*batch, 3), rotation.reshape(*batch, 3, 3)
+    places, axes = _all_tools(chain, flat)
+    return places.reshape(*batch, 3), axes.reshape(*batch, 3, 3)
 
 
 def link_poses(chain: Chain, joints: Float) -> tuple[Float, Float]:
     """Return the frames of links 0 to J: axes as columns, (..., J + 1, 3, 3), and origins (..., J + 1, 3), [m]."""
     flat, batch = _flat("joints", chain, joints)
-    links = len(chain.mass) + 1
-    rotation, origin = np.empty((len(flat), links, 3, 3)), np.empty((len(flat), links, 3))
-    _all_frames(chain, flat, rotation, origin)
-    return rotation.reshape(*batch, links, 3, 3), origin.reshape(*batch, links, 3)
+    rotation, origin = _all_frames(chain, flat)
+    return rotation.reshape(*batch, *rotation.shape[1:]), origin.reshape(*batch, *origin.shape[1:])
 
 
 def torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
@@ -422,9 +429,7 @@ def torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
     flat, batch = _flat("q", chain, q)
     rates, _ = _flat("v", chain, np.broadcast_to(v, np.shape(q)))
     accelerations, _ = _flat("a", chain, np.broadcast_to(a, np.shape(q)))
-    torque = np.empty_like(flat)
-    _all_torques(chain, flat, rates, accelerations, torque)
-    return torque.reshape(*batch, flat.shape[1])
+    return _all_torques(chain, flat, rates, accelerations).reshape(*batch, flat.shape[1])
 
 
 def sphere_centres(chain: Chain, spheres: Spheres, joints: Float) -> Float:

@@ -20,13 +20,11 @@ from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
 from viapoint.envs.arms.choices import (
     KNOWN_TORQUES,
     KNOWN_VELOCITIES,
-    LEAST_GAP,
     MOVES,
     Tool,
     ancestors,
     arm_joints,
     chain_joints,
-    choose_home,
     choose_tool,
     known_limits,
 )
@@ -38,6 +36,12 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least
 from viapoint.envs.geometry.obstacles import quaternions_of
 
+HOMES = 64
+"""Number of random configurations among which a home is looked for."""
+INSET = 0.1
+"""Least distance of home from the joint limits, as a share of the ranges."""
+LEAST_GAP = 0.002
+"""Distance of bodies at home below which another home is looked for, [m]."""
 DEFAULT_VELOCITY_LIMIT = 2.0
 """Velocity limit of joints without one, [rad/s] or [m/s]."""
 WEIGHTS, LEAST_TORQUE = 3.0, 1.0
@@ -379,20 +383,33 @@ def _torques(
         limits = [_actuator_torque(model, int(index)) for index in np.flatnonzero(drives)]
         found.append(max(limits, default=0.0))
     torque = np.array(found)
-    missing = torque <= 0.0
     known = known_limits(KNOWN_TORQUES, arm, len(joints))
-    if missing.any() and known is not None:
-        notes.append("torque limits: those of the arm of this name")
-        torque = np.where(missing, known, torque)
-    elif missing.any():
-        weight = _greatest_weight(model, joints)
-        torque[missing] = np.maximum(WEIGHTS * weight[missing], LEAST_TORQUE)
-        some = ", ".join(itertools.compress(joints, missing))
-        notes.append(
-            f"{WARNING}the file has no torque limits of {some}; they get {WEIGHTS:g} times what the arm's weight "
-            "needs; give torque_limit"
-        )
-    return torque, False
+    weight = 0.0
+    if known is None and (torque <= 0.0).any():
+        weight = np.maximum(WEIGHTS * _greatest_weight(model, joints), LEAST_TORQUE)
+    how = f"{WEIGHTS:g} times what the arm's weight needs"
+    return _completed("torque", joints, torque, known, weight, how, notes), False
+
+
+def _completed(
+    what: str,
+    joints: tuple[str, ...],
+    limits: Float,
+    known: Float | None,
+    default: Any,
+    how: str,
+    notes: list[str],
+) -> Float:
+    """Return limits of which missing ones, which are 0, are those of a known arm or a default; a note tells it."""
+    missing = limits <= 0.0
+    if not missing.any():
+        return limits
+    if known is not None:
+        notes.append(f"{what} limits: those of the arm of this name")
+        return np.where(missing, known, limits)
+    some = ", ".join(itertools.compress(joints, missing))
+    notes.append(f"{WARNING}the file has no {what} limits of {some}; they get {how}; give {what}_limit")
+    return np.where(missing, default, limits)
 
 
 def _greatest_weight(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
@@ -439,17 +456,9 @@ def _velocities(
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
         return _per_joint("velocity_limit", model.numeric("velocity_limit").data, joints)
     found = np.array([in_urdf.get(name, 0.0) for name in joints])
-    missing = found <= 0.0
+    how = f"{DEFAULT_VELOCITY_LIMIT:g} rad/s (slides {DEFAULT_VELOCITY_LIMIT:g} m/s)"
     known = known_limits(KNOWN_VELOCITIES, arm, len(joints))
-    if missing.any() and known is not None:
-        notes.append("velocity limits: those of the arm of this name")
-        return np.where(missing, known, found)
-    if missing.any():
-        notes.append(
-            f"{WARNING}the file has no velocity limits of {', '.join(itertools.compress(joints, missing))}; they get "
-            f"{DEFAULT_VELOCITY_LIMIT:g} rad/s (slides {DEFAULT_VELOCITY_LIMIT:g} m/s); give velocity_limit"
-        )
-    return np.where(missing, DEFAULT_VELOCITY_LIMIT, found)
+    return _completed("velocity", joints, found, known, DEFAULT_VELOCITY_LIMIT, how, notes)
 
 
 def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[tuple[int, int]], notes: list[str]) -> Float:
@@ -465,12 +474,21 @@ def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[tuple[int, int]
     if model.nkey:
         address = [int(model.joint(name).qposadr[0]) for name in joints]
         candidates["the file's keyframe"] = model.key_qpos[0, address].copy()
-    candidates["zeros"] = np.zeros(len(joints))
-    home, origin = choose_home(
-        ranges, candidates, lambda home: float(_distances(parsed, home, pairs).min(initial=1.0))
-    )
-    notes.append(f"home: {origin}")
-    return home
+    low, high = ranges.T
+    candidates |= {"zeros": np.zeros(len(joints)), "the middle of the ranges": 0.5 * (low + high)}
+
+    def apart(configuration: Float) -> float:
+        return float(_distances(parsed, configuration, pairs).min(initial=1.0))
+
+    for origin, configuration in candidates.items():
+        inside = (configuration >= low) & (configuration <= high)
+        if inside.all() and apart(configuration) >= LEAST_GAP:
+            notes.append(f"home: {origin}")
+            return np.asarray(configuration)
+    notes.append("home: the one that is farthest from touching itself, of random ones")
+    inset = INSET * (high - low)
+    drawn = np.random.default_rng(0).uniform(low + inset, high - inset, (HOMES, len(low)))
+    return max(drawn, key=apart)
 
 
 def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: list[str]) -> Parsed:
@@ -540,30 +558,27 @@ def _check_order(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[in
             raise ValueError(f"joints must be in order from the base: {first!r} does not carry {second!r}")
 
 
-def _collide_in_file(parsed: Parsed, first: int, second: int) -> bool:
-    """Return True if MuJoCo would let geoms of two bodies collide: contact bits, excluded and explicit pairs."""
-    model = parsed.model
-    low, high = sorted((first, second))
-    if (low << 16) + high in model.exclude_signature:
-        return False
-    explicit = set(map(frozenset, zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)))
-    for a, b in itertools.product(parsed.geoms[first], parsed.geoms[second]):
-        bits = model.geom_contype[a] & model.geom_conaffinity[b]
-        bits |= model.geom_contype[b] & model.geom_conaffinity[a]
-        # Geoms that collide with nothing stand for a link that has no others.
-        silent = any(not (model.geom_contype[geom] | model.geom_conaffinity[geom]) for geom in (a, b))
-        if bits or silent or frozenset((a, b)) in explicit:
-            return True
-    return False
-
-
 def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> list[frozenset[str]]:
-    """Return the names of pairs of bodies that the file does not let collide, or an SRDF file."""
-    silent = {frozenset(pair) for pair in never_touch}
+    """Return the names of pairs of bodies that the file does not let collide, or an SRDF file.
+
+    MuJoCo decides by contact bits, excluded bodies, and explicit pairs of geoms.
+    """
+    model = parsed.model
+    silent = set(map(frozenset, never_touch))
+    explicit = set(map(frozenset, zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)))
+    types, affinities = model.geom_contype, model.geom_conaffinity
+    # Geoms that collide with nothing stand for a link that has no others.
+    spare = (types | affinities) == 0
     found = []
-    for pair in parsed.compared({}):
-        if not _collide_in_file(parsed, *pair) or parsed.pair(pair) in silent:
-            found.append(parsed.pair(pair))
+    for first, second in parsed.compared({}):
+        pair = parsed.pair((first, second))
+        collide = False
+        for a, b in itertools.product(parsed.geoms[first], parsed.geoms[second]):
+            bits = (types[a] & affinities[b]) | (types[b] & affinities[a])
+            collide = collide or bool(bits or spare[a] or spare[b] or frozenset((a, b)) in explicit)
+        excluded = (min(first, second) << 16) + max(first, second) in model.exclude_signature
+        if pair in silent or excluded or not collide:
+            found.append(pair)
     return found
 
 

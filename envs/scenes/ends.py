@@ -45,8 +45,6 @@ class Setting(NamedTuple):
     """Ranges of the joints, shape (J, 2), [rad] or [m]."""
     inner_range: Float
     """Ranges of the joints at ends, shape (J, 2), [rad] or [m]."""
-    velocity_limit: Float
-    """Shape (J,), [rad/s] or [m/s]."""
     home: Float
     """Shape (J,), [rad] or [m]."""
     bearing: float
@@ -63,8 +61,8 @@ class Setting(NamedTuple):
     """Least length of the way from start to goal in joint space, [rad]."""
     n_jumps: tuple[int, int]
     """Fewest and most jumps of the target."""
-    durations: tuple[float, float, float]
-    """Shortest, centre and longest duration of movements, [s], in joint space relative to the shortest possible."""
+    relative_durations: tuple[float, float]
+    """Shortest and longest duration of movements, relative to that of the zero action."""
 
 
 class Draft(NamedTuple):
@@ -187,7 +185,13 @@ def _draw_end(draft: Draft, scene: int, pair: int, end: int) -> bool:
             there = draft.places[scene, listed, int(numbers[first] * n_places)]
             if not _reach(draft, scene, there, numbers[first + 1 : first + 8], joints):
                 continue
-        if is_end(draft, joints) and (draft.keep[scene] > 0 or _is_clear(draft, scene)):
+        if not is_end(draft, joints):
+            continue
+        if draft.keep[scene] > 0:  # obstacles in the way are left out
+            return True
+        placed, margin = draft.placed, setting.margin
+        obstacles = draft.scenes.obstacles
+        if obstacle_clearance(setting.spheres, placed, obstacles, scene, 0.0, margin, margin) >= margin:
             return True
     return False
 
@@ -206,18 +210,21 @@ def is_end(draft: Draft, joints: Float) -> bool:
 
 
 @compiled
-def _is_clear(draft: Draft, scene: int) -> bool:
-    """Return True if the placed arm has the margin of ends to all obstacles at time 0."""
-    margin = draft.setting.margin
-    spheres, obstacles = draft.setting.spheres, draft.scenes.obstacles
-    return bool(obstacle_clearance(spheres, draft.placed, obstacles, scene, 0.0, margin, margin) >= margin)
-
-
-@compiled
-def _is_row_clear(draft: Draft, placed: Placed, scene: int, row: int, link: int) -> bool:
-    """Return True if links from `link` on of a placed arm have the margin of ends to one obstacle at time 0."""
-    margin, spheres = draft.setting.margin, draft.setting.spheres
-    least = row_clearance(spheres, placed, draft.scenes.obstacles, scene, row, 0.0, margin, margin, link)
+def is_row_clear(
+    draft: Draft, placed: Placed, scene: int, row: int, time: float, margin: float, link: int
+) -> bool:
+    """Return True if links from `link` on of a placed arm have a margin to one obstacle at some time, [m]."""
+    scenes, obstacles = draft.scenes, draft.scenes.obstacles
+    x, y, z = obstacles.centre[scene, row]
+    # After the turn, the place is that of the first course, moved by the difference of the courses.
+    after = max(time - scenes.turn_time[scene, row], 0.0)
+    for axis in range(3):
+        change = scenes.turn_velocity[scene, row, axis] - obstacles.velocity[scene, row, axis]
+        obstacles.centre[scene, row, axis] += after * change
+    least = row_clearance(draft.setting.spheres, placed, obstacles, scene, row, time, margin, margin, link)
+    obstacles.centre[scene, row, 0] = x
+    obstacles.centre[scene, row, 1] = y
+    obstacles.centre[scene, row, 2] = z
     return bool(least >= margin)
 
 
@@ -237,8 +244,8 @@ def _make_room(draft: Draft, scene: int) -> bool:
         if keep > 0 and count == keep:
             obstacles.kind[scene, row] = ABSENT
             continue
-        free = _is_row_clear(draft, draft.at_start, scene, row, 1)
-        free = free and _is_row_clear(draft, draft.at_goal, scene, row, 1)
+        free = is_row_clear(draft, draft.at_start, scene, row, 0.0, setting.margin, 1)
+        free = free and is_row_clear(draft, draft.at_goal, scene, row, 0.0, setting.margin, 1)
         if not free and keep == 0:
             return False
         kind = obstacles.kind[scene, row]
@@ -261,34 +268,23 @@ def straight_movement(draft: Draft, scene: int) -> int:
     if setting.of_hand:
         x, y, _ = tool_position(setting.chain, start, placed.rotation, placed.origin)
         u, v, _ = tool_position(setting.chain, goal, placed.rotation, placed.origin)
-        for k in range(1, INSTANTS):
-            share = k / INSTANTS
+    blocked = False
+    for k in range(1, INSTANTS):
+        share = k / INSTANTS
+        if setting.of_hand:
             here = x + share * (u - x), y + share * (v - y)
             if not solve_planar(setting.chain, setting.joint_range, here[0], here[1], joints):
                 return OUT_OF_REACH
-    for k in range(1, INSTANTS):
-        share = _bit_reversed(k)
-        if setting.of_hand:
-            here = x + share * (u - x), y + share * (v - y)
-            solve_planar(setting.chain, setting.joint_range, here[0], here[1], joints)
         else:
             for joint in range(len(joints)):
                 joints[joint] = start[joint] + share * (goal[joint] - start[joint])
-        place(setting.chain, setting.spheres, joints, placed)
-        if obstacle_clearance(setting.spheres, placed, draft.scenes.obstacles, scene, 0.0, 0.0, 0.0) < 0.0:
-            return BLOCKED
-    return FREE
-
-
-@compiled
-def _bit_reversed(number: int) -> float:
-    """Return the k-th point of the sequence 1/2, 1/4, 3/4, 1/8, 5/8, ..."""
-    point, step = 0.0, 0.5
-    while number:
-        point += step * (number & 1)
-        number >>= 1
-        step *= 0.5
-    return point
+        if not blocked:
+            place(setting.chain, setting.spheres, joints, placed)
+            least = obstacle_clearance(setting.spheres, placed, draft.scenes.obstacles, scene, 0.0, 0.0, 0.0)
+            blocked = least < 0.0
+        if blocked and not setting.of_hand:  # the hand may still leave the reach
+            break
+    return BLOCKED if blocked else FREE
 
 
 @compiled
@@ -349,7 +345,7 @@ def _is_hand_clear(draft: Draft, scene: int, position: Float, axes: Float) -> bo
             placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2] = ball
     clear = True
     for row in range(draft.scenes.obstacles.kind.shape[1]):
-        clear = clear and _is_row_clear(draft, placed, scene, row, last)
+        clear = clear and is_row_clear(draft, placed, scene, row, 0.0, draft.setting.margin, last)
     return clear
 
 

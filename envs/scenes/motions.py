@@ -7,11 +7,11 @@ import numpy as np
 from viapoint.envs.arms.inverse_kinematics import solve_planar
 from viapoint.envs.arms.kinematics import tool_position
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.clearance import Placed, place, row_clearance
+from viapoint.envs.geometry.clearance import place
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE
-from viapoint.envs.plans import SHORTEST_DURATION
-from viapoint.envs.scenes.ends import Draft, Setting, is_end
+from viapoint.envs.scenes.ends import Draft, is_end, is_row_clear
+from viapoint.envs.scenes.layout import mix
 from viapoint.envs.scenes.scene import MOST_JUMPS, NEVER
 
 CANDIDATES = 8
@@ -42,50 +42,34 @@ PASSED = 8
 """Parts of the way to a new target between which it is looked at."""
 
 
+_mixed = compiled(mix)
+
+
 def numbers_of_jumps(joints: int) -> int:
     """Return how many random numbers the jumps of a scene take."""
     return 1 + MOST_JUMPS * (1 + CANDIDATES * (1 + joints))
 
 
 @compiled
-def _mixed(limits: tuple[float, float], share: float) -> float:
-    """Return the number at a share of the way from a lower limit to an upper one."""
-    return limits[0] + (limits[1] - limits[0]) * share
-
-
-@compiled
-def time_unit(setting: Setting, start: Float, goal: Float) -> float:
-    """Return the unit of durations, [s]: in joint space the shortest duration that the velocity limits allow."""
-    if setting.of_hand:
-        return 1.0
-    unit = SHORTEST_DURATION
-    for joint in range(len(start)):
-        # The greatest rate of a minimum-jerk movement is 15/8 of the mean one.
-        unit = max(unit, 1.875 * abs(goal[joint] - start[joint]) / setting.velocity_limit[joint])
-    return unit
-
-
-@compiled
-def draw_courses(draft: Draft, which: Int, numbers: Float) -> None:
+def draw_courses(draft: Draft, which: Int, durations: Float, numbers: Float) -> None:
     """Set the obstacles of the scenes at indices (K,) in motion, but half-spaces, and those of which no course fits.
 
-    `numbers` are uniform random numbers, shape (K, W, CANDIDATES, COURSE_NUMBERS).
+    `durations` are those of the straight movements, shape (K,), [s]; `numbers` are uniform random numbers, shape
+    (K, W, CANDIDATES, COURSE_NUMBERS).
     """
-    setting, obstacles = draft.setting, draft.scenes.obstacles
+    setting, scenes, obstacles = draft.setting, draft.scenes, draft.scenes.obstacles
     for k in range(len(which)):
         scene = which[k]
-        start, goal = draft.scenes.start[scene], draft.scenes.goal[scene]
-        unit = time_unit(setting, start, goal)
-        place(setting.chain, setting.spheres, start, draft.at_start)
-        place(setting.chain, setting.spheres, goal, draft.at_goal)
+        place(setting.chain, setting.spheres, scenes.start[scene], draft.at_start)
+        place(setting.chain, setting.spheres, scenes.goal[scene], draft.at_goal)
         for row in range(obstacles.kind.shape[1]):
             if obstacles.kind[scene, row] in (ABSENT, HALF_SPACE):
                 continue
             met = obstacles.centre[scene, row].copy()
             fits = False
             for candidate in range(CANDIDATES):
-                _set_course(draft, scene, row, met, unit * setting.durations[1], numbers[k, row, candidate])
-                fits = _course_fits(draft, unit, scene, row)
+                _set_course(draft, scene, row, met, durations[k], numbers[k, row, candidate])
+                fits = _course_fits(draft, durations[k], scene, row)
                 if fits:
                     break
             if not fits:
@@ -123,49 +107,30 @@ def _fill_velocity(fast: float, heading: float, rise: float, velocity: Float) ->
 
 
 @compiled
-def _course_fits(draft: Draft, unit: float, scene: int, row: int) -> bool:
+def _course_fits(draft: Draft, duration: float, scene: int, row: int) -> bool:
     """Return True if an obstacle leaves the start free at first, and the goal at first and while movements may end."""
-    shortest, centre, longest = draft.setting.durations
+    shortest, longest = draft.setting.relative_durations
     x, y, z = draft.scenes.obstacles.centre[scene, row]
     if max(abs(x), abs(y), abs(z)) > FARTHEST:
         return False
     for k in range(BEGINNING_TIMES):
-        time = unit * centre * BEGINNING * k / (BEGINNING_TIMES - 1)
-        if clearance_at(draft, draft.at_start, scene, row, time) < MARGIN:
+        time = duration * BEGINNING * k / (BEGINNING_TIMES - 1)
+        if not is_row_clear(draft, draft.at_start, scene, row, time, MARGIN, 1):
             return False
     for k in range(-1, ENDING_TIMES):
         share = k / (ENDING_TIMES - 1)
-        time = unit * _mixed((shortest, ENDING * longest), share) if k >= 0 else 0.0
-        if clearance_at(draft, draft.at_goal, scene, row, time) < MARGIN:
+        time = duration * _mixed((shortest, ENDING * longest), share) if k >= 0 else 0.0
+        if not is_row_clear(draft, draft.at_goal, scene, row, time, MARGIN, 1):
             return False
     return True
 
 
 @compiled
-def clearance_at(draft: Draft, placed: Placed, scene: int, row: int, time: float) -> float:
-    """Return the clearance of a placed arm from an obstacle at some time, at most MARGIN, [m]."""
-    obstacles = draft.scenes.obstacles
-    after = max(time - draft.scenes.turn_time[scene, row], 0.0)
-    before = (
-        obstacles.centre[scene, row, 0],
-        obstacles.centre[scene, row, 1],
-        obstacles.centre[scene, row, 2],
-    )
-    # After the turn, the place is that of the first course, moved by what the turn changes.
-    for axis in range(3):
-        change = draft.scenes.turn_velocity[scene, row, axis] - obstacles.velocity[scene, row, axis]
-        obstacles.centre[scene, row, axis] += after * change
-    least = row_clearance(draft.setting.spheres, placed, obstacles, scene, row, time, MARGIN, MARGIN, 1)
-    for axis in range(3):
-        obstacles.centre[scene, row, axis] = before[axis]
-    return float(least)
-
-
-@compiled
-def draw_jumps(draft: Draft, which: Int, numbers: Float) -> Bool:
+def draw_jumps(draft: Draft, which: Int, durations: Float, numbers: Float) -> Bool:
     """Draw the jumps of the target of the scenes at indices (K,), and return True where all of them fit, shape (K,).
 
-    `numbers` are uniform random numbers, shape (K, :func:`numbers_of_jumps`).
+    `durations` are those of the straight movements, shape (K,), [s]; `numbers` are uniform random numbers, shape
+    (K, :func:`numbers_of_jumps`).
     """
     joints = draft.scenes.start.shape[1]
     fewest, most = draft.setting.n_jumps
@@ -175,14 +140,13 @@ def draw_jumps(draft: Draft, which: Int, numbers: Float) -> Bool:
     for k in range(len(which)):
         scene, u = which[k], numbers[k]
         count = fewest + int((most - fewest + 1) * u[0])
-        start, goal = draft.scenes.start[scene], draft.scenes.goal[scene]
-        duration = draft.setting.durations[1] * time_unit(draft.setting, start, goal)
+        start = draft.scenes.start[scene]
+        before[:] = draft.scenes.goal[scene]
         draft.scenes.jumps[scene] = 0.0
-        before[:] = goal
         time = 0.0
         for jump in range(count):
             first = 1 + jump * each
-            time += duration * _mixed(NEXT_JUMP if jump else FIRST_JUMP, u[first])
+            time += durations[k] * _mixed(NEXT_JUMP if jump else FIRST_JUMP, u[first])
             fits = False
             for candidate in range(CANDIDATES):
                 begin = first + 1 + candidate * (1 + joints)
@@ -233,6 +197,6 @@ def _is_free_at(draft: Draft, scene: int, target: Float, time: float) -> bool:
     if not is_end(draft, target):
         return False
     for row in range(draft.scenes.obstacles.kind.shape[1]):
-        if clearance_at(draft, draft.placed, scene, row, time) < MARGIN:
+        if not is_row_clear(draft, draft.placed, scene, row, time, MARGIN, 1):
             return False
     return True

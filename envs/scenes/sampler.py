@@ -20,6 +20,7 @@ from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import memory, row_clearances
 from viapoint.envs.geometry.distance import point_clearances
 from viapoint.envs.geometry.obstacles import no_obstacles
+from viapoint.envs.plans import SHORTEST_DURATION
 from viapoint.envs.scenes.ends import (
     HOME_SHARE,
     PAIRS,
@@ -184,11 +185,19 @@ class SceneSampler:
         def numbers(*shape: int) -> Float:
             return np.array([generators[scene].random(shape) for scene in which]).reshape(-1, *shape)
 
-        if self.task.moving_obstacles and "obstacles" not in given:
-            draw_courses(draft, which, numbers(self._width, CANDIDATES, COURSE_NUMBERS))
-        if self.task.n_jumps[1] == 0 or "jumps" in given:
+        moves = self.task.moving_obstacles and "obstacles" not in given
+        jumps = self.task.n_jumps[1] > 0 and "jumps" not in given
+        if not moves and not jumps:
             return np.ones(len(which), bool)
-        return draw_jumps(draft, which, numbers(numbers_of_jumps(draft.scenes.start.shape[1])))
+        space, action = self.task.space, self.task.action
+        start, goal = draft.scenes.start[which], draft.scenes.goal[which]
+        durations = action.zero_duration(space.coordinates(start), space.coordinates(goal))
+        durations = np.maximum(durations, SHORTEST_DURATION * action.centre)
+        if moves:
+            draw_courses(draft, which, durations, numbers(self._width, CANDIDATES, COURSE_NUMBERS))
+        if not jumps:
+            return np.ones(len(which), bool)
+        return draw_jumps(draft, which, durations, numbers(numbers_of_jumps(start.shape[1])))
 
 
 def _write(draft: Draft, scene: int, layout: Layout) -> None:
@@ -214,6 +223,7 @@ def _setting_of(task: Task, plane: bool) -> Setting:
     """Return what compiled functions know of a task."""
     arm = task.arm
     shortest, longest = task.duration_range
+    centre = task.action.centre
     width = arm.joint_range[:, 1] - arm.joint_range[:, 0]
     margin = np.minimum(LIMIT_MARGIN, 0.1 * width)
     inner = arm.joint_range + margin[:, None] * np.array([1.0, -1.0])
@@ -229,7 +239,6 @@ def _setting_of(task: Task, plane: bool) -> Setting:
         spheres=arm.spheres,
         joint_range=arm.joint_range,
         inner_range=inner,
-        velocity_limit=arm.velocity_limit,
         home=arm.home,
         bearing=math.atan2(away[1], away[0]),
         plane=plane,
@@ -238,7 +247,7 @@ def _setting_of(task: Task, plane: bool) -> Setting:
         self_margin=min(SELF_MARGIN, HOME_SHARE * float(own[0])),
         least_way=0.0 if plane else LEAST_WAY,
         n_jumps=task.n_jumps,
-        durations=(shortest, task.action.centre, longest),
+        relative_durations=(shortest / centre, longest / centre),
     )
 
 
