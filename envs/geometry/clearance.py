@@ -341,7 +341,7 @@ def configuration_clearances(
     return found
 
 
-@compiled
+@kernel
 def row_clearance(
     spheres: Spheres,
     placed: Placed,

@@ -10,7 +10,7 @@ from viapoint.envs.arms.inverse_kinematics import descend, solve_planar
 from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position, transform
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, row_clearance, self_clearance
-from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.obstacles import ABSENT
 from viapoint.envs.scenes.scene import NEVER, Scenes
 
@@ -209,13 +209,15 @@ def is_end(draft: Draft, joints: Float) -> bool:
     return bool(self_clearance(setting.spheres, placed, margin, margin) >= margin)
 
 
-@compiled
+@kernel
 def is_row_clear(
     draft: Draft, placed: Placed, scene: int, row: int, time: float, margin: float, link: int
 ) -> bool:
     """Return True if links from `link` on of a placed arm have a margin to one obstacle at some time, [m]."""
     scenes, obstacles = draft.scenes, draft.scenes.obstacles
-    x, y, z = obstacles.centre[scene, row]
+    x = obstacles.centre[scene, row, 0]
+    y = obstacles.centre[scene, row, 1]
+    z = obstacles.centre[scene, row, 2]
     # After the turn, the place is that of the first course, moved by the difference of the courses.
     after = max(time - scenes.turn_time[scene, row], 0.0)
     for axis in range(3):
@@ -270,7 +272,7 @@ def straight_movement(draft: Draft, scene: int) -> int:
         u, v, _ = tool_position(setting.chain, goal, placed.rotation, placed.origin)
     blocked = False
     for k in range(1, INSTANTS):
-        share = k / INSTANTS
+        share = _bit_reversed(k)
         if setting.of_hand:
             here = x + share * (u - x), y + share * (v - y)
             if not solve_planar(setting.chain, setting.joint_range, here[0], here[1], joints):
@@ -285,6 +287,17 @@ def straight_movement(draft: Draft, scene: int) -> int:
         if blocked and not setting.of_hand:  # the hand may still leave the reach
             break
     return BLOCKED if blocked else FREE
+
+
+@compiled
+def _bit_reversed(number: int) -> float:
+    """Return the k-th point of the sequence 1/2, 1/4, 3/4, 1/8, 5/8, ..., which soon finds what is in the way."""
+    point, step = 0.0, 0.5
+    while number:
+        point += step * (number & 1)
+        number >>= 1
+        step *= 0.5
+    return point
 
 
 @compiled
