@@ -112,13 +112,7 @@ class EventPredictor:
     ) -> Ends:
         """Return the ends of decisions that begin at physics step `now` under plans that began at step `began`.
 
-        Args:
-            plan: Plans of N episodes.
-            began: Steps at which they began, shape (N,).
-            now: Present steps, shape (N,).
-            scenes: Scenes.
-            goal: Goals at the time of arrival in coordinates of the space, as a function of times (N,) -> (N, D).
-            looks: Looks of the sensor so far.
+        Steps have the shape (N,); `goal` returns the goals at times, shape (N,), in coordinates of the space, (N, D).
         """
         jump, turn = self.steps(scenes.jump_times), self.steps(scenes.turn_time)
         moving_until = began + self.steps(plan.duration)

@@ -351,16 +351,9 @@ def _cast(
     ranges: Float,
     seen: Int,
 ) -> None:
-    """Shorten ranges to the first surface along each ray, and fill in the row of the obstacle.
+    """Shorten ranges, (N, R), to the first surface along each ray, (N, R, 3), and fill in the row of the obstacle.
 
-    Args:
-        obstacles: Obstacles of N scenes.
-        centre: Centres of their bounding balls, shape (N, n, 3), [m].
-        ball: Radii of these balls, infinite for half-spaces, shape (N, n), [m].
-        origin: Origins of the sensors, shape (N, 3), [m].
-        rays: Unit vectors, shape (N, R, 3).
-        ranges: Greatest distances, shape (N, R), [m].
-        seen: Rows, shape (N, R).
+    The bounding balls of obstacles have a centre, (N, n, 3), and a radius, which is infinite for half-spaces.
     """
     for scene in range(len(origin)):
         for row in range(obstacles.kind.shape[1]):

@@ -137,18 +137,8 @@ class Arm:
         of the motion, plus stiffness and damping times the references. Torques are computed every `stride` steps; those
         in between are interpolated linearly.
         """
-        out = np.empty(position.shape)
-        _controls(
-            self.chain,
-            self.stiffness,
-            self.damping,
-            np.ascontiguousarray(position),
-            np.ascontiguousarray(velocity),
-            np.ascontiguousarray(acceleration),
-            stride,
-            out,
-        )
-        return out
+        motion = map(np.ascontiguousarray, (position, velocity, acceleration))
+        return _controls(self.chain, self.stiffness, self.damping, *motion, stride)
 
 
 def arm_from_xml(
@@ -229,10 +219,10 @@ def _controls(
     velocity: Float,
     acceleration: Float,
     stride: int,
-    out: Float,
-) -> None:
-    """Fill in controls, see :meth:`Arm.controls`."""
+) -> Float:
+    """Return controls, see :meth:`Arm.controls`."""
     number, steps, joints = position.shape
+    out = np.empty(position.shape)
     before = np.empty(joints)
     after = np.empty(joints)
     for i in range(number):
@@ -253,6 +243,7 @@ def _controls(
                     servo = stiffness[j] * position[i, k, j] + damping[j] * velocity[i, k, j]
                     out[i, k, j] = torque + servo
             before[:] = after
+    return out
 
 
 def _chain(

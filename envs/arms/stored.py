@@ -30,8 +30,6 @@ MARK = "viapoint_arm"
 """Name of the text element with the choices."""
 COPY = "arm.xml"
 """Name of a copy in the folder of a run or a model."""
-UNREADABLE = (OSError, KeyError, TypeError, ValueError, ET.ParseError)
-"""Errors of files that are missing or broken."""
 
 
 def keep_arm(folder: Path, arm: Arm) -> None:
@@ -134,10 +132,11 @@ def _plain(value: Any) -> Any:
 
 
 def read_cached(path: Path) -> Arm | None:
-    """Return the arm of a copy in the cache folder; None if there is none, or if it is broken."""
-    with suppress(*UNREADABLE):
+    """Return the arm of a copy in the cache folder; None if it is missing or broken."""
+    try:
         return read_arm(path)
-    return None
+    except (OSError, KeyError, TypeError, ValueError, ET.ParseError):
+        return None
 
 
 def write_cached(path: Path, arm: Arm) -> None:

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clouds import Clouds, join_clouds, split_clouds
@@ -167,15 +166,12 @@ def pack(scenes: Sequence[Iterable[Shape | Mapping[str, Any]]], rows: int | None
     meshes: list[Meshes] = []
     clouds: list[Clouds] = []
     for scene, each in enumerate(shapes):
-        if not each:
-            continue
-        some = scene, slice(len(each))
-        found.kind[some] = [shape.number for shape in each]
-        found.centre[some] = [shape.position for shape in each]
-        found.rotation[some] = frame_matrices(np.array([shape.quaternion for shape in each]))
-        found.size[some] = [shape.packed_size for shape in each]
-        found.velocity[some] = [shape.velocity for shape in each]
         for row, shape in enumerate(each):
+            found.kind[scene, row] = shape.number
+            found.centre[scene, row] = shape.position
+            found.rotation[scene, row] = shape.rotation
+            found.size[scene, row] = shape.packed_size
+            found.velocity[scene, row] = shape.velocity
             if shape.mesh is not None:
                 found.size[scene, row, 0] = len(meshes)
                 meshes.append(shape.mesh)
@@ -225,14 +221,12 @@ def quaternions_of(rotation: Float) -> Float:
 
 def mesh_names(meshes: Meshes) -> list[str]:
     """Return the registered names of packed meshes, empty for others."""
-    names = []
-    for mesh in split_meshes(meshes):
-        same = ""
+    names = [""] * (len(meshes.first) - 1)
+    for index, mesh in enumerate(split_meshes(meshes)):
         for name, known in REGISTERED_MESHES.items():
             if known.mesh is not None and np.array_equal(known.mesh.corners, mesh.corners):
-                same = name
+                names[index] = name
                 break
-        names.append(same)
     return names
 
 

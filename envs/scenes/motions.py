@@ -150,8 +150,11 @@ def draw_jumps(draft: Draft, which: Int, durations: Float, numbers: Float) -> Bo
             fits = False
             for candidate in range(CANDIDATES):
                 begin = first + 1 + candidate * (1 + joints)
-                if _jump(draft, start, before, u[begin : begin + 1 + joints], target):
-                    fits = _is_free_at(draft, scene, target, time)
+                fits = _jump(draft, start, before, u[begin : begin + 1 + joints], target)
+                fits = fits and is_end(draft, target)
+                for row in range(draft.scenes.obstacles.kind.shape[1]):
+                    # The target must be free when it appears.
+                    fits = fits and is_row_clear(draft, draft.placed, scene, row, time, MARGIN, 1)
                 if fits:
                     break
             if not fits:
@@ -188,15 +191,4 @@ def _jump(draft: Draft, start: Float, before: Float, u: Float, target: Float) ->
             there = p + share * (to_x - p), q + share * (to_y - q)
             if not solve_planar(setting.chain, setting.inner_range, there[0], there[1], target):
                 return False
-    return True
-
-
-@compiled
-def _is_free_at(draft: Draft, scene: int, target: Float, time: float) -> bool:
-    """Return True if a target is within the limits and free when it appears."""
-    if not is_end(draft, target):
-        return False
-    for row in range(draft.scenes.obstacles.kind.shape[1]):
-        if not is_row_clear(draft, draft.placed, scene, row, time, MARGIN, 1):
-            return False
     return True
