@@ -241,7 +241,7 @@ class Episodes:
             return
         state, given = self.executor.state, plan
         plan, movements, stretch, within, inside = self._within_limits(plan.take(rows))
-        state.reachable[rows] &= inside
+        state.reachable[rows] &= inside  # the arm does not start on a plan that leaves the reach
         adopted = within | ~self.begun[rows]
         rows, plan = rows[adopted], plan.take(adopted)
         state.stretch[rows] = np.maximum(state.stretch[rows], stretch[adopted])
@@ -373,7 +373,7 @@ class Episodes:
         if not task.stepwise:
             final = final & (event == Event.ARRIVAL)
         after = self._outcome(final)
-        ended = final | (event >= Event.CONTACT)
+        ended = final | (event >= Event.CONTACT)  # events of the highest ranks end an episode
         truncated = (event == Event.TIME_LIMIT) & ~final & task.stepwise
         length = norm(task.space.coordinates(self.scenes.goal) - self._start)
         terms = reward_terms(

@@ -218,7 +218,7 @@ def _risky_steps(
                 place(chain, spheres, path[state], placed)
                 time = timestep * (state + 1)
                 apart += obstacle_clearance(spheres, placed, obstacles, scene, time, way, -way)
-            if apart < way:
+            if apart < way:  # so a state between may be in contact
                 found.append((scene, k, int(min(2.0 * way / thin, MOST_BETWEEN))))
     return found
 

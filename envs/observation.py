@@ -14,12 +14,9 @@ from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.obstacles import POSE_SIZE, Obstacles, observation_rows
 from viapoint.envs.plans import Motion
 from viapoint.envs.replanning import NominalPlan
+from viapoint.envs.scenes.scene import FARTHEST, FASTEST
 from viapoint.envs.sensors import Looks, Sensor
 
-FARTHEST = 2.0
-"""Bound of every coordinate and length, [m]."""
-FASTEST = 1.0
-"""Bound of the velocity of an obstacle along any axis, [m/s]."""
 BEYOND_LIMIT = 0.1
 """Margin beyond the joint limits at which observed joints are clipped, [rad]."""
 
@@ -66,13 +63,13 @@ class ObservationLayout:
     def bounds(self) -> dict[str, tuple[Float, Float]]:
         """Lower and upper bounds of the parts."""
         low, high = self.arm.joint_range.T
-        joints = low - BEYOND_LIMIT, high + BEYOND_LIMIT
+        joints = low - BEYOND_LIMIT, high + BEYOND_LIMIT  # MuJoCo's joint limits are soft
         found = {"joints": joints, "hand": _box(FARTHEST, 3), "goal": _box(FARTHEST, 3)}
         if self.in_joints:
             found["goal_joints"] = joints
         if self.sensor is not None:
             farthest = self.sensor.range + FARTHEST + float(np.abs(self.sensor.position).max())
-            number = self.sensor.looks * self.sensor.n_rays
+            number = self.sensor.looks * self.sensor.n_rays  # all looks that are remembered
             found["ranges"] = np.zeros(number), np.full(number, self.sensor.range)
             found["points"] = _box(farthest, 3 * number)
             if self.sensor.looks > 1:
@@ -147,7 +144,7 @@ class ObservationLayout:
             parts["remaining"] = nominal.remaining[:, None]
         observation = {}
         for name, (low, high) in self.bounds.items():
-            observation[name] = np.clip(parts[name], low, high).astype(np.float32)
+            observation[name] = np.clip(parts[name], low, high).astype(np.float32)  # as the space promises
         return observation
 
     def rows(self, part: Any) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,23 +48,6 @@ class RewardWeights:
             value = number_of_at_least(f"reward weight {field.name}", getattr(self, field.name), 0.0)
             object.__setattr__(self, field.name, value)
 
-    @classmethod
-    def of(cls, weights: RewardWeights | Mapping[str, float] | None, **defaults: float) -> RewardWeights:
-        """Return weights from a record, from a mapping of some of them, or the defaults.
-
-        Raises:
-            ValueError: The argument is something else, or names an unknown term.
-        """
-        if isinstance(weights, RewardWeights):
-            return weights
-        known = {field.name for field in dataclasses.fields(cls)}
-        if weights is None or (isinstance(weights, Mapping) and known >= set(weights)):
-            return cls(**{**defaults, **(weights or {})})
-        raise ValueError(
-            f"reward_weights must be {cls.__name__} or a mapping with some of {', '.join(sorted(known))}, "
-            f"got {weights!r}"
-        )
-
 
 TERMS = tuple(f"reward_{field.name}" for field in dataclasses.fields(RewardWeights))
 """Names of the terms of the reward in infos."""
@@ -96,9 +78,9 @@ def reward_terms(
     The length is that from start to goal, [m] or [rad], and u, `goal_unit`, the distance at which the term of the goal
     saturates.
     """
-    later = ~first
+    later = ~first  # before the first decision nothing was commanded
     clearance = _bounded(after.planned_clearance) - later * _bounded(before.planned_clearance)
-    cost = straight_jerk_cost(length, zero_duration)
+    cost = straight_jerk_cost(length, zero_duration)  # J_0
     rough = np.log1p(after.jerk_cost / cost) - np.log1p(before.jerk_cost / cost)
     spent = (after.duration - before.duration) / zero_duration
     far = np.minimum(after.goal_error / goal_unit, 1.0)

@@ -359,7 +359,7 @@ def _add_actuators(spec: mujoco.MjSpec, arm: Arm) -> None:
         servo.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         servo.gainprm[0] = 1.0
         servo.biasprm[1:3] = -arm.stiffness[j], -arm.damping[j]
-        if arm.torque_limit[j] < 1e9:
+        if arm.torque_limit[j] < 1e9:  # MuJoCo takes no infinite range
             servo.forcelimited = True
             servo.forcerange = -arm.torque_limit[j], arm.torque_limit[j]
 

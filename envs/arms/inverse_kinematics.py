@@ -11,7 +11,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.kinematics import Chain, link_frames, tool_jacobian, transform
 from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.common.validation import finite_array, whole_number
+from viapoint.envs.common.validation import finite_array, unit_quaternion, whole_number
 from viapoint.envs.geometry.compiled import compiled, kernel
 
 ITERATIONS = 80
@@ -109,7 +109,7 @@ def descend(
                 error[3 + a] *= angle / sine
         elif oriented and angle > 1.0:
             error[3] = 0.5  # half a turn: any axis will do
-        scale = min(LONGEST_STEP / away, 1.0)
+        scale = min(LONGEST_STEP / away, 1.0)  # the Jacobian holds for small steps
         tool_jacobian(chain, rotation, origin, tool, jacobian)
         damping = (DAMPING * min(away, 1.0)) ** 2 + 1e-12
         for i in range(rows):
@@ -128,7 +128,7 @@ def descend(
             before = joints[j]
             joints[j] = min(max(before + step, joint_range[j, 0]), joint_range[j, 1])
             moved = max(moved, abs(joints[j] - before))
-        if moved < STALLED:
+        if moved < STALLED:  # at the limits, or at a singularity
             break
     return away
 
@@ -307,11 +307,7 @@ def inverse_kinematics(
     position = finite_array("position", position, (3,))
     axes = np.eye(3)
     if quaternion is not None:
-        quaternion = finite_array("quaternion", quaternion, (4,))
-        length = float(np.linalg.norm(quaternion))
-        if abs(length - 1.0) > 1e-3:
-            raise ValueError(f"quaternion must have the length 1, got {quaternion.tolist()}")
-        axes = frame_matrices(quaternion / length)
+        axes = frame_matrices(unit_quaternion("quaternion", quaternion))
     number = whole_number("n_seeds", n_seeds, 1)
     first = arm.home if seed is None else finite_array("seed", seed, arm.home.shape)
     rng = np.random.default_rng(0) if rng is None else rng

@@ -248,7 +248,7 @@ def inverse_dynamics(chain: Chain, q: Float, v: Float, a: Float, torque: Float) 
     work = np.empty((n_joints, 11))
     spin = (0.0, 0.0, 0.0)
     turn = (0.0, 0.0, 0.0)
-    linear = (-chain.gravity[0], -chain.gravity[1], -chain.gravity[2])
+    linear = (-chain.gravity[0], -chain.gravity[1], -chain.gravity[2])  # at rest on earth
     for j in range(n_joints):
         slides = chain.sliding[j]
         cosine, sine = 1.0, 0.0
@@ -330,7 +330,7 @@ def slowdown(
     for k in range(len(position)):
         for j in range(joints):
             least = max(least, abs(velocity[k, j]) / (LIMIT_SHARE * velocity_limit[j]))
-        if k % TORQUE_STRIDE:
+        if k % TORQUE_STRIDE:  # torques change slowly
             continue
         inverse_dynamics(chain, position[k], rest, rest, heavy)
         inverse_dynamics(chain, position[k], velocity[k], acceleration[k], whole)
@@ -339,7 +339,7 @@ def slowdown(
             motion = whole[j] - heavy[j] - friction
             against = heavy[j] if motion + friction >= 0.0 else -heavy[j]
             room = max(LIMIT_SHARE * torque_limit[j] - against, LEAST_TORQUE_SHARE * torque_limit[j])
-            if room > 1e9:
+            if room > 1e9:  # no limit
                 continue
             friction = abs(friction)
             # The positive root of room s^2 - |f| s - |m| = 0.

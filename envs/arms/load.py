@@ -75,6 +75,9 @@ JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPAR
 RESERVED = ("", "world", "meshes")
 """Names that bodies of the arm cannot have, beside those of obstacles."""
 
+Pair = tuple[int, int]
+"""Numbers of two bodies, the first one first in the file."""
+
 
 class Parsed(NamedTuple):
     """Arm in the form of its file."""
@@ -94,16 +97,16 @@ class Parsed(NamedTuple):
     geoms: dict[int, list[int]]
     """Geoms of each of these bodies that count for collisions; bodies without any are left out."""
 
-    def pair(self, bodies: tuple[int, int]) -> frozenset[str]:
+    def pair(self, bodies: Pair) -> frozenset[str]:
         """Return the names of a pair of bodies."""
         return frozenset(self.names[body] for body in bodies)
 
-    def compared(self, exclude: Mapping[frozenset[str], str]) -> list[tuple[int, int]]:
+    def compared(self, exclude: Mapping[Pair, str]) -> list[Pair]:
         """Return the pairs of bodies with geoms of links that are neither the same nor consecutive, nor excluded."""
         found = []
         for first, second in itertools.combinations(self.geoms, 2):
             apart = abs(self.links[first] - self.links[second])
-            if apart > 1 and self.pair((first, second)) not in exclude:
+            if apart > 1 and (first, second) not in exclude:
                 found.append((first, second))
         return found
 
@@ -211,7 +214,7 @@ def _load(
         raise ValueError(f"there is no joint {', '.join(map(repr, missing))} in the file; there are: {named}")
     ranges = _ranges(whole, names, given["joint_range"], notes)
     velocity = _velocities(whole, names, given["velocity_limit"], urdf.velocity_limits, known_as, notes)
-    torque, stated = _torques(whole, names, given["torque_limit"], known_as, notes)
+    torque = _torques(whole, names, given["torque_limit"], known_as, notes)
     for what, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
         if not (limit > 0.0).all():
             raise ValueError(f"{what} must be positive, got {limit}")
@@ -225,19 +228,19 @@ def _load(
     looked_at = np.array([_distances(parsed, each, pairs) for each in drawn[:LOOKED_AT]])
     near = list(itertools.compress(pairs, np.median(looked_at, axis=0) < NEAR))
     apart = _apart(parsed, near, drawn)
-    exclude |= dict.fromkeys(map(parsed.pair, apart), never)
+    exclude |= dict.fromkeys(apart, never)
     movable = itertools.compress(pairs, looked_at.max(axis=0) > 0.0)
-    kept = [pair for pair in movable if parsed.pair(pair) not in exclude]
+    kept = [pair for pair in movable if pair not in exclude]
     home = _home(parsed, ranges, given["home"], kept, notes)
     origin = np.zeros(3) if given["origin"] is None else finite_array("origin", given["origin"], (3,))
     # Bodies that are near at home get smaller capsules, or are not compared, either.
     pairs = parsed.compared(exclude)
     at_home = _distances(parsed, home, pairs)
     close = itertools.compress(pairs, (at_home > 0.0) & (at_home < LEAST_GAP))
-    exclude |= dict.fromkeys(map(parsed.pair, _apart(parsed, close, drawn)), never)
+    exclude |= dict.fromkeys(_apart(parsed, close, drawn), never)
     distances = {}
     for pair, away in zip(pairs, at_home.tolist(), strict=True):
-        if away > 0.0 and parsed.pair(pair) not in exclude:
+        if away > 0.0 and pair not in exclude:
             distances[pair] = away
     tolerance = given["tolerance"]
     tolerances = dict.fromkeys(parsed.geoms, tolerance)
@@ -252,12 +255,12 @@ def _load(
         home=home,
         velocity_limit=velocity,
         torque_limit=torque,
-        exclude=exclude,
+        exclude={parsed.pair(pair): reason for pair, reason in exclude.items()},
     )
-    weight = np.abs(torques(arm.chain, home, 0.0 * home, 0.0 * home))
+    weight = np.abs(torques(arm.chain, home, 0.0, 0.0))
     weak = weight > torque
     some = ", ".join(itertools.compress(names, weak))
-    if some and stated:
+    if some and given["torque_limit"] is not None:
         raise ValueError(
             f"the torque limits of {some} do not hold the arm's own weight at home; raise torque_limit"
         )
@@ -367,12 +370,10 @@ def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: l
     return ranges
 
 
-def _torques(
-    model: mujoco.MjModel, joints: tuple[str, ...], given: Any, arm: str, notes: list[str]
-) -> tuple[Float, bool]:
-    """Return the torque limit of each joint, its own, or the greatest of the actuators that drive it; True if given."""
+def _torques(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, arm: str, notes: list[str]) -> Float:
+    """Return the torque limit of each joint, its own, or the greatest of the actuators that drive it."""
     if given is not None:
-        return _per_joint("torque_limit", given, joints), True
+        return _per_joint("torque_limit", given, joints)
     found = []
     for name in joints:
         joint = model.joint(name).id
@@ -388,7 +389,7 @@ def _torques(
     if known is None and (torque <= 0.0).any():
         weight = np.maximum(WEIGHTS * _greatest_weight(model, joints), LEAST_TORQUE)
     how = f"{WEIGHTS:g} times what the arm's weight needs"
-    return _completed("torque", joints, torque, known, weight, how, notes), False
+    return _completed("torque", joints, torque, known, weight, how, notes)
 
 
 def _completed(
@@ -461,7 +462,7 @@ def _velocities(
     return _completed("velocity", joints, found, known, DEFAULT_VELOCITY_LIMIT, how, notes)
 
 
-def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[tuple[int, int]], notes: list[str]) -> Float:
+def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[Pair], notes: list[str]) -> Float:
     """Return the home configuration, shape (J,), in which some pairs of bodies do not touch."""
     model, joints = parsed.model, parsed.joints
     if given is not None:
@@ -558,8 +559,8 @@ def _check_order(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[in
             raise ValueError(f"joints must be in order from the base: {first!r} does not carry {second!r}")
 
 
-def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> list[frozenset[str]]:
-    """Return the names of pairs of bodies that the file does not let collide, or an SRDF file.
+def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> list[Pair]:
+    """Return the pairs of bodies that the file does not let collide, or an SRDF file.
 
     MuJoCo decides by contact bits, excluded bodies, and explicit pairs of geoms.
     """
@@ -571,14 +572,13 @@ def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> list[fr
     spare = (types | affinities) == 0
     found = []
     for first, second in parsed.compared({}):
-        pair = parsed.pair((first, second))
         collide = False
         for a, b in itertools.product(parsed.geoms[first], parsed.geoms[second]):
             bits = (types[a] & affinities[b]) | (types[b] & affinities[a])
             collide = collide or bool(bits or spare[a] or spare[b] or frozenset((a, b)) in explicit)
         excluded = (min(first, second) << 16) + max(first, second) in model.exclude_signature
-        if pair in silent or excluded or not collide:
-            found.append(pair)
+        if excluded or not collide or parsed.pair((first, second)) in silent:
+            found.append((first, second))
     return found
 
 
@@ -587,7 +587,7 @@ def _fitted(
     ranges: Float,
     origin: Float,
     home: Float,
-    distances: dict[tuple[int, int], float],
+    distances: dict[Pair, float],
     tolerances: dict[int, float],
 ) -> tuple[str, float]:
     """Return the text of the arm's model, and the greatest excess of its capsules, [m].
@@ -626,7 +626,7 @@ def _fitted(
     return xml, max(capsule.excess for some in fits.values() for capsule in some)
 
 
-def _apart(parsed: Parsed, pairs: Iterable[tuple[int, int]], configurations: Float) -> list[tuple[int, int]]:
+def _apart(parsed: Parsed, pairs: Iterable[Pair], configurations: Float) -> list[Pair]:
     """Return the pairs of bodies that are in contact in none of some configurations, shape (N, J)."""
     pairs = list(pairs)
     for joints in configurations:
@@ -634,7 +634,7 @@ def _apart(parsed: Parsed, pairs: Iterable[tuple[int, int]], configurations: Flo
     return pairs
 
 
-def _distances(parsed: Parsed, joints: Float, pairs: Sequence[tuple[int, int]]) -> Float:
+def _distances(parsed: Parsed, joints: Float, pairs: Sequence[Pair]) -> Float:
     """Return the distances of P pairs of bodies in a configuration, shape (P,), [m]; at most 0.1."""
     _move(parsed.moved, parsed.joints, joints)
     found = np.full(len(pairs), 0.1)
@@ -646,7 +646,7 @@ def _distances(parsed: Parsed, joints: Float, pairs: Sequence[tuple[int, int]]) 
 
 
 def _near_capsules(
-    parsed: Parsed, xml: str, home: Float, distances: dict[tuple[int, int], float]
+    parsed: Parsed, xml: str, home: Float, distances: dict[Pair, float]
 ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """Return pairs of capsules, as body and index, that are much nearer to one another at home than the bodies."""
     model = mujoco.MjModel.from_xml_string(xml)

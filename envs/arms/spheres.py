@@ -69,7 +69,7 @@ def cover(
         if not len(close):
             return names, spheres, left_out, max(excess.values())
         for group in np.unique(close):
-            excess[names[group]] *= SHRUNK
+            excess[names[group]] *= SHRUNK  # smaller spheres, and more of them
     first, second = close[0]
     raise ValueError(
         f"the bodies {names[first]!r} and {names[second]!r} are so close at home that spheres on them overlap: give "
@@ -106,7 +106,7 @@ def _pairs(
     for (i, first), (j, second) in itertools.combinations(enumerate(names), 2):
         apart = abs(links[first] - links[second])
         pair = frozenset((first, second))
-        if apart == 0:
+        if apart == 0:  # rigid to one another
             continue
         if apart == 1:
             left_out.append(LeftOut(first, second, "consecutive links"))
@@ -159,7 +159,7 @@ def _along(capsule: Capsule, excess: float) -> tuple[Float, float]:
     largest = capsule.radius + excess
     spacing = 2.0 * np.sqrt(largest**2 - capsule.radius**2)
     number = int(np.ceil(length / spacing))
-    if number == 0:
+    if number == 0:  # a capsule without a length is a sphere
         return capsule.first[None], capsule.radius
     share = np.linspace(0.0, 1.0, number + 1)[:, None]
     radius = np.sqrt(capsule.radius**2 + 0.25 * (length / number) ** 2)

@@ -171,7 +171,7 @@ def obstacle_clearance(
     exact value below it does not matter.
     """
     for group in range(len(spheres.link)):
-        if spheres.link[group] > 0:
+        if spheres.link[group] > 0:  # the base may stand on an obstacle
             least = nearest_obstacle(spheres, placed, group, obstacles, scene, time, least, floor)
             if least < floor:
                 return least
@@ -272,7 +272,7 @@ def movement_clearance(
     The path begins at the time `begin` and takes `step` from one configuration to the next, [s].
     """
     least, least_self = FAR, FAR
-    drift = step * fastest(obstacles, scene)
+    drift = step * fastest(obstacles, scene)  # the way of obstacles in one step
     # A coarse look comes first: with a small clearance from the start, the second one skips most configurations.
     for stride in (COARSE, 1):
         _forget(placed)
@@ -360,7 +360,7 @@ def row_clearance(
     if obstacles.kind[scene, row] == ABSENT:
         return least
     for group in range(len(spheres.link)):
-        if spheres.link[group] < link:
+        if spheres.link[group] < link:  # the base, or links that are not asked for
             continue
         x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
         size = spheres.ball_radius[group]

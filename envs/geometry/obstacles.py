@@ -246,7 +246,7 @@ def bounding_boxes(obstacles: Obstacles) -> tuple[Float, Float]:
             middle[rows] = 0.5 * (box[:, 1] + box[:, 0])
             half[rows] = 0.5 * (box[:, 1] - box[:, 0])
     centre = obstacles.centre + np.einsum("...ij,...j->...i", rotation, middle)
-    walls = kind == HALF_SPACE
+    walls = kind == HALF_SPACE  # which have no size
     normal = rotation[walls][:, :, 2]
     depth = (centre[walls] * normal).sum(axis=-1, keepdims=True)
     centre[walls] = (depth - EXTENT) * normal
@@ -331,7 +331,7 @@ def obstacles_from_rows(rows: Float, kinds: Sequence[str]) -> Obstacles:
     centre, half, velocity = values[:, :3], values[:, 9:12], values[:, 12:15]
     # Rows in single precision have axes that are not quite orthonormal.
     first = values[:, 3:6] / np.linalg.norm(values[:, 3:6], axis=-1, keepdims=True)
-    third = np.cross(first, values[:, 6:9])
+    third = np.cross(first, values[:, 6:9])  # orthogonal to the first whatever the second is
     third /= np.linalg.norm(third, axis=-1, keepdims=True)
     rotation = np.stack((first, np.cross(third, first), third), axis=-1)
     size = np.einsum("...i,...ij->...j", half, np.linalg.pinv(BOXES)[kind])

@@ -115,7 +115,7 @@ def draw_ends(draft: Draft, which: Int) -> Bool:
 @compiled
 def _unpack_rows(draft: Draft, scene: int) -> None:
     """Put the obstacles of a layout into a scene, at rest; the rows behind them become absent."""
-    obstacles, rows = draft.scenes.obstacles, draft.rows[scene]
+    obstacles, rows = draft.scenes.obstacles, draft.rows[scene]  # pairs before may have left some out
     for row in range(obstacles.kind.shape[1]):
         draft.scenes.turn_time[scene, row] = NEVER
         obstacles.kind[scene, row] = ABSENT

@@ -157,7 +157,7 @@ def _checked(name: str, build: Build) -> Build:
     """Return a function that returns the layout of a user's function, or says what is wrong with it."""
 
     def checked(rng: np.random.Generator, room: Room) -> Layout:
-        built = build(rng, room)
+        built = build(rng, room)  # errors of the function itself are its own
         try:
             layout = built if isinstance(built, Layout) else _as_layout(*built)
             numbers = np.array([*layout.rows, *layout.goals, *layout.starts])

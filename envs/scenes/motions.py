@@ -73,7 +73,7 @@ def draw_courses(draft: Draft, which: Int, durations: Float, numbers: Float) -> 
                 if fits:
                     break
             if not fits:
-                _set_course(draft, scene, row, met, 0.0, np.zeros(COURSE_NUMBERS))
+                _set_course(draft, scene, row, met, 0.0, np.zeros(COURSE_NUMBERS))  # it rests
 
 
 @compiled
@@ -100,7 +100,7 @@ def _set_course(draft: Draft, scene: int, row: int, met: Float, duration: float,
 def _fill_velocity(fast: float, heading: float, rise: float, velocity: Float) -> None:
     """Fill in a velocity from two random numbers and the sine of its angle to the horizontal, shape (3,), [m/s]."""
     speed, angle = _mixed(SPEED, fast), 2.0 * np.pi * heading
-    level = np.sqrt(1.0 - rise * rise)
+    level = np.sqrt(1.0 - rise * rise)  # cosine of the angle to the horizontal
     velocity[0] = speed * level * np.cos(angle)
     velocity[1] = speed * level * np.sin(angle)
     velocity[2] = speed * rise

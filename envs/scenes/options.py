@@ -236,7 +236,7 @@ def _jumps(value: Any, sampler: SceneSampler, number: int) -> Float:
     if sampler.task.space_name == "hand":
         targets = _planar("target of options['jumps']", sampler.task.arm, targets)
     jumps[present] = np.concatenate((given[present][:, :1], targets), axis=-1)
-    order = np.argsort(~present, axis=-1, kind="stable")
+    order = np.argsort(~present, axis=-1, kind="stable")  # absent rows may be between others
     return np.take_along_axis(jumps, order[..., None], axis=1)
 
 

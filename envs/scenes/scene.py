@@ -109,8 +109,8 @@ class Scenes(NamedTuple):
     def obstacles_at(self, time: Float) -> Obstacles:
         """Return the obstacles with their places and velocities at one time for each scene, shape (N,), [s]."""
         time = time[:, None]
-        before = np.minimum(time, self.turn_time)[..., None]
-        after = np.maximum(time - self.turn_time, 0.0)[..., None]
+        before = np.minimum(time, self.turn_time)[..., None]  # time on the first course
+        after = np.maximum(time - self.turn_time, 0.0)[..., None]  # and on the second one
         velocity = self.obstacles.velocity
         centre = self.obstacles.centre + velocity * before + self.turn_velocity * after
         turned = (self.turn_time <= time + ROUNDING)[..., None]
@@ -169,7 +169,7 @@ def check_jumps(scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]] = ()) -
         obstacles = scenes.obstacles_at(np.where(given, time, 0.0))
         target = np.where(given[:, None], scenes.jumps[:, jump, 1:], scenes.goal)
         _check_end(arm, f"target of jump {jump}", target, obstacles, given, names)
-        before = time
+        before = time  # jumps are in order
 
 
 def _check_obstacles(scenes: Scenes, names: Sequence[Sequence[str]]) -> None:
