@@ -137,8 +137,8 @@ class Arm:
         of the motion, plus stiffness and damping times the references. Torques are computed every `stride` steps; those
         in between are interpolated linearly.
         """
-        motion = map(np.ascontiguousarray, (position, velocity, acceleration))
-        return _controls(self.chain, self.stiffness, self.damping, *motion, stride)
+        motion = [np.ascontiguousarray(part) for part in (position, velocity, acceleration)]
+        return _controls(self.chain, self.stiffness, self.damping, stride, *motion)
 
 
 def arm_from_xml(
@@ -215,10 +215,10 @@ def _controls(
     chain: Chain,
     stiffness: Float,
     damping: Float,
+    stride: int,
     position: Float,
     velocity: Float,
     acceleration: Float,
-    stride: int,
 ) -> Float:
     """Return controls, see :meth:`Arm.controls`."""
     number, steps, joints = position.shape

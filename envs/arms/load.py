@@ -257,7 +257,7 @@ def _load(
         torque_limit=torque,
         exclude={parsed.pair(pair): reason for pair, reason in exclude.items()},
     )
-    weight = np.abs(torques(arm.chain, home, 0.0, 0.0))
+    weight = np.abs(torques(arm.chain, home, np.zeros(1), np.zeros(1)))
     weak = weight > torque
     some = ", ".join(itertools.compress(names, weak))
     if some and given["torque_limit"] is not None:
@@ -385,7 +385,7 @@ def _torques(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, arm: st
         found.append(max(limits, default=0.0))
     torque = np.array(found)
     known = known_limits(KNOWN_TORQUES, arm, len(joints))
-    weight = 0.0
+    weight: Any = 0.0
     if known is None and (torque <= 0.0).any():
         weight = np.maximum(WEIGHTS * _greatest_weight(model, joints), LEAST_TORQUE)
     how = f"{WEIGHTS:g} times what the arm's weight needs"
