@@ -63,7 +63,7 @@ class Episodes:
         self.simulator = Simulator(
             task.arm, n_obstacles=task.observation.n_rows, num_envs=number, meshes=meshes
         )
-        self.executor = Executor(self.simulator, task.space, task.tolerance)
+        self.executor = Executor(self.simulator, task)
         home = np.tile(task.arm.home, (number, 1))
         self.scenes = resting(home, home.copy(), no_obstacles(number, task.observation.n_rows))
         """Scenes of the running episodes."""
@@ -317,15 +317,8 @@ class Episodes:
         scenes, now = self.scenes.take(rows), self.executor.state.steps[rows]
         obstacles = scenes.obstacles_at(np.asarray(now * self.simulator.timestep))
         goals = scenes.goals(np.asarray((now + steps) * self.simulator.timestep))
-        self.executor.run(
-            rows,
-            steps,
-            obstacles,
-            self.task.space.coordinates(goals),
-            references,
-            resume=not self.task.whole_movement,
-            moving=self._moving,
-        )
+        goal = self.task.space.coordinates(goals)
+        self.executor.run(rows, steps, obstacles, goal, references, self._moving)
 
     def _references(self, rows: Int, number: int) -> Motion:
         """Return references of plans from now on, shape (n, T + 1, D) each."""

@@ -262,19 +262,7 @@ class Task:
     @functools.cached_property
     def observation(self) -> ObservationLayout:
         """Layout of the observations."""
-        top = 2.0 * max(self.steering.top_speed) if not self.whole_movement else 0.0
-        return ObservationLayout(
-            arm=self.arm,
-            kinds=self.shapes,
-            n_rows=self.n_obstacles[1],
-            dimension=self.space.dimension,
-            in_joints=self.space_name == "joints",
-            n_via=self.n_via if self.replanning else None,
-            speed=top,
-            acceleration=0.0 if self.whole_movement else self.steering.greatest_acceleration,
-            time_limit=0.0 if self.whole_movement else self.time_limit,
-            sensor=self.sensor,
-        )
+        return ObservationLayout(self)
 
     def sampler(self) -> SceneSampler:
         """Return a sampler of scenes of the task."""
