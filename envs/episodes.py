@@ -226,10 +226,10 @@ class Episodes:
         first = ~self.begun
         before, begin = self._outcome(np.zeros(len(first), bool)), state.steps.copy()
         self._adopt(plan, np.flatnonzero(revised))
-        ends = self._events(self.plan, self._began, begin, scenes, self.goals, self.looks)
-        last = np.where(state.reachable & active, ends.step, begin)
+        step, event, final = self._events(self.plan, self._began, begin, scenes, self.goals, self.looks)
+        last = np.where(state.reachable & active, step, begin)
         self._run_until(last)
-        return self._decision(before, begin, first, ends.final, ends.event)
+        return self._decision(before, begin, first, final, event)
 
     def _adopt(self, plan: Plan, rows: Int) -> None:
         """Begin new plans in some episodes, as slow as the arm's limits need them.

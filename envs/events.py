@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -72,22 +72,11 @@ _RANK = (
 """Rank of simultaneous events, highest first."""
 
 
-class Ends(NamedTuple):
-    """Ends of N decisions without contact."""
-
-    step: Int
-    """Physics step of the episode before which each decision ends, shape (N,)."""
-    event: Int
-    """:class:`Event`, shape (N,)."""
-    final: Bool
-    """True if the arm has arrived and no change is left, shape (N,)."""
-
-
 class EventPredictor:
     """Predictor of the ends of decisions of a task."""
 
     def __init__(self, task: Task) -> None:
-        self.arm, self.space, self.margin, self.sensor = task.arm, task.space, task.margin, task.sensor
+        self.task = task
         self.timestep = task.arm.timestep
         self.triggers = frozenset(() if isinstance(task.decide_at, str) else task.decide_at)
         self.horizon = int(self.steps(min(task.horizon, task.time_limit)))
@@ -109,10 +98,14 @@ class EventPredictor:
         scenes: Scenes,
         goal: Callable[[Float], Float],
         looks: Looks | None,
-    ) -> Ends:
+    ) -> tuple[Int, Int, Bool]:
         """Return the ends of decisions that begin at physics step `now` under plans that began at step `began`.
 
         Steps have the shape (N,); `goal` returns the goals at times, shape (N,), in coordinates of the space, (N, D).
+
+        Returns:
+            Without contact: steps before which the decisions end; the :class:`Event` of each; True where the arm has
+            arrived and no change is left.
         """
         jump, turn = self.steps(scenes.jump_times), self.steps(scenes.turn_time)
         moving_until = began + self.steps(plan.duration)
@@ -138,7 +131,7 @@ class EventPredictor:
         ends[Event.SIGHT] = self._sight(plan, began, now, scenes, latest, looks)
         steps = np.stack([ends[event] for event in _RANK])
         event = np.array([int(each) for each in _RANK])[steps.argmin(axis=0)]
-        return Ends(steps.min(axis=0), event, there & (event == Event.ARRIVAL))
+        return steps.min(axis=0), event, there & (event == Event.ARRIVAL)
 
     def _clearance(self, plan: Plan, began: Int, now: Int, scenes: Scenes, latest: Int) -> Int:
         """Return the step at which the predicted clearance falls below the margin, NEVER if not before `latest`.
@@ -160,12 +153,12 @@ class EventPredictor:
         looks = (end - begin) // every + 1
         steps = begin[:, None] + every * np.arange(int(looks.max()) + ahead)
         movement = plan.take(rows).trajectory()
-        path = self.space.joints(movement(self.timestep * (steps - began[rows][:, None])))
+        path = self.task.space.joints(movement(self.timestep * (steps - began[rows][:, None])))
         obstacles = scenes.take(rows).obstacles_at(begin * self.timestep)
         interval = every * self.timestep
-        chain, spheres = self.arm.chain, self.arm.spheres
+        chain, spheres, margin = self.task.arm.chain, self.task.arm.spheres, self.task.margin
         _first_falls(
-            chain, spheres, path, obstacles, rows, steps, looks, ahead, interval, self.margin, latest, found
+            chain, spheres, path, obstacles, rows, steps, looks, ahead, interval, margin, latest, found
         )
         return found
 
@@ -177,9 +170,10 @@ class EventPredictor:
         The sensor glances along the planned movement. The arm follows it within a millimetre.
         """
         found = np.full(len(now), NEVER)
-        if "sight" not in self.triggers or self.sensor is None or looks is None:
+        task, sensor = self.task, self.task.sensor
+        if "sight" not in self.triggers or sensor is None or looks is None:
             return found
-        number, nothing = len(now), self.sensor.range
+        number, nothing = len(now), sensor.range
         known = looks.points.reshape(number, -1, 3)
         known_hit = looks.ranges.reshape(number, -1) < nothing
         every = max(round(GLANCE / self.timestep), 1)
@@ -187,9 +181,9 @@ class EventPredictor:
         rows = np.flatnonzero(step < latest)
         while rows.size:
             since = self.timestep * (step - began)[rows]
-            joints = self.space.joints(plan.take(rows).trajectory()(since[:, None]))[:, 0]
+            joints = task.space.joints(plan.take(rows).trajectory()(since[:, None]))[:, 0]
             obstacles = scenes.take(rows).obstacles_at(np.asarray(self.timestep * step[rows]))
-            glance = self.sensor.read(self.arm, joints, obstacles)
+            glance = sensor.read(task.arm, joints, obstacles)
             hit = glance.ranges < nothing
             new = _count_new(glance.points, hit, known[rows], known_hit[rows]) >= NEW_POINTS
             found[rows[new]] = step[rows[new]]

@@ -29,7 +29,7 @@ from viapoint.envs.arms.choices import (
     known_limits,
 )
 from viapoint.envs.arms.kinematics import torques
-from viapoint.envs.arms.stored import cached_path, read_cached, write_cached
+from viapoint.envs.arms.stored import cached_arm
 from viapoint.envs.arms.urdf import Urdf, read_urdf
 from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.types import Float
@@ -180,11 +180,9 @@ def load_arm(
     }
     notes = list(urdf.notes)
     whole = _compiled(spec, notes)
-    path = cached_path(whole, {**given, "name": name, "notes": notes, "urdf": urdf[2:]})
-    arm = read_cached(path)
-    if arm is None:
-        arm = _load(whole, name, f"{name} {spec.modelname}", urdf, notes, given)
-        write_cached(path, arm)
+    arguments = {**given, "name": name, "notes": notes, "urdf": urdf[2:]}
+    known_as = f"{name} {spec.modelname}"
+    arm = cached_arm(whole, arguments, lambda: _load(whole, name, known_as, urdf, notes, given))
     for note in arm.notes:
         if note.startswith(WARNING):
             warnings.warn(note.removeprefix(WARNING), stacklevel=2)

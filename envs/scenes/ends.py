@@ -132,7 +132,7 @@ def _unpack_rows(draft: Draft, scene: int) -> None:
 @compiled
 def _draw_pair(draft: Draft, scene: int, pair: int) -> bool:
     """Draw a start and a goal, and return True if they and the straight movement between them are as they must be."""
-    start_given, goal_given = draft.fixed[scene, 0], draft.fixed[scene, 1]
+    start_given, goal_given = draft.fixed[scene]
     # The goal first: it is harder to find.
     if not goal_given and not _draw_end(draft, scene, pair, 1):
         return False
@@ -175,7 +175,7 @@ def _draw_end(draft: Draft, scene: int, pair: int, end: int) -> bool:
     for k in range(1 if setting.plane else TRIES):
         first = 2 + k * (8 + size)
         for joint in range(size):
-            low, high = setting.inner_range[joint, 0], setting.inner_range[joint, 1]
+            low, high = setting.inner_range[joint]
             seed = numbers[first + 8 + joint]
             joints[joint] = low + (high - low) * seed
             if numbers[0] < home:
@@ -201,7 +201,7 @@ def is_end(draft: Draft, joints: Float) -> bool:
     """Return True if joints are within their inner ranges, and the arm, which is placed, is free of itself."""
     setting, placed = draft.setting, draft.placed
     for joint in range(len(joints)):
-        low, high = setting.inner_range[joint, 0], setting.inner_range[joint, 1]
+        low, high = setting.inner_range[joint]
         if not low <= joints[joint] <= high:
             return False
     place(setting.chain, setting.spheres, joints, placed)
@@ -330,7 +330,7 @@ def _seed(setting: Setting, position: Float, joints: Float) -> None:
     """
     origin = setting.chain.origin[0]
     for joint in range(len(joints)):
-        low, high = setting.inner_range[joint, 0], setting.inner_range[joint, 1]
+        low, high = setting.inner_range[joint]
         joints[joint] = setting.home[joint] + SEED_SPREAD * (joints[joint] - 0.5 * (low + high))
         if joint == 0 and not setting.chain.sliding[0]:
             joints[0] += np.arctan2(position[1] - origin[1], position[0] - origin[0]) - setting.bearing
@@ -365,7 +365,7 @@ def _is_hand_clear(draft: Draft, scene: int, position: Float, axes: Float) -> bo
 @compiled
 def _tool_axes(approach: Float, cone: float, numbers: Float, axes: Float) -> None:
     """Fill in random axes of the tool, as columns, with the z axis in a cone around the approach."""
-    x, y, z = approach[0], approach[1], approach[2]
+    x, y, z = approach
     length = np.sqrt(x * x + y * y + z * z)
     if length == 0.0:
         x, length, cone = 1.0, 1.0, np.pi
