@@ -23,7 +23,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.load import load_arm
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
-from viapoint.training.planning.benchmark_report import succeeding
+from viapoint.training.planning.benchmark import succeeding
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
 from viapoint.training.planning.plan_motion import plan_motion
 
@@ -197,7 +197,7 @@ def measure_movements(arm: Arm) -> Movements:
     """Return how many straight movements and drawn problems an arm masters."""
     # Straight movements in which the arm would touch itself are none that physics could master.
     straight = [plan for plan in planned(arm, drawn(arm, 0, 2 * STRAIGHT), time_limit=0.0) if plan.success]
-    outcome = execute_plans(straight[:STRAIGHT])
+    outcome, _ = execute_plans(straight[:STRAIGHT])
     found = planned(arm, drawn(arm, (1, 16), PROBLEMS), time_limit=1.0)
     times = [plan.milliseconds for plan in found]
     solved = succeeding(found)

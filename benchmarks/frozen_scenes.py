@@ -35,7 +35,7 @@ from viapoint.training.planning.search import (
     registered_task,
 )
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets.scene_set import (
+from viapoint.training.scene_sets import (
     BANDS,
     DRAWN,
     MOVING,

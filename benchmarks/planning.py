@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from viapoint.envs.geometry.obstacles import pack
-from viapoint.training.planning import benchmark_report
+from viapoint.training.planning import benchmark
 from viapoint.training.planning.benchmark import BenchmarkProblem, benchmark_panda, benchmark_problems
 from viapoint.training.planning.plan_motion import plan_motion
 
@@ -56,9 +56,9 @@ def main() -> None:
 
 def write_table(problems: list[BenchmarkProblem]) -> None:
     """Measure all planners, print the table, and write it."""
-    lines = pd.concat([benchmark_report.measure_planner(name, problems) for name in PLANNERS])
-    print(benchmark_report.markdown(lines))
-    found = benchmark_report.summary(lines)
+    lines = pd.concat([benchmark.measure_planner(name, problems) for name in PLANNERS])
+    print(benchmark.markdown(lines))
+    found = benchmark.summary(lines)
     found.to_csv(TABLE, index=False, float_format="%.4g", lineterminator="\n")
     before, _, after = PAGE.read_text(encoding="utf-8").partition(BEGIN)
     _, _, after = after.partition(END)
@@ -116,12 +116,12 @@ def draw_curves(problems: list[BenchmarkProblem]) -> None:
         curves["plan_motion"].append((taken, len(solved) / len(plans), float(np.median(solved))))
         print(f"plan_motion {limit} ms", curves["plan_motion"][-1], file=sys.stderr)
     for checks in CHECKS:
-        lines = benchmark_report.measure_planner(f"search{checks}", problems, physics=False)
+        lines = benchmark.measure_planner(f"search{checks}", problems, physics=False)
         curves["search"].append(
             (lines.milliseconds.median(), lines.solved.mean(), lines[lines.solved].jerk.median())
         )
     # A path is found or not: the curve is the share of those that took less than a time.
-    lines = benchmark_report.measure_planner("ompl", problems, physics=False)
+    lines = benchmark.measure_planner("ompl", problems, physics=False)
     for limit in LIMITS:
         found = lines[lines.solved & (lines.milliseconds <= limit)]
         if len(found):

@@ -20,7 +20,7 @@ import tyro
 from viapoint.training import Run, evaluate, load_agent
 from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.planning.search import registered_task
-from viapoint.training.scene_sets.scene_set import SETS, shipped_set
+from viapoint.training.scene_sets import SETS, shipped_set
 
 BASELINES = ("untrained", "straight", "sobol64", "search512", "plan_motion")
 REPLANNING_BASELINES = BASELINES[:-1]

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
+from viapoint.training.config import configs
 
 ROOT = Path(__file__).parents[1]
 WRITTEN = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/environments/*-v0.md")]
@@ -103,6 +104,6 @@ def test_commands_are_known(name):
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
 def test_the_example_of_each_command_is_understood(name):
-    config = cli.COMMANDS[name][0]
+    config = getattr(configs, f"{name.capitalize()}Config")
     example = re.search(r"Example: (?:.*; )?viapoint (.+)", config.__doc__).group(1)
     assert type(cli.parse(shlex.split(example))) is config

@@ -26,7 +26,7 @@ from viapoint.envs.task import Task
 from viapoint.training import load_agent
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import plan_clearances
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.scene_sets import scenes_for
 
 ENV_ID, SCENE = "viapoint/PlanarObstacles-v0", 19
 """Environment, and row of its `validation` set."""

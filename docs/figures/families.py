@@ -13,7 +13,7 @@ from top_view import draw_movement, play
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.scenes.families_registry import scene_families
 from viapoint.training.planning.search import GeometrySearch
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.scene_sets import scenes_for
 
 FAMILIES = [name for name, family in scene_families(True).items() if not family.trained]
 TASKS = {"PlanarObstacles": "the hand must clear", "PlanarWholeArm": "every link must clear"}

@@ -19,7 +19,7 @@ from viapoint.envs.rendering.gl import Canvas
 from viapoint.envs.rendering.renderer import frame_steps, picture_of
 from viapoint.envs.rendering.scene_view import SceneView
 from viapoint.training import MotionPlan, plan_motion
-from viapoint.training.planning.motion_plan import executed
+from viapoint.training.planning.motion_plan import execute_plans
 
 SIZE = 600, 400
 """Width and height, [pixels]."""
@@ -66,7 +66,7 @@ def table() -> list[Shape]:
 
 def frames_of(plan: MotionPlan, colours: Sequence[Sequence[float]], step: int = 1) -> list[Frame]:
     """Return every so many of the pictures of the executed movement; obstacles have colours of their own."""
-    recorded = executed([plan])[1].recorded(0)
+    recorded = execute_plans([plan])[1].recorded(0)
     states = frame_steps(recorded.rollout.time, round(FPS / SPEED))[::step]
     return pictures(plan, colours, states / len(recorded.rollout.time))
 
@@ -79,7 +79,7 @@ def pictures(
     **view_of: Any,
 ) -> list[Frame]:
     """Return pictures of the executed movement at shares of its duration; `view_of` are arguments of `stage`."""
-    outcome, episodes = executed([plan])
+    outcome, episodes = execute_plans([plan])
     if not outcome.is_success[0]:
         raise RuntimeError("the movement touches something")
     recorded = episodes.recorded(0)

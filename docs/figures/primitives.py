@@ -10,37 +10,47 @@ import numpy as np
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
+from viapoint.envs.common.palette import PALETTE
 from viapoint.primitives import curvature, passage_durations, point_to_point, speed, speed_valleys, through
+from viapoint.training.plotting.plots import style_axes
 
 FOLDER = Path(__file__).parents[1] / "images"
 COLOURS = plt.get_cmap("viridis")
+# The colours of all pictures, in the order in which lines of one axis are drawn
+LINES = (PALETTE.plan, PALETTE.via, PALETTE.goal, PALETTE.contact)
+mpl.rcParams.update({"axes.prop_cycle": mpl.cycler(color=LINES), "legend.frameon": False, "font.size": 11})
 
 
 def save(figure: plt.Figure, name: str) -> None:
     """Write one figure as a small PNG."""
+    for axes in figure.axes:
+        style_axes(axes)
     figure.tight_layout()
-    figure.savefig(FOLDER / f"primitives_{name}.png", dpi=90)
+    figure.savefig(FOLDER / f"primitives_{name}.png", dpi=110)
     plt.close(figure)
 
 
 def reach() -> None:
     """Draw position, speed, acceleration and jerk of a reach for the three orders."""
-    figure, axes = plt.subplots(1, 4, figsize=(12, 2.8))
+    figure, axes = plt.subplots(1, 4, figsize=(10.5, 2.8))
     time = np.linspace(0, 1, 301)
     names = ("position [m]", "speed [m/s]", "acceleration [m/s²]", "jerk [m/s³]")
     for order, label in ((2, "least acceleration"), (3, "least jerk"), (4, "least snap")):
         movement = point_to_point([0.0], [1.0], 1.0, order=order)
         for nu, axis in enumerate(axes):
-            axis.plot(time, movement(time, nu)[:, 0], label=label, lw=2 if order == 3 else 1)
+            # The colours of the same three movements on the page of the paper
+            colour = {2: PALETTE.via, 3: PALETTE.plan, 4: PALETTE.goal}[order]
+            axis.plot(time, movement(time, nu)[:, 0], label=label, color=colour, lw=2 if order == 3 else 1)
     for axis, name in zip(axes, names, strict=True):
         axis.set(title=name, xlabel="time [s]")
-    axes[0].legend(fontsize=8)
+    axes[0].set_ylim(-0.05, 1.75)  # room for the legend
+    axes[0].legend(fontsize=9, loc="upper left", handlelength=1.2)
     save(figure, "reach")
 
 
 def family() -> None:
     """Draw movements through via-points of growing height: paths, speeds, curvatures."""
-    figure, (paths, speeds, bends) = plt.subplots(1, 3, figsize=(12, 3.2))
+    figure, (paths, speeds, bends) = plt.subplots(1, 3, figsize=(10.5, 3.2))
     time = np.linspace(0, 1, 401)
     for height in np.linspace(0, 0.6, 7):
         waypoints = np.array([[0.0, 0.0], [0.35, height], [1.0, 0.0]])
@@ -70,7 +80,7 @@ def passage() -> None:
         costs.semilogy(t, cost / 360, color=colour, label=f"via-point at ({along}, 0.3)")
         costs.semilogy(best[0], through(waypoints, best).cost() / 360, "o", color=colour)
     costs.set(xlabel="passage time / duration", title="jerk cost / that of the straight reach")
-    costs.legend(fontsize=8)
+    costs.legend(fontsize=9)
     along = np.linspace(0, 1, 401)
     for height in (0.0, 0.1, 0.3, 1.0):
         via = np.stack([along, np.full_like(along, height)], axis=-1)
@@ -78,7 +88,7 @@ def passage() -> None:
         waypoints = np.stack([ends[0], via, ends[1]], axis=1)
         times.plot(along, passage_durations(waypoints, 1.0)[:, 0], label=f"height {height}")
     times.set(xlabel="d1 / (d1 + d2)", title="passage time / duration")
-    times.legend(fontsize=8)
+    times.legend(fontsize=9)
     save(figure, "passage")
 
 
@@ -105,7 +115,7 @@ def replanning() -> None:
     jerks.plot(grid, smooth(grid, 3)[:, 0], "k:", label="without noise")
     positions.set(title="position [m]", xlabel="time [s]")
     jerks.set(title="jerk [m/s³]", xlabel="time [s]", yscale="symlog")
-    jerks.legend(fontsize=8)
+    jerks.legend(fontsize=9)
     save(figure, "replanning")
 
 

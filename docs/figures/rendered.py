@@ -27,7 +27,7 @@ from viapoint.training.planning.baselines import Method, Straight, agent_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plotting.video import play
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.scene_sets import scenes_for
 
 ROOT = Path(__file__).parents[2]
 IN_PLANE, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"

@@ -21,12 +21,14 @@ from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training import load_agent
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.scene_sets import scenes_for
 
 ENV_ID, SCENES = "viapoint/PlanarSensed-v0", (300, 420, 450)
 """Environment, and rows of its `validation` set."""
 LIMITS = (-0.5, 0.42), (-0.06, 0.7)
 RAY = "#e8c15a"
+DRAWN, N_DRAWN = 7, 1000
+"""First part of the seeds of scenes in which success is counted, and their number."""
 BINS = 8
 """Numbers of equally many scenes in which success is counted."""
 FINE_RAYS = 4_000
@@ -73,9 +75,9 @@ def draw_scene(axes: Axes, task: Task, scene: Scenes, agent: Any) -> None:
 
 
 def draw_calibration(axes: Axes, env_id: str, agent: Any) -> None:
-    """Draw the share of successes against the predicted probability, in all `validation` scenes."""
+    """Draw the share of successes against the predicted probability, in scenes that the environment draws."""
     task: Task = agent.policy.task
-    scenes = scenes_for("validation", task).scenes
+    scenes = task.sampler()([np.random.default_rng((DRAWN, each)) for each in range(N_DRAWN)])
     simulation = SceneSimulation(env_id)
     actions, predicted = agent.policy.assess(simulation.observe(scenes))
     success = simulation(scenes, actions).success

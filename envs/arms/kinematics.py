@@ -17,6 +17,8 @@ from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 
 Vector = tuple[float, float, float]
 """Three components."""
+PART = 16
+"""Greatest number of spheres of a part of a group."""
 LIMIT_SHARE = 0.97
 """Share of the velocity and torque limits that plans may use; feedback uses the rest."""
 LEAST_TORQUE_SHARE = 0.01
@@ -99,11 +101,17 @@ class Spheres(NamedTuple):
     link: Int
     """Link that each group moves with, shape (G,); 0 for the base."""
     ball_centre: Float
-    """Centre of a bounding sphere of each group, in the frame of the link, shape (G, 3), [m]."""
+    """Centre of a bounding sphere of each group and part, in the frame of the link, shape (G + C, 3), [m]."""
     ball_radius: Float
-    """Radius of this sphere, shape (G,), [m]."""
+    """Radius of this sphere, shape (G + C,), [m]."""
     pairs: Int
     """Pairs of groups that must not touch one another, shape (P, 2)."""
+    part: Int
+    """Row of the bounding sphere of the first part of each group, and the number of rows, shape (G + 1,).
+
+    Groups of more than PART spheres are divided into parts of PART neighbours, the last one of fewer. Their bounding
+    spheres stand behind those of the groups. A group of fewer has none.
+    """
 
 
 @kernel

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.kinematics import Chain, Spheres
-from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.arms.kinematics import PART, Chain, Spheres
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import memory, nearest_spheres, place
 from viapoint.envs.geometry.compiled import compiled
 
@@ -127,27 +127,54 @@ def _spheres(
     pairs: Sequence[tuple[int, int]],
 ) -> Spheres:
     """Return the spheres of all bodies."""
-    centres: list[Float] = []
-    radii: list[float] = []
-    first, balls = [0], []
+    centres, radii = [], []
     for name in names:
-        for capsule in capsules:
-            if capsule.body == name:
-                points, radius = _along(capsule, excess[name])
-                centres += list(points)
-                radii += [radius] * len(points)
-        some = slice(first[-1], len(centres))
-        balls.append(_bounding_ball(np.array(centres[some]), np.array(radii[some])))
-        first.append(len(centres))
+        covers = [_along(capsule, excess[name]) for capsule in capsules if capsule.body == name]
+        centres.append(np.concatenate([points for points, _ in covers]))
+        radii.append(np.concatenate([np.full(len(points), radius) for points, radius in covers]))
+    return grouped(centres, radii, [links[name] for name in names], pairs)
+
+
+def grouped(
+    centres: Sequence[Float], radii: Sequence[Float], links: Sequence[int], pairs: Sequence[tuple[int, int]]
+) -> Spheres:
+    """Return spheres from centres (n, 3) and radii (n,) of each group, [m], the links of groups, and pairs of them."""
+    spheres: list[Float] = []
+    balls, part_balls = [], []
+    first, part = [0], [len(links)]
+    for centre, radius in zip(centres, radii, strict=True):
+        order = _neighbours(centre, np.arange(len(centre)))
+        centre, radius = centre[order], radius[order]
+        balls.append(_bounding_ball(centre, radius))
+        if len(centre) > PART:
+            for begin in range(0, len(centre), PART):
+                some = slice(begin, begin + PART)
+                part_balls.append(_bounding_ball(centre[some], radius[some]))
+        spheres.append(np.column_stack((centre, radius)))
+        first.append(first[-1] + len(centre))
+        part.append(len(links) + len(part_balls))
+    every, around = np.concatenate(spheres), np.array(balls + part_balls)
     return Spheres(
-        centre=np.array(centres),
-        radius=np.array(radii),
+        centre=np.array(every[:, :3], order="C"),
+        radius=np.array(every[:, 3], order="C"),
         first=np.array(first),
-        link=np.array([links[name] for name in names]),
-        ball_centre=np.array([centre for centre, _ in balls]),
-        ball_radius=np.array([radius for _, radius in balls]),
+        link=np.array(links, dtype=np.int64),
+        ball_centre=np.array(around[:, :3], order="C"),
+        ball_radius=np.array(around[:, 3], order="C"),
         pairs=np.array(pairs, dtype=np.int64).reshape(-1, 2),
+        part=np.array(part),
     )
+
+
+def _neighbours(centre: Float, some: Int) -> Int:
+    """Return indices of centres, shape (n, 3), [m], in an order in which each PART of them are neighbours."""
+    if len(some) <= PART:
+        return some
+    away = centre[some] - centre[some].mean(axis=0)
+    longest = np.linalg.svd(away, full_matrices=False)[2][0]
+    along = some[np.argsort(away @ longest, kind="stable")]
+    middle = PART * ((len(along) + PART) // (2 * PART))
+    return np.concatenate((_neighbours(centre, along[:middle]), _neighbours(centre, along[middle:])))
 
 
 def _along(capsule: Capsule, excess: float) -> tuple[Float, float]:
@@ -166,8 +193,8 @@ def _along(capsule: Capsule, excess: float) -> tuple[Float, float]:
     return capsule.first + share * (capsule.second - capsule.first), float(radius)
 
 
-def _bounding_ball(centre: Float, radius: Float) -> tuple[Float, float]:
-    """Return a ball around spheres that is hardly larger than the smallest one: its centre and radius, [m].
+def _bounding_ball(centre: Float, radius: Float) -> Float:
+    """Return centre and radius of a ball around spheres that is hardly larger than the smallest one, shape (4,), [m].
 
     In each round the centre moves towards the farthest sphere, by less and less (M. Badoiu and K. L. Clarkson, Smaller
     core-sets for balls, 2003).
@@ -178,7 +205,7 @@ def _bounding_ball(centre: Float, radius: Float) -> tuple[Float, float]:
         far = np.sqrt((away * away).sum(axis=1)) + radius
         middle = middle + away[far.argmax()] / (k + 2.0)
     away = centre - middle
-    return middle, float((np.sqrt((away * away).sum(axis=1)) + radius).max())
+    return np.append(middle, (np.sqrt((away * away).sum(axis=1)) + radius).max())
 
 
 @compiled

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.kinematics import Chain, Spheres, link_frames
+from viapoint.envs.arms.kinematics import PART, Chain, Spheres, link_frames
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 from viapoint.envs.geometry.distance import point_distance
@@ -34,7 +34,7 @@ class Placed(NamedTuple):
     origin: Float
     """Origins of the links' frames, shape (J + 1, 3), [m]."""
     ball: Float
-    """Centres of the groups' bounding balls, shape (G, 3), [m]."""
+    """Centres of the bounding balls of groups, and of the parts of known groups, shape (G + C, 3), [m]."""
     centre: Float
     """Centres of the spheres of known groups, shape (S, 3), [m]."""
     known: Bool
@@ -55,7 +55,7 @@ def memory(chain: Chain, spheres: Spheres) -> Placed:
     return Placed(
         np.empty((joints + 1, 3, 3)),
         np.empty((joints + 1, 3)),
-        np.empty((groups, 3)),
+        np.empty((len(spheres.ball_radius), 3)),
         np.empty((len(spheres.radius), 3)),
         np.empty(groups, np.bool_),
         np.empty(joints + 1),
@@ -93,6 +93,14 @@ def place_group(spheres: Spheres, group: int, placed: Placed) -> None:
                     + placed.rotation[link, axis, 0] * spheres.centre[sphere, 0]
                     + placed.rotation[link, axis, 1] * spheres.centre[sphere, 1]
                     + placed.rotation[link, axis, 2] * spheres.centre[sphere, 2]
+                )
+        for part in range(spheres.part[group], spheres.part[group + 1]):
+            for axis in range(3):
+                placed.ball[part, axis] = (
+                    placed.origin[link, axis]
+                    + placed.rotation[link, axis, 0] * spheres.ball_centre[part, 0]
+                    + placed.rotation[link, axis, 1] * spheres.ball_centre[part, 1]
+                    + placed.rotation[link, axis, 2] * spheres.ball_centre[part, 2]
                 )
 
 
@@ -190,6 +198,8 @@ def nearest_spheres(
         return least, nearest, partner
     place_group(spheres, first, placed)
     place_group(spheres, second, placed)
+    if spheres.part[first] < spheres.part[first + 1] or spheres.part[second] < spheres.part[second + 1]:
+        return _nearest_by_parts(spheres, placed, first, second, least, floor)
     for one in range(spheres.first[first], spheres.first[first + 1]):
         # The ball of the second group excludes most spheres of the first.
         size = spheres.radius[one]
@@ -203,6 +213,45 @@ def nearest_spheres(
                 if least < floor:
                     return least, nearest, partner
     return least, nearest, partner
+
+
+@kernel
+def _nearest_by_parts(
+    spheres: Spheres, placed: Placed, first: int, second: int, least: float, floor: float
+) -> tuple[float, int, int]:
+    """Return the same for two placed groups, one of many spheres, of which most parts are apart."""
+    nearest, partner = -1, -1
+    balls = spheres.ball_radius
+    for start in range(spheres.first[first], spheres.first[first + 1], PART):
+        part = _part(spheres, first, start)
+        if _are_apart(placed.ball, part, placed.ball, second, balls[part] + balls[second] + least):
+            continue
+        for other_start in range(spheres.first[second], spheres.first[second + 1], PART):
+            other_part = _part(spheres, second, other_start)
+            if _are_apart(
+                placed.ball, part, placed.ball, other_part, balls[part] + balls[other_part] + least
+            ):
+                continue
+            for one in range(start, min(start + PART, spheres.first[first + 1])):
+                size = spheres.radius[one]
+                if _are_apart(placed.centre, one, placed.ball, other_part, size + balls[other_part] + least):
+                    continue
+                for other in range(other_start, min(other_start + PART, spheres.first[second + 1])):
+                    sizes = size + spheres.radius[other]
+                    if not _are_apart(placed.centre, one, placed.centre, other, sizes + least):
+                        least = math.sqrt(_square(placed.centre, one, placed.centre, other)) - sizes
+                        nearest, partner = one, other
+                        if least < floor:
+                            return least, nearest, partner
+    return least, nearest, partner
+
+
+@inlined
+def _part(spheres: Spheres, group: int, sphere: int) -> int:
+    """Return the bounding ball of the part of a group that begins with a sphere."""
+    if spheres.part[group] == spheres.part[group + 1]:
+        return group
+    return int(spheres.part[group] + (sphere - spheres.first[group]) // PART)
 
 
 @kernel

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from viapoint.training import scene_sets
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets import scene_set
-from viapoint.training.scene_sets.scene_set import FrozenScenes
+from viapoint.training.scene_sets import FrozenScenes
 
 sys.path.append(str(Path(__file__).parent))
 sys.path += [str(Path(__file__).parents[2] / folder) for folder in ("docs/figures", "benchmarks")]
@@ -42,7 +42,7 @@ def shipped(small_scenes, tmp_path, monkeypatch):
     """The small scenes in place of every shipped set."""
     path = tmp_path / "shipped.npz"
     small_scenes.save(path)
-    monkeypatch.setattr(scene_set, "shipped_set", lambda name, task: path)
+    monkeypatch.setattr(scene_sets, "shipped_set", lambda name, task: path)
     return small_scenes
 
 

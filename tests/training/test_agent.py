@@ -134,7 +134,7 @@ def test_the_task_survives_json(env_id):
 
 def test_it_learns_within_seconds_what_chance_does_not():
     simulation = SceneSimulation(PLANE, 256)
-    scenes = simulation.draw(256, seed=10_000)
+    scenes = simulation.task.sampler()([np.random.default_rng((10_000, each)) for each in range(256)])
     observation = simulation.observe(scenes)
     random = np.random.default_rng(0).uniform(-1.0, 1.0, (256, simulation.task.action.size))
     chance = simulation(scenes, random).success.mean()

@@ -9,7 +9,7 @@ import pytest
 from viapoint.envs import arm_of
 from viapoint.envs.arms.stored import write_arm
 from viapoint.training import Run, evaluate, load_agent
-from viapoint.training.cli.main import main
+from viapoint.training.cli.entry import main
 
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
 
 ENV, REACH = "viapoint/PlanarObstacles-v0", "viapoint/PlanarReach-v0"
 

@@ -8,13 +8,14 @@ from pathlib import Path
 import pytest
 
 from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
 from viapoint.training.config.configs import (
     EvaluateConfig,
     TrainConfig,
+    from_words,
+    to_words,
 )
 from viapoint.training.config.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
-from viapoint.training.config.words import from_words, to_words
 
 
 def test_configurations_are_frozen_and_that_of_a_training_survives_json():

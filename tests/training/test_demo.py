@@ -6,7 +6,7 @@ import pytest
 
 from viapoint.training.cli import demo
 from viapoint.training.config.configs import DemoConfig
-from viapoint.training.runs.callback import RunCallback, TrainingStoppedError
+from viapoint.training.runs.trainer import RunCallback, TrainingStoppedError
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def test_an_interrupted_demo_goes_on_and_what_is_done_is_not_done_again(quick, c
     assert {"agent", "agent, 16 checks", "untrained", "search512"} <= set(methods)
     assert methods["straight"]["success"]["rate"] == 0.0
 
-    for name in ("evaluate_methods", "gallery", "record_video"):
+    for name in ("evaluate", "gallery", "record_video"):
         monkeypatch.setattr(demo, name, pytest.fail)
     demo.run(quick)
     assert written == {name: (quick.out / name).stat().st_mtime_ns for name in demo.FILES}

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from viapoint.training.cli import doctor
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
 
 GOOD, GONE = "print('fine')", "import no_such_module"
 EXTRA = ("torch", "stable_baselines3", "sb3_contrib", "tyro", "rich", "matplotlib", "safetensors")

@@ -14,7 +14,7 @@ from viapoint.training.evaluation.evaluator import (
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets.scene_set import BANDS, drawn
+from viapoint.training.scene_sets import BANDS, drawn
 
 ENV = "viapoint/PlanarObstacles-v0"
 

@@ -6,7 +6,7 @@ import pytest
 from matplotlib.image import imread
 
 from viapoint.primitives import fit_via_points, through
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
 
 WAYPOINTS = {
     "around": [[0.0, 0.3, 0.1], [0.12, 0.45, 0.1], [0.3, 0.3, 0.2]],

@@ -8,7 +8,7 @@ from viapoint.training import load_agent
 from viapoint.training.agents.agent import find_model
 from viapoint.training.agents.model_io import weights
 from viapoint.training.cli import demo
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
 from viapoint.training.config.configs import DemoConfig, PaperConfig, TrainConfig
 from viapoint.training.io.files import BadFileError
 from viapoint.training.paper import run as paper

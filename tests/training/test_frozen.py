@@ -10,11 +10,11 @@ import pytest
 from viapoint.envs import Task
 from viapoint.envs.registration import ENV_IDS, twin_of
 from viapoint.envs.scenes.scene import check_scenes
+from viapoint.training import scene_sets
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets import scene_set
-from viapoint.training.scene_sets.scene_set import (
+from viapoint.training.scene_sets import (
     BANDS,
     SETS,
     load,
@@ -166,7 +166,7 @@ def test_a_file_comes_back_as_it_was_and_any_damage_is_noticed(some, tmp_path, m
         with contextlib.suppress(ValueError):  # a bit may lie where nothing is read
             assert load(path).sha256 == some.sha256
     path.write_bytes(whole)
-    monkeypatch.setattr(scene_set, "LARGEST", 1_000)
+    monkeypatch.setattr(scene_sets, "LARGEST", 1_000)
     refused(path)
 
 

@@ -20,7 +20,7 @@ from viapoint.training.planning.search import (
     refined_actions,
 )
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.scene_sets import scenes_for
 
 PLANE, WHOLE_ARM, PANDA = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarWholeArm", "PandaObstacles")

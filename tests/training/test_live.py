@@ -18,7 +18,7 @@ import viapoint.envs as ve
 from viapoint.envs.registration import ENV_IDS
 from viapoint.training.agents.agent import SAC
 from viapoint.training.agents.viaq import ViaQ
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
 from viapoint.training.live import drawing
 from viapoint.training.live.arena import AGENT, HAND, MOTION, SEARCH, STRAIGHT, Arena
 from viapoint.training.live.decide import APART, decide, describe_plan, execute, profile, propose

@@ -15,7 +15,7 @@ from viapoint.training.planning.benchmark import benchmark_panda, benchmark_prob
 from viapoint.training.planning.ompl_paths import points_on
 from viapoint.training.planning.plan_motion import plan_motion
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets.scene_set import load, shipped_path
+from viapoint.training.scene_sets import load, shipped_path
 
 PLANE = "viapoint/PlanarObstacles-v0"
 

@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from viapoint.training.cli import main as cli
-from viapoint.training.paper import run
+from viapoint.training.cli import entry as cli
+from viapoint.training.paper import obstacles, run
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
+from viapoint.training.paper.double_step import double_step, excess_cost
 from viapoint.training.paper.movements import Profile, construction, via_waypoints
-from viapoint.training.paper.rows import obstacles
-from viapoint.training.paper.rows.double_step import double_step, excess_cost
-from viapoint.training.paper.rows.one_via import passage_polynomial, roots_of
+from viapoint.training.paper.one_via import passage_polynomial, roots_of
 from viapoint.training.paper.run import DRAWINGS, ROWS
 
 GUIDE = Path(__file__).parents[2] / "docs" / "flash-hogan.md"

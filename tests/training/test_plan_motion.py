@@ -12,7 +12,7 @@ from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import pack
 from viapoint.envs.plans import Plan
 from viapoint.training import plan_motion, plan_motions
-from viapoint.training.cli.main import main
+from viapoint.training.cli.entry import main
 from viapoint.training.planning import plan_motion as module
 from viapoint.training.planning import refine
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems, read_problems
@@ -20,7 +20,7 @@ from viapoint.training.planning.export import read_motion, write_motion
 from viapoint.training.planning.motion_plan import UnsafePlanError, execute_plans
 from viapoint.training.planning.movements import OUTSIDE, Movement, movement_table
 from viapoint.training.planning.search import registered_task
-from viapoint.training.scene_sets.scene_set import BANDS, scenes_for
+from viapoint.training.scene_sets import BANDS, scenes_for
 
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 PANDA = arm_of("panda")
@@ -47,7 +47,7 @@ def test_successful_plans_succeed_in_physics(kwargs) -> None:
     plans = plan_motions(task.arm, starts, goals, obstacles, space=task.space_name)
     good = [plan for plan in plans if plan.success and len(plan.durations) == 3]
     assert len(good) >= 30
-    outcome = execute_plans(good)
+    outcome, _ = execute_plans(good)
     assert outcome.is_success.all()
     assert (outcome.stretch < 1.001).all()
     assert np.abs(outcome.planned_clearance - [plan.clearance for plan in good]).max() < 2e-3
@@ -314,7 +314,8 @@ def test_first_problems_of_the_benchmark() -> None:
     problems = [problem for problem in benchmark_problems() if problem.number <= 3]
     plans = [plan_motion(arm, problem.start, problem.goal, problem.obstacles) for problem in problems]
     assert all(plan.success for plan in plans)
-    assert execute_plans([plan for plan in plans if len(plan.durations) == 3]).is_success.all()
+    outcome, _ = execute_plans([plan for plan in plans if len(plan.durations) == 3])
+    assert outcome.is_success.all()
 
 
 @pytest.mark.parametrize("file", ["plan.csv", "plan.yaml"])

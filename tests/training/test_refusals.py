@@ -15,7 +15,7 @@ from viapoint.training import evaluate, load_agent
 from viapoint.training.agents.agent import SAC, find_model
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.viaq import ViaQ
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
 from viapoint.training.config.checks import ELSEWHERE
 from viapoint.training.config.configs import (
     DemoConfig,
@@ -25,8 +25,8 @@ from viapoint.training.config.configs import (
     PlayConfig,
     StudyConfig,
     TrainConfig,
+    from_words,
 )
-from viapoint.training.config.words import from_words
 from viapoint.training.evaluation import statistics
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError
@@ -38,7 +38,7 @@ from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train
-from viapoint.training.scene_sets.scene_set import load, scenes_for, shipped_path
+from viapoint.training.scene_sets import load, scenes_for, shipped_path
 
 ENV, REACH, STEP = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarReach", "PlanarObstaclesStep")

@@ -8,10 +8,10 @@ from viapoint.envs.scenes.options import scene_from_json, scene_to_json
 from viapoint.training.agents.model_io import build
 from viapoint.training.config.presets import STEP_PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.planning.baselines import Straight, agent_method, make_method
-from viapoint.training.rollouts.rollout import SceneSimulation, StepAgentMethod, whole_task
+from viapoint.training.planning.baselines import StepAgentMethod, Straight, agent_method, make_method
+from viapoint.training.rollouts.rollout import SceneSimulation, whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.scene_sets import scenes_for
 
 MOVING, JUMPS = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarTargetJump-v0"
 STEP = "viapoint/PlanarObstaclesStep-v0"
@@ -36,7 +36,7 @@ def test_a_jumping_target_is_reached_by_revision_only():
 
 def test_an_episode_is_the_same_alone_and_among_others():
     simulation = SceneSimulation(MOVING, 8)
-    scenes = simulation.draw(11, seed=4)
+    scenes = simulation.task.sampler()([np.random.default_rng((4, each)) for each in range(11)])
     actions = np.random.default_rng(0).uniform(-0.5, 0.5, (11, simulation.task.action.size))
     together = simulation(scenes, actions)
     for row in (0, 7, 10):
@@ -71,7 +71,7 @@ def test_an_agent_of_steps_is_measured_where_the_task_changes_during_an_episode(
     step = "viapoint/PlanarMovingObstaclesStep-v0"
     twin = SceneSimulation(step, 2, **whole_task(step, {}))
     assert twin.task.replanning
-    scenes = twin.draw(2, seed=0)
+    scenes = twin.task.sampler()([np.random.default_rng((0, each)) for each in range(2)])
     method = StepAgentMethod("forwards", Forwards(), step, {})
     decided = method.decide(twin.observe(scenes), scenes)
     assert decided.shape == (2, 2)
@@ -81,7 +81,7 @@ def test_an_agent_of_steps_is_measured_where_the_task_changes_during_an_episode(
 def test_what_a_method_carries_out_is_what_the_single_environment_does():
     method = StepAgentMethod("forwards", Forwards(), STEP, {})
     simulation = SceneSimulation(STEP, 6)
-    scenes = simulation.draw(6, seed=1)
+    scenes = simulation.task.sampler()([np.random.default_rng((1, each)) for each in range(6)])
     together = method.execute(scenes, method.decide(simulation.observe(scenes), scenes))
     env = gym.make(STEP)
     for i in range(6):

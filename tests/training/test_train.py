@@ -15,18 +15,18 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from viapoint.training.agents.model_io import load_model
-from viapoint.training.cli import main as cli
+from viapoint.training.cli import entry as cli
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError, read_arrays
+from viapoint.training.planning.baselines import agent_method
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.runs import callback
-from viapoint.training.runs.callback import TrainingStoppedError
+from viapoint.training.runs import trainer
 from viapoint.training.runs.checkpoints import read_state
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import TrainingFailedError, train
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.runs.trainer import TrainingFailedError, TrainingStoppedError, train
+from viapoint.training.scene_sets import scenes_for
 
 OFF_POLICY = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16}
 TINY = {
@@ -127,7 +127,7 @@ def test_what_a_run_leaves(tmp_path, capsys):
         assert (np.diff([record[name] for record in run.curve]) > 0.0).all()
     best = max(record["success"]["rate"] for record in run.curve)
     assert run.best.name == "best"
-    method = callback.agent_method("agent", load_model(run.best))
+    method = agent_method("agent", load_model(run.best))
     scenes = scenes_for("validation", run.config.task, 8)
     (again,) = evaluate_methods([method], scenes, WHOLE, time_decisions=False).results
     assert again.success.mean() == best
@@ -175,17 +175,17 @@ def with_success(monkeypatch, rates):
     """Let validations at 0, 64, 128, ... decisions find these rates of success; presets are of 128 decisions."""
     for algo, preset in PRESETS.items():
         monkeypatch.setitem(PRESETS, algo, dataclasses.replace(preset, n_timesteps=128))
-    evaluate = callback.evaluate_methods
+    evaluate = trainer.evaluate
 
-    def measured(methods, *args, **kwargs):
-        result = evaluate(methods, *args, **kwargs)
-        rate = rates[methods[0]._model.num_timesteps // 64]
+    def measured(agent, **kwargs):
+        result = evaluate(agent, **kwargs)
+        rate = rates[agent.num_timesteps // 64]
         (only,) = result.results
         number = len(only.success)
         only.outcomes["is_success"][:] = np.arange(number) < round(rate * number)
         return result
 
-    monkeypatch.setattr(callback, "evaluate_methods", measured)
+    monkeypatch.setattr(trainer, "evaluate", measured)
 
 
 @pytest.mark.parametrize("algo", ["viaq", "ppo"])

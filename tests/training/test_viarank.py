@@ -10,7 +10,7 @@ from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.places import places_of
 from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import plan_clearances, registered_task
-from viapoint.training.scene_sets.scene_set import scenes_for
+from viapoint.training.scene_sets import scenes_for
 
 ENV = "viapoint/PlanarSensed-v0"
 

@@ -10,8 +10,10 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import inspect
+import math
+import typing
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -30,13 +32,14 @@ from stable_baselines3.common.utils import (
 )
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn.modules.module import register_module_parameter_registration_hook
+from typeguard import TypeCheckError, check_type
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.stored import keep_arm, with_kept_arm
+from viapoint.envs.common.validation import is_number
 from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES
 from viapoint.training.agents.extractors import SceneExtractor
-from viapoint.training.config.checks import check_arguments
 from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
 from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments
 
@@ -55,6 +58,20 @@ NOT_STORED = frozenset(
     | {"stats_window_size", "monitor_wrapper", "sde_support", "support_multi_env", "supported_action_spaces"}
     | {"replay_buffer_class", "replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"}
 )
+
+# Hyperparameters that must be greater than zero
+POSITIVE = frozenset({"learning_rate", "temperature", "clip_range", "max_grad_norm"})
+SHARES = frozenset({"gamma", "gae_lambda", "tau", "explore_uniformly"})  # From 0 to 1
+# Least values of hyperparameters; -1 gradient steps are as many as there were steps of the environment
+LEAST: dict[str, float] = {
+    "gradient_steps": -1,
+    **dict.fromkeys(("learning_starts", "target_policy_noise", "target_noise_clip", "ent_coef"), 0),
+    **dict.fromkeys(("vf_coef", "top_quantiles_to_drop_per_net", "refinements", "checks", "refine"), 0),
+    **dict.fromkeys(("buffer_size", "batch_size", "train_freq", "n_steps", "n_epochs"), 1),
+    **dict.fromkeys(("policy_delay", "target_update_interval", "next_candidates", "nearest"), 1),
+    **dict.fromkeys(("width", "candidates", "per_refinement"), 1),
+    **dict.fromkeys(("explore_candidates", "labels", "instants"), 2),
+}
 
 LARGEST_MODEL_JSON = 1 << 20  # Greatest size of `model.json`, [bytes]
 LARGEST_WEIGHTS = 1 << 30  # Greatest size of `weights.safetensors`, [bytes]
@@ -77,7 +94,6 @@ def save_model(model: BaseAlgorithm, folder: Path) -> None:
     Raises:
         ValueError: Its class is not in ALGORITHMS, or it has no environment of this package.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / "weights.safetensors"
     write_arrays(path, weights(model))
     keep_arm(folder, model.get_env().get_attr("task", [0])[0].arm)  # type: ignore[union-attr]
@@ -165,6 +181,38 @@ def check_hyperparameters(algorithm: str, hyperparameters: Mapping[str, Any]) ->
     for name in sorted(set(hyperparameters) - allowed):
         raise ValueError(f"{algorithm} has no hyperparameter {name!r}; it has {', '.join(sorted(allowed))}")
     check_arguments(kind, {name: _decode(value, 1) for name, value in hyperparameters.items()})
+
+
+def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> None:
+    """Check values against the type hints of a function or class, and numbers against their ranges.
+
+    The algorithms accept any number, and many a wrong one shows only as a training that does not learn.
+    """
+    # The hints of Stable-Baselines3 name VecEnv, which its modules import for type checkers only.
+    hinted: Any = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
+    hints = typing.get_type_hints(hinted, localns={"VecEnv": object})
+    for name, value in values.items():
+        number, hint = value.item() if isinstance(value, np.generic) else value, hints.get(name, Any)
+        try:
+            check_type(number, hint)
+        except TypeCheckError as error:
+            raise ValueError(f"{name} has a wrong type: {error}, got {value!r}") from None
+        if isinstance(number, bool) and bool not in (hint, *typing.get_args(hint)):
+            raise ValueError(f"{name} must be a number, got {value!r}")  # a bool counts as an int for Python
+        if name == "train_freq" and isinstance(number, tuple):
+            number, unit = number
+            if unit != "step":  # episodes end at different times in several environments
+                raise ValueError(f"{name} must count steps, got {value!r}")
+        if not is_number(number):
+            continue
+        if not math.isfinite(number):
+            raise ValueError(f"{name} must be finite, got {value!r}")
+        if name in POSITIVE and number <= 0:
+            raise ValueError(f"{name} must be greater than 0, got {value!r}")
+        if name in SHARES and not 0 <= number <= 1:
+            raise ValueError(f"{name} must be from 0 to 1, got {value!r}")
+        if number < LEAST.get(name, -math.inf):
+            raise ValueError(f"{name} must be {LEAST[name]:g} or more, got {value!r}")
 
 
 def untrained(model: BaseAlgorithm, seed: int = 0) -> BaseAlgorithm:
@@ -296,7 +344,7 @@ def parameter_budget(arrays: Mapping[str, Any]) -> Iterator[None]:
     try:
         yield
     finally:
-        handle.remove()
+        handle.remove()  # other networks may have any size
 
 
 def argument_names(kind: type[BaseAlgorithm]) -> set[str]:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
-from viapoint.training.config.checks import check_arguments
+from viapoint.training.agents.model_io import check_arguments
 
 Observation = Mapping[str, NDArray[Any]]
 Numbers = NDArray[np.floating[Any]]

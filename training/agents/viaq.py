@@ -123,7 +123,7 @@ class ViaQ(PlanAlgorithm):
         before = self._last_obs
         prepared = super()._setup_learn(*args, **kwargs)
         if self._last_obs is not before and self.replay_buffer is not None:  # the environment was reset
-            self.replay_buffer.begin()
+            self.replay_buffer.begin()  # the running episodes are others
         return prepared
 
     def _task_of(self, env: VecEnv) -> Task:
@@ -222,12 +222,12 @@ class ViaQ(PlanAlgorithm):
         every = candidate_actions(policy.task, policy.candidates, replanning=True)
         shape = len(batch.ended), self.next_candidates
         chosen = np.random.randint(min(1, len(every) - 1), len(every), size=shape)  # noqa: NPY002 - as SB3
-        chosen[:, 0] = 0
+        chosen[:, 0] = 0  # the action that keeps the plan
         values = critic(
             policy.inputs(Problem.of_observation(batch.next_observations, policy.task), every[chosen])
         )
         worth = critic.value(values)
-        worth[:, 0] += KEEP
+        worth[:, 0] += KEEP  # as the policy prefers it
         best = worth.argmax(dim=1, keepdim=True)
         return Values(*(each.gather(1, best)[:, 0] for each in values))
 

@@ -78,18 +78,15 @@ class ViaQCritic(nn.Module):
         ends = (4 * dimension + 3) if task.replanning else (2 * dimension + 1)
         self.replanning = task.replanning
         self.pairs = PairNetwork(len(task.shapes), width)
-        self.arrival = nn.Parameter(torch.tensor(2.0))
-        """Logit d of arrival of a movement within reach."""
+        self.arrival = nn.Parameter(torch.tensor(2.0))  # Logit d of arrival of a movement within reach
         self.rest = dense(ends + EFFORT + (0 if task.replanning else size), 64, 64, 2)
         for parameter in self.rest[-1].parameters():
             nn.init.zeros_(parameter)
         weights = task.weights
         self.linear = nn.Parameter(torch.tensor([-weights.smoothness, -weights.duration, 0.0, 0.0]))
         """Weights of the effort features, initialised from the reward weights."""
-        self.slope = nn.Parameter(torch.tensor([6.0, 0.0]))
-        """Logarithm of k [1/m], and b."""
-        self.self_slope = nn.Parameter(torch.tensor([6.0, 2.0]))
-        """Logarithm of k' [1/m], and b'."""
+        self.slope = nn.Parameter(torch.tensor([6.0, 0.0]))  # Logarithm of k [1/m], and b
+        self.self_slope = nn.Parameter(torch.tensor([6.0, 2.0]))  # Logarithm of k' [1/m], and b'
         self.scales = nn.Parameter(
             torch.tensor([weights.success, weights.collision, weights.goal_error, weights.clearance])
         )

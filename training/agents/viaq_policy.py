@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Float, Int
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import turned
 from viapoint.envs.task import Task
+from viapoint.training.agents.model_io import check_arguments
 from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.agents.plan_agent import Numbers, Observation, PlanPolicy
 from viapoint.training.agents.viaq_critic import PlanInputs, ViaQCritic
-from viapoint.training.config.checks import check_arguments
 from viapoint.training.planning.candidates import candidate_actions, normal_steps
 from viapoint.training.planning.movements import FINE_INSTANTS, INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
@@ -84,9 +84,10 @@ class ViaQPolicy(PlanPolicy):
         check_arguments(type(self), self._own())
         self.replanning = self.task.replanning
         self._check_refine()
-        self.critic = self.make_critic()
-        self.critic_target = self.make_critic() if self.replanning else None
-        if self.critic_target is not None:
+        self.critic = ViaQCritic(self.task, width=self.width)
+        self.critic_target: ViaQCritic | None = None
+        if self.replanning:  # values of later decisions are learned from a critic that changes slowly
+            self.critic_target = ViaQCritic(self.task, width=self.width)
             self.critic_target.load_state_dict(self.critic.state_dict())
             self.critic_target.requires_grad_(False)
         self._make_optimizer(self.critic, lr_schedule)
@@ -95,10 +96,6 @@ class ViaQPolicy(PlanPolicy):
     def network(self) -> ViaQCritic:
         """Network that is trained."""
         return self.critic
-
-    def make_critic(self) -> ViaQCritic:
-        """Return a new critic for the task."""
-        return ViaQCritic(self.task, width=self.width)
 
     @property
     def can_refine(self) -> bool:
@@ -111,11 +108,6 @@ class ViaQPolicy(PlanPolicy):
                 f"refine must be 0 where plans are revised or have no via-points, got {self.refine}"
             )
 
-    @property
-    def shown_instants(self) -> Int:
-        """Instants of a plan at which the arm is looked at."""
-        return np.linspace(0, INSTANTS - 1, min(self.instants, INSTANTS)).round().astype(np.int64)
-
     def inputs(self, problem: Problem, actions: Numbers, until: Float | None = None) -> PlanInputs:
         """Return the critic's inputs for actions of shape (B, H, m) in B problems.
 
@@ -126,7 +118,8 @@ class ViaQPolicy(PlanPolicy):
         if problem.time_left is not None:
             spare = np.clip(problem.time_left[:, None] - moves.duration - SETTLING, -0.2, 0.2)
         effort = np.stack((moves.rough, moves.relative, np.log(moves.relative), spare), axis=-1)
-        pairs = pairs_of(self.task, problem, moves, self.shown_instants, until)
+        instants = np.linspace(0, INSTANTS - 1, min(self.instants, INSTANTS)).round().astype(np.int64)
+        pairs = pairs_of(self.task, problem, moves, instants, until)
         ends = seen_ends(self.task, problem)
         # Geometry is computed on the processor, the networks may be on another device.
         device = self.device

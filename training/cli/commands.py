@@ -24,14 +24,13 @@ from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import evaluate as measure
 from viapoint.training.io.files import read_json, write_json
 from viapoint.training.io.progress import scene_progress
-from viapoint.training.planning import benchmark_report
+from viapoint.training.planning import benchmark
 from viapoint.training.planning.baselines import agent_method, make_method
-from viapoint.training.planning.benchmark import benchmark_problems, read_problems
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.datasets import dataset_folder, record_dataset
 from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
-from viapoint.training.scene_sets.scene_set import evenly_spread, scenes_for
+from viapoint.training.scene_sets import evenly_spread, scenes_for
 
 
 def train(config: TrainConfig) -> None:
@@ -86,7 +85,7 @@ def evaluate(config: EvaluateConfig) -> None:
         print(f"results, scene by scene: {config.json}", file=_notes(config))
     if result.partial:
         print("the results are partial", file=_notes(config))
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt  # after all that is there has been written
 
 
 def _notes(config: EvaluateConfig) -> TextIO:
@@ -96,20 +95,24 @@ def _notes(config: EvaluateConfig) -> TextIO:
 
 def _measure_planners(config: EvaluateConfig) -> None:
     """Measure planners on the problems of MotionBenchMaker, print the table, and write one line for each problem."""
-    problems = benchmark_problems() if config.problems is None else read_problems(config.problems)
+    problems = (
+        benchmark.benchmark_problems()
+        if config.problems is None
+        else benchmark.read_problems(config.problems)
+    )
     problems = [problems[row] for row in evenly_spread(len(problems), config.n_scenes)]
     names = ("plan_motion",) if config.baselines == USUAL_BASELINES else config.baselines
     for name in names:
-        benchmark_report.benchmark_planner(name)  # an unknown name is told before anything is measured
+        benchmark.benchmark_planner(name)  # an unknown name is told before anything is measured
     with scene_progress() as progress:
-        lines = [benchmark_report.measure_planner(name, problems, progress=progress) for name in names]
+        lines = [benchmark.measure_planner(name, problems, progress=progress) for name in names]
     table = pd.concat(lines)
     if config.format == "csv":
         print(table.to_csv(index=False).rstrip())
     elif config.format == "json":
         print(table.to_json(orient="records", indent=1))
     else:
-        print(f"{benchmark_report.markdown(table)}\n\n{benchmark_report.NOTES}")
+        print(f"{benchmark.markdown(table)}\n\n{benchmark.NOTES}")
     if config.json is not None:
         write_json(config.json, table.to_dict("records"))
         print(f"results, problem by problem: {config.json}", file=_notes(config))
@@ -120,14 +123,12 @@ def play(config: PlayConfig) -> None:
     from viapoint.training.plotting.video import record_video
 
     agent, env_id, env_kwargs = _named(config)
-    task = registered_task(env_id, **env_kwargs)
-    scenes = scenes_for(config.scenes, task, config.n_scenes).scenes
+    scenes = scenes_for(config.scenes, registered_task(env_id, **env_kwargs), config.n_scenes).scenes
     env = gym.make(env_id, render_mode="rgb_array_list", **env_kwargs)
     if agent is None:
         method = make_method("search512", env_id, **env_kwargs)
     else:
         method = agent_method("agent", agent, config.checks)
-    config.video.parent.mkdir(parents=True, exist_ok=True)
     record_video(config.video, env, scenes, method.decide, name=method.name)
     env.close()
     print(f"{len(scenes.start)} movements: {config.video}")

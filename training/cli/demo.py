@@ -15,19 +15,20 @@ from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.agents.model_io import untrained
 from viapoint.training.config.configs import DemoConfig, TrainConfig
 from viapoint.training.evaluation import report
-from viapoint.training.evaluation.evaluator import evaluate_methods
+from viapoint.training.evaluation.evaluator import evaluate
 from viapoint.training.io.files import check_ours, read_json
 from viapoint.training.io.progress import scene_progress
-from viapoint.training.planning.baselines import Method, agent_method, make_method
+from viapoint.training.planning.baselines import agent_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.video import gallery, record_video
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
-from viapoint.training.scene_sets.scene_set import BANDS, FrozenScenes, scenes_for
+from viapoint.training.scene_sets import BANDS, FrozenScenes, scenes_for
 
 CHECKS = 16  # Proposals that the agent checks in the second row of the table
 BASELINES = ("search16", "search512", "straight", "random")
+# Files besides those of the run, and what they show
 FILES = {
     "table.md": "the table",
     "table.json": "the table with every outcome",
@@ -36,7 +37,6 @@ FILES = {
     "gallery.png": "test scenes, planned and executed",
     "movements.mp4": "movements",
 }
-"""Files besides those of the run, and what they show."""
 PICTURES = 12  # Number of movements in the gallery
 MOVEMENTS = 4  # Number of movements in the video
 
@@ -56,11 +56,11 @@ def run(config: DemoConfig) -> None:
     weights = read_json(trained.best / "model.json")["weights_sha256"]
     record = read_json(folder / "table.json") if (folder / "table.json").exists() else {}
     if (record.get("sha256"), record.get("weights_sha256")) != (frozen.sha256, weights):
-        record = {**_measured(config, agent, frozen), "weights_sha256": weights}
+        record = {**_measured(agent, frozen), "weights_sha256": weights}
         report.write(record, folder)
         plots.learning_curve(folder / "learning_curve.png", trained.curve)
         plots.success_by_band(folder / "success_by_band.png", record)
-        (folder / "movements.mp4").unlink(missing_ok=True)
+        (folder / "movements.mp4").unlink(missing_ok=True)  # they are of another agent
     if not (folder / "movements.mp4").exists():
         try:
             _show_movements(folder, agent, frozen)
@@ -85,16 +85,11 @@ def _trained(config: DemoConfig) -> Run:
     return train_or_resume(TrainConfig(env=config.env, n_timesteps=number, out=config.out))
 
 
-def _measured(config: DemoConfig, agent: Agent, frozen: FrozenScenes) -> dict[str, Any]:
+def _measured(agent: Agent, frozen: FrozenScenes) -> dict[str, Any]:
     """Return the evaluation of the agent and of methods without training."""
-    methods: list[Method] = [
-        agent_method("agent", agent, 0),
-        agent_method("agent", agent, CHECKS),
-        agent_method("untrained", untrained(agent), 0),
-        *(make_method(name, config.env) for name in BASELINES),
-    ]
+    others = (agent_method("untrained", untrained(agent), 0), *BASELINES)
     with scene_progress() as progress:
-        result = evaluate_methods(methods, frozen, config.env, progress=progress)
+        result = evaluate(agent, scenes=frozen, checks=(0, CHECKS), baselines=others, progress=progress)
     if result.partial:
         raise KeyboardInterrupt
     return result.to_dict()

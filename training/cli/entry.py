@@ -1,26 +1,159 @@
-"""Entry point of the command `viapoint`, which imports packages of the extra `training` only if they are installed."""
+"""Command `viapoint`, which imports packages of the extra `training` only where it needs them."""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import importlib
+import io
+import os
+import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 from viapoint.training.cli import doctor
 
+if TYPE_CHECKING:
+    from viapoint.training.config.configs import TrainConfig
 
-def main() -> None:
-    """Run the command; if packages are missing, print what to install and exit with code 2."""
+
+class UsageError(ValueError):
+    """Error of an invalid command line; the message is one line."""
+
+
+# Module and function of each subcommand, whose configuration is `TrainConfig`, `EvaluateConfig` and so on
+COMMANDS = {
+    "train": "cli.commands:train",
+    "evaluate": "cli.commands:evaluate",
+    "plan": "cli.plan:run",
+    "play": "cli.commands:play",
+    "record": "cli.commands:record",
+    "fit": "cli.fit:run",
+    "paper": "paper.run:run",
+    "demo": "cli.demo:run",
+    "study": "study.run:run",
+    "live": "live.page:run",
+    "doctor": "cli.doctor:run",
+}
+OVERVIEW = """usage: viapoint COMMAND [OPTIONS]
+
+Agents that reach around obstacles by placing via-points of minimum-jerk
+movements.
+
+{commands}
+
+viapoint COMMAND --help shows the options of a command and an example;
+--debug shows where an error came from."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a subcommand; errors print one line to the standard error output and exit with code 2."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
     try:
-        from viapoint.training.cli.main import main as run
-    except ImportError as error:
-        if sys.argv[1:2] == ["doctor"]:
+        config = parse(words)
+        if words[0] == "train" and config.resume:
+            _check_resumed(config, words)
+        run_command(config)
+    except KeyboardInterrupt:
+        _leave("stopped", 130)
+    except BrokenPipeError:  # nobody reads the output any more, as in `viapoint --help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes the rest at its exit
+        raise SystemExit(141) from None
+    except Exception as error:
+        if isinstance(error, ImportError) and words[:1] == ["doctor"]:
+            # It says what is missing, without the package that reads options.
             doctor.run(SimpleNamespace(out=Path("runs")))
-        if "--debug" in sys.argv:
+        if debug:
             raise
-        print(f"viapoint: {doctor.explain_import_error(error)}", file=sys.stderr)
-        raise SystemExit(2) from None
-    run()
+        _leave(_one_line(error), getattr(error, "exit_code", 2))
+
+
+def run_command(config: Any) -> None:
+    """Run the subcommand of a configuration."""
+    module, function = COMMANDS[type(config).__name__.removesuffix("Config").lower()].split(":")
+    getattr(importlib.import_module(f"viapoint.training.{module}"), function)(config)
+
+
+def parse(words: Sequence[str], usual: Any = None) -> Any:
+    """Return the configuration that a command line stands for, with defaults of `usual` where it is given.
+
+    Raises:
+        SystemExit: Help was asked for; code 0.
+        UsageError: A word is not understood or not allowed.
+    """
+    import tyro
+
+    from viapoint.training.config import checks, configs
+
+    kinds = {name: getattr(configs, f"{name.capitalize()}Config") for name in COMMANDS}
+    if words and words[0] in ("-h", "--help"):
+        lines = [f"  {name:<10}{str(kind.__doc__).splitlines()[0]}" for name, kind in kinds.items()]
+        print(OVERVIEW.format(commands="\n".join(lines)))
+        raise SystemExit(0)
+    if not words:
+        raise UsageError(f"name a command: {', '.join(COMMANDS)} (viapoint --help)")
+    command, *options = words
+    if command not in COMMANDS:
+        raise UsageError(checks.unknown_name("command", command, COMMANDS))
+    kind = kinds[command]
+    default = {} if usual is None else {"default": usual}
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(
+                kind, prog=f"viapoint {command}", args=options, registry=configs.REGISTRY, **default
+            )
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise UsageError(_complaint(complaint.getvalue(), command, kind)) from None
+
+
+def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
+    """Check that flags equal those of the run to resume, including flags with default values."""
+    from viapoint.training.runs.run_dir import Run, check_unchanged
+
+    run = Run(config.folder)
+    usual = dataclasses.replace(run.config, out=config.out, resume=True)
+    check_unchanged(run, parse(words, usual), usual)
+
+
+def _complaint(text: str, command: str, kind: type[Any]) -> str:
+    """Return the words in tyro's boxes in one line, and fields by their flags.
+
+    Where the output knows only ASCII, there is no frame, and a rule follows the title.
+    """
+    lines = [line.strip("│╭╮╰╯─ ") for line in text.splitlines() if not line.startswith(("╭", "╰"))]
+    if "╭" not in text:
+        rule = next((i for i, line in enumerate(lines) if line and not line.strip("-")), -1)
+        lines = lines[rule + 1 :]
+    said = " ".join(line for line in lines if line.strip("-")) or text
+    said = re.sub(
+        rf"^Error parsing ({kind.__name__}: )?|( Argument helptext: .*)? For full helptext, .*", "", said
+    )
+    for each in dataclasses.fields(kind):
+        said = re.sub(rf"^{each.name}\b", f"--{each.name.replace('_', '-')}", said)
+    return f"{said} (viapoint {command} --help)"
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, ImportError):
+        return doctor.explain_import_error(error)
+    known = isinstance(error, ValueError | OSError) or type(error).__module__.startswith(
+        ("viapoint", "gymnasium")
+    )
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if known else f"{type(error).__name__}: {text} (--debug shows where)"
+
+
+def _leave(message: str, code: int) -> None:
+    print(f"viapoint: {message}", file=sys.stderr)
+    raise SystemExit(code)
 
 
 if __name__ == "__main__":

@@ -44,7 +44,6 @@ def run(config: PlanConfig) -> None:
     if config.video is not None:
         from viapoint.training.plotting.video import record_plan
 
-        config.video.parent.mkdir(parents=True, exist_ok=True)
         print(f"{record_plan(config.video, plan)} frames: {config.video}")
 
 

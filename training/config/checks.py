@@ -1,21 +1,16 @@
-"""Checks of configurations and hyperparameters."""
+"""Checks of configurations."""
 
 from __future__ import annotations
 
 import difflib
-import math
 import os
 import tempfile
-import typing
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from typeguard import TypeCheckError, check_type
-
-from viapoint.envs.common.validation import is_number, whole_number
+from viapoint.envs.common.validation import whole_number
 from viapoint.training.io.files import check_ours
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
@@ -23,6 +18,7 @@ SHIPPED = Path(str(files("viapoint.training") / "pretrained"))  # Agents of the 
 # Ids of environments with a shipped agent
 SHIPPED_IDS = tuple(f"viapoint/{path.parent.name}" for path in sorted(SHIPPED.glob("*/model.json")))
 
+# Arguments that a training's environment does not take, and what to use instead
 ELSEWHERE = {
     "num_envs": "--n-envs says how many environments are stepped together",
     "seed": "--seed is that of everything",
@@ -33,7 +29,6 @@ ELSEWHERE = {
     "vector_kwargs": "the environments are native vector environments",
     "wrappers": "the environments are trained on as they are",
 }
-"""Arguments that a training's environment does not take, and what to use instead."""
 # Least and greatest values of whole numbers, by the names of arguments and fields
 RANGES: dict[str, tuple[int, int | None]] = {
     "seed": (0, 2**32 - 1),  # that of NumPy's legacy generator
@@ -89,50 +84,3 @@ def check_folder(name: str, folder: Path | None) -> None:
             pass
     except OSError:
         raise ValueError(f"{name} cannot be written: nothing may be written in {there}") from None
-
-
-# Hyperparameters that must be greater than zero
-POSITIVE = frozenset({"learning_rate", "temperature", "clip_range", "max_grad_norm"})
-SHARES = frozenset({"gamma", "gae_lambda", "tau", "explore_uniformly"})  # From 0 to 1
-# Least values of hyperparameters; -1 gradient steps are as many as there were steps of the environment
-LEAST: dict[str, float] = {
-    "gradient_steps": -1,
-    **dict.fromkeys(("learning_starts", "target_policy_noise", "target_noise_clip", "ent_coef"), 0),
-    **dict.fromkeys(("vf_coef", "top_quantiles_to_drop_per_net", "refinements", "checks", "refine"), 0),
-    **dict.fromkeys(("buffer_size", "batch_size", "train_freq", "n_steps", "n_epochs"), 1),
-    **dict.fromkeys(("policy_delay", "target_update_interval", "next_candidates", "nearest"), 1),
-    **dict.fromkeys(("width", "candidates", "per_refinement"), 1),
-    **dict.fromkeys(("explore_candidates", "labels", "instants"), 2),
-}
-
-
-def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> None:
-    """Check values against the type hints of a function or class, and numbers against their ranges.
-
-    The algorithms accept any number, and many a wrong one shows only as a training that does not learn.
-    """
-    # The hints of Stable-Baselines3 name VecEnv, which its modules import for type checkers only.
-    hinted: Any = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
-    hints = typing.get_type_hints(hinted, localns={"VecEnv": object})
-    for name, value in values.items():
-        number, hint = value.item() if isinstance(value, np.generic) else value, hints.get(name, Any)
-        try:
-            check_type(number, hint)
-        except TypeCheckError as error:
-            raise ValueError(f"{name} has a wrong type: {error}, got {value!r}") from None
-        if isinstance(number, bool) and bool not in (hint, *typing.get_args(hint)):
-            raise ValueError(f"{name} must be a number, got {value!r}")  # a bool counts as an int for Python
-        if name == "train_freq" and isinstance(number, tuple):
-            number, unit = number
-            if unit != "step":  # episodes end at different times in several environments
-                raise ValueError(f"{name} must count steps, got {value!r}")
-        if not is_number(number):
-            continue
-        if not math.isfinite(number):
-            raise ValueError(f"{name} must be finite, got {value!r}")
-        if name in POSITIVE and number <= 0:
-            raise ValueError(f"{name} must be greater than 0, got {value!r}")
-        if name in SHARES and not 0 <= number <= 1:
-            raise ValueError(f"{name} must be from 0 to 1, got {value!r}")
-        if number < LEAST.get(name, -math.inf):
-            raise ValueError(f"{name} must be {LEAST[name]:g} or more, got {value!r}")

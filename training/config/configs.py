@@ -5,14 +5,17 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import json
 import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args
 
 import numpy as np
 import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.registry import ARM_FILES, arm_names, arm_of
@@ -31,8 +34,77 @@ from viapoint.training.config.checks import (
     unknown_name,
 )
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of, usual_algorithm
-from viapoint.training.config.words import NamedValues, to_words
+from viapoint.training.io.files import parse_yaml
 from viapoint.training.planning.search import registered_task
+
+REGISTRY = ConstructorRegistry()  # Ways in which the command line reads numbers and paths
+# Name in helps and in errors of the types of values.
+KINDS = {
+    int: ("INT", "a whole number"),
+    float: ("FLOAT", "a number"),
+    Path: ("PATH", "a path"),
+    str: ("TEXT", ""),
+}
+
+
+@REGISTRY.primitive_rule
+def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Return the form of a number, path or text, or of one that may be left out."""
+    kinds = get_args(info.type) if info.type_origin in (Union, UnionType) else (info.type,)
+    kind: Any = next((each for each in KINDS if each in kinds), None)  # a path before a text
+    if kind is None or not set(kinds) <= {NoneType, *KINDS}:
+        return None
+    metavar, what = KINDS[kind]
+
+    def read(words: list[str]) -> Any:
+        try:
+            return kind(words[0])
+        except ValueError:
+            raise ValueError(f"must be {what}, got {words[0]!r}") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=read,
+        is_instance=lambda value: value is None or isinstance(value, kind),
+        str_from_instance=lambda value: ["none" if value is None else str(value)],
+    )
+
+
+def from_words(words: list[str]) -> dict[str, Any]:
+    """Return NAME=VALUE words as a dictionary; values are YAML, so that lists and settings by name have a form."""
+    values: dict[str, Any] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals or not name:
+            raise ValueError(f"must be NAME=VALUE, got {word!r}")
+        if name in values:
+            raise ValueError(f"{name} is there twice")
+        values[name] = parse_yaml(text)
+    return values
+
+
+def to_words(values: Mapping[str, Any]) -> list[str]:
+    """Return a dictionary as NAME=VALUE words; :func:`from_words` is the inverse."""
+    words = []
+    for name, value in values.items():
+        plain = isinstance(value, str) and parse_yaml(value) == value
+        words.append(f"{name}={value if plain else json.dumps(value)}")
+    return words
+
+
+# tyro reads a dictionary of one type of values only.
+NamedValues = Annotated[
+    dict[str, Any],
+    PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="NAME=VALUE",
+        instance_from_str=from_words,
+        is_instance=lambda value: isinstance(value, dict),
+        str_from_instance=to_words,
+    ),
+]
+"""Dictionary that the command line writes as NAME=VALUE NAME=VALUE ..."""
 
 
 def _listed(ids: Iterable[str]) -> str:
@@ -180,7 +252,6 @@ class TrainConfig(Config):
     def _check(self) -> None:
         if not isinstance(self.env, str):
             raise ValueError(f"env must be the id of an environment, got {self.env!r}")
-        check_registered(self.env)
         if self.algo is not None and self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
         check_env_kwargs(self.env_kwargs)
@@ -312,16 +383,14 @@ class EvaluateConfig(AgentConfig):
     unrevised (the first plan alone)."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
-    refine: tuple[int, ...] = ()
-    """Numbers of proposals that the planner refines, one further row each."""
+    refine: tuple[int, ...] = ()  # Numbers of proposals that the planner refines, one further row each.
     scenes: str = "test"
     """Scene set: validation, test, hard, uniform, or a scene file; motionbenchmaker for the problems of that benchmark,
     on which planners are measured: straight, plan_motion, plan_motion+ompl, ompl, search512."""
     problems: Path | None = None
     """Folder of MotionBenchMaker's own files, in place of the problems that are shipped."""
     n_scenes: int | None = None  # Number of scenes, evenly spread over the set; all if not given.
-    format: Format = "table"
-    """Form in which the table is printed: for the terminal, Markdown, CSV or JSON."""
+    format: Format = "table"  # Form in which the table is printed: for the terminal, Markdown, CSV or JSON.
     json: Path | None = None  # JSON file for all results, scene by scene.
 
     @property
@@ -392,7 +461,6 @@ class RecordConfig(AgentConfig):
         super()._check()
         if self.agent is None:
             raise ValueError("name an agent (run folder, model folder or id), or a baseline such as random")
-        check_env_kwargs(self.env_kwargs)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -405,8 +473,7 @@ class PlanConfig(Config):
     arm: str = "panda"  # Name of an arm, or MJCF or URDF file of one.
     start: tuple[float, ...] = ()
     """Joint positions at the start, [rad]; by default those of the scene file, or home."""
-    goal: tuple[float, ...] = ()
-    """Joint positions at the goal, [rad]; by default those of the scene file."""
+    goal: tuple[float, ...] = ()  # Joint positions at the goal, [rad]; by default those of the scene file.
     position: tuple[float, ...] = ()
     """Place of the tool at the goal, x y z, [m], in place of joint positions."""
     quaternion: tuple[float, ...] = ()  # Orientation of the tool there, w x y z; any if not given.
@@ -417,8 +484,7 @@ class PlanConfig(Config):
     """Names of its joints from the base to the tool; by default all of the chain."""
     base: str = ""  # Body that the chain begins at, where a file has two arms.
     packages: tuple[Path, ...] = ()  # Folders for package:// in a URDF.
-    velocity_limit: float | None = None
-    """Velocity limit of its joints, [rad/s]; by default that of the file."""
+    velocity_limit: float | None = None  # Velocity limit of its joints, [rad/s]; by default that of the file.
     n_via: int = 2  # Number of via-points, 1 to 3.
     margin: float = 0.0  # Least clearance, [m].
     duration: float | None = None  # Duration, [s]; by default the shortest that the limits allow.
@@ -431,7 +497,6 @@ class PlanConfig(Config):
     force: bool = False  # True to write plans that touch something, too.
 
     def _check(self) -> None:
-        super()._check()
         check_file("video", self.video, ".mp4")
         if self.out is not None and self.out.suffix not in MOTION_FILES:
             raise ValueError(f"out must end in {' or '.join(MOTION_FILES)}, got {self.out}")
@@ -509,11 +574,9 @@ class DemoConfig(Config):
     out: Path = Path("runs/demo")  # Folder for all files; existing results are kept.
     env: Annotated[str, ENV] = DEFAULT_ENV  # Id of the environment.
     n_timesteps: int | None = None  # Decisions in total; default: a quarter of those of the preset.
-    n_scenes: int | None = None
-    """Number of test scenes, evenly spread over the set; all if not given."""
+    n_scenes: int | None = None  # Number of test scenes, evenly spread over the set; all if not given.
 
     def _check(self) -> None:
-        check_registered(self.env)
         if not registered_task(self.env).whole_movement:
             raise ValueError(f"env must have whole movements as actions, as {DEFAULT_ENV}, got {self.env!r}")
         check_folder(f"out {self.out}", self.out)

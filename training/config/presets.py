@@ -17,7 +17,7 @@ Algorithm = Literal["viaq", "viarank", "sac", "td3", "ppo", "tqc"]
 class Preset:
     """Default settings of an algorithm."""
 
-    policy: str  # Name of the policy
+    policy: str = "MultiInputPolicy"  # Name of the policy
     n_envs: int = 64  # Environments that are stepped together
     n_timesteps: int  # Decisions in total
     eval_every: int = 1_000  # Decisions between two evaluations on the validation scenes
@@ -29,10 +29,15 @@ class Preset:
         return copy.deepcopy(dict(self.hyperparameters))
 
 
-def _preset(n_timesteps: int, policy: str = "MultiInputPolicy", **values: Any) -> Preset:
-    """Return a preset from its fields and hyperparameters."""
-    fields = {name: values.pop(name) for name in ("eval_every", "checkpoint_every") if name in values}
-    return Preset(policy=policy, n_timesteps=n_timesteps, **fields, hyperparameters=values)
+def _changed(preset: Preset, n_timesteps: int, **hyperparameters: Any) -> Preset:
+    """Return a preset with another number of decisions and some other hyperparameters."""
+    changed = {**preset.hyperparameters, **hyperparameters}
+    return dataclasses.replace(preset, n_timesteps=n_timesteps, hyperparameters=changed)
+
+
+def _falling(start: float, end: float) -> dict[str, Any]:
+    """Return a learning rate that falls linearly in the course of a training."""
+    return {"kind": "linear", "start": start, "end": end, "end_fraction": 1.0}
 
 
 _NETWORK: dict[str, Any] = {
@@ -49,75 +54,67 @@ _OFF_POLICY: dict[str, Any] = {
     "gradient_steps": 16,
     "policy_kwargs": _NETWORK,
 }
-_LITTLE_ENTROPY = "auto_0.02"  # rewards are of order one, and the usual 1 outweighs them
 _STEP_WISE: dict[str, Any] = {**_OFF_POLICY, "learning_starts": 4096, "gamma": 0.98}
+_LITTLE_ENTROPY = {"ent_coef": "auto_0.02"}  # rewards are of order one, and the usual 1 outweighs them
+_NOISE = {"action_noise": {"kind": "normal", "sigma": 0.2}}
 _SELDOM: dict[str, Any] = {"eval_every": 10_000, "checkpoint_every": 50_000}
+_OWN: dict[str, Any] = {"n_timesteps": 40_000, "eval_every": 5_000, "checkpoint_every": 20_000}
 
+# Presets by the names of algorithms on the command line
 PRESETS: dict[str, Preset] = {
-    "viaq": _preset(
-        40_000,
-        "ViaQPolicy",  # its defaults are its settings
-        eval_every=5_000,
-        checkpoint_every=20_000,
-        learning_starts=4096,
-        learning_rate={"kind": "linear", "start": 3e-3, "end": 3e-5, "end_fraction": 1.0},
+    # The defaults of the own policies are their settings.
+    "viaq": Preset(
+        policy="ViaQPolicy",
+        hyperparameters={"learning_starts": 4096, "learning_rate": _falling(3e-3, 3e-5)},
+        **_OWN,
     ),
-    "viarank": _preset(
-        40_000,
-        "ViaRankPolicy",  # its defaults are its settings
-        eval_every=5_000,
-        checkpoint_every=20_000,
-        learning_rate={"kind": "linear", "start": 2e-3, "end": 2e-5, "end_fraction": 1.0},
+    "viarank": Preset(
+        policy="ViaRankPolicy", hyperparameters={"learning_rate": _falling(2e-3, 2e-5)}, **_OWN
     ),
-    "sac": _preset(40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
-    "td3": _preset(40_000, **_OFF_POLICY, action_noise={"kind": "normal", "sigma": 0.2}),
-    "tqc": _preset(40_000, **_OFF_POLICY, ent_coef=_LITTLE_ENTROPY),
-    "ppo": _preset(
-        400_000,
+    "sac": Preset(n_timesteps=40_000, hyperparameters={**_OFF_POLICY, **_LITTLE_ENTROPY}),
+    "td3": Preset(n_timesteps=40_000, hyperparameters={**_OFF_POLICY, **_NOISE}),
+    "tqc": Preset(n_timesteps=40_000, hyperparameters={**_OFF_POLICY, **_LITTLE_ENTROPY}),
+    "ppo": Preset(
+        n_timesteps=400_000,
+        hyperparameters={
+            "learning_rate": _falling(1e-3, 1e-5),
+            "n_steps": 16,
+            "batch_size": 256,
+            "n_epochs": 10,
+            "ent_coef": 0.001,
+            "policy_kwargs": _NETWORK,
+        },
         **_SELDOM,
-        learning_rate={"kind": "linear", "start": 1e-3, "end": 1e-5, "end_fraction": 1.0},
-        n_steps=16,
-        batch_size=256,
-        n_epochs=10,
-        ent_coef=0.001,
-        policy_kwargs=_NETWORK,
     ),
 }
-"""Presets by the names of algorithms on the command line."""
 
+# Presets of tasks in which an action lasts one control step, which counts as a decision
 STEP_PRESETS: dict[str, Preset] = {
-    "sac": _preset(200_000, **_SELDOM, **_STEP_WISE, ent_coef=_LITTLE_ENTROPY),
-    "td3": _preset(200_000, **_SELDOM, **_STEP_WISE, action_noise={"kind": "normal", "sigma": 0.2}),
-    "tqc": _preset(200_000, **_SELDOM, **_STEP_WISE, ent_coef=_LITTLE_ENTROPY),
-    "ppo": _preset(
-        2_000_000,
+    "sac": Preset(n_timesteps=200_000, hyperparameters={**_STEP_WISE, **_LITTLE_ENTROPY}, **_SELDOM),
+    "td3": Preset(n_timesteps=200_000, hyperparameters={**_STEP_WISE, **_NOISE}, **_SELDOM),
+    "tqc": Preset(n_timesteps=200_000, hyperparameters={**_STEP_WISE, **_LITTLE_ENTROPY}, **_SELDOM),
+    "ppo": Preset(
+        n_timesteps=2_000_000,
         eval_every=50_000,
         checkpoint_every=200_000,
-        learning_rate={"kind": "linear", "start": 1e-3, "end": 1e-5, "end_fraction": 1.0},
-        n_steps=64,
-        batch_size=512,
-        n_epochs=5,
-        gamma=0.98,
-        ent_coef=0.0,
-        policy_kwargs=_NETWORK,
+        hyperparameters={
+            "learning_rate": _falling(1e-3, 1e-5),
+            "n_steps": 64,
+            "batch_size": 512,
+            "n_epochs": 5,
+            "gamma": 0.98,
+            "ent_coef": 0.0,
+            "policy_kwargs": _NETWORK,
+        },
     ),
 }
-"""Presets of tasks in which an action lasts one control step, which counts as a decision."""
 
 # Presets of tasks without obstacles, which need fewer decisions
-REACH_PRESETS: dict[str, Preset] = {"viaq": dataclasses.replace(PRESETS["viaq"], n_timesteps=8_000)}
-
-REPLANNING_PRESETS: dict[str, Preset] = {
-    "viaq": dataclasses.replace(
-        PRESETS["viaq"],
-        n_timesteps=24_000,
-        hyperparameters={**PRESETS["viaq"].hyperparameters, "gradient_steps": 6, "next_candidates": 4},
-    )
-}
-"""Presets of replanning tasks."""
-JOINT_DECISIONS = 16_000  # decisions in joint space, where one costs several times as much
-
-
+REACH_PRESETS = {"viaq": _changed(PRESETS["viaq"], 8_000)}
+# Presets of replanning tasks
+REPLANNING_PRESETS = {"viaq": _changed(PRESETS["viaq"], 24_000, gradient_steps=6, next_candidates=4)}
+JOINT_DECISIONS = 16_000  # Decisions in joint space, where one costs several times as much
+# Settings of viarank in joint space, where the arm has many more places in a movement
 JOINT_SIGHT: dict[str, Any] = {
     "batch_size": 32,
     "labels": 16,
@@ -125,7 +122,6 @@ JOINT_SIGHT: dict[str, Any] = {
     "gradient_steps": 6,
     "policy_kwargs": {"instants": 16, "nearest": 48, "candidates": 128, "refine": 4},
 }
-"""Settings of viarank in joint space, where the arm has many more places in a movement."""
 
 
 def usual_algorithm(task: Task) -> Algorithm:
@@ -143,8 +139,7 @@ def preset_of(task: Task, algo: Algorithm) -> Preset:
     elif not task.n_obstacles[1]:
         preset = REACH_PRESETS.get(algo, preset)
     if algo == "viaq" and not task.space.of_hand:
-        preset = dataclasses.replace(preset, n_timesteps=min(preset.n_timesteps, JOINT_DECISIONS))
+        return _changed(preset, min(preset.n_timesteps, JOINT_DECISIONS))
     if algo == "viarank" and not task.space.of_hand:
-        settings = {**preset.hyperparameters, **JOINT_SIGHT}
-        preset = dataclasses.replace(preset, n_timesteps=JOINT_DECISIONS, hyperparameters=settings)
+        return _changed(preset, JOINT_DECISIONS, **JOINT_SIGHT)
     return preset

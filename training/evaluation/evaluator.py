@@ -17,7 +17,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.outcome import Outcome
-from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import NEVER, Scenes
 from viapoint.training.agents.agent import load_agent
 from viapoint.training.agents.model_io import untrained
@@ -29,13 +28,12 @@ from viapoint.training.planning.baselines import (
     Method,
     OpenLoopBaseline,
     agent_method,
-    check_method,
     make_method,
 )
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults, whole_task
 from viapoint.training.rollouts.vec_env import env_arguments
-from viapoint.training.scene_sets.scene_set import BANDS, DRAWN, FrozenScenes, scenes_for
+from viapoint.training.scene_sets import BANDS, DRAWN, FrozenScenes, scenes_for
 
 Progress = Callable[[str, int, int], None]  # Method's name, scenes done, all scenes
 
@@ -49,22 +47,17 @@ class MethodResult:
     """Outcomes of one method in the first n of N scenes."""
 
     name: str
-    outcomes: Mapping[str, NDArray[Any]]
-    """Scalars of the environment's info by name, shape (n,) each."""
-    actions: Float
-    """Actions, shape (n, m)."""
+    outcomes: Mapping[str, NDArray[Any]]  # Scalars of the environment's info by name, shape (n,) each
+    actions: Float  # Actions, shape (n, m)
     decision_times: Float
     """Wall times of single decisions, [s]; one number, the mean of a batch, for a slow method."""
-    band: NDArray[np.int64]
-    """Index into BANDS of each scene, -1 if the share is unknown, shape (n,)."""
-    family: NDArray[np.str_]
-    """Scene family of each scene, '' for the training distribution, shape (n,)."""
+    band: NDArray[np.int64]  # Index into BANDS of each scene, -1 if the share is unknown, shape (n,)
+    family: NDArray[np.str_]  # Scene family of each scene, '' for the training distribution, shape (n,)
     distance: Float
     """Distance from start to goal, shape (n,), [m]; NaN if the target jumps, as the shortest path is unknown."""
     interrupted: bool
     """Mark of an evaluation that Ctrl-C ended; decision times, and scenes if it is partial, are missing."""
-    partial: bool
-    """Mark of an evaluation that was interrupted before the last scene."""
+    partial: bool  # Mark of an evaluation that was interrupted before the last scene
 
     @property
     def success(self) -> NDArray[np.bool_]:
@@ -228,24 +221,21 @@ def evaluate(
         agent = load_agent(agent)
     env_id, kwargs = _environment_of(agent, env, env_kwargs)
     task = registered_task(env_id, **kwargs)
-    for each in baselines:
-        if isinstance(each, str) and not (each == "untrained" and isinstance(agent, BaseAlgorithm)):
-            check_method(each, task)
-    frozen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(scenes, task, n_scenes)
-    chosen = frozen.spread(n_scenes)
-    if n_scenes is not None and n_scenes > len(chosen.share):
-        print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
     methods = _rows_of(agent, settings)
     for each in baselines:
         if not isinstance(each, str):
             methods.append(each)
         elif each == "untrained" and isinstance(agent, BaseAlgorithm):
             methods += _rows_of(untrained(agent), settings, each)
-        elif each == "unrevised" and isinstance(agent, BaseAlgorithm):
+        elif each == "unrevised" and isinstance(agent, BaseAlgorithm) and task.replanning:
             first = agent_method("agent", agent, checks=0 if settings[0] else None)
             methods.append(OpenLoopBaseline(first, SceneSimulation(env_id, 250, **kwargs)))
         else:
             methods.append(make_method(each, env_id, **kwargs))
+    frozen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(scenes, task, n_scenes)
+    chosen = frozen.spread(n_scenes)
+    if n_scenes is not None and n_scenes > len(chosen.share):
+        print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
     return evaluate_methods(
         methods, chosen, env_id, env_kwargs=kwargs, time_decisions=time_decisions, progress=progress
     )
@@ -258,7 +248,6 @@ def _environment_of(
     if not isinstance(agent, BaseAlgorithm):
         if env is None:
             raise ValueError("env must be the id of an environment where no trained agent is given")
-        check_registered(env)
         return env, whole_task(env, env_kwargs or {})
     mine, kwargs = env_arguments(agent.get_env())
     if env not in (None, mine):
@@ -373,11 +362,11 @@ def _decision_times(method: Method, scenes: Scenes, simulation: SceneSimulation,
             if replanning:
                 alone.episodes(one, decided, decide)
             usual = float(np.median(times[1:] or [times[0] / 20.0]))  # the first may warm up
-            if usual > SLOW_DECISION:
+            if usual > SLOW_DECISION:  # a look at each scene would take too long
                 return np.array([in_batch])
             if len(times) > TIMED_DECISIONS or time.perf_counter() - began > TIMING_BUDGET:
                 break
-    return np.array(times[1:] or times)
+    return np.array(times[1:] or times)  # without the first one, which may warm up
 
 
 @contextmanager

@@ -12,10 +12,11 @@ import pandas as pd
 
 from viapoint.training.config.configs import Format
 from viapoint.training.io.files import MARK, write_bytes, write_json
-from viapoint.training.scene_sets.scene_set import BANDS
+from viapoint.training.scene_sets import BANDS
 
 Record = Mapping[str, Any]  # Result of `EvaluationResult.to_dict`, or the content of its file
 
+# Metric, scale and number of digits of the columns of numbers, by heading
 NUMBERS = {
     "clearance [mm]": ("min_clearance", 1e3, 1),
     "goal error [mm]": ("goal_error", 1e3, 2),
@@ -25,7 +26,6 @@ NUMBERS = {
     "decision [ms]": ("decision_time", 1e3, 2),
     "98 % of them [ms]": ("decision_time_98", 1e3, 2),
 }
-"""Metric, scale and number of digits of the columns of numbers, by heading."""
 NOTES = (
     "Success: arrived at rest within 1 cm, no contact at any physics step, joint limits kept; with its 95 % "
     "Wilson interval. Share: success among scenes of that solution share, the fraction of random actions "

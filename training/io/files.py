@@ -78,7 +78,7 @@ def write_bytes(path: Path, content: bytes) -> None:
         with temporary.open("wb") as file:
             file.write(content)
             file.flush()
-            os.fsync(file.fileno())
+            os.fsync(file.fileno())  # a rename may reach the disk before the content
         temporary.replace(path)
         _sync_folder(path.parent)
     except BaseException as error:
@@ -104,14 +104,12 @@ def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
     try:
         fill(temporary)
         _sync_folder(temporary)
+        outdated = path.with_name(f".{path.name}.{uuid.uuid4().hex}.old")
         if path.exists():
             _check_replaceable(path, {each.name for each in temporary.iterdir()})
-            outdated = path.with_name(f".{path.name}.{uuid.uuid4().hex}.old")
             path.rename(outdated)
-            temporary.rename(path)
-            shutil.rmtree(outdated, ignore_errors=True)
-        else:
-            temporary.rename(path)
+        temporary.rename(path)
+        shutil.rmtree(outdated, ignore_errors=True)  # there is none of a new folder
         _sync_folder(path.parent)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)

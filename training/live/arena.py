@@ -21,8 +21,9 @@ from viapoint.envs.geometry.obstacles import KINDS, pack
 from viapoint.training.agents.agent import Agent
 from viapoint.training.live.state import Scene, State
 from viapoint.training.paper.movements import TARGETS, rows_of_lights
+from viapoint.training.planning.baselines import AgentMethod
 from viapoint.training.planning.search import registered_task
-from viapoint.training.scene_sets.scene_set import load, shipped_set
+from viapoint.training.scene_sets import load, shipped_set
 
 MOTION, AGENT, SEARCH = "motion planner", "agent", "geometry search"
 STRAIGHT, OMPL, HAND = "straight movement", "OMPL", "by hand"  # Names of methods
@@ -92,12 +93,8 @@ class Arena:
 
     def act(self, observation: Observation, checks: int = 0) -> Float:
         """Return the action that the agent chooses, shape (1, m)."""
-        agent: Any = self.agent
         with _agent_lock:
-            if hasattr(agent.policy, "checks"):
-                agent.policy.checks = checks
-            actions, _ = agent.predict(observation, deterministic=True)
-        return np.asarray(actions, dtype=np.float64)
+            return AgentMethod(AGENT, self.agent, checks).decide(observation)
 
     def propose(self, problem: Any) -> tuple[Float, Float]:
         """Return the candidates of the agent in one problem, shape (N, m), and its values of them, shape (N,)."""

@@ -74,7 +74,7 @@ class Tab:
         kind = name, *(value for value in values if isinstance(value, str)), *changes
         job = functools.partial(getattr(self, name), *values, **changes)
         with self._wake:
-            self._jobs.pop(kind, None)
+            self._jobs.pop(kind, None)  # the new one goes to the end of the line
             self._jobs[kind] = time.perf_counter(), job
             self._wake.notify()
 
@@ -122,7 +122,7 @@ class Tab:
                 self._wake.wait(patience)
             self._busy = True
             if self._jobs:
-                self._posted, job = self._jobs.pop(next(iter(self._jobs)))
+                self._posted, job = self._jobs.pop(next(iter(self._jobs)))  # the oldest one
                 return job
             if playing:
                 return self._advance
@@ -203,7 +203,7 @@ class Tab:
         state, scene, arena = self.state, self.state.scene, self.arena
         if kind == "start":
             self.change(scene=scene._replace(start=arena.moved(scene.start, place, scene)), by_hand=None)
-        elif kind == "goal" and state.playing and arena.task.replanning:
+        elif kind == "goal" and state.playing and arena.task.replanning:  # the running movement follows it
             goal = arena.moved(scene.goal, place, None)
             if not arena.task.space.inside(goal):
                 raise ValueError("the goal would be out of the arm's reach")

@@ -28,12 +28,12 @@ CODE = (
     '<button onclick="navigator.clipboard.writeText(this.previousElementSibling.textContent)">Copy</button>'
 )
 LINE = {"width": 2, "points": {"show": False}}
+# Lines of the plots
 LINES: Any = (
     {"label": "time"},
     {**LINE, "label": "plan", "stroke": to_hex(PALETTE.plan)},
     {**LINE, "label": "executed", "stroke": to_hex(PALETTE.executed), "dash": (6, 5)},
 )
-"""Lines of the plots."""
 
 
 class Panels:

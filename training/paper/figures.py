@@ -17,12 +17,11 @@ from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import unpack
 from viapoint.training.io.files import MARK
-from viapoint.training.paper import movements
+from viapoint.training.paper import double_step, movements, one_via, point_to_point
 from viapoint.training.paper.movements import TARGETS, Profile, curved, passage_share, simulate, straight
-from viapoint.training.paper.rows import alternatives, double_step, one_via
-from viapoint.training.paper.rows.obstacles import ObstacleMovements, features
-from viapoint.training.paper.rows.one_via import ENDS
-from viapoint.training.paper.rows.straight import DIAGONALS, DURATION, diagonals
+from viapoint.training.paper.obstacles import ObstacleMovements, features
+from viapoint.training.paper.one_via import ENDS
+from viapoint.training.paper.point_to_point import DIAGONALS, DURATION, diagonals
 
 WIDTH = 8.5  # Width of a column, [cm]
 STYLE = Path(__file__).with_name("paper.mplstyle")  # Matplotlib's style of all figures
@@ -326,7 +325,7 @@ def orders_and_spaces() -> Figure:
     time = np.linspace(0.0, 1.0, 401)
     for order, colour, width in ((2, THIRD, 1.2), (3, PALETTE.plan, 2.2), (4, SECOND, 1.2)):
         movement = straight("T1", "T4", 1.0, order=order)
-        style = {"color": colour, "linewidth": width, "label": alternatives.PEAKS[order][0]}
+        style = {"color": colour, "linewidth": width, "label": point_to_point.PEAKS[order][0]}
         for ax, nu in zip(axes[0], (1, 2), strict=True):
             ax.plot(time, movement(time, nu)[:, 0] / 0.4, **style)
     axes[0, 0].axhspan(1.805 - 0.153, 1.805 + 0.153, color="0.9", zorder=0)
@@ -337,7 +336,7 @@ def orders_and_spaces() -> Figure:
     axes[0, 1].legend(title="least", loc="upper right", handlelength=1.2)
     for ax, motion in (
         (axes[1, 0], simulate(diagonals())),
-        (axes[1, 1], alternatives.joint_space(DIAGONALS)),
+        (axes[1, 1], point_to_point.joint_space(DIAGONALS)),
     ):
         plane(ax)
         for planned, hand in zip(motion.planned, motion.hand, strict=True):
@@ -349,15 +348,15 @@ def limits() -> Figure:
     """Draw a repetitive movement, and torques at the limit and beyond."""
     figure, axes = sheet(2, 2, 8.0)
     (repetitive, both), torques = axes
-    motion = simulate(alternatives.swings())
+    motion = simulate(point_to_point.swings())
     cycles = np.linspace(3.0, 5.0, 201)
-    relative = alternatives.relative_swing_speed(motion)
-    repetitive.plot(motion.time / alternatives.SWING, relative, **MODEL, label="least jerk, arm")
+    relative = point_to_point.relative_swing_speed(motion)
+    repetitive.plot(motion.time / point_to_point.SWING, relative, **MODEL, label="least jerk, arm")
     repetitive.plot(cycles, np.pi / 2 * np.abs(np.sin(np.pi * cycles)), label="sinusoid", **ARM)
-    repetitive.set(xlabel="half cycles", ylabel=r"$T\;t_f/A$", xlim=(0, alternatives.SWINGS), ylim=(0, 2.5))
+    repetitive.set(xlabel="half cycles", ylabel=r"$T\;t_f/A$", xlim=(0, point_to_point.SWINGS), ylim=(0, 2.5))
     repetitive.legend(loc="upper right", ncols=1)
-    fastest = alternatives.torque_limited()
-    for ax, factor, dashes in zip(torques, (1.0, alternatives.HURRY), ("-", (0, (2, 1))), strict=True):
+    fastest = point_to_point.torque_limited()
+    for ax, factor, dashes in zip(torques, (1.0, point_to_point.HURRY), ("-", (0, (2, 1))), strict=True):
         motion = simulate(fastest.stretched(factor * fastest.duration))
         path(both, motion.hand[0], **{**ARM, "linestyle": dashes})
         for joint, (name, colour) in enumerate(JOINTS):
@@ -370,7 +369,7 @@ def limits() -> Figure:
     torques[0].legend(loc="upper right", handlelength=1.2)
     plane(both, names=("T3", "T6"))
     both.annotate("at the\nlimit", (-16.0, 38.0), ha="right", fontsize=6.0)
-    both.annotate(f"in {alternatives.HURRY} of\nthe time", (-4.0, 46.0), fontsize=6.0)
+    both.annotate(f"in {point_to_point.HURRY} of\nthe time", (-4.0, 46.0), fontsize=6.0)
     return figure
 
 

@@ -18,29 +18,29 @@ from viapoint.training.config.configs import PaperConfig
 from viapoint.training.evaluation.evaluator import one_thread
 from viapoint.training.io.files import MARK, check_ours, versions, write_bytes, write_json
 from viapoint.training.io.progress import progress_bar
-from viapoint.training.paper import figures
+from viapoint.training.paper import double_step, figures, obstacles, one_via, point_to_point
 from viapoint.training.paper.claim import Claim, Number
-from viapoint.training.paper.rows import alternatives, double_step, obstacles, one_via, straight
-from viapoint.training.paper.rows.one_via import ENDS, FAST, SLOW, THREE_POINTS
+from viapoint.training.paper.one_via import ENDS, FAST, SLOW, THREE_POINTS
 
+# Titles and functions of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991
 ROWS: dict[int, tuple[str, Callable[..., list[Claim]]]] = {
-    1: ("Point to point", straight.point_to_point_claims),
-    2: ("Invariance of hand paths", straight.invariance_claims),
-    3: ("Joints and torques", straight.joint_claims),
+    1: ("Point to point", point_to_point.point_to_point_claims),
+    2: ("Invariance of hand paths", point_to_point.invariance_claims),
+    3: ("Joints and torques", point_to_point.joint_claims),
     4: ("Free passage time", one_via.passage_claims),
     5: ("Speed valley and curvature", one_via.valley_claims),
     6: ("Place of the via-point", one_via.place_claims),
     7: ("Isochrony", one_via.isochrony_claims),
     8: ("Scaling with time", one_via.scaling_claims),
-    9: ("Alternatives to minimum jerk", alternatives.alternative_claims),
-    10: ("Repetitive and performance-limited movements", alternatives.limit_claims),
+    9: ("Alternatives to minimum jerk", point_to_point.alternative_claims),
+    10: ("Repetitive and performance-limited movements", point_to_point.limit_claims),
     11: ("The primer and its replanned version", double_step.replanning_claims),
     12: ("Obstacle avoidance", obstacles.obstacle_claims),
     13: ("A target that jumps on the way (Flash & Henis 1991)", double_step.double_step_claims),
 }
-"""Titles and functions of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991."""
 
 
+# Captions and functions of the figures by their file names, in the order of the paper
 DRAWINGS: dict[str, tuple[str, Callable[..., Figure]]] = {
     "fig01_model": ("The model (Fig. 1). A: straight movement, speed T relative to its peak V_M. B: through a "
         "via-point; path with d1, d2, d3, speed, curvature C (valley of the speed dotted) and velocities.",
@@ -79,7 +79,6 @@ DRAWINGS: dict[str, tuple[str, Callable[..., Figure]]] = {
         "plan's and greatest distance from it, for three durations of the second movement. D: peak speeds.",
         figures.comparison),
 }  # fmt: skip
-"""Captions and functions of the figures by their file names, in the order of the paper."""
 # Functions of them that take the movements around obstacles
 AROUND_LIGHTS = (obstacles.obstacle_claims, figures.around_lights, figures.isochrony)
 

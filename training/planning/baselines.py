@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,7 +20,7 @@ from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl
 from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
 from viapoint.training.planning.search import GeometrySearch, registered_task
-from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults, StepAgentMethod
+from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
 from viapoint.training.rollouts.vec_env import env_arguments
 
 
@@ -57,7 +57,7 @@ class RandomVias:
 
     def __init__(self, simulation: SceneSimulation, count: int) -> None:
         self._simulation, self._count = simulation, count
-        self._generator = np.random.default_rng(0)
+        self._generator = np.random.default_rng(0)  # the same actions in every evaluation
         self.name = "random" if count == 1 else f"random{count}"
 
     @functools.cached_property
@@ -71,7 +71,7 @@ class RandomVias:
         actions = self._generator.uniform(-1.0, 1.0, (number, self._count, size))
         if self._count == 1:
             return actions[:, 0]
-        every = scenes.take(np.repeat(np.arange(number), self._count))
+        every = scenes.take(np.repeat(np.arange(number), self._count))  # each scene with each action
         simulation = self._for_one_scene if number == 1 else self._simulation
         reward = simulation(every, actions.reshape(-1, size)).reward.reshape(number, self._count)
         return np.asarray(actions[np.arange(number), reward.argmax(axis=-1)])
@@ -163,7 +163,7 @@ class AgentMethod:
         given = {"checks": checks, "refine": refine}
         self._settings = {name: number for name, number in given.items() if number is not None}
 
-    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+    def decide(self, observation: Observation, scenes: Any = None) -> Float:
         """Return actions of the agent, see :class:`Method`; the scenes are unused."""
         policy = self._model.policy
         own = {name: getattr(policy, name) for name in self._settings if hasattr(policy, name)}
@@ -175,6 +175,29 @@ class AgentMethod:
             for name, number in own.items():
                 setattr(policy, name, number)
         return np.asarray(actions, dtype=np.float64)
+
+
+class StepAgentMethod:
+    """Trained agent that acts in every control step, in environments of its own.
+
+    A decision is the first action; the others follow during the simulation. The decision time is that of one control
+    step, of which a movement has about twenty.
+    """
+
+    def __init__(self, name: str, model: Any, env_id: str, env_kwargs: Mapping[str, Any]) -> None:
+        self.name, self._model = name, model
+        self._simulation = SceneSimulation(env_id, 250, **env_kwargs)
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """Return actions for the next step, shape (N, D), from observations of the step-wise task or its twin."""
+        if "time_left" not in observation or "remaining" in observation:  # that of the twin
+            observation = self._simulation.observe(scenes)
+        actions, _ = self._model.predict(observation, deterministic=True)
+        return np.asarray(actions, dtype=np.float64)
+
+    def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
+        """Play every episode to its end, beginning with the given actions."""
+        return self._simulation.episodes(scenes, decisions, self.decide)
 
 
 def agent_method(name: str, model: Any, checks: int | None = None, refine: int | None = None) -> Method:
@@ -237,11 +260,6 @@ REPLANNING_METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "random": lambda simulation: RandomVias(simulation, 1),
     "unrevised": lambda simulation: OpenLoopBaseline(Straight(simulation), simulation),
 }
-
-
-def check_method(name: str, task: Task) -> None:
-    """Check that a baseline of this name exists for a task."""
-    factory(name, task)
 
 
 def make_method(name: str, env_id: str, **kwargs: Any) -> Method:

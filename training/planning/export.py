@@ -54,7 +54,6 @@ def write_motion(
     form = _form(path)
     motion = plan.joints(rate, force=force)
     names = plan.arm.joint_names
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, (_table(names, motion) if form == "csv" else _message(names, motion)).encode())
     return motion
 

@@ -165,7 +165,8 @@ class MotionPlan:
         self.refuse_unsafe(force)
         if self.velocity.any() or self.acceleration.any():
             raise ValueError("a movement that begins in motion cannot be executed from rest")
-        return execute_plans([self])
+        outcome, _ = execute_plans([self])
+        return outcome
 
     def refuse_unsafe(self, force: bool) -> None:
         """Raise UnsafePlanError for a plan without success, unless `force` is True."""
@@ -179,16 +180,12 @@ def joint_motion(space: Space, position: Float, velocity: Float, acceleration: F
     return Motion(*(np.ascontiguousarray(part[0]) for part in motion))
 
 
-def execute_plans(plans: Sequence[MotionPlan]) -> Outcome:
-    """Execute plans of one arm in MuJoCo, each among its obstacles, and return the metrics, shape (N,) each.
+def execute_plans(plans: Sequence[MotionPlan]) -> tuple[Outcome, Episodes]:
+    """Execute plans of one arm in MuJoCo, each among its obstacles.
 
-    All plans must have equally many via-points; plans without success are executed, too.
+    All plans must have equally many via-points; plans without success are executed, too. The results are the metrics,
+    shape (N,) each, and the simulations, which hold the records of the movements until the next ones.
     """
-    return executed(plans)[0]
-
-
-def executed(plans: Sequence[MotionPlan]) -> tuple[Outcome, Episodes]:
-    """Return the metrics of :func:`execute_plans`, and the simulations, which hold the records until the next ones."""
     first, number = plans[0], len(plans)
     rows = max(plan.obstacles.kind.shape[1] for plan in plans)
     episodes = _episodes(first.arm, first.space, len(first.durations) - 1, rows, number)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.kinematics import Spheres
+from viapoint.envs.arms.spheres import grouped
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, place
@@ -377,13 +378,6 @@ def _some_groups(arm: Arm, wanted: tuple[bool, ...]) -> Spheres:
     """Return some groups of spheres of an arm, the last one if none is wanted, so that no table is empty."""
     spheres = arm.spheres
     kept = np.flatnonzero(wanted) if any(wanted) else np.array([len(wanted) - 1])
-    rows = np.concatenate([np.arange(spheres.first[group], spheres.first[group + 1]) for group in kept])
-    return Spheres(
-        centre=spheres.centre[rows],
-        radius=spheres.radius[rows],
-        first=np.concatenate(([0], np.cumsum(np.diff(spheres.first)[kept]))),
-        link=spheres.link[kept],
-        ball_centre=spheres.ball_centre[kept],
-        ball_radius=spheres.ball_radius[kept],
-        pairs=np.zeros((0, 2), np.int64),
-    )
+    some = [slice(spheres.first[group], spheres.first[group + 1]) for group in kept]
+    centres = [spheres.centre[rows] for rows in some]
+    return grouped(centres, [spheres.radius[rows] for rows in some], spheres.link[kept].tolist(), ())

@@ -1,20 +1,33 @@
-"""Figures of a training and of an evaluation."""
+"""Figures of trainings, evaluations and studies, and of fits to measured movements."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import matplotlib.style
 import numpy as np
 from matplotlib.figure import Figure
 
+from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
+from viapoint.primitives import ViaPointFit
 from viapoint.training.io.files import MARK
-from viapoint.training.scene_sets.scene_set import BANDS
+from viapoint.training.scene_sets import BANDS
 
 BLUE = "#1f5fa8"
 DOTS_PER_INCH = 130
+STYLE = files("viapoint.training") / "paper" / "paper.mplstyle"  # Style of figures in centimetres
+WIDTH, HEIGHT, LEGEND = 17.0, 5.4, 0.7  # Of a figure of fits, each movement, the legend, [cm]
+# Style of the fit: a wide light line below the samples
+FITTED: dict[str, Any] = {"color": PALETTE.plan, "linewidth": 2.2, "label": "fitted"}
+POINT: dict[str, Any] = {"linestyle": "none", "markeredgecolor": "white", "markeredgewidth": 0.6}
+SAMPLES: dict[str, Any] = {"color": PALETTE.executed, "linestyle": "none", "marker": ".", "markersize": 1.8}
+VIA: dict[str, Any] = {**POINT, "color": PALETTE.via, "marker": "o", "markersize": 6.0, "label": "via-points"}
+START: dict[str, Any] = {**POINT, "color": PALETTE.start, "marker": "s", "markersize": 5.0, "label": "start"}
+GOAL: dict[str, Any] = {**POINT, "color": PALETTE.goal, "marker": "D", "markersize": 5.0, "label": "goal"}
 
 
 def learning_curve(path: Path, curve: Sequence[Mapping[str, Any]]) -> Path:
@@ -91,6 +104,44 @@ def success_of_rows(
     return _save(figure, path)
 
 
+def fitted_movements(
+    path: Path, movements: Mapping[str, tuple[Float, Float]], fits: Mapping[str, ViaPointFit]
+) -> Path:
+    """Draw path and speed, from neighbouring samples, of each movement, measured and fitted, one row each.
+
+    Movements are times, shape (N,), [s], and positions, shape (N, D), [m], by name; `fits` has one for each of them.
+    """
+    with matplotlib.style.context(str(STYLE)):
+        figure = Figure(figsize=(WIDTH / 2.54, (HEIGHT * len(movements) + LEGEND) / 2.54))
+        axes = figure.subplots(len(movements), 2, squeeze=False)
+        for (left, right), (name, (time, position)) in zip(axes, movements.items(), strict=True):
+            fit = fits[name]
+            # The path is seen in the plane of the two coordinates that change most.
+            shown = np.sort(np.argsort(-np.ptp(position, axis=0), kind="stable")[:2])
+            path_fitted = fit(np.linspace(fit.onset, fit.end, 200))
+            left.plot(*path_fitted[:, shown].T, **FITTED)
+            left.plot(*position[:, shown].T, label="samples", **SAMPLES)
+            left.plot(*fit.start[shown], **START)
+            left.plot(*fit.via_points[:, shown].T, **VIA)
+            left.plot(*fit.goal[shown], **GOAL)
+            left.set_aspect("equal", adjustable="datalim")
+            horizontal, vertical = ("xyz"[i] for i in shown)
+            left.set(xlabel=f"{horizontal} [m]", ylabel=f"{vertical} [m]", title=f"movement {name}")
+
+            measured = np.linalg.norm(np.gradient(position, time, axis=0), axis=1)
+            every = np.linspace(min(fit.onset, time[0]), max(fit.end, time[-1]), 300)
+            right.plot(every, np.linalg.norm(fit(every, 1), axis=1), **FITTED)
+            right.plot(time, measured, **SAMPLES)
+            right.plot(fit.passage_times, np.linalg.norm(fit(fit.passage_times, 1), axis=1), **VIA)
+            right.set_ylim(bottom=0.0)
+            right.set(xlabel="time [s]", ylabel="speed [m/s]")
+            title = f"residuals {1e3 * fit.noise:.2g} mm, $R^2$ = {fit.r_squared:.5f}"
+            right.set_title(title, fontweight="normal")
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), markerscale=1.2)
+        return _save(figure, path, matplotlib.rcParams["savefig.dpi"])
+
+
 def style_axes(ax: Any) -> None:
     """Remove the upper and right spines and draw horizontal grid lines."""
     ax.spines[["top", "right"]].set_visible(False)
@@ -104,7 +155,7 @@ def _percent(rates: Sequence[Mapping[str, float]]) -> tuple[Float, Float, Float]
     return rate, low, high
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def _save(figure: Figure, path: Path, dots_per_inch: float = DOTS_PER_INCH) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=DOTS_PER_INCH, metadata={"Software": MARK.decode()})
+    figure.savefig(path, dpi=dots_per_inch, metadata={"Software": MARK.decode()})
     return path

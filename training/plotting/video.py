@@ -24,7 +24,7 @@ from viapoint.envs.rendering.renderer import EpisodeRenderer
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.config.checks import check_file
 from viapoint.training.io.files import MARK
-from viapoint.training.planning.motion_plan import MotionPlan, executed
+from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
 from viapoint.training.rollouts.rollout import Decide
 
 CAPTION = 48  # Height of the caption below the picture, [pixels]
@@ -44,7 +44,7 @@ def record_video(
     """Record one episode in each scene as an MP4, and return the number of frames.
 
     Args:
-        path: MP4 file; its folder must exist.
+        path: MP4 file; its folder is created.
         env: Environment made with `render_mode="rgb_array_list"`.
         scenes: Scenes with as many rows for obstacles as the environment has.
         decide: Function from observation and scene, of one row each, to actions, shape (1, m).
@@ -69,7 +69,7 @@ def record_plan(path: str | Path, plan: MotionPlan) -> int:
     """Record the execution of a plan as an MP4, and return the number of frames.
 
     Args:
-        path: MP4 file; its folder must exist.
+        path: MP4 file; its folder is created.
         plan: Plan.
 
     Raises:
@@ -78,7 +78,7 @@ def record_plan(path: str | Path, plan: MotionPlan) -> int:
     """
     path = Path(path).expanduser()
     check_file("path", path, ".mp4")
-    outcome, episodes = executed([plan])
+    outcome, episodes = execute_plans([plan])
     info = {name: value[0] for name, value in outcome._asdict().items()}
     film = EpisodeRenderer(episodes, 0, "rgb_array_list", *PLAN_SIZE, PLAN_FPS)
     left = f"{plan.source}   {plan.duration:.2f} s   planned in {plan.milliseconds:.0f} ms"
@@ -99,6 +99,7 @@ def _scenes(env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, name: str, f
 
 def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
     """Encode frames of equal size, at least one, as a slow MP4 file (H.264), and return their number."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part.mp4")
     count, writer = 0, None
     try:
@@ -110,7 +111,7 @@ def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
                     output_params=["-crf", "20", "-movflags", "+faststart", "-metadata", f"comment={MARK.decode()}"],
                     macro_block_size=1, ffmpeg_log_level="error",
                 )  # fmt: skip
-                writer.send(None)
+                writer.send(None)  # the generator opens the file
             writer.send(np.ascontiguousarray(frame))
             count += 1
         if writer is not None:
@@ -119,7 +120,7 @@ def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
     finally:
         if writer is not None:
             writer.close()
-        part.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)  # what is left of a film that failed
     return count
 
 

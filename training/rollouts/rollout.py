@@ -9,9 +9,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.common.types import Float, Int, Observation
 from viapoint.envs.plans import Plan
-from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planning.search import registered_task
 
@@ -48,22 +47,16 @@ class SceneSimulation:
     """
 
     def __init__(self, env_id: str, num_envs: int = 512, **kwargs: Any) -> None:
-        check_registered(env_id)
         self.env_id, self.kwargs = env_id, kwargs
         self._capacity = num_envs
         self._envs: dict[int, ReachVectorEnv] = {}
         self.task = registered_task(env_id, **kwargs)
 
-    def draw(self, number: int, seed: int) -> Scenes:
-        """Sample scenes of the task, the same ones for the same seed."""
-        return self.task.sampler()([np.random.default_rng((seed, each)) for each in range(number)])
-
     def observe(self, scenes: Scenes) -> Observation:
         """Return first observations in N scenes."""
         pieces = []
-        for rows, env in self._groups(len(scenes.start)):
-            seen = self._begin(env, scenes, rows)
-            pieces.append({name: part[: rows.stop - rows.start] for name, part in seen.items()})
+        for rows, _, _, seen in self._begun(scenes):
+            pieces.append({name: part[: len(rows)] for name, part in seen.items()})
         return _joined(pieces)
 
     def __call__(self, scenes: Scenes, actions: Float) -> SimulationResults:
@@ -82,8 +75,7 @@ class SceneSimulation:
     ) -> SimulationResults:
         """Simulate one episode in each of N scenes, from first actions (N, m); later ones are decided, or zero."""
         pieces = []
-        for rows, env in self._groups(len(scenes.start)):
-            self._begin(env, scenes, rows)
+        for rows, _, env, _ in self._begun(scenes):
             some = scenes.take(rows)
             pieces.append(_episodes(env, some, actions[rows], decide, single_decision))
         return SimulationResults.concatenate(pieces)
@@ -91,12 +83,10 @@ class SceneSimulation:
     def execute_plan(self, scenes: Scenes, plan: Plan) -> SimulationResults:
         """Simulate one plan in each of N scenes, N at least 1; plans may have any number of via-points."""
         pieces = []
-        for rows, env in self._groups(len(scenes.start)):
-            self._begin(env, scenes, rows)
-            number = rows.stop - rows.start
-            decision = env.execute_plan(plan.take(_filled(rows, env.num_envs)))
-            info = {name: value[:number] for name, value in decision.info.items()}
-            pieces.append(SimulationResults(decision.reward[:number], info))
+        for rows, filled, env, _ in self._begun(scenes):
+            decision = env.execute_plan(plan.take(filled))
+            info = {name: value[: len(rows)] for name, value in decision.info.items()}
+            pieces.append(SimulationResults(decision.reward[: len(rows)], info))
         return SimulationResults.concatenate(pieces)
 
     def close(self) -> None:
@@ -104,31 +94,32 @@ class SceneSimulation:
         for env in self._envs.values():
             env.close()
 
-    def _begin(self, env: ReachVectorEnv, scenes: Scenes, rows: slice) -> Observation:
-        """Start some scenes, the last one also in environments that are left over."""
-        return env.begin(scenes.take(_filled(rows, env.num_envs)))
+    def _begun(self, scenes: Scenes) -> Iterator[tuple[Int, Int, ReachVectorEnv, Observation]]:
+        """Start groups of scenes, each in the smallest vector environment that takes it.
 
-    def _groups(self, number: int) -> Iterator[tuple[slice, ReachVectorEnv]]:
-        """Yield rows of scenes with the smallest vector environment that takes them."""
+        Yields the rows of a group, the same rows with the last one repeated for environments that are left over, the
+        vector environment, and its first observations.
+        """
+        number = len(scenes.start)
         for first in range(0, number, self._capacity):
-            rows = slice(first, min(first + self._capacity, number))
-            sizes = [1, min(64, self._capacity), self._capacity]
-            size = next(each for each in sizes if each >= rows.stop - rows.start)
+            rows = np.arange(first, min(first + self._capacity, number))
+            sizes = [
+                1,
+                min(64, self._capacity),
+                self._capacity,
+            ]  # each has an environment, which is made once
+            size = next(each for each in sizes if each >= len(rows))
             if size not in self._envs:
                 made: Any = gym.make_vec(self.env_id, num_envs=size, **self.kwargs)
                 self._envs[size] = made.unwrapped
-            yield rows, self._envs[size]
+            env = self._envs[size]
+            filled = np.minimum(first + np.arange(size), rows[-1])
+            yield rows, filled, env, env.begin(scenes.take(filled))
 
 
 def _joined(pieces: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
     """Return arrays by name, joined over batches."""
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
-
-
-def _filled(rows: slice, number: int) -> NDArray[np.int64]:
-    """Return indices of some rows, the last one repeated up to a number of them."""
-    indices: NDArray[np.int64] = np.minimum(rows.start + np.arange(number), rows.stop - 1)
-    return indices
 
 
 def _episodes(
@@ -148,15 +139,15 @@ def _episodes(
         decisions += now
         for name, values in decision.info.items():
             last[name] = np.where(now, values[:number], last.get(name, values[:number]))
-        running &= ~(decision.terminated | decision.truncated | single_decision)
-        actions[:] = 0.0
+        running &= ~(decision.terminated | decision.truncated | single_decision)  # which must not go on
+        actions[:] = 0.0  # which keeps the plan under way
         rows = np.flatnonzero(running)
         if decide is not None and rows.size:
             seen = {name: part[rows] for name, part in decision.observation.items()}
             actions[rows] = decide(seen, scenes.take(rows))
     last["decisions"] = decisions
     if not env.task.whole_movement:
-        last["duration"] = last["time"]
+        last["duration"] = last["time"]  # of the episode, not of its last decision
     return SimulationResults(reward, last)
 
 
@@ -167,26 +158,3 @@ def whole_task(env_id: str, kwargs: Mapping[str, Any]) -> dict[str, Any]:
         return dict(kwargs)
     twin = task.of_movements()
     return {**kwargs, "decide_at": twin.decide_at, "reward_weights": {**vars(twin.weights)}}
-
-
-class StepAgentMethod:
-    """Trained agent that acts in every control step, in environments of its own.
-
-    A decision is the first action; the others follow during the simulation. The decision time is that of one control
-    step, of which a movement has about twenty.
-    """
-
-    def __init__(self, name: str, model: Any, env_id: str, env_kwargs: Mapping[str, Any]) -> None:
-        self.name, self._model = name, model
-        self._simulation = SceneSimulation(env_id, 250, **env_kwargs)
-
-    def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """Return actions for the next step, shape (N, D), from observations of the step-wise task or its twin."""
-        if "time_left" not in observation or "remaining" in observation:  # that of the twin
-            observation = self._simulation.observe(scenes)
-        actions, _ = self._model.predict(observation, deterministic=True)
-        return np.asarray(actions, dtype=np.float64)
-
-    def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
-        """Play every episode to its end, beginning with the given actions."""
-        return self._simulation.episodes(scenes, decisions, self.decide)

@@ -123,7 +123,7 @@ class ViaVecEnv(VecEnv):
             raise ValueError(f"options must be a mapping, or a list of {self.num_envs} alike, got {given!r}")
         options = {name: [each[name] for each in given] for name in given[0]}
         observation, _ = self.venv.reset(seed=seeds, options=options or None)
-        self._reset_seeds()
+        self._reset_seeds()  # a later reset goes on with the generators
         self._returns[:], self._lengths[:] = 0.0, 0
         started: Observation = observation
         return started
@@ -156,7 +156,7 @@ class ViaVecEnv(VecEnv):
                 infos[row] = {**ended[row], **last}
             self._returns[done], self._lengths[done] = 0.0, 0
         for each, cut in zip(infos, (truncated & ~terminated).tolist(), strict=True):
-            each["TimeLimit.truncated"] = cut
+            each["TimeLimit.truncated"] = cut  # SB3 then looks beyond the end of the episode
         return observation, np.asarray(reward, dtype=np.float32), done, infos
 
     def _listed(self, info: Mapping[str, Any]) -> list[dict[str, Any]]:

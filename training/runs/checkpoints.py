@@ -25,6 +25,7 @@ from viapoint.training.io.files import BadFileError, read_bytes, write_bytes
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 FORMAT = 3
+# Counters of Stable-Baselines3's algorithms
 COUNTERS = (
     "seed",
     "num_timesteps",
@@ -33,7 +34,6 @@ COUNTERS = (
     "_n_updates",
     "_current_progress_remaining",
 )
-"""Counters of Stable-Baselines3's algorithms."""
 ARRAYS = ("_last_obs", "_last_episode_starts")
 DEQUES = ("ep_info_buffer", "ep_success_buffer")
 # Errors of content that is none of a checkpoint, or that does not fit the model
@@ -100,7 +100,7 @@ def read_state(path: Path) -> dict[str, Any]:
             torn = archive.testzip()
         if torn is not None:
             raise ValueError(f"the sum of {torn} is another one")
-        content.seek(0)
+        content.seek(0)  # for a second reader
         state = torch.load(content, weights_only=True)
         if state["format"] != FORMAT or not isinstance(state["model"], dict):
             raise ValueError(f"format must be {FORMAT}")

@@ -264,7 +264,7 @@ def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = N
 
 def _settings(config: TrainConfig) -> dict[str, Any]:
     """Return the settings that may not change, those in fields with several by their own names."""
-    values = json.loads(json.dumps(config.as_json()))
+    values = json.loads(json.dumps(config.as_json()))  # with lists for tuples, as in the file
     for name in MAY_CHANGE:
         del values[name]
     env_kwargs, hyperparameters = values.pop("env_kwargs"), values.pop("hyperparameters")

@@ -18,13 +18,13 @@ from typing import Any
 
 from viapoint.envs.common.validation import is_number
 from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
-from viapoint.training.agents.model_io import check_hyperparameters
-from viapoint.training.config.checks import check_arguments, check_env_kwargs, check_whole, unknown_name
+from viapoint.training.agents.model_io import check_arguments, check_hyperparameters
+from viapoint.training.config.checks import check_env_kwargs, check_whole, unknown_name
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import read_json, read_yaml
-from viapoint.training.planning.baselines import check_method
+from viapoint.training.planning.baselines import factory
 from viapoint.training.planning.search import registered_task
-from viapoint.training.scene_sets.scene_set import SEEDS, SETS, shipped_set
+from viapoint.training.scene_sets import SEEDS, SETS, shipped_set
 
 Values = Mapping[str, Any]
 # Fields of a training that an agent may set
@@ -184,7 +184,7 @@ def _study(
         for row, fields in _entries(given or {}):
             if row in rows:
                 raise ValueError(f"rows must have different names, {row} is there twice")
-            rows.add(row)
+            rows.add(row)  # rows are folders, which must not be shared
             for env in fields.pop("environments", list(known)):
                 if env not in known:
                     raise ValueError(unknown_name(f"{row}: environments", env, known))
@@ -297,7 +297,7 @@ def _agent(
 
 def _baseline(env: Values, row: str, *, method: str = "") -> list[Trial]:
     """Return the trial of a baseline that exists in its environment."""
-    check_method(method or row, registered_task(env["env_id"], **env["env_kwargs"]))
+    factory(method or row, registered_task(env["env_id"], **env["env_kwargs"]))  # an unknown name is told now
     return [Trial(**env, row=row, method=method or row)]
 
 

@@ -29,17 +29,17 @@ from viapoint.training.plotting.plots import success_of_rows
 from viapoint.training.rollouts.rollout import whole_task
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.runs.trainer import train_or_resume
-from viapoint.training.scene_sets.scene_set import FrozenScenes, scenes_for
+from viapoint.training.scene_sets import FrozenScenes, scenes_for
 from viapoint.training.study.config import Search, Study, Trial, Values
 
 RETRIES = 2  # Number of times that a trial whose worker died is begun again
+# Environment variables of Ray, which reads them when it is imported
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",  # Ray sends nothing to its authors
     "RAY_AIR_NEW_OUTPUT": "0",  # Ray Tune's own tables
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
     "TUNE_GLOBAL_CHECKPOINT_S": "5",  # a killed search loses at most its last seconds
 }
-"""Environment variables of Ray, which reads them when it is imported."""
 Record = dict[str, Any]
 KEYS = ["environment", "set", "method"]
 # Columns that are medians over seeds; `decisions` are those of a training
@@ -296,7 +296,7 @@ def _connected(address: str | None, workers: int | None) -> Iterator[None]:
 def _run_trials(trials: list[Trial], folder: Path, told: Told) -> list[str]:
     """Run trials as tasks of Ray, and return a line for each that failed."""
     ray, _ = _import_libraries()
-    task = ray.remote(num_cpus=1, max_retries=RETRIES)(run_trial)
+    task = ray.remote(num_cpus=1, max_retries=RETRIES)(run_trial)  # each trial computes on one core
     running: dict[Any, Trial] = {task.remote(trial, folder): trial for trial in trials}
     failed = []
     while running:

@@ -19,7 +19,7 @@ from viapoint.training.config.checks import DEFAULT_ENV
 from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, Range, at_least, at_most, near
 from viapoint.training.paper.movements import PLANE, TARGETS, Profile, SimulatedMovements, simulate
-from viapoint.training.paper.rows.one_via import slow_and_fast
+from viapoint.training.paper.one_via import slow_and_fast
 from viapoint.training.planning.baselines import Method, agent_method
 from viapoint.training.rollouts.rollout import SceneSimulation
 

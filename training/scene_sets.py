@@ -249,7 +249,7 @@ def _padded(scenes: Scenes, rows: int) -> Scenes:
     """Return scenes with room for a number of obstacles."""
     present = scenes.obstacles.kind.shape[1]
     padded = resting(scenes.start, scenes.goal, scenes.obstacles.with_rows(rows))
-    padded.turn_time[:, :present] = scenes.turn_time
+    padded.turn_time[:, :present] = scenes.turn_time  # obstacles that are absent never turn
     padded.turn_velocity[:, :present] = scenes.turn_velocity
     return padded._replace(jumps=scenes.jumps)
 

@@ -1,1 +1,0 @@
-"""Frozen scene sets for validation and tests."""
