@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.arms.kinematics import slowdowns
-from viapoint.envs.common.arrays import norm, put, take
+from viapoint.envs.common.arrays import as_dict, from_dict, norm, put, take
 from viapoint.envs.common.types import Bool, Float, Int, Observation
-from viapoint.envs.events import NEVER, Event, EventPredictor
-from viapoint.envs.executor import Executor, Pieces
+from viapoint.envs.events import NEVER, Event, EventPredictor, next_step
+from viapoint.envs.executor import Executor, Pieces, References
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
 from viapoint.envs.outcome import SETTLING, Outcome, Rollout, straight_jerk_cost
 from viapoint.envs.plans import Motion, Movements, Plan, checked_plan, jerk_cost_between
@@ -63,7 +63,7 @@ class Episodes:
         self.simulator = Simulator(
             task.arm, n_obstacles=task.observation.n_rows, num_envs=number, meshes=meshes
         )
-        self.executor = Executor(self.simulator, task.space, task.tolerance)
+        self.executor = Executor(self.simulator, task)
         home = np.tile(task.arm.home, (number, 1))
         self.scenes = resting(home, home.copy(), no_obstacles(number, task.observation.n_rows))
         """Scenes of the running episodes."""
@@ -226,10 +226,10 @@ class Episodes:
         first = ~self.begun
         before, begin = self._outcome(np.zeros(len(first), bool)), state.steps.copy()
         self._adopt(plan, np.flatnonzero(revised))
-        ends = self._events(self.plan, self._began, begin, scenes, self.goals, self.looks)
-        last = np.where(state.reachable & active, ends.step, begin)
+        step, event, final = self._events(self.plan, self._began, begin, scenes, self.goals, self.looks)
+        last = np.where(state.reachable & active, step, begin)
         self._run_until(last)
-        return self._decision(before, begin, first, ends.final, ends.event)
+        return self._decision(before, begin, first, final, event)
 
     def _adopt(self, plan: Plan, rows: Int) -> None:
         """Begin new plans in some episodes, as slow as the arm's limits need them.
@@ -241,7 +241,7 @@ class Episodes:
             return
         state, given = self.executor.state, plan
         plan, movements, stretch, within, inside = self._within_limits(plan.take(rows))
-        state.reachable[rows] &= inside
+        state.reachable[rows] &= inside  # the arm does not start on a plan that leaves the reach
         adopted = within | ~self.begun[rows]
         rows, plan = rows[adopted], plan.take(adopted)
         state.stretch[rows] = np.maximum(state.stretch[rows], stretch[adopted])
@@ -299,26 +299,26 @@ class Episodes:
 
     def _run_until(self, last: Int) -> None:
         """Run the episodes until a physics step each; obstacles keep their velocity in every piece of it."""
-        state, timestep, space = self.executor.state, self.simulator.timestep, self.task.space
+        state, timestep = self.executor.state, self.simulator.timestep
         turns = self._events.steps(self.scenes.turn_time)
         while True:
             rows = np.flatnonzero((state.steps < last) & ~state.collision & ~state.unstable)
             if not rows.size:
                 return
             now = state.steps[rows]
-            turn = np.where(turns[rows] > now[:, None], turns[rows], NEVER).min(axis=1, initial=NEVER)
-            steps = np.minimum(last[rows], turn) - now
-            scenes = self.scenes.take(rows)
-            obstacles = scenes.obstacles_at(np.asarray(now * timestep))
-            goal = space.coordinates(scenes.goals(np.asarray((now + steps) * timestep)))
-            resume = not self.task.whole_movement
-            self.executor.run(
-                rows, steps, obstacles, goal, self._references, resume=resume, moving=self._moving
-            )
+            self._run(rows, np.minimum(last[rows], next_step(turns[rows], now)) - now, self._references)
             movements, began = take(self._movements, rows), self._began[rows]
             done = state.steps[rows] - began
             begin, end = np.asarray((now - began) * timestep), np.asarray(done * timestep)
             state.jerk_cost[rows] += jerk_cost_between(movements, begin, end)
+
+    def _run(self, rows: Int, steps: Int, references: References) -> None:
+        """Execute references in some episodes for a number of physics steps each, shape (n,)."""
+        scenes, now = self.scenes.take(rows), self.executor.state.steps[rows]
+        obstacles = scenes.obstacles_at(np.asarray(now * self.simulator.timestep))
+        goals = scenes.goals(np.asarray((now + steps) * self.simulator.timestep))
+        goal = self.task.space.coordinates(goals)
+        self.executor.run(rows, steps, obstacles, goal, references, self._moving)
 
     def _references(self, rows: Int, number: int) -> Motion:
         """Return references of plans from now on, shape (n, T + 1, D) each."""
@@ -344,11 +344,7 @@ class Episodes:
             def references(some: Int, count: int) -> Motion:
                 return steering.follow(take(self._motion, some), velocity[some], count)
 
-            scenes, now = self.scenes.take(rows), self.time[rows]
-            obstacles = scenes.obstacles_at(now)
-            goal = task.space.coordinates(scenes.goals(now + number * self.simulator.timestep))
-            steps = np.full(len(rows), number)
-            self.executor.run(rows, steps, obstacles, goal, references, resume=True, moving=self._moving)
+            self._run(rows, np.full(len(rows), number), references)
             state.jerk_cost[rows] += steering.jerk_cost(motion, velocity[rows])
             put(self._motion, rows, Motion(*(part[rows, -1] for part in ahead)))
         self.begun[:] = True
@@ -370,7 +366,7 @@ class Episodes:
         if not task.stepwise:
             final = final & (event == Event.ARRIVAL)
         after = self._outcome(final)
-        ended = final | (event >= Event.CONTACT)
+        ended = final | (event >= Event.CONTACT)  # events of the highest ranks end an episode
         truncated = (event == Event.TIME_LIMIT) & ~final & task.stepwise
         length = norm(task.space.coordinates(self.scenes.goal) - self._start)
         terms = reward_terms(
@@ -379,8 +375,9 @@ class Episodes:
         elapsed = (state.steps - begin) * self.simulator.timestep
         times = {"elapsed": elapsed, "time": self.time, "event": event}
         self._look(np.arange(len(event)))
-        info = {**after._asdict(), **terms.as_info(), **times}
-        return Decision(self.observe(), terms.total(), ended & ~truncated, truncated, info)
+        info = {**after._asdict(), **terms, **times}
+        reward = np.asarray(sum(terms.values()))
+        return Decision(self.observe(), reward, ended & ~truncated, truncated, info)
 
     def _outcome(self, final: Bool) -> Outcome:
         """Return the metrics so far, where `final` is True for arms that have arrived at their last goal."""
@@ -434,10 +431,10 @@ class Episodes:
     def state(self) -> dict[str, Any]:
         """Return the state of the running episodes as arrays, for :meth:`restore`; films of the past are not part."""
         return {
-            "scenes": self.scenes.as_dict(),
-            "metrics": {name: part.copy() for name, part in self.executor.state._asdict().items()},
-            "plan": {name: part.copy() for name, part in self.plan._asdict().items()},
-            "motion": {name: part.copy() for name, part in self._motion._asdict().items()},
+            "scenes": as_dict(self.scenes),
+            "metrics": as_dict(self.executor.state),
+            "plan": as_dict(self.plan),
+            "motion": as_dict(self._motion),
             "began": self._began.copy(),
             "begun": self.begun.copy(),
             "physics": self.simulator.batch.state.copy(),
@@ -447,11 +444,11 @@ class Episodes:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state of environments of the same task and number."""
-        self.start(np.arange(len(self.begun)), Scenes.from_dict(state["scenes"]))
-        put(self.executor.state, slice(None), type(self.executor.state)(**state["metrics"]))
-        self.plan = Plan(**{name: np.array(part) for name, part in state["plan"].items()})
+        self.start(np.arange(len(self.begun)), from_dict(self.scenes, state["scenes"]))
+        put(self.executor.state, slice(None), from_dict(self.executor.state, state["metrics"]))
+        self.plan = from_dict(self.plan, state["plan"])
         self._movements = Movements.of(self.plan)
-        put(self._motion, slice(None), Motion(**state["motion"]))
+        put(self._motion, slice(None), from_dict(self._motion, state["motion"]))
         self._began[:], self.begun[:] = state["began"], state["begun"]
         self.simulator.batch.state[:] = state["physics"]
         self.simulator.physics_steps = int(state["physics_steps"])

@@ -8,11 +8,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.arms.kinematics import Chain, Spheres
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import memory, obstacle_clearance, place
 from viapoint.envs.geometry.compiled import compiled
@@ -72,22 +72,11 @@ _RANK = (
 """Rank of simultaneous events, highest first."""
 
 
-class Ends(NamedTuple):
-    """Ends of N decisions without contact."""
-
-    step: Int
-    """Physics step of the episode before which each decision ends, shape (N,)."""
-    event: Int
-    """:class:`Event`, shape (N,)."""
-    final: Bool
-    """True if the arm has arrived and no change is left, shape (N,)."""
-
-
 class EventPredictor:
     """Predictor of the ends of decisions of a task."""
 
     def __init__(self, task: Task) -> None:
-        self.arm, self.space, self.margin, self.sensor = task.arm, task.space, task.margin, task.sensor
+        self.task = task
         self.timestep = task.arm.timestep
         self.triggers = frozenset(() if isinstance(task.decide_at, str) else task.decide_at)
         self.horizon = int(self.steps(min(task.horizon, task.time_limit)))
@@ -109,23 +98,21 @@ class EventPredictor:
         scenes: Scenes,
         goal: Callable[[Float], Float],
         looks: Looks | None,
-    ) -> Ends:
+    ) -> tuple[Int, Int, Bool]:
         """Return the ends of decisions that begin at physics step `now` under plans that began at step `began`.
 
-        Args:
-            plan: Plans of N episodes.
-            began: Steps at which they began, shape (N,).
-            now: Present steps, shape (N,).
-            scenes: Scenes.
-            goal: Goals at the time of arrival in coordinates of the space, as a function of times (N,) -> (N, D).
-            looks: Looks of the sensor so far.
+        Steps have the shape (N,); `goal` returns the goals at times, shape (N,), in coordinates of the space, (N, D).
+
+        Returns:
+            Without contact: steps before which the decisions end; the :class:`Event` of each; True where the arm has
+            arrived and no change is left.
         """
         jump, turn = self.steps(scenes.jump_times), self.steps(scenes.turn_time)
         moving_until = began + self.steps(plan.duration)
         arrival = np.maximum(began + self.steps(plan.duration + SETTLING), now + 1)
         away = np.abs(plan.waypoints[:, -1] - goal(arrival * self.timestep)).max(axis=-1)
         there = away < MAX_START_OFFSET  # a plan of a user may have rounded its end
-        after_jump, after_turn = _next(jump, arrival), _next(turn, arrival)
+        after_jump, after_turn = next_step(jump, arrival), next_step(turn, arrival)
         # At rest at the goal, the arm waits for what is still to come.
         waits = there & (np.minimum(after_jump, after_turn) < NEVER) & (len(self.triggers) > 0)
         ends = {Event.TIME_LIMIT: np.maximum(np.full(len(now), self.limit), now + 1)}
@@ -133,7 +120,7 @@ class EventPredictor:
             (Event.TARGET, "target", jump, after_jump),
             (Event.COURSE, "course", turn, after_turn),
         ):
-            ends[event] = _next(steps, now) if trigger in self.triggers else np.where(waits, later, NEVER)
+            ends[event] = next_step(steps, now) if trigger in self.triggers else np.where(waits, later, NEVER)
         horizon = now + self.horizon
         ends[Event.HORIZON] = np.where(
             ("horizon" in self.triggers) & (horizon < moving_until), horizon, NEVER
@@ -144,7 +131,7 @@ class EventPredictor:
         ends[Event.SIGHT] = self._sight(plan, began, now, scenes, latest, looks)
         steps = np.stack([ends[event] for event in _RANK])
         event = np.array([int(each) for each in _RANK])[steps.argmin(axis=0)]
-        return Ends(steps.min(axis=0), event, there & (event == Event.ARRIVAL))
+        return steps.min(axis=0), event, there & (event == Event.ARRIVAL)
 
     def _clearance(self, plan: Plan, began: Int, now: Int, scenes: Scenes, latest: Int) -> Int:
         """Return the step at which the predicted clearance falls below the margin, NEVER if not before `latest`.
@@ -166,12 +153,13 @@ class EventPredictor:
         looks = (end - begin) // every + 1
         steps = begin[:, None] + every * np.arange(int(looks.max()) + ahead)
         movement = plan.take(rows).trajectory()
-        path = self.space.joints(movement(self.timestep * (steps - began[rows][:, None])))
+        path = self.task.space.joints(movement(self.timestep * (steps - began[rows][:, None])))
         obstacles = scenes.take(rows).obstacles_at(begin * self.timestep)
         interval = every * self.timestep
-        chain, spheres = self.arm.chain, self.arm.spheres
-        low = _low_clearances(chain, spheres, path, obstacles, looks + ahead, interval, self.margin)
-        _first_falls(low, rows, steps, looks, ahead, now, latest, found)
+        chain, spheres, margin = self.task.arm.chain, self.task.arm.spheres, self.task.margin
+        _first_falls(
+            chain, spheres, path, obstacles, rows, steps, looks, ahead, interval, margin, latest, found
+        )
         return found
 
     def _sight(
@@ -182,9 +170,10 @@ class EventPredictor:
         The sensor glances along the planned movement. The arm follows it within a millimetre.
         """
         found = np.full(len(now), NEVER)
-        if "sight" not in self.triggers or self.sensor is None or looks is None:
+        task, sensor = self.task, self.task.sensor
+        if "sight" not in self.triggers or sensor is None or looks is None:
             return found
-        number, nothing = len(now), self.sensor.range
+        number, nothing = len(now), sensor.range
         known = looks.points.reshape(number, -1, 3)
         known_hit = looks.ranges.reshape(number, -1) < nothing
         every = max(round(GLANCE / self.timestep), 1)
@@ -192,9 +181,9 @@ class EventPredictor:
         rows = np.flatnonzero(step < latest)
         while rows.size:
             since = self.timestep * (step - began)[rows]
-            joints = self.space.joints(plan.take(rows).trajectory()(since[:, None]))[:, 0]
+            joints = task.space.joints(plan.take(rows).trajectory()(since[:, None]))[:, 0]
             obstacles = scenes.take(rows).obstacles_at(np.asarray(self.timestep * step[rows]))
-            glance = self.sensor.read(self.arm, joints, obstacles)
+            glance = sensor.read(task.arm, joints, obstacles)
             hit = glance.ranges < nothing
             new = _count_new(glance.points, hit, known[rows], known_hit[rows]) >= NEW_POINTS
             found[rows[new]] = step[rows[new]]
@@ -205,13 +194,9 @@ class EventPredictor:
 
 @compiled
 def _count_new(points: Float, hit: Bool, known: Float, known_hit: Bool) -> Int:
-    """Return how many points of each scene are NEW_DISTANCE or more from all known ones, at most NEW_POINTS.
+    """Return how many points, shape (N, R, 3), are NEW_DISTANCE or more from all known ones, (N, M, 3).
 
-    Args:
-        points: Shape (N, R, 3), [m].
-        hit: True for those that count, shape (N, R).
-        known: Shape (N, M, 3), [m].
-        known_hit: True for those that count, shape (N, M).
+    It is at most NEW_POINTS in each scene. Points count where `hit`, shape (N, R) and (N, M).
     """
     found = np.zeros(len(points), np.int64)
     for scene in range(len(points)):
@@ -231,68 +216,51 @@ def _count_new(points: Float, hit: Bool, known: Float, known_hit: Bool) -> Int:
 
 
 @compiled
-def _low_clearances(
+def _first_falls(
     chain: Chain,
     spheres: Spheres,
     path: Float,
     obstacles: Obstacles,
-    number: Int,
+    rows: Int,
+    steps: Int,
+    looks: Int,
+    ahead: int,
     interval: float,
     margin: float,
-) -> Bool:
-    """Return True where the clearance from obstacles is below a margin, shape (M, T).
+    latest: Int,
+    found: Int,
+) -> None:
+    """Fill in the first step of each of N episodes at which the clearance ahead falls below a margin, [m].
 
-    Args:
-        chain: Chain of the arm.
-        spheres: Spheres of the arm.
-        path: Configurations of M movements, shape (M, T, J).
-        obstacles: Obstacles of M scenes at the first configuration.
-        number: Number of configurations of each movement that are looked at, shape (M,).
-        interval: Time between two configurations, [s].
-        margin: Margin, [m].
+    M pieces of the episodes `rows`, in order, have configurations, shape (M, T, J), at an interval, [s], from the
+    beginning on, where the obstacles are. A prediction at each of a number of `looks` sees `ahead` more of them.
     """
     placed = memory(chain, spheres)
-    low = np.zeros(path.shape[:2], np.bool_)
-    for scene in range(len(path)):
-        for k in range(number[scene]):
-            place(chain, spheres, path[scene, k], placed)
-            time = k * interval
-            clearance = obstacle_clearance(spheres, placed, obstacles, scene, time, margin, margin)
-            low[scene, k] = clearance < margin
-    return low
-
-
-@compiled
-def _first_falls(
-    low: Bool, rows: Int, steps: Int, looks: Int, ahead: int, now: Int, latest: Int, found: Int
-) -> None:
-    """Fill in the first step of each episode at which the clearance ahead falls below the margin.
-
-    Args:
-        low: True where the clearance is below the margin, shape (M, T).
-        rows: Episodes of M pieces, in order, shape (M,).
-        steps: Physics steps, shape (M, T).
-        looks: Number of predictions in each piece, shape (M,).
-        ahead: Number of further configurations of a prediction.
-        now: Present steps, shape (N,).
-        latest: Steps from which on the result does not matter, shape (N,).
-        found: Result, shape (N,).
-    """
-    below = True  # a clearance that is below the margin already does not fall
+    low = np.zeros(path.shape[1], np.bool_)
+    below = True
     for piece in range(len(rows)):
         row = rows[piece]
         if piece == 0 or row != rows[piece - 1]:
-            below = True
+            below = True  # a clearance that is below the margin already does not fall
+        if found[row] < NEVER:
+            continue
+        for k in range(looks[piece] + ahead):
+            place(chain, spheres, path[piece, k], placed)
+            time = k * interval
+            clearance = obstacle_clearance(spheres, placed, obstacles, piece, time, margin, margin)
+            low[k] = clearance < margin
         for look in range(looks[piece]):
             step = steps[piece, look]
-            if step >= latest[row] or found[row] < NEVER:
+            if step >= latest[row]:
                 break
-            will_be = bool(low[piece, look : look + ahead + 1].any())
-            if will_be and not below and step > now[row]:
+            will_be = bool(low[look : look + ahead + 1].any())
+            # The first prediction is that of the present step, which no decision can end at.
+            if will_be and not below:
                 found[row] = step
+                break
             below = will_be
 
 
-def _next(steps: Int, now: Int) -> Int:
+def next_step(steps: Int, now: Int) -> Int:
     """Return the first of some steps, shape (N, n), after the present one, NEVER without one, shape (N,)."""
     return np.asarray(np.where(steps > now[:, None], steps, NEVER).min(axis=1, initial=NEVER))

@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from viapoint.envs.arms.chain import Chain, Spheres
-from viapoint.envs.arms.kinematics import tool_position
+from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import (
     Placed,
@@ -22,11 +21,11 @@ from viapoint.envs.geometry.clearance import (
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import ABSENT, BOX, CYLINDER, HALF_SPACE, Obstacles
 from viapoint.envs.geometry.shapes import IN_TABLES
-from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Rollout, Tolerance
+from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Rollout
 from viapoint.envs.plans import Motion
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.simulator import MOST_BETWEEN, Simulator
-from viapoint.envs.spaces import Space
+from viapoint.envs.task import Task
 
 BLOCK, SIMILAR = 32, 1.1
 """Greatest number of movements that are executed together, few enough for the processor's cache, and the greatest
@@ -42,10 +41,11 @@ Pieces = list[tuple[Float, Float, Bool]]
 
 
 class Executor:
-    """Executor of references in a space, in the simulations of one thread; the tolerance bounds rest at the goal."""
+    """Executor of references of a task in the simulations of one thread."""
 
-    def __init__(self, simulator: Simulator, space: Space, tolerance: Tolerance) -> None:
-        self.simulator, self.space, self.tolerance = simulator, space, tolerance
+    def __init__(self, simulator: Simulator, task: Task) -> None:
+        self.simulator, self.space, self.tolerance = simulator, task.space, task.tolerance
+        self._resumes = not task.whole_movement
         arm = simulator.arm
         number = len(simulator.batch.state)
         self.state = EpisodeState.empty(number, len(arm.joint_names))
@@ -70,8 +70,6 @@ class Executor:
         obstacles: Obstacles,
         goal: Float,
         references: References,
-        *,
-        resume: bool,
         moving: bool,
     ) -> None:
         """Execute references in n episodes and add what comes of it to their metrics.
@@ -84,7 +82,6 @@ class Executor:
             obstacles: Obstacles of these episodes at their present places.
             goal: Goals in coordinates of the space, shape (n, D).
             references: Function that returns the references.
-            resume: True if the episodes may go on afterwards.
             moving: True if obstacles move.
         """
         order = np.argsort(steps, kind="stable")
@@ -95,7 +92,7 @@ class Executor:
             last = min(similar, first + BLOCK)
             some = np.sort(order[first:last])
             block = rows[some], steps[some], obstacles.take(some), goal[some]
-            self._run_block(*block, references, resume, moving)
+            self._run_block(*block, references, moving)
             first = last
 
     def rollout(self, pieces: Pieces, scene: Scenes) -> Rollout:
@@ -118,7 +115,6 @@ class Executor:
         obstacles: Obstacles,
         goal: Float,
         references: References,
-        resume: bool,
         moving: bool,
     ) -> None:
         """Execute episodes of about the same length; the arguments are those of :meth:`run`."""
@@ -132,7 +128,7 @@ class Executor:
         if moving:
             time = timestep * np.arange(number)[:, None, None]
             centres = obstacles.centre[:, None] + time * obstacles.velocity[:, None]
-        joints, contact, unstable = simulator.rollout(rows, controls, steps, centres, resume=resume)
+        joints, contact, unstable = simulator.rollout(rows, controls, steps, centres, resume=self._resumes)
         body = arm.chain, arm.spheres, arm.reach
         # Contacts between two physics steps
         for i, k, states in _risky_steps(
@@ -219,7 +215,7 @@ def _risky_steps(
                 place(chain, spheres, path[state], placed)
                 time = timestep * (state + 1)
                 apart += obstacle_clearance(spheres, placed, obstacles, scene, time, way, -way)
-            if apart < way:
+            if apart < way:  # so a state between may be in contact
                 found.append((scene, k, int(min(2.0 * way / thin, MOST_BETWEEN))))
     return found
 

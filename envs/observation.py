@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
 
-from viapoint.envs.arms.arm import Arm
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.obstacles import POSE_SIZE, Obstacles, observation_rows
 from viapoint.envs.plans import Motion
 from viapoint.envs.replanning import NominalPlan
-from viapoint.envs.sensors import Looks, Sensor
+from viapoint.envs.scenes.scene import FARTHEST, FASTEST
+from viapoint.envs.sensors import Looks
 
-FARTHEST = 2.0
-"""Bound of every coordinate and length, [m]."""
-FASTEST = 1.0
-"""Bound of the velocity of an obstacle along any axis, [m/s]."""
+if TYPE_CHECKING:
+    from viapoint.envs.task import Task
+
 BEYOND_LIMIT = 0.1
 """Margin beyond the joint limits at which observed joints are clipped, [rad]."""
 
 
-@dataclass(frozen=True, kw_only=True)
 class ObservationLayout:
     """Names, sizes, bounds and units of the observation's parts.
 
@@ -37,62 +34,46 @@ class ObservationLayout:
     bounds is clipped.
     """
 
-    arm: Arm
-    kinds: tuple[str, ...]
-    """Kinds that obstacles may have."""
-    n_rows: int
-    """Greatest number of obstacles."""
-    dimension: int
-    """Dimension D of the space of the movements."""
-    in_joints: bool
-    """True if movements are planned in joint space."""
-    n_via: int | None = None
-    """Number of via-points that are observed; None where plans are not revised."""
-    speed: float = 0.0
-    """Bound of the command's velocity; 0 where it is not observed."""
-    acceleration: float = 0.0
-    """Bound of the command's acceleration."""
-    time_limit: float = 0.0
-    """Time limit of an episode, [s]."""
-    sensor: Sensor | None = None
-    """Sensor whose readings are observed in place of the obstacles."""
-
-    @property
-    def row_size(self) -> int:
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.n_rows = task.n_obstacles[1]
+        """Greatest number of obstacles."""
+        self.row_size = len(task.shapes) + POSE_SIZE
         """Number of values of one obstacle."""
-        return len(self.kinds) + POSE_SIZE
 
     @functools.cached_property
     def bounds(self) -> dict[str, tuple[Float, Float]]:
         """Lower and upper bounds of the parts."""
-        low, high = self.arm.joint_range.T
-        joints = low - BEYOND_LIMIT, high + BEYOND_LIMIT
+        task, sensor = self.task, self.task.sensor
+        low, high = task.arm.joint_range.T
+        joints = low - BEYOND_LIMIT, high + BEYOND_LIMIT  # MuJoCo's joint limits are soft
         found = {"joints": joints, "hand": _box(FARTHEST, 3), "goal": _box(FARTHEST, 3)}
-        if self.in_joints:
+        if task.space_name == "joints":
             found["goal_joints"] = joints
-        if self.sensor is not None:
-            farthest = self.sensor.range + FARTHEST + float(np.abs(self.sensor.position).max())
-            number = self.sensor.looks * self.sensor.n_rays
-            found["ranges"] = np.zeros(number), np.full(number, self.sensor.range)
+        if sensor is not None:
+            farthest = sensor.range + FARTHEST + float(np.abs(sensor.position).max())
+            number = sensor.looks * sensor.n_rays  # all looks that are remembered
+            found["ranges"] = np.zeros(number), np.full(number, sensor.range)
             found["points"] = _box(farthest, 3 * number)
-            if self.sensor.looks > 1:
-                found["eyes"] = _box(FARTHEST, 3 * self.sensor.looks)
+            if sensor.looks > 1:
+                found["eyes"] = _box(FARTHEST, 3 * sensor.looks)
         elif self.n_rows:
-            kinds, pose = np.zeros(len(self.kinds)), [FARTHEST] * 3 + [1.0] * 6
+            kinds, pose = np.zeros(len(task.shapes)), [FARTHEST] * 3 + [1.0] * 6
             sizes = [FARTHEST] * 3
             lowest = np.concatenate((kinds, -np.array(pose), np.zeros(3), [-FASTEST] * 3, [0.0]))
             highest = np.concatenate((kinds + 1.0, pose, sizes, [FASTEST] * 3, [1.0]))
             found["obstacles"] = np.tile(lowest, self.n_rows), np.tile(highest, self.n_rows)
-        if self.speed:
-            place = joints if self.in_joints else _box(FARTHEST, self.dimension)
+        if not task.whole_movement:
+            dimension = task.space.dimension
+            place = joints if task.space_name == "joints" else _box(FARTHEST, dimension)
             found["command"] = place
-            found["velocity"] = _box(self.speed, self.dimension)
-            found["acceleration"] = _box(self.acceleration, self.dimension)
-            found["time_left"] = _span(self.time_limit)
-            if self.n_via is not None:
-                found["remaining"] = _span(self.time_limit)
-                if self.n_via:
-                    found["via"] = np.tile(place[0], self.n_via), np.tile(place[1], self.n_via)
+            found["velocity"] = _box(2.0 * max(task.steering.top_speed), dimension)
+            found["acceleration"] = _box(task.steering.greatest_acceleration, dimension)
+            found["time_left"] = _span(task.time_limit)
+            if task.replanning:
+                found["remaining"] = _span(task.time_limit)
+                if task.n_via:
+                    found["via"] = np.tile(place[0], task.n_via), np.tile(place[1], task.n_via)
         return found
 
     def space(self) -> spaces.Dict:
@@ -127,27 +108,28 @@ class ObservationLayout:
             "goal": goal[1],
             "goal_joints": goal[0],
         }
-        if self.sensor is not None:
+        task = self.task
+        if task.sensor is not None:
             if looks is None:
-                looks = Looks.none(self.sensor, len(joints))
-                looks.add(np.arange(len(joints)), self.sensor, self.arm, joints, obstacles)
+                looks = Looks.none(task.sensor, len(joints))
+                looks.add(np.arange(len(joints)), task.sensor, task.arm, joints, obstacles)
             for name, part in looks._asdict().items():
                 parts[name] = part.reshape(len(joints), -1)
         else:
-            parts["obstacles"] = observation_rows(obstacles, self.kinds).reshape(len(joints), -1)
+            parts["obstacles"] = observation_rows(obstacles, task.shapes).reshape(len(joints), -1)
         if command is not None and time is not None:
             parts |= {
                 "command": command.position,
                 "velocity": command.velocity,
                 "acceleration": command.acceleration,
-                "time_left": (self.time_limit - time)[:, None],
+                "time_left": (task.time_limit - time)[:, None],
             }
         if nominal is not None:
             parts["via"] = nominal.vias.reshape(len(joints), -1)
             parts["remaining"] = nominal.remaining[:, None]
         observation = {}
         for name, (low, high) in self.bounds.items():
-            observation[name] = np.clip(parts[name], low, high).astype(np.float32)
+            observation[name] = np.clip(parts[name], low, high).astype(np.float32)  # as the space promises
         return observation
 
     def rows(self, part: Any) -> Any:

@@ -151,7 +151,7 @@ class EpisodeState(NamedTuple):
         fresh.hand[:] = hand
         fresh.min_clearance[:] = clearance
         fresh.self_clearance[:] = self_clearance
-        fresh.planned_clearance[:] = np.minimum(clearance, self_clearance)
+        fresh.planned_clearance[:] = np.minimum(clearance, self_clearance)  # the start is commanded, too
         for mine, new in zip(self, fresh, strict=True):
             mine[rows] = new
 

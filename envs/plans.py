@@ -129,7 +129,7 @@ def _sampled(movements: Movements, times: Float) -> tuple[Float, Float, Float]:
     for i in range(number):
         c = movements.coefficients[i]
         for k in range(times.shape[1]):
-            time = min(max(times[i, k], 0.0), movements.end[i, 0])
+            time = min(max(times[i, k], 0.0), movements.end[i, 0])  # it rests before and after
             s = segments - 1
             while s > 0 and time < movements.starts[i, s]:
                 s -= 1

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,42 +48,9 @@ class RewardWeights:
             value = number_of_at_least(f"reward weight {field.name}", getattr(self, field.name), 0.0)
             object.__setattr__(self, field.name, value)
 
-    @classmethod
-    def of(cls, weights: RewardWeights | Mapping[str, float] | None, **defaults: float) -> RewardWeights:
-        """Return weights from a record, from a mapping of some of them, or the defaults.
 
-        Raises:
-            ValueError: The argument is something else, or names an unknown term.
-        """
-        if isinstance(weights, RewardWeights):
-            return weights
-        known = {field.name for field in dataclasses.fields(cls)}
-        if weights is None or (isinstance(weights, Mapping) and known >= set(weights)):
-            return cls(**{**defaults, **(weights or {})})
-        raise ValueError(
-            f"reward_weights must be {cls.__name__} or a mapping with some of {', '.join(sorted(known))}, "
-            f"got {weights!r}"
-        )
-
-
-class RewardTerms(NamedTuple):
-    """Weighted terms of N rewards, shape (N,) each; the reward is their sum."""
-
-    success: Float
-    collision: Float
-    clearance: Float
-    goal_error: Float
-    smoothness: Float
-    duration: Float
-    progress: Float
-
-    def total(self) -> Float:
-        """Return the reward, shape (N,): the terms added in order."""
-        return np.asarray(sum(self))
-
-    def as_info(self) -> dict[str, Any]:
-        """Return the terms as `reward_*`."""
-        return {f"reward_{name}": term for name, term in self._asdict().items()}
+TERMS = tuple(f"reward_{field.name}" for field in dataclasses.fields(RewardWeights))
+"""Names of the terms of the reward in infos."""
 
 
 def reward_terms(
@@ -97,8 +62,8 @@ def reward_terms(
     zero_duration: Float,
     goal_unit: float,
     weights: RewardWeights,
-) -> RewardTerms:
-    """Return the weighted terms of one decision of N episodes.
+) -> dict[str, Float]:
+    """Return the weighted terms of one decision of N episodes by their names in infos, shape (N,) each.
 
     Over an episode the terms add up to
 
@@ -113,22 +78,22 @@ def reward_terms(
     The length is that from start to goal, [m] or [rad], and u, `goal_unit`, the distance at which the term of the goal
     saturates.
     """
-    later = ~first
+    later = ~first  # before the first decision nothing was commanded
     clearance = _bounded(after.planned_clearance) - later * _bounded(before.planned_clearance)
-    cost = straight_jerk_cost(length, zero_duration)
+    cost = straight_jerk_cost(length, zero_duration)  # J_0
     rough = np.log1p(after.jerk_cost / cost) - np.log1p(before.jerk_cost / cost)
     spent = (after.duration - before.duration) / zero_duration
     far = np.minimum(after.goal_error / goal_unit, 1.0)
     nearer = (before.goal_error - after.goal_error) / length
-    return RewardTerms(
-        success=np.where(ended & after.is_success, weights.success, 0.0),
-        collision=np.where(ended & after.collision, -weights.collision, 0.0),
-        clearance=weights.clearance * clearance,
-        goal_error=np.where(ended, -weights.goal_error * far, 0.0),
-        smoothness=-weights.smoothness * rough,
-        duration=-weights.duration * spent,
-        progress=weights.progress * nearer,
-    )
+    return {
+        "reward_success": np.where(ended & after.is_success, weights.success, 0.0),
+        "reward_collision": np.where(ended & after.collision, -weights.collision, 0.0),
+        "reward_clearance": weights.clearance * clearance,
+        "reward_goal_error": np.where(ended, -weights.goal_error * far, 0.0),
+        "reward_smoothness": -weights.smoothness * rough,
+        "reward_duration": -weights.duration * spent,
+        "reward_progress": weights.progress * nearer,
+    }
 
 
 def _bounded(clearance: Float) -> Float:

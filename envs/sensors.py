@@ -7,7 +7,6 @@ seen: its pose is known, and software of real sensors filters it out.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from collections.abc import Mapping
@@ -20,7 +19,13 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.kinematics import forward, link_poses
 from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.common.validation import finite_array, number_of_at_least, whole_number
+from viapoint.envs.common.validation import (
+    finite_array,
+    number_of_at_least,
+    record_of,
+    unit_quaternion,
+    whole_number,
+)
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.distance import point_distance_and_normal
 from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, POINT_CLOUD, Obstacles, bounding_boxes
@@ -133,10 +138,7 @@ class Sensor:
         if self.mount not in MOUNTS:
             raise ValueError(f"mount of the sensor must be one of {', '.join(MOUNTS)}, got {self.mount!r}")
         position = finite_array("position of the sensor", self.position, (3,))
-        quaternion = finite_array("quaternion of the sensor", self.quaternion, (4,))
-        length = float(np.linalg.norm(quaternion))
-        if abs(length - 1.0) > 1e-3:
-            raise ValueError(f"quaternion of the sensor must have the length 1, got {length:.4g}")
+        quaternion = unit_quaternion("quaternion of the sensor", self.quaternion)
         columns = whole_number("columns of the sensor", self.columns, 1)
         rows = whole_number("rows of the sensor", self.rows, 1)
         if columns * rows > MOST_RAYS:
@@ -147,7 +149,7 @@ class Sensor:
             raise ValueError(f"field_of_view of the sensor must be at most {widest:.3g} rad, got {view:g}")
         checked = {
             "position": tuple(map(float, position)),
-            "quaternion": tuple(map(float, quaternion / length)),
+            "quaternion": tuple(map(float, quaternion)),
             "columns": columns,
             "rows": rows,
             "field_of_view": view,
@@ -161,22 +163,12 @@ class Sensor:
 
     @classmethod
     def of(cls, sensor: Sensor | Mapping[str, Any] | None) -> Sensor | None:
-        """Return a sensor from itself, or from a mapping of its fields.
+        """Return a sensor from itself, or from a mapping of its fields; None for none.
 
         Raises:
             ValueError: The argument is something else, or a number is out of range.
         """
-        if sensor is None or isinstance(sensor, cls):
-            return sensor
-        if not isinstance(sensor, Mapping):
-            raise ValueError(
-                f"sensor must be None, {', '.join(map(repr, NAMED))}, a Sensor or a mapping of its fields, "
-                f"got {sensor!r}"
-            )
-        unknown = sorted(set(sensor) - {field.name for field in dataclasses.fields(cls)})
-        if unknown:
-            raise ValueError(f"sensor has no field {', '.join(map(repr, unknown))}")
-        return cls(**sensor)
+        return None if sensor is None else record_of("sensor", cls, sensor)
 
     @property
     def n_rays(self) -> int:
@@ -230,7 +222,7 @@ class Sensor:
             inside = (column >= 0) & (column < self.columns)
             return np.where(inside, column, -1).astype(np.int32)
         width = 2.0 * math.tan(0.5 * self.field_of_view)
-        before = np.maximum(x, 1e-9)
+        before = np.maximum(x, 1e-9)  # points behind are left out below
         column = np.floor((0.5 - y / (before * width)) * self.columns)
         row = np.floor((0.5 - z * self.columns / (before * width * self.rows)) * self.rows)
         inside = (x > 0.0) & (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
@@ -262,7 +254,7 @@ class Sensor:
         rays = np.ascontiguousarray(np.einsum("nij,rj->nri", rotation, self.directions))
         centre, half = bounding_boxes(obstacles)
         ball = np.linalg.norm(half, axis=-1)
-        ball[obstacles.kind == HALF_SPACE] = np.inf
+        ball[obstacles.kind == HALF_SPACE] = np.inf  # they have no end
         ranges = np.full((len(origin), self.n_rays), self.range)
         seen = np.full(ranges.shape, -1, np.int64)
         _cast(obstacles, centre, ball, origin, rays, ranges, seen)
@@ -351,16 +343,9 @@ def _cast(
     ranges: Float,
     seen: Int,
 ) -> None:
-    """Shorten ranges to the first surface along each ray, and fill in the row of the obstacle.
+    """Shorten ranges, (N, R), to the first surface along each ray, (N, R, 3), and fill in the row of the obstacle.
 
-    Args:
-        obstacles: Obstacles of N scenes.
-        centre: Centres of their bounding balls, shape (N, n, 3), [m].
-        ball: Radii of these balls, infinite for half-spaces, shape (N, n), [m].
-        origin: Origins of the sensors, shape (N, 3), [m].
-        rays: Unit vectors, shape (N, R, 3).
-        ranges: Greatest distances, shape (N, R), [m].
-        seen: Rows, shape (N, R).
+    The bounding balls of obstacles have a centre, (N, n, 3), and a radius, which is infinite for half-spaces.
     """
     for scene in range(len(origin)):
         for row in range(obstacles.kind.shape[1]):
@@ -378,7 +363,7 @@ def _cast(
                 first, last = 0.0, ranges[scene, ray]
                 if radius < np.inf:
                     middle = away_x * x + away_y * y + away_z * z
-                    half_square = radius * radius - square + middle * middle
+                    half_square = radius * radius - square + middle * middle  # where the ray is in the ball
                     if half_square < 0.0:
                         continue
                     half = math.sqrt(half_square)
@@ -398,7 +383,7 @@ def _cast(
                     if kind != POINT_CLOUD:
                         # A convex shape lies behind the plane through its nearest point.
                         closing = -(a * x + b * y + c * z)
-                        if closing <= 0.0:
+                        if closing <= 0.0:  # the ray leaves the shape behind
                             break
                         step = apart / closing
                     way += step

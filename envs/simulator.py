@@ -9,12 +9,10 @@ import mujoco
 import numpy as np
 from mujoco import batch
 
-from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.arm import WAITING, Arm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.obstacles import MESH, Obstacles, geom_fields, geom_meshes, quaternions_of
 
-OUT_OF_THE_WAY = np.array([0.0, 0.0, -10.0])
-"""Position of absent obstacles, [m]."""
 MOVING = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 """Parts of a control sequence with moving obstacles: controls, then the obstacles' positions."""
 MOST_BETWEEN = 64
@@ -72,7 +70,7 @@ class Simulator:
             mujoco.mju_mulQuat(quaternion[scene, row], outer, self.model.geom_quat[mesh])
         self._offset[sims] = position - obstacles.centre
         self._present[sims] = obstacles.present
-        self.batch.bind("mocap_pos")[sims] = np.where(obstacles.present[..., None], position, OUT_OF_THE_WAY)
+        self.batch.bind("mocap_pos")[sims] = np.where(obstacles.present[..., None], position, WAITING)
         self.batch.bind("mocap_quat")[sims] = quaternion
 
     def rollout(
@@ -96,7 +94,7 @@ class Simulator:
             out = self.batch.rollout(number, controls, record=(*kept, "ncon"), ids=sims)
         else:
             places = np.where(
-                self._present[sims][:, None, :, None], centres + self._offset[sims][:, None], OUT_OF_THE_WAY
+                self._present[sims][:, None, :, None], centres + self._offset[sims][:, None], WAITING
             )
             sequence = np.concatenate((controls, places.reshape(*controls.shape[:2], -1)), axis=-1)
             out = self.batch.rollout(number, sequence, MOVING, record=(*kept, "ncon"), ids=sims)
@@ -120,7 +118,7 @@ class Simulator:
         Joint positions at both steps have the shape (2, J), and centres of the obstacles (2, rows, 3), [m].
         """
         if self._probe is None:
-            model = copy.copy(self.model)
+            model = copy.copy(self.model)  # its fields of obstacles will change
             self._probe = model, mujoco.MjData(model)
         model, data = self._probe
         for share in np.arange(1, number + 1) / (number + 1):
@@ -138,7 +136,7 @@ class Simulator:
             return
         for name, field in self._fields.items():
             getattr(model, name)[self._geoms] = field[sim, self._geoms]
-        places = np.where(self._present[sim][:, None], centres + self._offset[sim], OUT_OF_THE_WAY)
+        places = np.where(self._present[sim][:, None], centres + self._offset[sim], WAITING)
         data.mocap_pos[:] = places
         data.mocap_quat[:] = self.batch.bind("mocap_quat")[sim].reshape(-1, 4)
 

@@ -72,7 +72,8 @@ class HandPlane:
         """Return True where the hand reaches the coordinates with joints within their ranges."""
         chain, limits = self.arm.chain, self.arm.joint_range + REACH_TOLERANCE * np.array([-1.0, 1.0])
         flat = np.ascontiguousarray(coordinates.reshape(-1, 2))
-        return planar_solutions(chain, limits, flat, np.empty_like(flat)).reshape(coordinates.shape[:-1])
+        _, found = planar_solutions(chain, limits, flat)
+        return found.reshape(coordinates.shape[:-1])
 
 
 Space = JointSpace | HandPlane

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -16,6 +17,7 @@ from viapoint.envs.common.validation import (
     fewest_and_most,
     names_of,
     number_of_at_least,
+    record_of,
     whole_number,
 )
 from viapoint.envs.geometry.shapes import check_kinds
@@ -153,7 +155,9 @@ class Task:
             horizon=number_of_at_least("horizon", horizon, 1e-3),
             margin=number_of_at_least("margin", margin, 0.0),
             control_step=number_of_at_least("control_step", control_step, 1e-3),
-            weights=RewardWeights.of(reward_weights),
+            weights=record_of(
+                "reward_weights", RewardWeights, {} if reward_weights is None else reward_weights
+            ),
             sensor=sensor,
         )
         if "sight" in task.decide_at and sensor is None:
@@ -201,7 +205,7 @@ class Task:
         in_hand = self.space_name == "hand"
         width = self.arm.joint_range[:, 1] - self.arm.joint_range[:, 0]
         offsets = np.minimum(RANGE_SHARE * width, LARGEST_OFFSET)
-        limits = np.minimum(self.arm.velocity_limit, 1e6)
+        limits = np.minimum(self.arm.velocity_limit, 1e6)  # infinite for arms without limits
         return ActionLayout(
             space=self.space_name,
             names_of_axes=("along", "across") if in_hand else self.arm.joint_names,
@@ -258,36 +262,11 @@ class Task:
     @functools.cached_property
     def observation(self) -> ObservationLayout:
         """Layout of the observations."""
-        top = 2.0 * max(self.steering.top_speed) if not self.whole_movement else 0.0
-        return ObservationLayout(
-            arm=self.arm,
-            kinds=self.shapes,
-            n_rows=self.n_obstacles[1],
-            dimension=self.space.dimension,
-            in_joints=self.space_name == "joints",
-            n_via=self.n_via if self.replanning else None,
-            speed=top,
-            acceleration=0.0 if self.whole_movement else self.steering.greatest_acceleration,
-            time_limit=0.0 if self.whole_movement else self.time_limit,
-            sensor=self.sensor,
-        )
+        return ObservationLayout(self)
 
     def sampler(self) -> SceneSampler:
         """Return a sampler of scenes of the task."""
-        low, high = self.duration_range
-        return SceneSampler(
-            self.arm,
-            space=self.space_name,
-            n_obstacles=self.n_obstacles,
-            kinds=self.shapes,
-            families=self.families,
-            rows=self.n_obstacles[1],
-            tall=self.whole_arm,
-            jumps=self.n_jumps,
-            moving=self.moving_obstacles,
-            durations=(low, self.action.centre, high),
-            viewpoint=None if self.sensor is None else self.sensor.viewpoint,
-        )
+        return SceneSampler(self)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the task as plain values for JSON; the arm by its name."""
@@ -297,11 +276,9 @@ class Task:
         values["reward_weights"] = dataclasses.asdict(values.pop("weights"))
         sensor = values.pop("sensor")
         if sensor is not None:
-            values["sensor"] = {
-                name: list(value) if isinstance(value, tuple) else value
-                for name, value in dataclasses.asdict(sensor).items()
-            }
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+            values["sensor"] = dataclasses.asdict(sensor)
+        plain: dict[str, Any] = json.loads(json.dumps(values))  # lists in place of tuples
+        return plain
 
     @classmethod
     def from_dict(cls, record: Mapping[str, Any]) -> Task:
@@ -310,11 +287,7 @@ class Task:
         Raises:
             ValueError: The arm is not registered, or a value is not allowed.
         """
-        values: dict[str, Any] = dict(record)
-        for name, value in record.items():
-            if isinstance(value, list):
-                values[name] = tuple(value)
-        return cls.of(**values)
+        return cls.of(**record)
 
 
 def _checked_decisions(decide_at: Any) -> str | tuple[Trigger, ...]:

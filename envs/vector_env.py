@@ -179,7 +179,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         plans = [each.last_plan for each in self._episodes if each.last_plan is not None]
         if len(plans) < len(self._episodes):
             return None
-        return Plan(*(np.concatenate(parts) for parts in zip(*plans, strict=True)))
+        return Plan(*map(_together, zip(*plans, strict=True)))
 
     @property
     def last_plans(self) -> tuple[History, ...]:
@@ -317,7 +317,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def observe(self) -> Observation:
         """Return the present observations."""
-        return _together([each.observe() for each in self._episodes])
+        return _together([each.observe() for each in self._episodes])  # type: ignore[no-any-return]
 
     def state(self) -> dict[str, Any]:
         """Return scenes, random generators and running episodes as values and arrays for :meth:`restore`.
@@ -408,15 +408,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
 
     def _joined(self, parts: list[Decision]) -> Decision:
         """Return the decisions of all environments together."""
-        decision = parts[0]
-        if len(parts) > 1:
-            decision = Decision(
-                observation=_together([part.observation for part in parts]),
-                reward=np.concatenate([part.reward for part in parts]),
-                terminated=np.concatenate([part.terminated for part in parts]),
-                truncated=np.concatenate([part.truncated for part in parts]),
-                info=_together([part.info for part in parts]),
-            )
+        decision = Decision(*map(_together, zip(*parts, strict=True)))
         self.terminated = decision.terminated
         self.truncated = decision.truncated
         return decision
@@ -488,8 +480,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         return generators, first_seed
 
 
-def _together(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the arrays of all environments by name, from those of the environments of each thread."""
+def _together(parts: Sequence[Any]) -> Any:
+    """Return an array of all environments, or arrays by name, from those of the environments of each thread."""
     if len(parts) == 1:
         return parts[0]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    if isinstance(parts[0], dict):
+        return {name: _together([part[name] for part in parts]) for name in parts[0]}
+    return np.concatenate(parts)

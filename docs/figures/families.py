@@ -15,7 +15,7 @@ from viapoint.envs.scenes.families_registry import scene_families
 from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.scene_sets import scenes_for
 
-FAMILIES = [name for name, family in scene_families(True).items() if family.hard]
+FAMILIES = [name for name, family in scene_families(True).items() if not family.trained]
 TASKS = {"PlanarObstacles": "the hand must clear", "PlanarWholeArm": "every link must clear"}
 VIEW = ((-0.55, 0.45), (-0.10, 0.78))
 """Limits of x and y, [m]."""

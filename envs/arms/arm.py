@@ -10,11 +10,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.chain import Chain, FirstTwo, Spheres
-from viapoint.envs.arms.kinematics import forward, inverse_dynamics
-from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, touching_at_home
-from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.geometry.clearance import memory, nearest_spheres, place
+from viapoint.envs.arms.kinematics import Chain, FirstTwo, Spheres, forward, inverse_dynamics
+from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, overlapping, touching_at_home
+from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import add_to_model
 from viapoint.envs.geometry.shapes import as_obstacle
@@ -139,18 +137,8 @@ class Arm:
         of the motion, plus stiffness and damping times the references. Torques are computed every `stride` steps; those
         in between are interpolated linearly.
         """
-        out = np.empty(position.shape)
-        _controls(
-            self.chain,
-            self.stiffness,
-            self.damping,
-            np.ascontiguousarray(position),
-            np.ascontiguousarray(velocity),
-            np.ascontiguousarray(acceleration),
-            stride,
-            out,
-        )
-        return out
+        motion = [np.ascontiguousarray(part) for part in (position, velocity, acceleration)]
+        return _controls(self.chain, self.stiffness, self.damping, stride, *motion)
 
 
 def arm_from_xml(
@@ -189,7 +177,7 @@ def arm_from_xml(
     ranges = np.array([model.joint(each).range for each in joints])
     low, high = ranges.T
     drawn = np.random.default_rng(0).uniform(low, high, (COMPARED, len(ranges)))
-    touch = _touching(chain, spheres, drawn)
+    touch = overlapping(chain, spheres, drawn)
     for first, second in spheres.pairs[~touch]:
         reason = f"in contact in none of {COMPARED:,} configurations"
         left_out.append(LeftOut(names[first], names[second], reason))
@@ -217,20 +205,6 @@ def arm_from_xml(
     )
 
 
-@compiled
-def _touching(chain: Chain, spheres: Spheres, joints: Float) -> Bool:
-    """Return True for pairs of groups that overlap in one of N configurations, shape (P,)."""
-    found = np.zeros(len(spheres.pairs), np.bool_)
-    placed = memory(chain, spheres)
-    for n in range(len(joints)):
-        place(chain, spheres, joints[n], placed)
-        for pair in range(len(found)):
-            if not found[pair]:
-                least, _, _ = nearest_spheres(spheres, placed, pair, 0.0, 0.0)
-                found[pair] = least < 0.0
-    return found
-
-
 def asset(file: str) -> str:
     """Return the text of a model file of the package."""
     return (files("viapoint.envs") / "assets" / file).read_text(encoding="utf-8")
@@ -241,14 +215,14 @@ def _controls(
     chain: Chain,
     stiffness: Float,
     damping: Float,
+    stride: int,
     position: Float,
     velocity: Float,
     acceleration: Float,
-    stride: int,
-    out: Float,
-) -> None:
-    """Fill in controls, see :meth:`Arm.controls`."""
+) -> Float:
+    """Return controls, see :meth:`Arm.controls`."""
     number, steps, joints = position.shape
+    out = np.empty(position.shape)
     before = np.empty(joints)
     after = np.empty(joints)
     for i in range(number):
@@ -269,6 +243,7 @@ def _controls(
                     servo = stiffness[j] * position[i, k, j] + damping[j] * velocity[i, k, j]
                     out[i, k, j] = torque + servo
             before[:] = after
+    return out
 
 
 def _chain(
@@ -384,7 +359,7 @@ def _add_actuators(spec: mujoco.MjSpec, arm: Arm) -> None:
         servo.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         servo.gainprm[0] = 1.0
         servo.biasprm[1:3] = -arm.stiffness[j], -arm.damping[j]
-        if arm.torque_limit[j] < 1e9:
+        if arm.torque_limit[j] < 1e9:  # MuJoCo takes no infinite range
             servo.forcelimited = True
             servo.forcerange = -arm.torque_limit[j], arm.torque_limit[j]
 

@@ -198,7 +198,7 @@ def _refine(
     probe, best = np.empty((2, 3)), np.empty((2, 3))
     step, least = FIRST_STEP * size, _excess(ends, corners, body, np.inf)
     while step > last_step * size:
-        lowest = least - 1e-9
+        lowest = least - 1e-9  # less of an improvement is rounding
         for move in range(len(moves)):
             probe[:] = ends + step * moves[move]
             value = _excess(probe, corners, body, lowest)
@@ -209,7 +209,7 @@ def _refine(
             ends[:] = best
             least = lowest
         else:
-            step *= 0.5
+            step *= 0.5  # no direction is better
     return least
 
 
@@ -237,7 +237,7 @@ def _radius(ends: Float, corners: Float, bound: float) -> float:
     Once it is above a bound, it need not be the greatest.
     """
     most = max(bound, 0.0) ** 2
-    length = 1e-18
+    length = 1e-18  # a sphere has no axis to divide by
     for a in range(3):
         length += (ends[1, a] - ends[0, a]) ** 2
     greatest = 0.0
@@ -250,7 +250,7 @@ def _radius(ends: Float, corners: Float, bound: float) -> float:
         for a in range(3):
             square += (corners[corner, a] - ends[0, a] - share * (ends[1, a] - ends[0, a])) ** 2
         greatest = max(greatest, square)
-        if greatest > most:
+        if greatest > most:  # worse than the best so far
             break
     return float(np.sqrt(greatest))
 

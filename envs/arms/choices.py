@@ -1,9 +1,8 @@
-"""Choices for an arm of a file: tool, joints, limits and home, where the user names none."""
+"""Choices for an arm of a file: tool, joints and limits, where the user names none."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import mujoco
@@ -24,12 +23,6 @@ GRIPPERS = re.compile(r"grip|jaw|finger|fngr|claw|knuckle", re.IGNORECASE)
 """Words in the names of bodies and joints of a gripper, which is not part of a chain whose tool has no usual name."""
 LEAST_CHAIN = 3
 """Least number of joints of a branch that is an arm and not a finger."""
-HOMES = 64
-"""Number of random configurations among which a home is looked for."""
-INSET = 0.1
-"""Least distance of home from the joint limits, as a share of the ranges."""
-LEAST_GAP = 0.002
-"""Distance of bodies at home below which another home is looked for, [m]."""
 KNOWN_VELOCITIES: dict[str, tuple[float, ...]] = {
     "panda": (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),
     "fr3": (2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
@@ -239,21 +232,3 @@ def known_limits(table: dict[str, tuple[float, ...]], name: str, number: int) ->
         if known in plain and len(limits) == number:
             return np.array(limits)
     return None
-
-
-def choose_home(
-    ranges: Float, candidates: Mapping[str, Float], apart: Callable[[Float], float]
-) -> tuple[Float, str]:
-    """Return the first configuration in which the arm does not touch itself, and where it comes from.
-
-    Named candidates are tried first. `apart` returns the least distance of bodies that should not touch, [m].
-    """
-    low, high = ranges.T
-    candidates = {**candidates, "the middle of the ranges": 0.5 * (low + high)}
-    for origin, configuration in candidates.items():
-        inside = (configuration >= low) & (configuration <= high)
-        if inside.all() and apart(configuration) >= LEAST_GAP:
-            return configuration, origin
-    inset = INSET * (high - low)
-    drawn = np.random.default_rng(0).uniform(low + inset, high - inset, (HOMES, len(low)))
-    return max(drawn, key=apart), "the one that is farthest from touching itself, of random ones"

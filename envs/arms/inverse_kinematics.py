@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.chain import Chain
-from viapoint.envs.arms.kinematics import link_frames, tool_jacobian, transform
+from viapoint.envs.arms.kinematics import Chain, link_frames, tool_jacobian, transform
+from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.common.validation import finite_array, whole_number
+from viapoint.envs.common.validation import finite_array, unit_quaternion, whole_number
 from viapoint.envs.geometry.compiled import compiled, kernel
 
 ITERATIONS = 80
@@ -110,7 +109,7 @@ def descend(
                 error[3 + a] *= angle / sine
         elif oriented and angle > 1.0:
             error[3] = 0.5  # half a turn: any axis will do
-        scale = min(LONGEST_STEP / away, 1.0)
+        scale = min(LONGEST_STEP / away, 1.0)  # the Jacobian holds for small steps
         tool_jacobian(chain, rotation, origin, tool, jacobian)
         damping = (DAMPING * min(away, 1.0)) ** 2 + 1e-12
         for i in range(rows):
@@ -129,7 +128,7 @@ def descend(
             before = joints[j]
             joints[j] = min(max(before + step, joint_range[j, 0]), joint_range[j, 1])
             moved = max(moved, abs(joints[j] - before))
-        if moved < STALLED:
+        if moved < STALLED:  # at the limits, or at a singularity
             break
     return away
 
@@ -192,12 +191,13 @@ def in_planar_reach(chain: Chain, limits: Float, x: float, y: float) -> bool:
 
 
 @compiled
-def planar_solutions(chain: Chain, joint_range: Float, places: Float, joints: Float) -> Bool:
-    """Fill in the joints for places of the hand in the plane, (N, 2), [m], and return True where it gets there."""
+def planar_solutions(chain: Chain, joint_range: Float, places: Float) -> tuple[Float, Bool]:
+    """Return the joints for places of the hand in the plane, (N, 2), [m], and True where it gets there, (N,)."""
+    joints = np.empty_like(places)
     found = np.empty(len(places), np.bool_)
     for i in range(len(places)):
         found[i] = solve_planar(chain, joint_range, places[i, 0], places[i, 1], joints[i])
-    return found
+    return joints, found
 
 
 @compiled
@@ -207,16 +207,17 @@ def _planar_motion(
     position: Float,
     velocity: Float,
     acceleration: Float,
-    out: tuple[Float, Float, Float],
-) -> None:
-    """Fill in joints, rates and accelerations for N states of the hand.
+) -> tuple[Float, Float, Float]:
+    """Return joints, rates and accelerations for N states of the hand.
 
     With unit vectors u along the links and n across them, the velocity is l1 a1' n1 + l2 a2' n2 for the angles a of the
     links in the world, and n1 . u2 = sin(a2 - a1), so its components along u2 and u1 give the rates. Accelerations
     follow alike after the centripetal terms are taken away.
     """
     first, second, turn, base, upper, fore = chain.first_two
-    joints, rates, changes = out
+    joints = np.empty_like(position)
+    rates = np.empty_like(position)
+    changes = np.empty_like(position)
     for i in range(len(position)):
         solve_planar(chain, joint_range, position[i, 0], position[i, 1], joints[i])
         one = base + joints[i, 0] + first
@@ -233,6 +234,7 @@ def _planar_motion(
         change_2 = -(x * c1 + y * s1) / (fore * sine)
         rates[i, 0], rates[i, 1] = rate_1, rate_2 - rate_1
         changes[i, 0], changes[i, 1] = change_1, change_2 - change_1
+    return joints, rates, changes
 
 
 def planar_joints(arm: Arm, places: Any) -> Float:
@@ -241,10 +243,8 @@ def planar_joints(arm: Arm, places: Any) -> Float:
     Out of reach, the elbow is as straight or as bent as it can be.
     """
     places = np.asarray(places, dtype=np.float64)
-    flat = places.reshape(-1, 2)
-    out = np.empty((len(flat), 2))
-    planar_solutions(arm.chain, arm.joint_range, flat, out)
-    return out.reshape(places.shape)
+    joints, _ = planar_solutions(arm.chain, arm.joint_range, places.reshape(-1, 2))
+    return joints.reshape(places.shape)
 
 
 def planar_motion(
@@ -252,10 +252,9 @@ def planar_motion(
 ) -> tuple[Float, Float, Float]:
     """Return joint positions, rates and accelerations for motions of the hand in the plane, shape (..., 2) each."""
     flat = [np.ascontiguousarray(part.reshape(-1, 2)) for part in (position, velocity, acceleration)]
-    out = (np.empty_like(flat[0]), np.empty_like(flat[0]), np.empty_like(flat[0]))
-    _planar_motion(arm.chain, arm.joint_range, flat[0], flat[1], flat[2], out)
+    joints, rates, changes = _planar_motion(arm.chain, arm.joint_range, *flat)
     shape = position.shape
-    return out[0].reshape(shape), out[1].reshape(shape), out[2].reshape(shape)
+    return joints.reshape(shape), rates.reshape(shape), changes.reshape(shape)
 
 
 def _least_distance(arm: Arm, position: Float, begin: Float) -> float:
@@ -306,13 +305,9 @@ def inverse_kinematics(
         [0.5, 0.2, 0.4]
     """
     position = finite_array("position", position, (3,))
-    axes = np.zeros(9)
+    axes = np.eye(3)
     if quaternion is not None:
-        quaternion = finite_array("quaternion", quaternion, (4,))
-        length = float(np.linalg.norm(quaternion))
-        if abs(length - 1.0) > 1e-3:
-            raise ValueError(f"quaternion must have the length 1, got {quaternion.tolist()}")
-        mujoco.mju_quat2Mat(axes, quaternion / length)
+        axes = frame_matrices(unit_quaternion("quaternion", quaternion))
     number = whole_number("n_seeds", n_seeds, 1)
     first = arm.home if seed is None else finite_array("seed", seed, arm.home.shape)
     rng = np.random.default_rng(0) if rng is None else rng
@@ -326,7 +321,7 @@ def inverse_kinematics(
             arm.chain,
             arm.joint_range,
             position,
-            axes.reshape(3, 3),
+            axes,
             quaternion is not None,
             configuration,
             rotation,

@@ -1,4 +1,4 @@
-"""Forward kinematics, Jacobians, inverse dynamics and limits of movements of a chain of joints.
+"""Forward kinematics, Jacobians, inverse dynamics and limits of movements of a chain of joints with spheres.
 
 Compiled functions work on one configuration and fill arrays of the caller. The functions at the end of the module are
 batched over leading axes; they check their arguments and return new arrays.
@@ -7,22 +7,111 @@ batched over leading axes; they check their arguments and return new arrays.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.chain import Chain, Spheres
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 
 Vector = tuple[float, float, float]
 """Three components."""
+PART = 16
+"""Greatest number of spheres of a part of a group."""
 LIMIT_SHARE = 0.97
 """Share of the velocity and torque limits that plans may use; feedback uses the rest."""
 LEAST_TORQUE_SHARE = 0.01
 """Least share of a joint's torque limit that counts as available for motion, however heavy the arm is."""
 TORQUE_STRIDE = 2
 """Torques are looked at in every second configuration: they change slowly."""
+
+
+class FirstTwo(NamedTuple):
+    """Angles and lengths of an arm of two hinges with vertical axes."""
+
+    upper_angle: float
+    """Angle of the upper arm in the frame of the shoulder, [rad]."""
+    fore_angle: float
+    """Angle of the forearm in the frame of the elbow, [rad]."""
+    elbow: float
+    """Angle of the frame of the elbow in that of the shoulder, [rad]."""
+    base: float
+    """Angle of the frame of the shoulder in the world, [rad]."""
+    upper: float
+    """Length of the upper arm, [m]."""
+    fore: float
+    """Length of the forearm, [m]."""
+
+    @classmethod
+    def of(cls, origin: Float, rotation: Float, tool_origin: Float) -> FirstTwo:
+        """Return the numbers of a chain; see :class:`Chain` for the arguments."""
+        return cls(
+            upper_angle=math.atan2(origin[1, 1], origin[1, 0]),
+            fore_angle=math.atan2(tool_origin[1], tool_origin[0]),
+            elbow=math.atan2(rotation[1, 1, 0], rotation[1, 0, 0]),
+            base=math.atan2(rotation[0, 1, 0], rotation[0, 0, 0]),
+            upper=math.hypot(origin[1, 0], origin[1, 1]),
+            fore=math.hypot(tool_origin[0], tool_origin[1]),
+        )
+
+
+class Chain(NamedTuple):
+    """Serial chain of J joints with one link each.
+
+    Link 0 is the base, which does not move; link j moves with joints 1 to j. The frame of a link is that of its joint;
+    its z axis is the axis of the joint.
+    """
+
+    origin: Float
+    """Origin of the frame of each joint at 0, in the frame of the link before, shape (J, 3), [m]."""
+    rotation: Float
+    """Axes of this frame as columns, in the frame of the link before, shape (J, 3, 3)."""
+    sliding: Bool
+    """True for joints that slide along their z axis, False for hinges about it, shape (J,)."""
+    tool_origin: Float
+    """Origin of the tool's frame in that of the last link, shape (3,), [m]."""
+    tool_rotation: Float
+    """Axes of the tool's frame as columns, shape (3, 3)."""
+    mass: Float
+    """Mass of each moving link with all that is fixed to it, shape (J,), [kg]."""
+    centre: Float
+    """Centre of mass in the link's frame, shape (J, 3), [m]."""
+    inertia: Float
+    """Rotational inertia about the centre of mass, in the link's frame, shape (J, 3, 3), [kg m^2]."""
+    armature: Float
+    """Inertia of the motors seen at the joints, shape (J,), [kg m^2] or [kg]."""
+    damping: Float
+    """Viscous friction of the joints, shape (J,), [N m s/rad] or [N s/m]."""
+    gravity: Float
+    """Gravitational acceleration, shape (3,), [m/s^2]."""
+    first_two: FirstTwo
+    """Angles and lengths of the first two links, for the inverse kinematics of an arm in the plane."""
+
+
+class Spheres(NamedTuple):
+    """Spheres that cover an arm, in G groups; a group is rigid and belongs to one body of the model."""
+
+    centre: Float
+    """Centres in the frame of the link, shape (S, 3), [m]."""
+    radius: Float
+    """Radii, shape (S,), [m]."""
+    first: Int
+    """Index of the first sphere of each group, and the number of spheres, shape (G + 1,)."""
+    link: Int
+    """Link that each group moves with, shape (G,); 0 for the base."""
+    ball_centre: Float
+    """Centre of a bounding sphere of each group and part, in the frame of the link, shape (G + C, 3), [m]."""
+    ball_radius: Float
+    """Radius of this sphere, shape (G + C,), [m]."""
+    pairs: Int
+    """Pairs of groups that must not touch one another, shape (P, 2)."""
+    part: Int
+    """Row of the bounding sphere of the first part of each group, and the number of rows, shape (G + 1,).
+
+    Groups of more than PART spheres are divided into parts of PART neighbours, the last one of fewer. Their bounding
+    spheres stand behind those of the groups. A group of fewer has none.
+    """
 
 
 @kernel
@@ -167,7 +256,7 @@ def inverse_dynamics(chain: Chain, q: Float, v: Float, a: Float, torque: Float) 
     work = np.empty((n_joints, 11))
     spin = (0.0, 0.0, 0.0)
     turn = (0.0, 0.0, 0.0)
-    linear = (-chain.gravity[0], -chain.gravity[1], -chain.gravity[2])
+    linear = (-chain.gravity[0], -chain.gravity[1], -chain.gravity[2])  # at rest on earth
     for j in range(n_joints):
         slides = chain.sliding[j]
         cosine, sine = 1.0, 0.0
@@ -249,7 +338,7 @@ def slowdown(
     for k in range(len(position)):
         for j in range(joints):
             least = max(least, abs(velocity[k, j]) / (LIMIT_SHARE * velocity_limit[j]))
-        if k % TORQUE_STRIDE:
+        if k % TORQUE_STRIDE:  # torques change slowly
             continue
         inverse_dynamics(chain, position[k], rest, rest, heavy)
         inverse_dynamics(chain, position[k], velocity[k], acceleration[k], whole)
@@ -258,7 +347,7 @@ def slowdown(
             motion = whole[j] - heavy[j] - friction
             against = heavy[j] if motion + friction >= 0.0 else -heavy[j]
             room = max(LIMIT_SHARE * torque_limit[j] - against, LEAST_TORQUE_SHARE * torque_limit[j])
-            if room > 1e9:
+            if room > 1e9:  # no limit
                 continue
             friction = abs(friction)
             # The positive root of room s^2 - |f| s - |m| = 0.
@@ -286,44 +375,41 @@ def slowdowns(
 
 
 @compiled
-def _all_frames(chain: Chain, joints: Float, rotation: Float, origin: Float) -> None:
-    for n in range(joints.shape[0]):
+def _all_frames(chain: Chain, joints: Float) -> tuple[Float, Float]:
+    """Return the frames of the links for N configurations, see :func:`link_poses`."""
+    number, links = len(joints), len(chain.mass) + 1
+    rotation = np.empty((number, links, 3, 3))
+    origin = np.empty((number, links, 3))
+    for n in range(number):
         link_frames(chain, joints[n], rotation[n], origin[n])
+    return rotation, origin
 
 
 @compiled
-def _all_tools(chain: Chain, joints: Float, tool_rotation: Float, tool_origin: Float) -> None:
-    n_joints = joints.shape[1]
-    rotation, origin = np.empty((n_joints + 1, 3, 3)), np.empty((n_joints + 1, 3))
-    for n in range(joints.shape[0]):
-        x, y, z = tool_position(chain, joints[n], rotation, origin)
-        tool_origin[n, 0], tool_origin[n, 1], tool_origin[n, 2] = x, y, z
+def _all_tools(chain: Chain, joints: Float) -> tuple[Float, Float]:
+    """Return places and axes of the tool for N configurations, see :func:`forward`."""
+    number, last = joints.shape
+    rotation, origin = np.empty((last + 1, 3, 3)), np.empty((last + 1, 3))
+    places, axes = np.empty((number, 3)), np.empty((number, 3, 3))
+    for n in range(number):
+        places[n, 0], places[n, 1], places[n, 2] = tool_position(chain, joints[n], rotation, origin)
         for row in range(3):
             for column in range(3):
-                tool_rotation[n, row, column] = (
-                    rotation[n_joints, row, 0] * chain.tool_rotation[0, column]
-                    + rotation[n_joints, row, 1] * chain.tool_rotation[1, column]
-                    + rotation[n_joints, row, 2] * chain.tool_rotation[2, column]
+                axes[n, row, column] = (
+                    rotation[last, row, 0] * chain.tool_rotation[0, column]
+                    + rotation[last, row, 1] * chain.tool_rotation[1, column]
+                    + rotation[last, row, 2] * chain.tool_rotation[2, column]
                 )
+    return places, axes
 
 
 @compiled
-def _all_torques(chain: Chain, q: Float, v: Float, a: Float, torque: Float) -> None:
+def _all_torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
+    """Return the torques of N motions, see :func:`torques`."""
+    torque = np.empty_like(q)
     for n in range(q.shape[0]):
         inverse_dynamics(chain, q[n], v[n], a[n], torque[n])
-
-
-@compiled
-def _all_centres(chain: Chain, spheres: Spheres, joints: Float, centre: Float) -> None:
-    n_joints = joints.shape[1]
-    rotation, origin = np.empty((n_joints + 1, 3, 3)), np.empty((n_joints + 1, 3))
-    for n in range(joints.shape[0]):
-        link_frames(chain, joints[n], rotation, origin)
-        for group in range(spheres.link.shape[0]):
-            link = spheres.link[group]
-            for s in range(spheres.first[group], spheres.first[group + 1]):
-                x, y, z = transform(rotation, origin, link, spheres.centre[s])
-                centre[n, s, 0], centre[n, s, 1], centre[n, s, 2] = x, y, z
+    return torque
 
 
 def _flat(name: str, chain: Chain, joints: Float) -> tuple[Float, tuple[int, ...]]:
@@ -335,18 +421,15 @@ def _flat(name: str, chain: Chain, joints: Float) -> tuple[Float, tuple[int, ...
 def forward(chain: Chain, joints: Float) -> tuple[Float, Float]:
     """Return places of the tool, (..., 3), [m], and its axes as columns, (..., 3, 3), for joints (..., J)."""
     flat, batch = _flat("joints", chain, joints)
-    position, rotation = np.empty((len(flat), 3)), np.empty((len(flat), 3, 3))
-    _all_tools(chain, flat, rotation, position)
-    return position.reshape(*batch, 3), rotation.reshape(*batch, 3, 3)
+    places, axes = _all_tools(chain, flat)
+    return places.reshape(*batch, 3), axes.reshape(*batch, 3, 3)
 
 
 def link_poses(chain: Chain, joints: Float) -> tuple[Float, Float]:
     """Return the frames of links 0 to J: axes as columns, (..., J + 1, 3, 3), and origins (..., J + 1, 3), [m]."""
     flat, batch = _flat("joints", chain, joints)
-    links = len(chain.mass) + 1
-    rotation, origin = np.empty((len(flat), links, 3, 3)), np.empty((len(flat), links, 3))
-    _all_frames(chain, flat, rotation, origin)
-    return rotation.reshape(*batch, links, 3, 3), origin.reshape(*batch, links, 3)
+    rotation, origin = _all_frames(chain, flat)
+    return rotation.reshape(*batch, *rotation.shape[1:]), origin.reshape(*batch, *origin.shape[1:])
 
 
 def torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
@@ -354,14 +437,12 @@ def torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
     flat, batch = _flat("q", chain, q)
     rates, _ = _flat("v", chain, np.broadcast_to(v, np.shape(q)))
     accelerations, _ = _flat("a", chain, np.broadcast_to(a, np.shape(q)))
-    torque = np.empty_like(flat)
-    _all_torques(chain, flat, rates, accelerations, torque)
-    return torque.reshape(*batch, flat.shape[1])
+    return _all_torques(chain, flat, rates, accelerations).reshape(*batch, flat.shape[1])
 
 
 def sphere_centres(chain: Chain, spheres: Spheres, joints: Float) -> Float:
     """Return the world positions of all S spheres, shape (..., S, 3), [m]."""
-    flat, batch = _flat("joints", chain, joints)
-    centre = np.empty((len(flat), len(spheres.radius), 3))
-    _all_centres(chain, spheres, flat, centre)
-    return centre.reshape(*batch, len(spheres.radius), 3)
+    rotation, origin = link_poses(chain, joints)
+    link = np.repeat(spheres.link, np.diff(spheres.first))
+    turned = rotation[..., link, :, :] @ spheres.centre[..., None]
+    return np.asarray(origin[..., link, :] + turned[..., 0])

@@ -20,21 +20,28 @@ from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
 from viapoint.envs.arms.choices import (
     KNOWN_TORQUES,
     KNOWN_VELOCITIES,
-    LEAST_GAP,
+    MOVES,
     Tool,
     ancestors,
     arm_joints,
     chain_joints,
-    choose_home,
     choose_tool,
     known_limits,
 )
 from viapoint.envs.arms.kinematics import torques
-from viapoint.envs.arms.stored import cached_path, read_cached, write_cached
+from viapoint.envs.arms.stored import cached_arm
 from viapoint.envs.arms.urdf import Urdf, read_urdf
+from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least
+from viapoint.envs.geometry.obstacles import quaternions_of
 
+HOMES = 64
+"""Number of random configurations among which a home is looked for."""
+INSET = 0.1
+"""Least distance of home from the joint limits, as a share of the ranges."""
+LEAST_GAP = 0.002
+"""Distance of bodies at home below which another home is looked for, [m]."""
 DEFAULT_VELOCITY_LIMIT = 2.0
 """Velocity limit of joints without one, [rad/s] or [m/s]."""
 WEIGHTS, LEAST_TORQUE = 3.0, 1.0
@@ -65,10 +72,11 @@ INERTIA_MARGIN = 2e-5
 """Relative margin of the triangle inequality of principal moments; the text of a model keeps six digits."""
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 """Transmissions of actuators that drive a joint directly."""
-JOINT_TYPES = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-"""Types of joints that an arm may have."""
 RESERVED = ("", "world", "meshes")
 """Names that bodies of the arm cannot have, beside those of obstacles."""
+
+Pair = tuple[int, int]
+"""Numbers of two bodies, the first one first in the file."""
 
 
 class Parsed(NamedTuple):
@@ -89,16 +97,16 @@ class Parsed(NamedTuple):
     geoms: dict[int, list[int]]
     """Geoms of each of these bodies that count for collisions; bodies without any are left out."""
 
-    def pair(self, bodies: tuple[int, int]) -> frozenset[str]:
+    def pair(self, bodies: Pair) -> frozenset[str]:
         """Return the names of a pair of bodies."""
         return frozenset(self.names[body] for body in bodies)
 
-    def compared(self, exclude: Mapping[frozenset[str], str]) -> list[tuple[int, int]]:
+    def compared(self, exclude: Mapping[Pair, str]) -> list[Pair]:
         """Return the pairs of bodies with geoms of links that are neither the same nor consecutive, nor excluded."""
         found = []
         for first, second in itertools.combinations(self.geoms, 2):
             apart = abs(self.links[first] - self.links[second])
-            if apart > 1 and self.pair((first, second)) not in exclude:
+            if apart > 1 and (first, second) not in exclude:
                 found.append((first, second))
         return found
 
@@ -172,11 +180,9 @@ def load_arm(
     }
     notes = list(urdf.notes)
     whole = _compiled(spec, notes)
-    path = cached_path(whole, {**given, "name": name, "notes": notes, "urdf": urdf[2:]})
-    arm = read_cached(path)
-    if arm is None:
-        arm = _load(whole, name, f"{name} {spec.modelname}", urdf, notes, given)
-        write_cached(path, arm)
+    arguments = {**given, "name": name, "notes": notes, "urdf": urdf[2:]}
+    known_as = f"{name} {spec.modelname}"
+    arm = cached_arm(whole, arguments, lambda: _load(whole, name, known_as, urdf, notes, given))
     for note in arm.notes:
         if note.startswith(WARNING):
             warnings.warn(note.removeprefix(WARNING), stacklevel=2)
@@ -206,7 +212,7 @@ def _load(
         raise ValueError(f"there is no joint {', '.join(map(repr, missing))} in the file; there are: {named}")
     ranges = _ranges(whole, names, given["joint_range"], notes)
     velocity = _velocities(whole, names, given["velocity_limit"], urdf.velocity_limits, known_as, notes)
-    torque, stated = _torques(whole, names, given["torque_limit"], known_as, notes)
+    torque = _torques(whole, names, given["torque_limit"], known_as, notes)
     for what, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
         if not (limit > 0.0).all():
             raise ValueError(f"{what} must be positive, got {limit}")
@@ -220,19 +226,19 @@ def _load(
     looked_at = np.array([_distances(parsed, each, pairs) for each in drawn[:LOOKED_AT]])
     near = list(itertools.compress(pairs, np.median(looked_at, axis=0) < NEAR))
     apart = _apart(parsed, near, drawn)
-    exclude |= dict.fromkeys(map(parsed.pair, apart), never)
+    exclude |= dict.fromkeys(apart, never)
     movable = itertools.compress(pairs, looked_at.max(axis=0) > 0.0)
-    kept = [pair for pair in movable if parsed.pair(pair) not in exclude]
+    kept = [pair for pair in movable if pair not in exclude]
     home = _home(parsed, ranges, given["home"], kept, notes)
     origin = np.zeros(3) if given["origin"] is None else finite_array("origin", given["origin"], (3,))
     # Bodies that are near at home get smaller capsules, or are not compared, either.
     pairs = parsed.compared(exclude)
     at_home = _distances(parsed, home, pairs)
     close = itertools.compress(pairs, (at_home > 0.0) & (at_home < LEAST_GAP))
-    exclude |= dict.fromkeys(map(parsed.pair, _apart(parsed, close, drawn)), never)
+    exclude |= dict.fromkeys(_apart(parsed, close, drawn), never)
     distances = {}
     for pair, away in zip(pairs, at_home.tolist(), strict=True):
-        if away > 0.0 and parsed.pair(pair) not in exclude:
+        if away > 0.0 and pair not in exclude:
             distances[pair] = away
     tolerance = given["tolerance"]
     tolerances = dict.fromkeys(parsed.geoms, tolerance)
@@ -247,12 +253,12 @@ def _load(
         home=home,
         velocity_limit=velocity,
         torque_limit=torque,
-        exclude=exclude,
+        exclude={parsed.pair(pair): reason for pair, reason in exclude.items()},
     )
-    weight = np.abs(torques(arm.chain, home, 0.0 * home, 0.0 * home))
+    weight = np.abs(torques(arm.chain, home, np.zeros(1), np.zeros(1)))
     weak = weight > torque
     some = ", ".join(itertools.compress(names, weak))
-    if some and stated:
+    if some and given["torque_limit"] is not None:
         raise ValueError(
             f"the torque limits of {some} do not hold the arm's own weight at home; raise torque_limit"
         )
@@ -342,7 +348,7 @@ def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: l
     found, endless = [], []
     for name in joints:
         joint = model.joint(name).id
-        if not np.isin(model.jnt_type[joint], JOINT_TYPES):
+        if not np.isin(model.jnt_type[joint], MOVES):
             raise ValueError(f"joint {name!r} is neither a hinge nor a slide; leave it out to fix it")
         limited = bool(model.jnt_limited[joint])
         if given is None and not limited and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
@@ -362,12 +368,10 @@ def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: l
     return ranges
 
 
-def _torques(
-    model: mujoco.MjModel, joints: tuple[str, ...], given: Any, arm: str, notes: list[str]
-) -> tuple[Float, bool]:
-    """Return the torque limit of each joint, its own, or the greatest of the actuators that drive it; True if given."""
+def _torques(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, arm: str, notes: list[str]) -> Float:
+    """Return the torque limit of each joint, its own, or the greatest of the actuators that drive it."""
     if given is not None:
-        return _per_joint("torque_limit", given, joints), True
+        return _per_joint("torque_limit", given, joints)
     found = []
     for name in joints:
         joint = model.joint(name).id
@@ -378,20 +382,33 @@ def _torques(
         limits = [_actuator_torque(model, int(index)) for index in np.flatnonzero(drives)]
         found.append(max(limits, default=0.0))
     torque = np.array(found)
-    missing = torque <= 0.0
     known = known_limits(KNOWN_TORQUES, arm, len(joints))
-    if missing.any() and known is not None:
-        notes.append("torque limits: those of the arm of this name")
-        torque = np.where(missing, known, torque)
-    elif missing.any():
-        weight = _greatest_weight(model, joints)
-        torque[missing] = np.maximum(WEIGHTS * weight[missing], LEAST_TORQUE)
-        some = ", ".join(itertools.compress(joints, missing))
-        notes.append(
-            f"{WARNING}the file has no torque limits of {some}; they get {WEIGHTS:g} times what the arm's weight "
-            "needs; give torque_limit"
-        )
-    return torque, False
+    weight: Any = 0.0
+    if known is None and (torque <= 0.0).any():
+        weight = np.maximum(WEIGHTS * _greatest_weight(model, joints), LEAST_TORQUE)
+    how = f"{WEIGHTS:g} times what the arm's weight needs"
+    return _completed("torque", joints, torque, known, weight, how, notes)
+
+
+def _completed(
+    what: str,
+    joints: tuple[str, ...],
+    limits: Float,
+    known: Float | None,
+    default: Any,
+    how: str,
+    notes: list[str],
+) -> Float:
+    """Return limits of which missing ones, which are 0, are those of a known arm or a default; a note tells it."""
+    missing = limits <= 0.0
+    if not missing.any():
+        return limits
+    if known is not None:
+        notes.append(f"{what} limits: those of the arm of this name")
+        return np.where(missing, known, limits)
+    some = ", ".join(itertools.compress(joints, missing))
+    notes.append(f"{WARNING}the file has no {what} limits of {some}; they get {how}; give {what}_limit")
+    return np.where(missing, default, limits)
 
 
 def _greatest_weight(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
@@ -438,20 +455,12 @@ def _velocities(
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
         return _per_joint("velocity_limit", model.numeric("velocity_limit").data, joints)
     found = np.array([in_urdf.get(name, 0.0) for name in joints])
-    missing = found <= 0.0
+    how = f"{DEFAULT_VELOCITY_LIMIT:g} rad/s (slides {DEFAULT_VELOCITY_LIMIT:g} m/s)"
     known = known_limits(KNOWN_VELOCITIES, arm, len(joints))
-    if missing.any() and known is not None:
-        notes.append("velocity limits: those of the arm of this name")
-        return np.where(missing, known, found)
-    if missing.any():
-        notes.append(
-            f"{WARNING}the file has no velocity limits of {', '.join(itertools.compress(joints, missing))}; they get "
-            f"{DEFAULT_VELOCITY_LIMIT:g} rad/s (slides {DEFAULT_VELOCITY_LIMIT:g} m/s); give velocity_limit"
-        )
-    return np.where(missing, DEFAULT_VELOCITY_LIMIT, found)
+    return _completed("velocity", joints, found, known, DEFAULT_VELOCITY_LIMIT, how, notes)
 
 
-def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[tuple[int, int]], notes: list[str]) -> Float:
+def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[Pair], notes: list[str]) -> Float:
     """Return the home configuration, shape (J,), in which some pairs of bodies do not touch."""
     model, joints = parsed.model, parsed.joints
     if given is not None:
@@ -464,12 +473,21 @@ def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[tuple[int, int]
     if model.nkey:
         address = [int(model.joint(name).qposadr[0]) for name in joints]
         candidates["the file's keyframe"] = model.key_qpos[0, address].copy()
-    candidates["zeros"] = np.zeros(len(joints))
-    home, origin = choose_home(
-        ranges, candidates, lambda home: float(_distances(parsed, home, pairs).min(initial=1.0))
-    )
-    notes.append(f"home: {origin}")
-    return home
+    low, high = ranges.T
+    candidates |= {"zeros": np.zeros(len(joints)), "the middle of the ranges": 0.5 * (low + high)}
+
+    def apart(configuration: Float) -> float:
+        return float(_distances(parsed, configuration, pairs).min(initial=1.0))
+
+    for origin, configuration in candidates.items():
+        inside = (configuration >= low) & (configuration <= high)
+        if inside.all() and apart(configuration) >= LEAST_GAP:
+            notes.append(f"home: {origin}")
+            return np.asarray(configuration)
+    notes.append("home: the one that is farthest from touching itself, of random ones")
+    inset = INSET * (high - low)
+    drawn = np.random.default_rng(0).uniform(low + inset, high - inset, (HOMES, len(low)))
+    return max(drawn, key=apart)
 
 
 def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: list[str]) -> Parsed:
@@ -539,30 +557,26 @@ def _check_order(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[in
             raise ValueError(f"joints must be in order from the base: {first!r} does not carry {second!r}")
 
 
-def _collide_in_file(parsed: Parsed, first: int, second: int) -> bool:
-    """Return True if MuJoCo would let geoms of two bodies collide: contact bits, excluded and explicit pairs."""
+def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> list[Pair]:
+    """Return the pairs of bodies that the file does not let collide, or an SRDF file.
+
+    MuJoCo decides by contact bits, excluded bodies, and explicit pairs of geoms.
+    """
     model = parsed.model
-    low, high = sorted((first, second))
-    if (low << 16) + high in model.exclude_signature:
-        return False
+    silent = set(map(frozenset, never_touch))
     explicit = set(map(frozenset, zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)))
-    for a, b in itertools.product(parsed.geoms[first], parsed.geoms[second]):
-        bits = model.geom_contype[a] & model.geom_conaffinity[b]
-        bits |= model.geom_contype[b] & model.geom_conaffinity[a]
-        # Geoms that collide with nothing stand for a link that has no others.
-        silent = any(not (model.geom_contype[geom] | model.geom_conaffinity[geom]) for geom in (a, b))
-        if bits or silent or frozenset((a, b)) in explicit:
-            return True
-    return False
-
-
-def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> list[frozenset[str]]:
-    """Return the names of pairs of bodies that the file does not let collide, or an SRDF file."""
-    silent = {frozenset(pair) for pair in never_touch}
+    types, affinities = model.geom_contype, model.geom_conaffinity
+    # Geoms that collide with nothing stand for a link that has no others.
+    spare = (types | affinities) == 0
     found = []
-    for pair in parsed.compared({}):
-        if not _collide_in_file(parsed, *pair) or parsed.pair(pair) in silent:
-            found.append(parsed.pair(pair))
+    for first, second in parsed.compared({}):
+        collide = False
+        for a, b in itertools.product(parsed.geoms[first], parsed.geoms[second]):
+            bits = (types[a] & affinities[b]) | (types[b] & affinities[a])
+            collide = collide or bool(bits or spare[a] or spare[b] or frozenset((a, b)) in explicit)
+        excluded = (min(first, second) << 16) + max(first, second) in model.exclude_signature
+        if excluded or not collide or parsed.pair((first, second)) in silent:
+            found.append((first, second))
     return found
 
 
@@ -571,7 +585,7 @@ def _fitted(
     ranges: Float,
     origin: Float,
     home: Float,
-    distances: dict[tuple[int, int], float],
+    distances: dict[Pair, float],
     tolerances: dict[int, float],
 ) -> tuple[str, float]:
     """Return the text of the arm's model, and the greatest excess of its capsules, [m].
@@ -610,7 +624,7 @@ def _fitted(
     return xml, max(capsule.excess for some in fits.values() for capsule in some)
 
 
-def _apart(parsed: Parsed, pairs: Iterable[tuple[int, int]], configurations: Float) -> list[tuple[int, int]]:
+def _apart(parsed: Parsed, pairs: Iterable[Pair], configurations: Float) -> list[Pair]:
     """Return the pairs of bodies that are in contact in none of some configurations, shape (N, J)."""
     pairs = list(pairs)
     for joints in configurations:
@@ -618,7 +632,7 @@ def _apart(parsed: Parsed, pairs: Iterable[tuple[int, int]], configurations: Flo
     return pairs
 
 
-def _distances(parsed: Parsed, joints: Float, pairs: Sequence[tuple[int, int]]) -> Float:
+def _distances(parsed: Parsed, joints: Float, pairs: Sequence[Pair]) -> Float:
     """Return the distances of P pairs of bodies in a configuration, shape (P,), [m]; at most 0.1."""
     _move(parsed.moved, parsed.joints, joints)
     found = np.full(len(pairs), 0.1)
@@ -630,7 +644,7 @@ def _distances(parsed: Parsed, joints: Float, pairs: Sequence[tuple[int, int]]) 
 
 
 def _near_capsules(
-    parsed: Parsed, xml: str, home: Float, distances: dict[tuple[int, int], float]
+    parsed: Parsed, xml: str, home: Float, distances: dict[Pair, float]
 ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """Return pairs of capsules, as body and index, that are much nearer to one another at home than the bodies."""
     model = mujoco.MjModel.from_xml_string(xml)
@@ -670,7 +684,7 @@ def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[Fi
         written[body] = parent.add_body(
             name=parsed.names[body],
             pos=axes.T @ (rest.xpos[body] - start),
-            quat=_quaternion(axes.T @ rest.xmat[body].reshape(3, 3)),
+            quat=quaternions_of(axes.T @ rest.xmat[body].reshape(3, 3)),
         )
         if link:
             _add_inertia(written[body], model, body)
@@ -726,18 +740,10 @@ def _add_joint(written: Any, parsed: Parsed, index: int, ranges: Float) -> None:
 
 def _add_capsule(written: Any, model: mujoco.MjModel, capsule: FittedCapsule) -> None:
     """Add a capsule that covers a geom, or a part of it, to the body."""
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[capsule.geom])
-    first, second = model.geom_pos[capsule.geom] + capsule.ends @ turn.reshape(3, 3).T
+    turn = frame_matrices(model.geom_quat[capsule.geom])
+    first, second = model.geom_pos[capsule.geom] + capsule.ends @ turn.T
     size = (capsule.radius, 0.0, 0.0)
     if np.array_equal(capsule.ends[0], capsule.ends[1]):
         written.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=first, size=size)
     else:
         written.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(*first, *second), size=size)
-
-
-def _quaternion(matrix: Float) -> Float:
-    """Return the quaternion of a rotation matrix."""
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, matrix.flatten())
-    return quaternion

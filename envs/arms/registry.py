@@ -16,8 +16,6 @@ from viapoint.envs.arms.stored import read_arm
 
 ARM_FILES = (".xml", ".mjcf", ".urdf")
 """Suffixes of files of arms."""
-REGISTER_HINT = "register_arm adds an arm of your own"
-"""Advice for names that are not known."""
 PANDA_HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
 """Joint positions at home, [rad]: Franka's ready pose."""
 
@@ -109,7 +107,7 @@ def arm_of(arm: Any) -> Arm:
         return _of_file(path, path.stat().st_mtime_ns)
     raise ValueError(
         f"arm must be an Arm, a file that ends in {' or '.join(ARM_FILES)}, or one of {', '.join(arm_names())}, got "
-        f"{arm!r:.60}; {REGISTER_HINT}"
+        f"{arm!r:.60}; register_arm adds an arm of your own"
     )
 
 

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.chain import PART, Chain, Spheres
-from viapoint.envs.arms.kinematics import sphere_centres
-from viapoint.envs.common.types import Float, Int
+from viapoint.envs.arms.kinematics import PART, Chain, Spheres
+from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.geometry.clearance import memory, nearest_spheres, place
+from viapoint.envs.geometry.compiled import compiled
 
 LARGEST_EXCESS = 0.005
 """Greatest distance by which a sphere may stick out of a capsule, [m]."""
@@ -64,14 +65,14 @@ def cover(
     excess = dict.fromkeys(names, LARGEST_EXCESS)
     for _ in range(SHRINKING):
         spheres = _spheres(names, links, capsules, excess, pairs)
-        centres = sphere_centres(chain, spheres, home)
-        close = [(names[a], names[b]) for a, b in pairs if _least_distance(spheres, centres, a, b) <= 0.0]
-        if not close:
+        close = spheres.pairs[overlapping(chain, spheres, home[None])]
+        if not len(close):
             return names, spheres, left_out, max(excess.values())
-        for name in {name for pair in close for name in pair}:
-            excess[name] *= SHRUNK
+        for group in np.unique(close):
+            excess[names[group]] *= SHRUNK  # smaller spheres, and more of them
+    first, second = close[0]
     raise ValueError(
-        f"the bodies {close[0][0]!r} and {close[0][1]!r} are so close at home that spheres on them overlap: give "
+        f"the bodies {names[first]!r} and {names[second]!r} are so close at home that spheres on them overlap: give "
         "another home"
     )
 
@@ -105,7 +106,7 @@ def _pairs(
     for (i, first), (j, second) in itertools.combinations(enumerate(names), 2):
         apart = abs(links[first] - links[second])
         pair = frozenset((first, second))
-        if apart == 0:
+        if apart == 0:  # rigid to one another
             continue
         if apart == 1:
             left_out.append(LeftOut(first, second, "consecutive links"))
@@ -185,7 +186,7 @@ def _along(capsule: Capsule, excess: float) -> tuple[Float, float]:
     largest = capsule.radius + excess
     spacing = 2.0 * np.sqrt(largest**2 - capsule.radius**2)
     number = int(np.ceil(length / spacing))
-    if number == 0:
+    if number == 0:  # a capsule without a length is a sphere
         return capsule.first[None], capsule.radius
     share = np.linspace(0.0, 1.0, number + 1)[:, None]
     radius = np.sqrt(capsule.radius**2 + 0.25 * (length / number) ** 2)
@@ -207,9 +208,15 @@ def _bounding_ball(centre: Float, radius: Float) -> Float:
     return np.append(middle, (np.sqrt((away * away).sum(axis=1)) + radius).max())
 
 
-def _least_distance(spheres: Spheres, centres: Float, first: int, second: int) -> float:
-    """Return the least distance of the spheres of two groups, [m]."""
-    one = slice(spheres.first[first], spheres.first[first + 1])
-    other = slice(spheres.first[second], spheres.first[second + 1])
-    apart = np.linalg.norm(centres[one][:, None] - centres[other], axis=-1)
-    return float((apart - spheres.radius[one][:, None] - spheres.radius[other]).min())
+@compiled
+def overlapping(chain: Chain, spheres: Spheres, joints: Float) -> Bool:
+    """Return True for pairs of groups that overlap in one of N configurations, shape (P,)."""
+    found = np.zeros(len(spheres.pairs), np.bool_)
+    placed = memory(chain, spheres)
+    for n in range(len(joints)):
+        place(chain, spheres, joints[n], placed)
+        for pair in range(len(found)):
+            if not found[pair]:
+                least, _, _ = nearest_spheres(spheres, placed, pair, 0.0, 0.0)
+                found[pair] = least < 0.0
+    return found

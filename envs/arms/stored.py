@@ -12,7 +12,7 @@ import json
 import os
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from importlib.resources import files
@@ -30,8 +30,6 @@ MARK = "viapoint_arm"
 """Name of the text element with the choices."""
 COPY = "arm.xml"
 """Name of a copy in the folder of a run or a model."""
-UNREADABLE = (OSError, KeyError, TypeError, ValueError, ET.ParseError)
-"""Errors of files that are missing or broken."""
 
 
 def keep_arm(folder: Path, arm: Arm) -> None:
@@ -106,15 +104,31 @@ def read_arm(path: Path) -> Arm | None:
     )
 
 
-def cached_path(model: mujoco.MjModel, arguments: dict[str, Any]) -> Path:
-    """Return the place of a copy in the cache folder: it tells models, arguments and versions of the program apart."""
+def cached_arm(model: mujoco.MjModel, arguments: dict[str, Any], make: Callable[[], Arm]) -> Arm:
+    """Return an arm from its copy in the cache folder; where there is none, or a broken one, make it and write one.
+
+    The name of the copy tells models, arguments and versions of the program apart.
+    """
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
     digest = hashlib.blake2b(content.tobytes(), digest_size=16)
     digest.update(_program().encode())
     digest.update(json.dumps(arguments, sort_keys=True, default=_plain).encode())
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return folder / "viapoint" / "arms" / f"{digest.hexdigest()}.xml"
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "viapoint" / "arms"
+    path = folder / f"{digest.hexdigest()}.xml"
+    arm = None
+    with suppress(OSError, KeyError, TypeError, ValueError, ET.ParseError):
+        arm = read_arm(path)
+    if arm is not None:
+        return arm
+    arm = make()
+    with suppress(OSError):  # the folder cannot be written
+        folder.mkdir(parents=True, exist_ok=True)
+        # A file of its own, which is renamed at the end: other processes never see half of it.
+        with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as file:
+            write_arm(Path(file.name), arm)
+        os.replace(file.name, path)
+    return arm
 
 
 @functools.cache
@@ -131,20 +145,3 @@ def _program() -> str:
 def _plain(value: Any) -> Any:
     """Return an argument of another type as numbers or text."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
-
-
-def read_cached(path: Path) -> Arm | None:
-    """Return the arm of a copy in the cache folder; None if there is none, or if it is broken."""
-    with suppress(*UNREADABLE):
-        return read_arm(path)
-    return None
-
-
-def write_cached(path: Path, arm: Arm) -> None:
-    """Write a copy into the cache folder; nothing happens where the folder cannot be written."""
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # A file of its own, which is renamed at the end: other processes never see half of it.
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-            write_arm(Path(file.name), arm)
-        os.replace(file.name, path)

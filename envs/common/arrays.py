@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import mujoco
@@ -21,6 +22,23 @@ def put(record: Record, rows: Any, others: Record) -> None:
     """Overwrite rows of a named tuple of arrays."""
     for mine, theirs in zip(record, others, strict=True):
         mine[rows] = theirs
+
+
+def as_dict(record: Any) -> dict[str, Any]:
+    """Return copies of the arrays of a named tuple, and of such tuples in it, by their names."""
+    copies = {}
+    for name, part in record._asdict().items():
+        copies[name] = as_dict(part) if isinstance(part, tuple) else part.copy()
+    return copies
+
+
+def from_dict(like: Record, copies: Mapping[str, Any]) -> Record:
+    """Return a named tuple of the same kinds as another one with arrays of :func:`as_dict`, which are copied."""
+    parts = []
+    for name, part in like._asdict().items():  # type: ignore[attr-defined]
+        value = copies[name]
+        parts.append(from_dict(part, value) if isinstance(part, tuple) else np.array(value))
+    return type(like)(*parts)
 
 
 def norm(vectors: Float) -> Float:

@@ -3,14 +3,31 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Mapping, Sequence
 from numbers import Real
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Int
+
+Record = TypeVar("Record")
+UNIT_TOLERANCE = 1e-3
+"""Greatest error of a quaternion's length; smaller ones are corrected."""
+
+
+def record_of(name: str, kind: type[Record], value: Any) -> Record:
+    """Return a record of a dataclass from itself, or from a mapping of some of its fields."""
+    if isinstance(value, kind):
+        return value
+    known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    if not isinstance(value, Mapping) or not set(known) >= set(value):
+        raise ValueError(
+            f"{name} must be a {kind.__name__} or a mapping with some of {', '.join(known)}, got {value!r}"
+        )
+    return kind(**value)
 
 
 def is_whole(value: Any) -> bool:
@@ -146,6 +163,17 @@ def finite_array(name: str, values: Any, *shapes: tuple[Any, ...]) -> Float:
     if not finite.all():
         raise ValueError(f"{name} must be finite, got {array[~finite][0]}")
     return array.astype(np.float64, copy=False)
+
+
+def unit_quaternion(name: str, values: Any) -> Float:
+    """Return a quaternion, shape (4,), whose length may be a little off 1, with the length 1."""
+    quaternion = finite_array(name, values, (4,))
+    length = float(np.linalg.norm(quaternion))
+    off = abs(length - 1.0)
+    if off > UNIT_TOLERANCE:
+        raise ValueError(f"{name} must have length 1 (within {UNIT_TOLERANCE:g}), got length {length:.6g}")
+    # A quaternion that was normalised before stays as it is, so that reading what was written changes nothing.
+    return quaternion if off <= 8.0 * np.finfo(np.float64).eps else quaternion / length
 
 
 def _fits(shape: tuple[int, ...], allowed: tuple[Any, ...]) -> bool:

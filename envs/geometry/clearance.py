@@ -1,6 +1,6 @@
 """Clearance of configurations and movements: least signed distances of an arm from obstacles and from itself.
 
-The arm is a set of spheres, see :class:`~viapoint.envs.arms.chain.Spheres`. Its clearance from an obstacle is the
+The arm is a set of spheres, see :class:`~viapoint.envs.arms.kinematics.Spheres`. Its clearance from an obstacle is the
 least signed distance of a sphere's centre, minus the radius of the sphere. Broad phase: a bounding ball of each group
 of spheres comes first, and the spheres of a group are only placed where its ball is near enough to matter.
 """
@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.chain import PART, Chain, Spheres
-from viapoint.envs.arms.kinematics import link_frames
+from viapoint.envs.arms.kinematics import PART, Chain, Spheres, link_frames
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 from viapoint.envs.geometry.distance import point_distance
@@ -180,7 +179,7 @@ def obstacle_clearance(
     exact value below it does not matter.
     """
     for group in range(len(spheres.link)):
-        if spheres.link[group] > 0:
+        if spheres.link[group] > 0:  # the base may stand on an obstacle
             least = nearest_obstacle(spheres, placed, group, obstacles, scene, time, least, floor)
             if least < floor:
                 return least
@@ -322,7 +321,7 @@ def movement_clearance(
     The path begins at the time `begin` and takes `step` from one configuration to the next, [s].
     """
     least, least_self = FAR, FAR
-    drift = step * fastest(obstacles, scene)
+    drift = step * fastest(obstacles, scene)  # the way of obstacles in one step
     # A coarse look comes first: with a small clearance from the start, the second one skips most configurations.
     for stride in (COARSE, 1):
         _forget(placed)
@@ -389,3 +388,52 @@ def configuration_clearances(
         found[scene, 0] = obstacle_clearance(spheres, placed, obstacles, scene, times[scene], FAR, -FAR)
         found[scene, 1] = self_clearance(spheres, placed, FAR, -FAR)
     return found
+
+
+@kernel
+def row_clearance(
+    spheres: Spheres,
+    placed: Placed,
+    obstacles: Obstacles,
+    scene: int,
+    row: int,
+    time: float,
+    least: float,
+    floor: float,
+    link: int,
+) -> float:
+    """Return the clearance of links from `link` on of a placed arm from one obstacle, at most `least`, [m].
+
+    The search stops at the first clearance below `floor`; the exact value below it does not matter.
+    """
+    if obstacles.kind[scene, row] == ABSENT:
+        return least
+    for group in range(len(spheres.link)):
+        if spheres.link[group] < link:  # the base, or links that are not asked for
+            continue
+        x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
+        size = spheres.ball_radius[group]
+        if point_distance(obstacles, scene, row, x, y, z, time, least + size) - size < least:
+            least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
+            if least < floor:
+                return least
+    return least
+
+
+@compiled
+def row_clearances(
+    chain: Chain, spheres: Spheres, joints: Float, obstacles: Obstacles, most: float
+) -> tuple[Float, Float]:
+    """Return the clearances of N arms from n obstacles at time 0, shape (N, n), and from themselves, shape (N,), [m].
+
+    They are at most `most`.
+    """
+    placed = memory(chain, spheres)
+    number, rows = obstacles.kind.shape
+    found, own = np.empty((number, rows)), np.empty(number)
+    for scene in range(number):
+        place(chain, spheres, joints[scene], placed)
+        own[scene] = self_clearance(spheres, placed, most, -FAR)
+        for row in range(rows):
+            found[scene, row] = row_clearance(spheres, placed, obstacles, scene, row, 0.0, most, -FAR, 1)
+    return found, own

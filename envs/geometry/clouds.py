@@ -9,12 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.common.types import Float, Int
-from viapoint.envs.geometry.compiled import kernel
+from viapoint.envs.geometry.compiled import TINY, kernel
 
 LEAF = 16
 """Greatest number of points of a leaf of the tree."""
-TINY = 1e-12
-"""Length below which a vector has no direction, [m]."""
 
 
 class Clouds(NamedTuple):
@@ -49,7 +47,7 @@ def cloud_distance(
     if bound > limit:
         return bound, 0.0, 0.0, 1.0
     nearest = _nearest_point(clouds, index, x, y, z, max(limit + radius, 0.0))
-    if nearest < 0:
+    if nearest < 0:  # none within the limit
         return limit, 0.0, 0.0, 1.0
     dx = x - clouds.points[nearest, 0]
     dy = y - clouds.points[nearest, 1]
@@ -79,7 +77,7 @@ def _nearest_point(clouds: Clouds, index: int, x: float, y: float, z: float, rea
             left = _box_square(clouds.boxes, root + 2 * node, x, y, z)
             right = _box_square(clouds.boxes, root + 2 * node + 1, x, y, z)
             if min(left, right) < least:
-                waiting = 2 * waiting + (1 if max(left, right) < least else 0)
+                waiting = 2 * waiting + (1 if max(left, right) < least else 0)  # one bit a level
                 node = 2 * node + (1 if right < left else 0)
                 continue
         else:
@@ -103,9 +101,9 @@ def _next_node(
     while waiting:
         while not waiting & 1:
             waiting >>= 1
-            node >>= 1
+            node >>= 1  # up again: nothing waits here
         waiting ^= 1
-        node ^= 1
+        node ^= 1  # the sibling
         if _box_square(boxes, root + node, x, y, z) < least:
             return node, waiting
     return 0, 0
@@ -134,7 +132,7 @@ def _tree(points: Float) -> tuple[Float, Float]:
     """
     leaves = 1
     while leaves * LEAF < len(points):
-        leaves *= 2
+        leaves *= 2  # a balanced tree has a power of two of them
     boxes = np.zeros((2 * leaves, 6))
     level = 1
     while True:

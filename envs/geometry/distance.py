@@ -57,14 +57,10 @@ def point_distance_and_normal(
     )
 
 
+@compiled
 def point_clearances(obstacles: Obstacles, point: tuple[float, float, float]) -> Float:
     """Return the signed distance of a point from the nearest obstacle of each of N scenes, shape (N,), at most 1 m."""
-    return np.asarray(_point_clearances(obstacles, *point))
-
-
-@compiled
-def _point_clearances(obstacles: Obstacles, x: float, y: float, z: float) -> Float:
-    """Return the least distances of a point, see :func:`point_clearances`."""
+    x, y, z = point
     found = np.ones(len(obstacles.kind))
     for scene in range(len(found)):
         for row in range(obstacles.kind.shape[1]):

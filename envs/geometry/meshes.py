@@ -10,10 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.common.types import Float, Int
-from viapoint.envs.geometry.compiled import kernel
+from viapoint.envs.geometry.compiled import TINY, kernel
 
-TINY = 1e-12
-"""Length below which a vector has no direction, [m]."""
 FAR = 1e6
 """Distance beyond everything, [m]."""
 DENT = 1e-6
@@ -57,20 +55,20 @@ def mesh_distance(
         if height > highest:
             highest, top = height, face
     nx, ny, nz = meshes.normals[top, 0], meshes.normals[top, 1], meshes.normals[top, 2]
-    if highest <= 0.0 or highest > limit:
+    if highest <= 0.0 or highest > limit:  # inside, or a lower bound that is enough
         return highest, nx, ny, nz
     least = FAR * FAR
     dx, dy, dz = 0.0, 0.0, 0.0
     for face in range(meshes.first[index], meshes.first[index + 1]):
         height = _height(meshes, face, x, y, z)
-        if height > 0.0 and height * height < least:
+        if height > 0.0 and height * height < least:  # others cannot have the nearest point
             gx, gy, gz = _from_triangle(meshes, face, height, x, y, z)
             square = gx * gx + gy * gy + gz * gz
             if square < least:
                 least = square
                 dx, dy, dz = gx, gy, gz
     distance = math.sqrt(least)
-    if distance < TINY:
+    if distance < TINY:  # on the surface the gradient of the distance is the normal
         return highest, nx, ny, nz
     return distance, dx / distance, dy / distance, dz / distance
 
@@ -139,7 +137,7 @@ def build_mesh(vertices: Float, faces: Int | None) -> Meshes:
     if faces is not None:
         _check_faces(vertices, faces, hull.volume, DENT * size**3)
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    clockwise = (area * normals).sum(axis=1) < 0.0
+    clockwise = (area * normals).sum(axis=1) < 0.0  # Qhull does not order corners
     corners[clockwise] = corners[clockwise, ::-1]
     wide = np.linalg.norm(area, axis=1) > SLIVER * size**2
     return Meshes(np.array([0, int(wide.sum())]), corners[wide], normals[wide])

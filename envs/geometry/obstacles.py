@@ -7,7 +7,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clouds import Clouds, join_clouds, split_clouds
@@ -92,10 +91,12 @@ class Obstacles(NamedTuple):
         return Obstacles(kind, centre, rotation, size, velocity, self.meshes, self.clouds)
 
     def with_rows(self, rows: int) -> Obstacles:
-        """Return the obstacles with room for more of them in each scene."""
+        """Return the obstacles with another number of rows in each scene; those behind are left out."""
         wide = no_obstacles(len(self.kind), rows)
+        kept = min(rows, self.kind.shape[1])
+        present = self.present[:, :kept]
         for mine, theirs in zip(wide[:5], self[:5], strict=True):
-            mine[:, : theirs.shape[1]] = theirs
+            mine[:, :kept][present] = theirs[:, :kept][present]
         return wide._replace(meshes=self.meshes, clouds=self.clouds)
 
     def put(self, scenes: Any, others: Obstacles) -> Obstacles:
@@ -165,15 +166,12 @@ def pack(scenes: Sequence[Iterable[Shape | Mapping[str, Any]]], rows: int | None
     meshes: list[Meshes] = []
     clouds: list[Clouds] = []
     for scene, each in enumerate(shapes):
-        if not each:
-            continue
-        some = scene, slice(len(each))
-        found.kind[some] = [shape.number for shape in each]
-        found.centre[some] = [shape.position for shape in each]
-        found.rotation[some] = frame_matrices(np.array([shape.quaternion for shape in each]))
-        found.size[some] = [shape.packed_size for shape in each]
-        found.velocity[some] = [shape.velocity for shape in each]
         for row, shape in enumerate(each):
+            found.kind[scene, row] = shape.number
+            found.centre[scene, row] = shape.position
+            found.rotation[scene, row] = shape.rotation
+            found.size[scene, row] = shape.packed_size
+            found.velocity[scene, row] = shape.velocity
             if shape.mesh is not None:
                 found.size[scene, row, 0] = len(meshes)
                 meshes.append(shape.mesh)
@@ -223,14 +221,12 @@ def quaternions_of(rotation: Float) -> Float:
 
 def mesh_names(meshes: Meshes) -> list[str]:
     """Return the registered names of packed meshes, empty for others."""
-    names = []
-    for mesh in split_meshes(meshes):
-        same = ""
+    names = [""] * (len(meshes.first) - 1)
+    for index, mesh in enumerate(split_meshes(meshes)):
         for name, known in REGISTERED_MESHES.items():
             if known.mesh is not None and np.array_equal(known.mesh.corners, mesh.corners):
-                same = name
+                names[index] = name
                 break
-        names.append(same)
     return names
 
 
@@ -250,7 +246,7 @@ def bounding_boxes(obstacles: Obstacles) -> tuple[Float, Float]:
             middle[rows] = 0.5 * (box[:, 1] + box[:, 0])
             half[rows] = 0.5 * (box[:, 1] - box[:, 0])
     centre = obstacles.centre + np.einsum("...ij,...j->...i", rotation, middle)
-    walls = kind == HALF_SPACE
+    walls = kind == HALF_SPACE  # which have no size
     normal = rotation[walls][:, :, 2]
     depth = (centre[walls] * normal).sum(axis=-1, keepdims=True)
     centre[walls] = (depth - EXTENT) * normal
@@ -335,7 +331,7 @@ def obstacles_from_rows(rows: Float, kinds: Sequence[str]) -> Obstacles:
     centre, half, velocity = values[:, :3], values[:, 9:12], values[:, 12:15]
     # Rows in single precision have axes that are not quite orthonormal.
     first = values[:, 3:6] / np.linalg.norm(values[:, 3:6], axis=-1, keepdims=True)
-    third = np.cross(first, values[:, 6:9])
+    third = np.cross(first, values[:, 6:9])  # orthogonal to the first whatever the second is
     third /= np.linalg.norm(third, axis=-1, keepdims=True)
     rotation = np.stack((first, np.cross(third, first), third), axis=-1)
     size = np.einsum("...i,...ij->...j", half, np.linalg.pinv(BOXES)[kind])

@@ -24,10 +24,11 @@ import numpy as np
 from viapoint.envs.common.arrays import frame_matrices, frozen, quaternion_to
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least
+from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, unit_quaternion
 from viapoint.envs.geometry.clouds import Clouds, build_cloud, cloud_distance, join_clouds
-from viapoint.envs.geometry.compiled import inlined, kernel
+from viapoint.envs.geometry.compiled import TINY, inlined, kernel
 from viapoint.envs.geometry.meshes import (
+    FAR,
     Meshes,
     build_mesh,
     convex_hull,
@@ -44,14 +45,8 @@ IN_TABLES = (MESH, POINT_CLOUD)
 """Kinds whose first size is an index of a table, and whose second is the radius of a bounding sphere."""
 PLAIN_KINDS = tuple(kind for number, kind in enumerate(KINDS) if number not in IN_TABLES)
 """Kinds that are known by their sizes alone."""
-UNIT_TOLERANCE = 1e-3
-"""Greatest error of a quaternion's length; smaller ones are corrected."""
 LEAST_SPACING = 1e-6
 """Least edge of the cubes of :meth:`PointCloud.covering`, [m]."""
-TINY = 1e-12
-"""Length below which a vector has no direction, [m]."""
-FAR = 1e6
-"""Distance of absent obstacles, and limit of distances that are exact, [m]."""
 
 Matrix = tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]
 Distance = tuple[float, float, float, float]
@@ -212,7 +207,7 @@ class Shape:
                 self._set(name, values if shape else float(values))
             self._set("position", finite_array("position", self.position, (3,)))
             self._set("velocity", finite_array("velocity", self.velocity, (3,)))
-            self._set("quaternion", _unit(finite_array("quaternion", self.quaternion, (4,))))
+            self._set("quaternion", unit_quaternion("quaternion", self.quaternion))
             self._complete()
         except ValueError as error:
             named = f"{self.kind} {self.name!r}" if self.name else self.kind
@@ -660,15 +655,3 @@ def obstacles_from_json(text: str) -> list[Shape]:
     if not isinstance(values, list):
         raise ValueError(f"obstacles must be a JSON list of dictionaries, got {type(values).__name__}")
     return as_obstacles(values)
-
-
-def _unit(quaternion: Float) -> Float:
-    """Return a quaternion with the length 1."""
-    length = float(np.linalg.norm(quaternion))
-    off = abs(length - 1.0)
-    if off > UNIT_TOLERANCE:
-        raise ValueError(
-            f"quaternion must have length 1 (within {UNIT_TOLERANCE:g}), got length {length:.6g}"
-        )
-    # A quaternion that was normalised before stays as it is, so that reading what was written changes nothing.
-    return quaternion if off <= 8.0 * np.finfo(np.float64).eps else quaternion / length

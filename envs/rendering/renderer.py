@@ -10,7 +10,6 @@ import numpy as np
 from viapoint.envs.common.types import Float, Int
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.episodes import Episodes, Recorded
-from viapoint.envs.plans import Plan
 from viapoint.envs.rendering.gl import Canvas, GLUnavailableError, Window
 from viapoint.envs.rendering.scene_view import Picture, SceneView
 from viapoint.envs.task import Task
@@ -111,7 +110,10 @@ def picture_of(task: Task, recorded: Recorded, step: int) -> Picture:
     joints = np.concatenate((scene.start, rollout.joints))
     done = np.concatenate((arm.hand(scene.start), rollout.hand))[: step + 1]
     plans = [plan for began, plan in history if began <= now[0] + 1e-9]
-    paths = [arm.hand(space.joints(_path(plan))) for plan in plans]
+    paths = []
+    for plan in plans:
+        position = plan.trajectory().sample(POINTS, 0)[0][0]
+        paths.append(arm.hand(space.joints(np.asarray(position))))
     vias = arm.hand(space.joints(np.asarray(plans[-1].waypoints)[0, 1:-1])) if plans else np.zeros((0, 3))
     # The contact of a step is that of the state before it.
     contact = rollout.contact[: step + 1]
@@ -140,8 +142,3 @@ def _seen(task: Task, recorded: Recorded, joints: Float, now: float) -> Float:
     scenes = recorded.scene.take(np.zeros(len(looks), np.int64))
     readings = sensor.read(task.arm, joints[steps], scenes.obstacles_at(looks))
     return readings.points[readings.seen >= 0]
-
-
-def _path(plan: Plan) -> Float:
-    """Return points along the path of one plan, shape (POINTS, D)."""
-    return np.asarray(plan.trajectory().sample(POINTS, 0)[0][0])

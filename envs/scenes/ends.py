@@ -6,14 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.arms.inverse_kinematics import descend, solve_planar
-from viapoint.envs.arms.kinematics import tool_position, transform
+from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position, transform
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, self_clearance
-from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
-from viapoint.envs.scenes.scene import NEVER, row_clearance
+from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, row_clearance, self_clearance
+from viapoint.envs.geometry.compiled import compiled, kernel
+from viapoint.envs.geometry.obstacles import ABSENT
+from viapoint.envs.scenes.scene import NEVER, Scenes
 
 PAIRS, TRIES = 3, 6
 """Pairs of start and goal for a layout, and attempts at each end."""
@@ -37,8 +36,8 @@ BLOCKED, FREE, OUT_OF_REACH = 1, 0, -1
 """Outcome of a straight movement."""
 
 
-class Mover(NamedTuple):
-    """Arm and the space in which it moves, as compiled functions read them."""
+class Setting(NamedTuple):
+    """Arm, the space in which it moves, and what scenes must be like, as compiled functions read them."""
 
     chain: Chain
     spheres: Spheres
@@ -46,8 +45,6 @@ class Mover(NamedTuple):
     """Ranges of the joints, shape (J, 2), [rad] or [m]."""
     inner_range: Float
     """Ranges of the joints at ends, shape (J, 2), [rad] or [m]."""
-    velocity_limit: Float
-    """Shape (J,), [rad/s] or [m/s]."""
     home: Float
     """Shape (J,), [rad] or [m]."""
     bearing: float
@@ -62,12 +59,18 @@ class Mover(NamedTuple):
     """Least clearance of ends from the arm itself, [m]."""
     least_way: float
     """Least length of the way from start to goal in joint space, [rad]."""
+    n_jumps: tuple[int, int]
+    """Fewest and most jumps of the target."""
+    relative_durations: tuple[float, float]
+    """Shortest and longest duration of movements, relative to that of the zero action."""
 
 
 class Draft(NamedTuple):
     """N scenes that are being drawn: one attempt at each, with a layout as padded tables, and memory."""
 
-    mover: Mover
+    setting: Setting
+    scenes: Scenes
+    """Scenes with W obstacles each, which compiled functions change in place."""
     rows: Float
     """Obstacles of the layouts, shape (N, W, ROW)."""
     n_rows: Int
@@ -82,16 +85,6 @@ class Draft(NamedTuple):
     """True for starts and goals that are given, shape (N, 2)."""
     numbers: Float
     """Uniform random numbers, shape (N, PAIRS, 2, :func:`numbers_of_end`)."""
-    ends: Float
-    """Starts and goals, shape (N, 2, J)."""
-    obstacles: Obstacles
-    """W obstacles of each scene, or those that are given."""
-    turn_time: Float
-    """Times of the changes of course, shape (N, W), [s]."""
-    turn_velocity: Float
-    """Velocities after the changes, shape (N, W, 3), [m/s]."""
-    jumps: Float
-    """Jumps of the target, shape (N, MOST_JUMPS, J + 1)."""
     placed: Placed
     at_start: Placed
     at_goal: Placed
@@ -109,7 +102,7 @@ def draw_ends(draft: Draft, which: Int) -> Bool:
     for k in range(len(which)):
         scene = which[k]
         # Places in the plane are points: another attempt would be the same one.
-        once = draft.mover.plane or (draft.fixed[scene, 0] and draft.fixed[scene, 1])
+        once = draft.setting.plane or (draft.fixed[scene, 0] and draft.fixed[scene, 1])
         for pair in range(1 if once else PAIRS):
             if draft.n_rows[scene] >= 0:
                 _unpack_rows(draft, scene)
@@ -122,13 +115,13 @@ def draw_ends(draft: Draft, which: Int) -> Bool:
 @compiled
 def _unpack_rows(draft: Draft, scene: int) -> None:
     """Put the obstacles of a layout into a scene, at rest; the rows behind them become absent."""
-    obstacles, rows = draft.obstacles, draft.rows[scene]
+    obstacles, rows = draft.scenes.obstacles, draft.rows[scene]  # pairs before may have left some out
     for row in range(obstacles.kind.shape[1]):
-        draft.turn_time[scene, row] = NEVER
+        draft.scenes.turn_time[scene, row] = NEVER
         obstacles.kind[scene, row] = ABSENT
         if row < draft.n_rows[scene]:
             obstacles.kind[scene, row] = int(rows[row, 0])
-        draft.turn_velocity[scene, row] = 0.0
+        draft.scenes.turn_velocity[scene, row] = 0.0
         obstacles.velocity[scene, row] = 0.0
         obstacles.centre[scene, row] = rows[row, 1:4]
         obstacles.size[scene, row] = rows[row, 13:16]
@@ -139,13 +132,13 @@ def _unpack_rows(draft: Draft, scene: int) -> None:
 @compiled
 def _draw_pair(draft: Draft, scene: int, pair: int) -> bool:
     """Draw a start and a goal, and return True if they and the straight movement between them are as they must be."""
-    start_given, goal_given = draft.fixed[scene, 0], draft.fixed[scene, 1]
+    start_given, goal_given = draft.fixed[scene]
     # The goal first: it is harder to find.
     if not goal_given and not _draw_end(draft, scene, pair, 1):
         return False
     if not start_given and not _draw_end(draft, scene, pair, 0):
         return False
-    start, goal = draft.ends[scene, 0], draft.ends[scene, 1]
+    start, goal = draft.scenes.start[scene], draft.scenes.goal[scene]
     exchange = not start_given and not goal_given and draft.n_places[scene, 0] == 0
     if exchange and draft.numbers[scene, pair, 0, 1] < EXCHANGED:
         for joint in range(len(start)):
@@ -154,7 +147,7 @@ def _draw_pair(draft: Draft, scene: int, pair: int) -> bool:
     for joint in range(len(start)):
         way += (goal[joint] - start[joint]) ** 2
     both_given = start_given and goal_given
-    if not both_given and np.sqrt(way) < draft.mover.least_way:
+    if not both_given and np.sqrt(way) < draft.setting.least_way:
         return False
     drawn = draft.n_rows[scene] >= 0
     if drawn and (start_given or goal_given or draft.keep[scene]) and not _make_room(draft, scene):
@@ -169,29 +162,36 @@ def _draw_pair(draft: Draft, scene: int, pair: int) -> bool:
 @compiled
 def _draw_end(draft: Draft, scene: int, pair: int, end: int) -> bool:
     """Draw a start (end 0) or a goal (end 1), and return True if it is free."""
-    mover, joints = draft.mover, draft.ends[scene, end]
+    setting = draft.setting
+    joints = draft.scenes.goal[scene] if end else draft.scenes.start[scene]
     numbers = draft.numbers[scene, pair, end]
     size = len(joints)
     listed = end
-    home, reaching = 0.0, 1.0 if mover.plane else 1.0 - FREE_GOALS
-    if end == 0 and draft.n_places[scene, 0] == 0 and not mover.plane:
+    home, reaching = 0.0, 1.0 if setting.plane else 1.0 - FREE_GOALS
+    if end == 0 and draft.n_places[scene, 0] == 0 and not setting.plane:
         listed = 1
         home, reaching = HOME, REACHING
     n_places = draft.n_places[scene, listed]
-    for k in range(1 if mover.plane else TRIES):
+    for k in range(1 if setting.plane else TRIES):
         first = 2 + k * (8 + size)
         for joint in range(size):
-            low, high = mover.inner_range[joint, 0], mover.inner_range[joint, 1]
+            low, high = setting.inner_range[joint]
             seed = numbers[first + 8 + joint]
             joints[joint] = low + (high - low) * seed
             if numbers[0] < home:
                 deviation = JITTER if numbers[first] < 0.5 else 0.0
-                joints[joint] = mover.home[joint] + deviation * (2.0 * seed - 1.0)
+                joints[joint] = setting.home[joint] + deviation * (2.0 * seed - 1.0)
         if n_places > 0 and home <= numbers[0] < reaching:
             there = draft.places[scene, listed, int(numbers[first] * n_places)]
             if not _reach(draft, scene, there, numbers[first + 1 : first + 8], joints):
                 continue
-        if is_end(draft, joints) and (draft.keep[scene] > 0 or _is_clear(draft, scene)):
+        if not is_end(draft, joints):
+            continue
+        if draft.keep[scene] > 0:  # obstacles in the way are left out
+            return True
+        placed, margin = draft.placed, setting.margin
+        obstacles = draft.scenes.obstacles
+        if obstacle_clearance(setting.spheres, placed, obstacles, scene, 0.0, margin, margin) >= margin:
             return True
     return False
 
@@ -199,29 +199,34 @@ def _draw_end(draft: Draft, scene: int, pair: int, end: int) -> bool:
 @compiled
 def is_end(draft: Draft, joints: Float) -> bool:
     """Return True if joints are within their inner ranges, and the arm, which is placed, is free of itself."""
-    mover, placed = draft.mover, draft.placed
+    setting, placed = draft.setting, draft.placed
     for joint in range(len(joints)):
-        low, high = mover.inner_range[joint, 0], mover.inner_range[joint, 1]
+        low, high = setting.inner_range[joint]
         if not low <= joints[joint] <= high:
             return False
-    place(mover.chain, mover.spheres, joints, placed)
-    margin = mover.self_margin
-    return bool(self_clearance(mover.spheres, placed, margin, margin) >= margin)
+    place(setting.chain, setting.spheres, joints, placed)
+    margin = setting.self_margin
+    return bool(self_clearance(setting.spheres, placed, margin, margin) >= margin)
 
 
-@compiled
-def _is_clear(draft: Draft, scene: int) -> bool:
-    """Return True if the placed arm has the margin of ends to all obstacles at time 0."""
-    margin = draft.mover.margin
-    spheres, obstacles = draft.mover.spheres, draft.obstacles
-    return bool(obstacle_clearance(spheres, draft.placed, obstacles, scene, 0.0, margin, margin) >= margin)
-
-
-@compiled
-def _is_row_clear(draft: Draft, placed: Placed, scene: int, row: int, link: int) -> bool:
-    """Return True if links from `link` on of a placed arm have the margin of ends to one obstacle at time 0."""
-    margin, spheres = draft.mover.margin, draft.mover.spheres
-    least = row_clearance(spheres, placed, draft.obstacles, scene, row, 0.0, margin, margin, link)
+@kernel
+def is_row_clear(
+    draft: Draft, placed: Placed, scene: int, row: int, time: float, margin: float, link: int
+) -> bool:
+    """Return True if links from `link` on of a placed arm have a margin to one obstacle at some time, [m]."""
+    scenes, obstacles = draft.scenes, draft.scenes.obstacles
+    x = obstacles.centre[scene, row, 0]
+    y = obstacles.centre[scene, row, 1]
+    z = obstacles.centre[scene, row, 2]
+    # After the turn, the place is that of the first course, moved by the difference of the courses.
+    after = max(time - scenes.turn_time[scene, row], 0.0)
+    for axis in range(3):
+        change = scenes.turn_velocity[scene, row, axis] - obstacles.velocity[scene, row, axis]
+        obstacles.centre[scene, row, axis] += after * change
+    least = row_clearance(draft.setting.spheres, placed, obstacles, scene, row, time, margin, margin, link)
+    obstacles.centre[scene, row, 0] = x
+    obstacles.centre[scene, row, 1] = y
+    obstacles.centre[scene, row, 2] = z
     return bool(least >= margin)
 
 
@@ -231,9 +236,9 @@ def _make_room(draft: Draft, scene: int) -> bool:
 
     If the obstacles of the layout belong together, none may touch an end.
     """
-    mover, obstacles, keep = draft.mover, draft.obstacles, draft.keep[scene]
-    place(mover.chain, mover.spheres, draft.ends[scene, 0], draft.at_start)
-    place(mover.chain, mover.spheres, draft.ends[scene, 1], draft.at_goal)
+    setting, obstacles, keep = draft.setting, draft.scenes.obstacles, draft.keep[scene]
+    place(setting.chain, setting.spheres, draft.scenes.start[scene], draft.at_start)
+    place(setting.chain, setting.spheres, draft.scenes.goal[scene], draft.at_goal)
     count = 0
     for row in range(obstacles.kind.shape[1]):
         if obstacles.kind[scene, row] == ABSENT:
@@ -241,8 +246,8 @@ def _make_room(draft: Draft, scene: int) -> bool:
         if keep > 0 and count == keep:
             obstacles.kind[scene, row] = ABSENT
             continue
-        free = _is_row_clear(draft, draft.at_start, scene, row, 1)
-        free = free and _is_row_clear(draft, draft.at_goal, scene, row, 1)
+        free = is_row_clear(draft, draft.at_start, scene, row, 0.0, setting.margin, 1)
+        free = free and is_row_clear(draft, draft.at_goal, scene, row, 0.0, setting.margin, 1)
         if not free and keep == 0:
             return False
         kind = obstacles.kind[scene, row]
@@ -259,34 +264,34 @@ def _make_room(draft: Draft, scene: int) -> bool:
 @compiled
 def straight_movement(draft: Draft, scene: int) -> int:
     """Return what becomes of the straight movement: FREE, BLOCKED by an obstacle, or OUT_OF_REACH."""
-    mover, start, goal = draft.mover, draft.ends[scene, 0], draft.ends[scene, 1]
+    setting, start, goal = draft.setting, draft.scenes.start[scene], draft.scenes.goal[scene]
     placed, joints = draft.placed, np.empty(len(start))
     x, y, u, v = 0.0, 0.0, 0.0, 0.0
-    if mover.of_hand:
-        x, y, _ = tool_position(mover.chain, start, placed.rotation, placed.origin)
-        u, v, _ = tool_position(mover.chain, goal, placed.rotation, placed.origin)
-        for k in range(1, INSTANTS):
-            share = k / INSTANTS
-            here = x + share * (u - x), y + share * (v - y)
-            if not solve_planar(mover.chain, mover.joint_range, here[0], here[1], joints):
-                return OUT_OF_REACH
+    if setting.of_hand:
+        x, y, _ = tool_position(setting.chain, start, placed.rotation, placed.origin)
+        u, v, _ = tool_position(setting.chain, goal, placed.rotation, placed.origin)
+    blocked = False
     for k in range(1, INSTANTS):
         share = _bit_reversed(k)
-        if mover.of_hand:
+        if setting.of_hand:
             here = x + share * (u - x), y + share * (v - y)
-            solve_planar(mover.chain, mover.joint_range, here[0], here[1], joints)
+            if not solve_planar(setting.chain, setting.joint_range, here[0], here[1], joints):
+                return OUT_OF_REACH
         else:
             for joint in range(len(joints)):
                 joints[joint] = start[joint] + share * (goal[joint] - start[joint])
-        place(mover.chain, mover.spheres, joints, placed)
-        if obstacle_clearance(mover.spheres, placed, draft.obstacles, scene, 0.0, 0.0, 0.0) < 0.0:
-            return BLOCKED
-    return FREE
+        if not blocked:
+            place(setting.chain, setting.spheres, joints, placed)
+            least = obstacle_clearance(setting.spheres, placed, draft.scenes.obstacles, scene, 0.0, 0.0, 0.0)
+            blocked = least < 0.0
+        if blocked and not setting.of_hand:  # the hand may still leave the reach
+            break
+    return BLOCKED if blocked else FREE
 
 
 @compiled
 def _bit_reversed(number: int) -> float:
-    """Return the k-th point of the sequence 1/2, 1/4, 3/4, 1/8, 5/8, ..."""
+    """Return the k-th point of the sequence 1/2, 1/4, 3/4, 1/8, 5/8, ..., which soon finds what is in the way."""
     point, step = 0.0, 0.5
     while number:
         point += step * (number & 1)
@@ -298,16 +303,16 @@ def _bit_reversed(number: int) -> float:
 @compiled
 def _reach(draft: Draft, scene: int, there: Float, numbers: Float, joints: Float) -> bool:
     """Solve for joint positions with the tool in a place, and return True if it gets there."""
-    mover, placed = draft.mover, draft.placed
+    setting, placed = draft.setting, draft.placed
     across = there[6] * (2.0 * numbers[0] - 1.0), there[7] * (2.0 * numbers[1] - 1.0)
     position, axes = np.empty(3), np.empty((3, 3))
     position[0] = there[0] + there[9] * across[0] - there[10] * across[1]
     position[1] = there[1] + there[10] * across[0] + there[9] * across[1]
     position[2] = there[2] + there[8] * (2.0 * numbers[2] - 1.0)
-    chain, limits = mover.chain, mover.inner_range
-    if mover.plane:
+    chain, limits = setting.chain, setting.inner_range
+    if setting.plane:
         return bool(solve_planar(chain, limits, position[0], position[1], joints))
-    _seed(mover, position, joints)
+    _seed(setting, position, joints)
     rotation, origin = placed.rotation, placed.origin
     if len(joints) < 6:
         return bool(descend(chain, limits, position, axes, False, joints, rotation, origin) == 0.0)
@@ -318,24 +323,24 @@ def _reach(draft: Draft, scene: int, there: Float, numbers: Float, joints: Float
 
 
 @compiled
-def _seed(mover: Mover, position: Float, joints: Float) -> None:
+def _seed(setting: Setting, position: Float, joints: Float) -> None:
     """Change joints between their limits into some near home, with the first one turned towards a position.
 
     From there inverse kinematics finds more solutions, and fewer contorted ones.
     """
-    origin = mover.chain.origin[0]
+    origin = setting.chain.origin[0]
     for joint in range(len(joints)):
-        low, high = mover.inner_range[joint, 0], mover.inner_range[joint, 1]
-        joints[joint] = mover.home[joint] + SEED_SPREAD * (joints[joint] - 0.5 * (low + high))
-        if joint == 0 and not mover.chain.sliding[0]:
-            joints[0] += np.arctan2(position[1] - origin[1], position[0] - origin[0]) - mover.bearing
+        low, high = setting.inner_range[joint]
+        joints[joint] = setting.home[joint] + SEED_SPREAD * (joints[joint] - 0.5 * (low + high))
+        if joint == 0 and not setting.chain.sliding[0]:
+            joints[0] += np.arctan2(position[1] - origin[1], position[0] - origin[0]) - setting.bearing
         joints[joint] = min(max(joints[joint], low), high)
 
 
 @compiled
 def _is_hand_clear(draft: Draft, scene: int, position: Float, axes: Float) -> bool:
     """Return True if the last link is free with the tool at a pose, which is known without inverse kinematics."""
-    chain, spheres, placed = draft.mover.chain, draft.mover.spheres, draft.placed
+    chain, spheres, placed = draft.setting.chain, draft.setting.spheres, draft.placed
     last = len(chain.mass)
     for row in range(3):
         for column in range(3):
@@ -352,15 +357,15 @@ def _is_hand_clear(draft: Draft, scene: int, position: Float, axes: Float) -> bo
             ball = transform(placed.rotation, placed.origin, last, spheres.ball_centre[group])
             placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2] = ball
     clear = True
-    for row in range(draft.obstacles.kind.shape[1]):
-        clear = clear and _is_row_clear(draft, placed, scene, row, last)
+    for row in range(draft.scenes.obstacles.kind.shape[1]):
+        clear = clear and is_row_clear(draft, placed, scene, row, 0.0, draft.setting.margin, last)
     return clear
 
 
 @compiled
 def _tool_axes(approach: Float, cone: float, numbers: Float, axes: Float) -> None:
     """Fill in random axes of the tool, as columns, with the z axis in a cone around the approach."""
-    x, y, z = approach[0], approach[1], approach[2]
+    x, y, z = approach
     length = np.sqrt(x * x + y * y + z * z)
     if length == 0.0:
         x, length, cone = 1.0, 1.0, np.pi

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.common.validation import whole_number
-from viapoint.envs.geometry.obstacles import KINDS, pack
-from viapoint.envs.geometry.shapes import IN_TABLES, PLAIN_KINDS, Shape
+from viapoint.envs.geometry.shapes import IN_TABLES, KINDS, PLAIN_KINDS, Shape, as_obstacles
 from viapoint.envs.scenes import families_plane, families_space
 from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Layout, Place, Room, most_rows
 
@@ -20,51 +19,35 @@ Build = Callable[[np.random.Generator, Room], Any]
 """Function of a random generator and a room that returns a layout, see :func:`register_scene_family`."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class SceneFamily:
     """Kind of scenes that have a name."""
 
     build: Build
     """Function that draws a layout."""
-    plane: bool = False
-    """True for arms in the plane, False for arms in space."""
-    kinds: tuple[str, ...] = ()
-    """Kinds of obstacles that the family needs."""
     n_obstacles: int = 1
     """Least number of obstacles that a scene must have room for."""
+    kinds: tuple[str, ...] = ("box",)
+    """Kinds of obstacles that the family needs."""
     trained: bool = False
-    """True if the family is one of those of training by default."""
-    hard: bool = False
-    """True if the family is part of the frozen hard scenes."""
-
-
-def _plane(build: Build, n_obstacles: int) -> SceneFamily:
-    """Return a family of structures in the plane, which are not trained on."""
-    return SceneFamily(build=build, plane=True, kinds=("box",), n_obstacles=n_obstacles, hard=True)
-
-
-def _furniture(build: Build, n_obstacles: int, *, trained: bool = True) -> SceneFamily:
-    """Return a family of furniture in space."""
-    return SceneFamily(
-        build=build, kinds=("box",), n_obstacles=n_obstacles, trained=trained, hard=not trained
-    )
+    """True if the family is one of those of training by default; those shipped without are hard."""
 
 
 FAMILIES: dict[tuple[bool, str], SceneFamily] = {
-    (True, "clutter"): SceneFamily(build=families_plane.clutter, plane=True, trained=True),
-    (True, "gate"): _plane(families_plane.gate, 2),
-    (True, "corridor"): _plane(families_plane.corridor, 4),
-    (True, "ring"): _plane(families_plane.ring, 5),
-    (True, "oblique bar"): _plane(families_plane.oblique_bar, 3),
-    (True, "cul-de-sac"): _plane(families_plane.cul_de_sac, 5),
-    (False, "shelf"): _furniture(families_space.shelf, 4),
-    (False, "table"): _furniture(families_space.table, 2),
-    (False, "bin"): _furniture(families_space.bin_, 5),
-    (False, "gate"): _furniture(families_space.gate, 3),
-    (False, "tunnel"): _furniture(families_space.tunnel, 4),
-    (False, "clutter"): SceneFamily(build=families_space.clutter, trained=True),
-    (False, "cage"): _furniture(families_space.cage, 6, trained=False),
-    (False, "wall_window"): _furniture(families_space.wall_window, 4, trained=False),
+    (True, "clutter"): SceneFamily(families_plane.clutter, 1, (), trained=True),
+    (True, "gate"): SceneFamily(families_plane.gate, 2),
+    (True, "corridor"): SceneFamily(families_plane.corridor, 4),
+    (True, "ring"): SceneFamily(families_plane.ring, 5),
+    (True, "oblique bar"): SceneFamily(families_plane.oblique_bar, 3),
+    (True, "cul-de-sac"): SceneFamily(families_plane.cul_de_sac, 5),
+    (False, "shelf"): SceneFamily(families_space.shelf, 4, trained=True),
+    (False, "table"): SceneFamily(families_space.table, 2, trained=True),
+    (False, "bin"): SceneFamily(families_space.bin_, 5, trained=True),
+    (False, "gate"): SceneFamily(families_space.gate, 3, trained=True),
+    (False, "tunnel"): SceneFamily(families_space.tunnel, 4, trained=True),
+    (False, "clutter"): SceneFamily(families_space.clutter, 1, (), trained=True),
+    (False, "cage"): SceneFamily(families_space.cage, 6),
+    (False, "wall_window"): SceneFamily(families_space.wall_window, 4),
 }
 """Families by their place, True for the plane and False for space, and their name."""
 
@@ -167,20 +150,14 @@ def register_scene_family(
         inspect.signature(build).bind(None, None)
     except (TypeError, ValueError) as error:
         raise TypeError(f"build must be a function build(rng, room), got {build!r}: {error}") from None
-    FAMILIES[plane, name] = SceneFamily(
-        build=_checked(name, build),
-        plane=plane,
-        kinds=tuple(kinds),
-        n_obstacles=n_obstacles,
-        trained=trained,
-    )
+    FAMILIES[plane, name] = SceneFamily(_checked(name, build), n_obstacles, tuple(kinds), trained)
 
 
 def _checked(name: str, build: Build) -> Build:
     """Return a function that returns the layout of a user's function, or says what is wrong with it."""
 
     def checked(rng: np.random.Generator, room: Room) -> Layout:
-        built = build(rng, room)
+        built = build(rng, room)  # errors of the function itself are its own
         try:
             layout = built if isinstance(built, Layout) else _as_layout(*built)
             numbers = np.array([*layout.rows, *layout.goals, *layout.starts])
@@ -206,13 +183,11 @@ def _checked(name: str, build: Build) -> Build:
 
 def _as_layout(shapes: Iterable[Shape], goals: Iterable[Place] = (), starts: Iterable[Place] = ()) -> Layout:
     """Return the layout of shapes and places."""
-    obstacles = pack([list(shapes)])
     rows: list[float] = []
-    for row in range(obstacles.kind.shape[1]):
-        if obstacles.kind[0, row] in IN_TABLES:
+    for shape in as_obstacles(list(shapes)):
+        if shape.number in IN_TABLES:
             raise ValueError(f"kinds must be some of {', '.join(PLAIN_KINDS)}")
-        rows += [obstacles.kind[0, row], *obstacles.centre[0, row], *obstacles.rotation[0, row].ravel()]
-        rows += [*obstacles.size[0, row]]
+        rows += [shape.number, *shape.position, *shape.rotation.ravel(), *shape.packed_size]
     return Layout(rows, _numbers(goals), _numbers(starts))
 
 

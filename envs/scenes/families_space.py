@@ -29,14 +29,14 @@ def shelf(rng: np.random.Generator, room: Room) -> Layout:
     """Return a shelf of up to four compartments, closed or with posts, with things in it."""
     furniture = _in_front(rng, room, 0.35, 0.65)
     half_depth, half_width = between(rng, 0.12, 0.30), between(rng, 0.25, 0.55)
-    compartments = min(1 + int(4 * rng.random()), room.most - 3)
+    compartments = min(1 + int(4 * rng.random()), room.most - 3)  # a board more, and two walls
     gap, lowest = between(rng, 0.22, 0.42), between(rng, -0.30, 0.45)
     for board in range(compartments + 1):
         height = lowest + board * gap
         furniture.box((half_depth, 0.0, height), (half_depth, half_width, THICKNESS))
     half_height = 0.5 * compartments * gap
     middle = lowest + half_height
-    if rng.random() < 0.6 or furniture.left < 4:
+    if rng.random() < 0.6 or furniture.left < 4:  # posts need four rows
         _walls(furniture, half_depth, half_width, middle, half_height)
         if rng.random() < 0.5 and furniture.left:
             furniture.box((2.0 * half_depth, 0.0, middle), (THICKNESS, half_width, half_height))
@@ -47,12 +47,12 @@ def shelf(rng: np.random.Generator, room: Room) -> Layout:
     for compartment in range(compartments):
         height = lowest + compartment * gap
         _things(rng, furniture, int(3 * rng.random()), height, 2.0 * half_depth, half_width)
-        reach = min(half_depth, 0.17)
+        reach = min(half_depth, 0.17)  # deep shelves are reached into from the front
         position = (reach, 0.0, height + 0.5 * gap)
         half = (reach, 0.85 * half_width, 0.5 * gap - HAND_ROOM)
         furniture.goal(position, half, FORWARDS, CONE)
     if rng.random() < 0.5:
-        furniture.floor(min(lowest - 0.1, 0.0))
+        furniture.floor(min(lowest - 0.1, 0.0))  # below the lowest board
     return furniture.layout()
 
 
@@ -62,7 +62,7 @@ def table(rng: np.random.Generator, room: Room) -> Layout:
     height = between(rng, 0.05, 0.50)
     half_depth, half_width = between(rng, 0.2, 0.5), between(rng, 0.4, 0.8)
     furniture.box((half_depth, 0.0, height), (half_depth, half_width, THICKNESS))
-    if furniture.left > 6:
+    if furniture.left > 6:  # four legs, the floor and things
         for x in (0.03, 2.0 * half_depth - 0.03):
             for y in (0.03 - half_width, half_width - 0.03):
                 furniture.box((x, y, height - 0.35), (0.025, 0.025, 0.35))
@@ -165,7 +165,7 @@ def tunnel(rng: np.random.Generator, room: Room) -> Layout:
         furniture.box((half_depth, 0.0, height), (half_depth, half_width, THICKNESS))
     if rng.random() < 0.5:
         furniture.floor(0.0)
-    half = (half_depth, 0.8 * half_width - 0.02, half_height - HAND_ROOM)
+    half = (half_depth, 0.8 * half_width - 0.02, half_height - HAND_ROOM)  # the hand fits
     furniture.goal((half_depth, 0.0, middle), half, FORWARDS, 0.3)
     return furniture.layout()
 

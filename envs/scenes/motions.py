@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from viapoint.envs.arms.inverse_kinematics import solve_planar
 from viapoint.envs.arms.kinematics import tool_position
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.clearance import Placed, place
+from viapoint.envs.geometry.clearance import place
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE
-from viapoint.envs.plans import SHORTEST_DURATION
-from viapoint.envs.scenes.ends import Draft, Mover, is_end
-from viapoint.envs.scenes.scene import MOST_JUMPS, NEVER, row_clearance
+from viapoint.envs.scenes.ends import Draft, is_end, is_row_clear
+from viapoint.envs.scenes.layout import mix
+from viapoint.envs.scenes.scene import MOST_JUMPS, NEVER
 
 CANDIDATES = 8
 """Candidates for a jump, or for the course of an obstacle."""
@@ -44,17 +42,7 @@ PASSED = 8
 """Parts of the way to a new target between which it is looked at."""
 
 
-class Changes(NamedTuple):
-    """Distribution of changes."""
-
-    fewest_jumps: int
-    most_jumps: int
-    moving: bool
-    """True if obstacles move."""
-    shortest: float
-    """Shortest duration of movements, [s], in joint space relative to the shortest possible; then centre, longest."""
-    centre: float
-    longest: float
+_mixed = compiled(mix)
 
 
 def numbers_of_jumps(joints: int) -> int:
@@ -63,48 +51,29 @@ def numbers_of_jumps(joints: int) -> int:
 
 
 @compiled
-def _mixed(limits: tuple[float, float], share: float) -> float:
-    """Return the number at a share of the way from a lower limit to an upper one."""
-    return limits[0] + (limits[1] - limits[0]) * share
-
-
-@compiled
-def time_unit(mover: Mover, start: Float, goal: Float) -> float:
-    """Return the unit of durations, [s]: in joint space the shortest duration that the velocity limits allow."""
-    if mover.of_hand:
-        return 1.0
-    unit = SHORTEST_DURATION
-    for joint in range(len(start)):
-        # The greatest rate of a minimum-jerk movement is 15/8 of the mean one.
-        unit = max(unit, 1.875 * abs(goal[joint] - start[joint]) / mover.velocity_limit[joint])
-    return unit
-
-
-@compiled
-def draw_courses(draft: Draft, changes: Changes, which: Int, numbers: Float) -> None:
+def draw_courses(draft: Draft, which: Int, durations: Float, numbers: Float) -> None:
     """Set the obstacles of the scenes at indices (K,) in motion, but half-spaces, and those of which no course fits.
 
-    `numbers` are uniform random numbers, shape (K, W, CANDIDATES, COURSE_NUMBERS).
+    `durations` are those of the straight movements, shape (K,), [s]; `numbers` are uniform random numbers, shape
+    (K, W, CANDIDATES, COURSE_NUMBERS).
     """
-    mover, obstacles = draft.mover, draft.obstacles
+    setting, scenes, obstacles = draft.setting, draft.scenes, draft.scenes.obstacles
     for k in range(len(which)):
         scene = which[k]
-        start, goal = draft.ends[scene, 0], draft.ends[scene, 1]
-        unit = time_unit(mover, start, goal)
-        place(mover.chain, mover.spheres, start, draft.at_start)
-        place(mover.chain, mover.spheres, goal, draft.at_goal)
+        place(setting.chain, setting.spheres, scenes.start[scene], draft.at_start)
+        place(setting.chain, setting.spheres, scenes.goal[scene], draft.at_goal)
         for row in range(obstacles.kind.shape[1]):
             if obstacles.kind[scene, row] in (ABSENT, HALF_SPACE):
                 continue
             met = obstacles.centre[scene, row].copy()
             fits = False
             for candidate in range(CANDIDATES):
-                _set_course(draft, scene, row, met, unit * changes.centre, numbers[k, row, candidate])
-                fits = _course_fits(draft, changes, unit, scene, row)
+                _set_course(draft, scene, row, met, durations[k], numbers[k, row, candidate])
+                fits = _course_fits(draft, durations[k], scene, row)
                 if fits:
                     break
             if not fits:
-                _set_course(draft, scene, row, met, 0.0, np.zeros(COURSE_NUMBERS))
+                _set_course(draft, scene, row, met, 0.0, np.zeros(COURSE_NUMBERS))  # it rests
 
 
 @compiled
@@ -113,7 +82,7 @@ def _set_course(draft: Draft, scene: int, row: int, met: Float, duration: float,
     first, second = np.zeros(3), np.zeros(3)
     turn, meeting = NEVER, 0.0
     if duration > 0.0:
-        height = 0.0 if draft.mover.plane else STEEPNESS
+        height = 0.0 if draft.setting.plane else STEEPNESS
         _fill_velocity(u[0], u[1], height * (2.0 * u[2] - 1.0), first)
         meeting = duration * _mixed(MEETING, u[8])
         if u[6] < TURNING:
@@ -121,103 +90,88 @@ def _set_course(draft: Draft, scene: int, row: int, met: Float, duration: float,
             _fill_velocity(u[3], u[4], height * (2.0 * u[5] - 1.0), second)
     for axis in range(3):
         way = first[axis] * min(meeting, turn) + second[axis] * max(meeting - turn, 0.0)
-        draft.obstacles.centre[scene, row, axis] = met[axis] - way
-        draft.obstacles.velocity[scene, row, axis] = first[axis]
-        draft.turn_velocity[scene, row, axis] = second[axis]
-    draft.turn_time[scene, row] = turn
+        draft.scenes.obstacles.centre[scene, row, axis] = met[axis] - way
+        draft.scenes.obstacles.velocity[scene, row, axis] = first[axis]
+        draft.scenes.turn_velocity[scene, row, axis] = second[axis]
+    draft.scenes.turn_time[scene, row] = turn
 
 
 @compiled
 def _fill_velocity(fast: float, heading: float, rise: float, velocity: Float) -> None:
     """Fill in a velocity from two random numbers and the sine of its angle to the horizontal, shape (3,), [m/s]."""
     speed, angle = _mixed(SPEED, fast), 2.0 * np.pi * heading
-    level = np.sqrt(1.0 - rise * rise)
+    level = np.sqrt(1.0 - rise * rise)  # cosine of the angle to the horizontal
     velocity[0] = speed * level * np.cos(angle)
     velocity[1] = speed * level * np.sin(angle)
     velocity[2] = speed * rise
 
 
 @compiled
-def _course_fits(draft: Draft, changes: Changes, unit: float, scene: int, row: int) -> bool:
+def _course_fits(draft: Draft, duration: float, scene: int, row: int) -> bool:
     """Return True if an obstacle leaves the start free at first, and the goal at first and while movements may end."""
-    centre = draft.obstacles.centre[scene, row]
-    if max(abs(centre[0]), abs(centre[1]), abs(centre[2])) > FARTHEST:
+    shortest, longest = draft.setting.relative_durations
+    x, y, z = draft.scenes.obstacles.centre[scene, row]
+    if max(abs(x), abs(y), abs(z)) > FARTHEST:
         return False
     for k in range(BEGINNING_TIMES):
-        time = unit * changes.centre * BEGINNING * k / (BEGINNING_TIMES - 1)
-        if clearance_at(draft, draft.at_start, scene, row, time) < MARGIN:
+        time = duration * BEGINNING * k / (BEGINNING_TIMES - 1)
+        if not is_row_clear(draft, draft.at_start, scene, row, time, MARGIN, 1):
             return False
     for k in range(-1, ENDING_TIMES):
         share = k / (ENDING_TIMES - 1)
-        time = unit * _mixed((changes.shortest, ENDING * changes.longest), share) if k >= 0 else 0.0
-        if clearance_at(draft, draft.at_goal, scene, row, time) < MARGIN:
+        time = duration * _mixed((shortest, ENDING * longest), share) if k >= 0 else 0.0
+        if not is_row_clear(draft, draft.at_goal, scene, row, time, MARGIN, 1):
             return False
     return True
 
 
 @compiled
-def clearance_at(draft: Draft, placed: Placed, scene: int, row: int, time: float) -> float:
-    """Return the clearance of a placed arm from an obstacle at some time, at most MARGIN, [m]."""
-    obstacles = draft.obstacles
-    after = max(time - draft.turn_time[scene, row], 0.0)
-    before = (
-        obstacles.centre[scene, row, 0],
-        obstacles.centre[scene, row, 1],
-        obstacles.centre[scene, row, 2],
-    )
-    # After the turn, the place is that of the first course, moved by what the turn changes.
-    for axis in range(3):
-        change = draft.turn_velocity[scene, row, axis] - obstacles.velocity[scene, row, axis]
-        obstacles.centre[scene, row, axis] += after * change
-    least = row_clearance(draft.mover.spheres, placed, obstacles, scene, row, time, MARGIN, MARGIN, 1)
-    for axis in range(3):
-        obstacles.centre[scene, row, axis] = before[axis]
-    return float(least)
-
-
-@compiled
-def draw_jumps(draft: Draft, changes: Changes, which: Int, numbers: Float) -> Bool:
+def draw_jumps(draft: Draft, which: Int, durations: Float, numbers: Float) -> Bool:
     """Draw the jumps of the target of the scenes at indices (K,), and return True where all of them fit, shape (K,).
 
-    `numbers` are uniform random numbers, shape (K, :func:`numbers_of_jumps`).
+    `durations` are those of the straight movements, shape (K,), [s]; `numbers` are uniform random numbers, shape
+    (K, :func:`numbers_of_jumps`).
     """
-    joints = draft.ends.shape[2]
+    joints = draft.scenes.start.shape[1]
+    fewest, most = draft.setting.n_jumps
     each = 1 + CANDIDATES * (1 + joints)
     good = np.ones(len(which), np.bool_)
     before, target = np.empty(joints), np.empty(joints)
     for k in range(len(which)):
         scene, u = which[k], numbers[k]
-        count = changes.fewest_jumps + int((changes.most_jumps - changes.fewest_jumps + 1) * u[0])
-        start, goal = draft.ends[scene, 0], draft.ends[scene, 1]
-        duration = changes.centre * time_unit(draft.mover, start, goal)
-        draft.jumps[scene] = 0.0
-        before[:] = goal
+        count = fewest + int((most - fewest + 1) * u[0])
+        start = draft.scenes.start[scene]
+        before[:] = draft.scenes.goal[scene]
+        draft.scenes.jumps[scene] = 0.0
         time = 0.0
         for jump in range(count):
             first = 1 + jump * each
-            time += duration * _mixed(NEXT_JUMP if jump else FIRST_JUMP, u[first])
+            time += durations[k] * _mixed(NEXT_JUMP if jump else FIRST_JUMP, u[first])
             fits = False
             for candidate in range(CANDIDATES):
                 begin = first + 1 + candidate * (1 + joints)
-                if _jump(draft, start, before, u[begin : begin + 1 + joints], target):
-                    fits = _is_free_at(draft, scene, target, time)
+                fits = _jump(draft, start, before, u[begin : begin + 1 + joints], target)
+                fits = fits and is_end(draft, target)
+                for row in range(draft.scenes.obstacles.kind.shape[1]):
+                    # The target must be free when it appears.
+                    fits = fits and is_row_clear(draft, draft.placed, scene, row, time, MARGIN, 1)
                 if fits:
                     break
             if not fits:
                 good[k] = False
                 break
-            draft.jumps[scene, jump, 0] = time
+            draft.scenes.jumps[scene, jump, 0] = time
             for joint in range(joints):
                 before[joint] = target[joint]
-                draft.jumps[scene, jump, 1 + joint] = target[joint]
+                draft.scenes.jumps[scene, jump, 1 + joint] = target[joint]
     return good
 
 
 @compiled
 def _jump(draft: Draft, start: Float, before: Float, u: Float, target: Float) -> bool:
     """Fill in a target at a random distance from the one before, and return True if the hand has a way to it."""
-    mover, placed = draft.mover, draft.placed
-    if not mover.of_hand:
+    setting, placed = draft.setting, draft.placed
+    if not setting.of_hand:
         length = 0.0
         for joint in range(len(target)):
             target[joint] = 2.0 * u[1 + joint] - 1.0
@@ -226,8 +180,8 @@ def _jump(draft: Draft, start: Float, before: Float, u: Float, target: Float) ->
         for joint in range(len(target)):
             target[joint] = before[joint] + scale * target[joint]
         return True
-    x, y, _ = tool_position(mover.chain, before, placed.rotation, placed.origin)
-    a, b, _ = tool_position(mover.chain, start, placed.rotation, placed.origin)
+    x, y, _ = tool_position(setting.chain, before, placed.rotation, placed.origin)
+    a, b, _ = tool_position(setting.chain, start, placed.rotation, placed.origin)
     length, angle = _mixed(JUMP_OF_HAND, u[0]), 2.0 * np.pi * u[1]
     to_x, to_y = x + length * np.cos(angle), y + length * np.sin(angle)
     # The hand is between the start and the target before: its way is between the ways from there.
@@ -235,17 +189,6 @@ def _jump(draft: Draft, start: Float, before: Float, u: Float, target: Float) ->
         share = k / PASSED
         for p, q in ((a, b), (x, y)):
             there = p + share * (to_x - p), q + share * (to_y - q)
-            if not solve_planar(mover.chain, mover.inner_range, there[0], there[1], target):
+            if not solve_planar(setting.chain, setting.inner_range, there[0], there[1], target):
                 return False
-    return True
-
-
-@compiled
-def _is_free_at(draft: Draft, scene: int, target: Float, time: float) -> bool:
-    """Return True if a target is within the limits and free when it appears."""
-    if not is_end(draft, target):
-        return False
-    for row in range(draft.obstacles.kind.shape[1]):
-        if clearance_at(draft, draft.placed, scene, row, time) < MARGIN:
-            return False
     return True

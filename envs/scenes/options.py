@@ -14,7 +14,7 @@ from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.clearance import FAR
+from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.envs.geometry.distance import point_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, pack, unpack
 from viapoint.envs.geometry.shapes import (
@@ -33,7 +33,6 @@ from viapoint.envs.scenes.scene import (
     Scenes,
     check_scenes,
     resting,
-    row_clearances,
 )
 
 OPTIONS = (*ENDS, "obstacles", "jumps", "turns")
@@ -81,7 +80,7 @@ def draw_given(
     _refuse_unknown(options)
     if not options:
         return sampler(generators)
-    number, arm = len(generators), sampler.arm
+    number, arm = len(generators), sampler.task.arm
     shapes = _shapes(options["obstacles"], sampler, number) if "obstacles" in options else None
     obstacles = no_obstacles(number, sampler.rows) if shapes is None else pack(shapes, sampler.rows)
     names = [[shape.name for shape in each] for each in shapes or ()]
@@ -152,10 +151,10 @@ def _check_shape(row: int, shape: Shape, sampler: SceneSampler) -> None:
         for name, mesh in REGISTERED_MESHES.items():
             if np.array_equal(mesh.vertices, shape.vertices):
                 kinds.add(name)
-    if not kinds & set(sampler.kinds):
-        allowed = ", ".join(sampler.kinds)
+    if not kinds & set(sampler.task.shapes):
+        allowed = ", ".join(sampler.task.shapes)
         raise ValueError(f"obstacle {row} must be one of the shapes of the task, {allowed}, got {shape.kind}")
-    arm = sampler.arm
+    arm = sampler.task.arm
     base = np.repeat(arm.spheres.link, np.diff(arm.spheres.first)) == 0
     centres = sphere_centres(arm.chain, arm.spheres, arm.home)[base]
     if base.any() and (shape.distance(centres) + arm.spheres.radius[base]).max() <= 0.0:
@@ -165,7 +164,7 @@ def _check_shape(row: int, shape: Shape, sampler: SceneSampler) -> None:
 
 def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles) -> Float:
     """Return the joint positions of a given end, shape (N, J)."""
-    number, joints = len(obstacles.kind), len(sampler.arm.home)
+    number, joints = len(obstacles.kind), len(sampler.task.arm.home)
     label = f"options[{name!r}]"
     several = [value] * number if isinstance(value, Pose | Mapping) else value
     is_list = isinstance(several, Sequence) and len(several) > 0
@@ -173,11 +172,13 @@ def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles) -> 
         if len(several) != number:
             raise ValueError(f"{label} must be one pose, or {number} poses, got {len(several)}")
         poses = [_pose(label, each) for each in several]
-        if sampler.space == "joints":
-            found = [_solution(label, pose, sampler.arm, obstacles.take([i])) for i, pose in enumerate(poses)]
+        if sampler.task.space_name == "joints":
+            found = [
+                _solution(label, pose, sampler.task.arm, obstacles.take([i])) for i, pose in enumerate(poses)
+            ]
             return np.array(found)
         value = [pose.position for pose in poses]
-    if sampler.space == "joints":
+    if sampler.task.space_name == "joints":
         array = finite_array(label, value, (joints,), (number, joints))
         return np.array(np.broadcast_to(array, (number, joints)), order="C")
     array = finite_array(label, value, (2,), (3,), (number, 2), (number, 3))
@@ -186,7 +187,7 @@ def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles) -> 
         raise ValueError(
             f"{label} must have z = {height:g} m, which is the plane of the hand, got {array.tolist()}"
         )
-    return _planar(label, sampler.arm, np.broadcast_to(array[..., :2], (number, 2)))
+    return _planar(label, sampler.task.arm, np.broadcast_to(array[..., :2], (number, 2)))
 
 
 def _planar(label: str, arm: Arm, hand: Float) -> Float:
@@ -226,16 +227,16 @@ def _solution(label: str, pose: Pose, arm: Arm, obstacles: Obstacles) -> Float:
 
 def _jumps(value: Any, sampler: SceneSampler, number: int) -> Float:
     """Return given jumps of N scenes in joint positions, the absent ones last."""
-    joints = len(sampler.arm.home)
-    size = 2 if sampler.space == "hand" else joints
+    joints = len(sampler.task.arm.home)
+    size = 2 if sampler.task.space_name == "hand" else joints
     given = _rows("jumps", value, (number, MOST_JUMPS, 1 + size))
     present = (given != 0.0).any(axis=-1)
     jumps = np.zeros((number, MOST_JUMPS, 1 + joints))
     targets = given[present][:, 1:]
-    if sampler.space == "hand":
-        targets = _planar("target of options['jumps']", sampler.arm, targets)
+    if sampler.task.space_name == "hand":
+        targets = _planar("target of options['jumps']", sampler.task.arm, targets)
     jumps[present] = np.concatenate((given[present][:, :1], targets), axis=-1)
-    order = np.argsort(~present, axis=-1, kind="stable")
+    order = np.argsort(~present, axis=-1, kind="stable")  # absent rows may be between others
     return np.take_along_axis(jumps, order[..., None], axis=1)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,17 +17,16 @@ from viapoint.envs.arms.inverse_kinematics import planar_joints
 from viapoint.envs.arms.kinematics import link_poses, sphere_centres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
-from viapoint.envs.geometry.clearance import memory
+from viapoint.envs.geometry.clearance import memory, row_clearances
 from viapoint.envs.geometry.distance import point_clearances
 from viapoint.envs.geometry.obstacles import no_obstacles
-from viapoint.envs.plans import SpaceName
-from viapoint.envs.scenes import families_plane, families_space
+from viapoint.envs.plans import SHORTEST_DURATION
 from viapoint.envs.scenes.ends import (
     HOME_SHARE,
     PAIRS,
     SELF_MARGIN,
     Draft,
-    Mover,
+    Setting,
     draw_ends,
     numbers_of_end,
 )
@@ -36,12 +35,14 @@ from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Layout, Room, m
 from viapoint.envs.scenes.motions import (
     CANDIDATES,
     COURSE_NUMBERS,
-    Changes,
     draw_courses,
     draw_jumps,
     numbers_of_jumps,
 )
-from viapoint.envs.scenes.scene import ENDS, NEVER, Scenes, resting, row_clearances
+from viapoint.envs.scenes.scene import ENDS, Scenes, resting
+
+if TYPE_CHECKING:
+    from viapoint.envs.task import Task
 
 LOW_HALF_HEIGHT, TALL_HALF_HEIGHT = 0.04, 0.3
 """Half heights of obstacles in the plane that the hand alone must clear, and that links must clear, too, [m]."""
@@ -66,41 +67,28 @@ ATTEMPTS, FAMILY_ATTEMPTS = 1000, 50
 
 
 class SceneSampler:
-    """Sampler of scenes for an arm; a :class:`~viapoint.envs.task.Task` makes it of checked values.
+    """Sampler of the scenes of a task.
 
-    Scenes have `rows` for obstacles, at least as many as are drawn; furniture has as many as it needs. Obstacles in the
-    plane are in the way of the links, too, if they are `tall`, and keep away from the place of a sensor, `viewpoint`,
-    [m]. The durations are the shortest, the centre and the longest of a movement, [s]; in joint space relative to the
-    shortest one of the straight movement that the velocity limits of the joints allow.
+    Scenes have rows for as many obstacles as the task allows. Obstacles in the plane are in the way of the links, too,
+    if `whole_arm`, and keep away from the place of a sensor that does not move.
     """
 
-    def __init__(
-        self,
-        arm: Arm,
-        *,
-        space: SpaceName,
-        n_obstacles: tuple[int, int],
-        kinds: tuple[str, ...],
-        families: tuple[str, ...],
-        rows: int,
-        tall: bool = False,
-        jumps: tuple[int, int] = (0, 0),
-        moving: bool = False,
-        durations: tuple[float, float, float] = (0.5, 0.8, 1.2),
-        viewpoint: tuple[float, float, float] | None = None,
-    ) -> None:
-        fewest, most = n_obstacles
-        self.arm, self.space, self.kinds, self.rows = arm, space, kinds, rows
-        self.plane = is_planar(arm)
-        self.families, self.viewpoint = families, viewpoint
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.plane = is_planar(task.arm)
+        fewest, most = task.n_obstacles
+        self.rows = most
+        """Number of rows for obstacles."""
         most = min(most, max(fewest, MOST_DRAWN))
-        self.room = room_of(arm, kinds, (fewest, most), tall)
-        self.changes = Changes(*jumps, moving, *durations)
-        self._mover = _mover_of(arm, space, self.plane)
-        self._builds = [scene_families(self.plane)[name].build for name in self.families]
-        self._bare = families_plane.clutter if self.plane else families_space.clutter
-        self._width = max(most_rows(most), rows)
-        self._memories = [memory(arm.chain, arm.spheres) for _ in range(3)]
+        self.room = room_of(task.arm, task.shapes, (fewest, most), task.whole_arm)
+        self.viewpoint = None if task.sensor is None else task.sensor.viewpoint
+        """Place of a sensor that does not move, [m]."""
+        self._setting = _setting_of(task, self.plane)
+        known = scene_families(self.plane)
+        self._builds = [known[name].build for name in task.families]
+        self._bare = known["clutter"].build
+        self._width = max(most_rows(most), self.rows)
+        self._memories = [memory(task.arm.chain, task.arm.spheres) for _ in range(3)]
 
     def __call__(
         self,
@@ -117,7 +105,7 @@ class SceneSampler:
         """
         number = len(generators)
         if scenes is None:
-            home = np.tile(self.arm.home, (number, 1))
+            home = np.tile(self.task.arm.home, (number, 1))
             scenes = resting(home, home, no_obstacles(number, self.rows))
         draft = self._draft(scenes, given)
         rooms = self._rooms(scenes, given)
@@ -133,71 +121,42 @@ class SceneSampler:
                 rng.random(out=draft.numbers[i])
             found = draw_ends(draft, pending)
             if self.viewpoint is not None:
-                found &= point_clearances(draft.obstacles.take(pending), self.viewpoint) >= VIEW_MARGIN
+                obstacles = draft.scenes.obstacles.take(pending)
+                found &= point_clearances(obstacles, self.viewpoint) >= VIEW_MARGIN
             found[found] = self._change(draft, pending[found], generators, given)
             pending = pending[~found]
             if not len(pending):
-                return self._finished(draft)
+                return draft.scenes.with_rows(self.rows)
         raise RuntimeError(
-            f"no scene of the families {', '.join(self.families)} with {self.room.fewest} to {self.room.most} "
-            f"obstacles was found in {ATTEMPTS} attempts for the arm {self.arm.name!r}; allow fewer obstacles or "
+            f"no scene of the families {', '.join(self.task.families)} with {self.room.fewest} to {self.room.most} "
+            f"obstacles was found in {ATTEMPTS} attempts for the arm {self.task.arm.name!r}; allow fewer obstacles or "
             "other families, or give other ends"
         )
 
     def _draft(self, scenes: Scenes, given: Collection[str]) -> Draft:
-        """Return scenes with the given parts."""
+        """Return copies of scenes with the given parts, and memory for the others."""
         number, joints = scenes.start.shape
-        width, fixed = self._width, np.zeros((number, 2), np.bool_)
-        fixed[:, 0], fixed[:, 1] = "start" in given, "goal" in given
-        n_rows = np.full(number, -1)
-        if "obstacles" not in given:
-            n_rows[:] = 0
-            scenes = scenes._replace(
-                obstacles=no_obstacles(number, width),
-                turn_time=np.full((number, width), NEVER),
-                turn_velocity=np.zeros((number, width, 3)),
-            )
+        fixed = np.zeros((number, 2), np.bool_)
+        fixed[:, 0] = "start" in given
+        fixed[:, 1] = "goal" in given
+        drawn = "obstacles" not in given
+        copies = scenes.take(np.arange(number))
+        if drawn:
+            empty = resting(copies.start, copies.goal, no_obstacles(number, self._width))
+            copies = empty._replace(jumps=copies.jumps)
         return Draft(
-            mover=self._mover,
-            rows=np.zeros((number, width, ROW)),
-            n_rows=n_rows,
+            setting=self._setting,
+            scenes=copies,
+            rows=np.zeros((number, self._width, ROW)),
+            n_rows=np.full(number, 0 if drawn else -1),
             keep=np.zeros(number, np.int64),
             places=np.zeros((number, 2, MOST_PLACES, PLACE)),
             n_places=np.zeros((number, 2), np.int64),
             fixed=fixed,
             numbers=np.zeros((number, PAIRS, 2, numbers_of_end(joints))),
-            ends=np.stack((scenes.start, scenes.goal), axis=1),
-            obstacles=scenes.obstacles,
-            turn_time=scenes.turn_time.copy(),
-            turn_velocity=scenes.turn_velocity.copy(),
-            jumps=scenes.jumps.copy(),
             placed=self._memories[0],
             at_start=self._memories[1],
             at_goal=self._memories[2],
-        )
-
-    def _finished(self, draft: Draft) -> Scenes:
-        """Return drawn scenes, without the rows for obstacles that were left out."""
-        rows = slice(0, self.rows)
-        given = draft.obstacles
-        obstacles = given._replace(
-            kind=given.kind[:, rows].copy(),
-            centre=given.centre[:, rows].copy(),
-            rotation=given.rotation[:, rows].copy(),
-            size=given.size[:, rows].copy(),
-            velocity=given.velocity[:, rows].copy(),
-        )
-        absent = ~obstacles.present
-        for part in (obstacles.centre, obstacles.size, obstacles.velocity):
-            part[absent] = 0.0
-        obstacles.rotation[absent] = np.eye(3)
-        return Scenes(
-            start=draft.ends[:, 0].copy(),
-            goal=draft.ends[:, 1].copy(),
-            obstacles=obstacles,
-            jumps=draft.jumps,
-            turn_time=draft.turn_time[:, rows].copy(),
-            turn_velocity=draft.turn_velocity[:, rows].copy(),
         )
 
     def _any_family(self, rng: np.random.Generator) -> Build:
@@ -212,7 +171,7 @@ class SceneSampler:
         rooms = [room] * len(scenes.start)
         for end in ENDS:
             if self.plane and end in given:
-                hand = (self.arm.hand(getattr(scenes, end)) - np.array(room.foot)) / room.scale
+                hand = (self.task.arm.hand(getattr(scenes, end)) - np.array(room.foot)) / room.scale
                 for i, (x, y, _) in enumerate(hand.tolist()):
                     place: dict[str, Any] = {end: (x, y)}
                     rooms[i] = rooms[i]._replace(**place)
@@ -226,11 +185,19 @@ class SceneSampler:
         def numbers(*shape: int) -> Float:
             return np.array([generators[scene].random(shape) for scene in which]).reshape(-1, *shape)
 
-        if self.changes.moving and "obstacles" not in given:
-            draw_courses(draft, self.changes, which, numbers(self._width, CANDIDATES, COURSE_NUMBERS))
-        if self.changes.most_jumps == 0 or "jumps" in given:
+        moves = self.task.moving_obstacles and "obstacles" not in given
+        jumps = self.task.n_jumps[1] > 0 and "jumps" not in given
+        if not moves and not jumps:
             return np.ones(len(which), bool)
-        return draw_jumps(draft, self.changes, which, numbers(numbers_of_jumps(len(self.arm.home))))
+        space, action = self.task.space, self.task.action
+        start, goal = draft.scenes.start[which], draft.scenes.goal[which]
+        durations = action.zero_duration(space.coordinates(start), space.coordinates(goal))
+        durations = np.maximum(durations, SHORTEST_DURATION * action.centre)
+        if moves:
+            draw_courses(draft, which, durations, numbers(self._width, CANDIDATES, COURSE_NUMBERS))
+        if not jumps:
+            return np.ones(len(which), bool)
+        return draw_jumps(draft, which, durations, numbers(numbers_of_jumps(start.shape[1])))
 
 
 def _write(draft: Draft, scene: int, layout: Layout) -> None:
@@ -252,8 +219,11 @@ def is_planar(arm: Arm) -> bool:
     return bool((np.abs(rotation[1:, 2, 2]) > 1.0 - 1e-6).all())
 
 
-def _mover_of(arm: Arm, space: SpaceName, plane: bool) -> Mover:
-    """Return what compiled functions know of an arm."""
+def _setting_of(task: Task, plane: bool) -> Setting:
+    """Return what compiled functions know of a task."""
+    arm = task.arm
+    shortest, longest = task.duration_range
+    centre = task.action.centre
     width = arm.joint_range[:, 1] - arm.joint_range[:, 0]
     margin = np.minimum(LIMIT_MARGIN, 0.1 * width)
     inner = arm.joint_range + margin[:, None] * np.array([1.0, -1.0])
@@ -264,19 +234,20 @@ def _mover_of(arm: Arm, space: SpaceName, plane: bool) -> Mover:
     inner = np.where(several[:, None], near, inner)
     away = arm.hand(arm.home) - arm.chain.origin[0]
     _, own = row_clearances(arm.chain, arm.spheres, arm.home[None], no_obstacles(1), SELF_MARGIN / HOME_SHARE)
-    return Mover(
+    return Setting(
         chain=arm.chain,
         spheres=arm.spheres,
         joint_range=arm.joint_range,
         inner_range=inner,
-        velocity_limit=arm.velocity_limit,
         home=arm.home,
         bearing=math.atan2(away[1], away[0]),
         plane=plane,
-        of_hand=space == "hand",
+        of_hand=task.space_name == "hand",
         margin=PLANE_MARGIN if plane else SPACE_MARGIN,
         self_margin=min(SELF_MARGIN, HOME_SHARE * float(own[0])),
         least_way=0.0 if plane else LEAST_WAY,
+        n_jumps=task.n_jumps,
+        relative_durations=(shortest / centre, longest / centre),
     )
 
 

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.geometry.clearance import FAR, Placed, group_clearance, memory, place, self_clearance
-from viapoint.envs.geometry.clouds import Clouds
-from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.distance import point_distance
-from viapoint.envs.geometry.meshes import Meshes
-from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, Obstacles, no_obstacles
+from viapoint.envs.geometry.clearance import FAR, row_clearances
+from viapoint.envs.geometry.obstacles import HALF_SPACE, Obstacles, no_obstacles
 from viapoint.envs.geometry.shapes import IN_TABLES
 
 MOST_JUMPS = 4
@@ -75,6 +69,14 @@ class Scenes(NamedTuple):
                 getattr(self, name)[rows] = getattr(scenes, name)
         return self._replace(obstacles=self.obstacles.put(rows, scenes.obstacles))
 
+    def with_rows(self, rows: int) -> Scenes:
+        """Return the scenes with another number of rows for obstacles; those behind are left out."""
+        wide = resting(self.start, self.goal, self.obstacles.with_rows(rows))
+        kept = min(rows, self.turn_time.shape[1])
+        wide.turn_time[:, :kept] = self.turn_time[:, :kept]
+        wide.turn_velocity[:, :kept] = self.turn_velocity[:, :kept]
+        return wide._replace(jumps=self.jumps)
+
     @classmethod
     def together(cls, parts: Sequence[Scenes]) -> Scenes:
         """Return the scenes of several records in one, which shares no memory with them."""
@@ -90,21 +92,6 @@ class Scenes(NamedTuple):
             if name != "obstacles":
                 arrays[name] = np.concatenate([getattr(part, name) for part in parts])
         return cls(**arrays)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return copies of all arrays in nested dictionaries, for :meth:`from_dict`."""
-        obstacles = self.obstacles._asdict()
-        for name in ("meshes", "clouds"):
-            obstacles[name] = obstacles[name]._asdict()
-        return copy.deepcopy({**self._asdict(), "obstacles": obstacles})
-
-    @classmethod
-    def from_dict(cls, record: Mapping[str, Any]) -> Scenes:
-        """Return the scenes of a record of :meth:`as_dict`, with arrays of their own."""
-        parts = copy.deepcopy(dict(record))
-        meshes, clouds = Meshes(**parts["obstacles"]["meshes"]), Clouds(**parts["obstacles"]["clouds"])
-        parts["obstacles"] = Obstacles(**{**parts["obstacles"], "meshes": meshes, "clouds": clouds})
-        return cls(**parts)
 
     @property
     def jump_times(self) -> Float:
@@ -122,8 +109,8 @@ class Scenes(NamedTuple):
     def obstacles_at(self, time: Float) -> Obstacles:
         """Return the obstacles with their places and velocities at one time for each scene, shape (N,), [s]."""
         time = time[:, None]
-        before = np.minimum(time, self.turn_time)[..., None]
-        after = np.maximum(time - self.turn_time, 0.0)[..., None]
+        before = np.minimum(time, self.turn_time)[..., None]  # time on the first course
+        after = np.maximum(time - self.turn_time, 0.0)[..., None]  # and on the second one
         velocity = self.obstacles.velocity
         centre = self.obstacles.centre + velocity * before + self.turn_velocity * after
         turned = (self.turn_time <= time + ROUNDING)[..., None]
@@ -142,55 +129,6 @@ def resting(start: Float, goal: Float, obstacles: Obstacles) -> Scenes:
         np.full(obstacles.kind.shape, NEVER),
         np.zeros(obstacles.centre.shape),
     )
-
-
-@compiled
-def row_clearance(
-    spheres: Spheres,
-    placed: Placed,
-    obstacles: Obstacles,
-    scene: int,
-    row: int,
-    time: float,
-    least: float,
-    floor: float,
-    link: int,
-) -> float:
-    """Return the clearance of links from `link` on of a placed arm from one obstacle, at most `least`, [m].
-
-    The search stops at the first clearance below `floor`; the exact value below it does not matter.
-    """
-    if obstacles.kind[scene, row] == ABSENT:
-        return least
-    for group in range(len(spheres.link)):
-        if spheres.link[group] < link:
-            continue
-        x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
-        size = spheres.ball_radius[group]
-        if point_distance(obstacles, scene, row, x, y, z, time, least + size) - size < least:
-            least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
-            if least < floor:
-                return least
-    return least
-
-
-@compiled
-def row_clearances(
-    chain: Chain, spheres: Spheres, joints: Float, obstacles: Obstacles, most: float
-) -> tuple[Float, Float]:
-    """Return the clearances of N arms from n obstacles at time 0, shape (N, n), and from themselves, shape (N,), [m].
-
-    They are at most `most`.
-    """
-    placed = memory(chain, spheres)
-    number, rows = obstacles.kind.shape
-    found, own = np.empty((number, rows)), np.empty(number)
-    for scene in range(number):
-        place(chain, spheres, joints[scene], placed)
-        own[scene] = self_clearance(spheres, placed, most, -FAR)
-        for row in range(rows):
-            found[scene, row] = row_clearance(spheres, placed, obstacles, scene, row, 0.0, most, -FAR, 1)
-    return found, own
 
 
 def check_scenes(
@@ -231,7 +169,7 @@ def check_jumps(scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]] = ()) -
         obstacles = scenes.obstacles_at(np.where(given, time, 0.0))
         target = np.where(given[:, None], scenes.jumps[:, jump, 1:], scenes.goal)
         _check_end(arm, f"target of jump {jump}", target, obstacles, given, names)
-        before = time
+        before = time  # jumps are in order
 
 
 def _check_obstacles(scenes: Scenes, names: Sequence[Sequence[str]]) -> None:

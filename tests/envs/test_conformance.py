@@ -12,9 +12,9 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.registration import TASKS, twin_of
-from viapoint.envs.rewards import RewardTerms
+from viapoint.envs.rewards import TERMS
 
-INFO = {*Outcome._fields, *(f"reward_{name}" for name in RewardTerms._fields), "elapsed", "time", "event"}
+INFO = {*Outcome._fields, *TERMS, "elapsed", "time", "event"}
 DIFFERENT = sorted({str(TASKS[env_id]): env_id for env_id in reversed(IDS)}.values())
 """One id of each task."""
 

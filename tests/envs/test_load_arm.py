@@ -13,8 +13,8 @@ from self_contact import check_contact_implies_overlap, least_pair_distance
 from viapoint.envs.arms import load
 from viapoint.envs.arms.kinematics import forward, sphere_centres, torques
 from viapoint.envs.arms.load import load_arm
+from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import pack
-from viapoint.envs.scenes.scene import row_clearances
 
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 TEXT = UR5E.read_text(encoding="utf-8")

@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.chain import Chain, Spheres
 from viapoint.envs.arms.inverse_kinematics import in_planar_reach, planar_limits, solve_planar
+from viapoint.envs.arms.kinematics import Chain, Spheres
 from viapoint.envs.common.types import Float, Int
 from viapoint.envs.geometry.clearance import (
     WINDOW,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.chain import Chain, Spheres
+from viapoint.envs.arms.kinematics import Chain, Spheres
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.clearance import memory, obstacle_clearance, place, self_clearance

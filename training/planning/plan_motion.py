@@ -21,11 +21,11 @@ from viapoint.envs.arms.kinematics import slowdown, torques
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least, whole_number
+from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape
 from viapoint.envs.plans import SHORTEST_DURATION, Plan, SpaceName
 from viapoint.envs.scenes.options import Pose
-from viapoint.envs.scenes.scene import row_clearances
 from viapoint.envs.spaces import Space, space_of
 from viapoint.training.planning.motion_plan import Limits, MotionPlan, joint_motion
 from viapoint.training.planning.movements import (

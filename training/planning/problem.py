@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.chain import Spheres
+from viapoint.envs.arms.kinematics import Spheres
 from viapoint.envs.arms.spheres import grouped
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int

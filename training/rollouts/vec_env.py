@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import viapoint.envs
 from viapoint.envs.registration import check_registered
-from viapoint.envs.rewards import RewardTerms
+from viapoint.envs.rewards import TERMS as TERMS
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
@@ -24,7 +24,6 @@ Observation = dict[str, NDArray[np.float32]] | NDArray[Any]
 ELAPSED = "elapsed"  # Name of the duration of a decision in infos, [s]
 # Metrics of an episode that `episode` in the infos holds too, as with `info_keywords` of SB3's `Monitor`
 LOGGED = ("collision", "reachable", "min_clearance", "jerk_ratio", "duration")
-TERMS = tuple(f"reward_{name}" for name in RewardTerms._fields)  # Terms of the reward in infos
 
 
 def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
