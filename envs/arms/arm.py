@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -153,11 +153,13 @@ def arm_from_xml(
     space: SpaceName = "joints",
     bandwidth: float = 50.0,
     exclude: Mapping[frozenset[str], str] | None = None,
+    touch: Callable[[str, str, Float], bool] | None = None,
 ) -> Arm:
     """Return the arm of an MJCF text without actuators, in which all collision geoms are capsules and spheres.
 
     The joints are hinges and slides from the base to the tool, which is a site; all other bodies move with one of them.
-    Pairs of bodies in `exclude` may pass through one another, with the reason. The servos of the joints are critically
+    Pairs of bodies in `exclude` may pass through one another, with the reason. So may pairs for which `touch` is False
+    wherever their spheres overlap; by default, spheres decide. The servos of the joints are critically
     damped; `bandwidth` is their natural frequency, [rad/s].
 
     Raises:
@@ -177,11 +179,15 @@ def arm_from_xml(
     ranges = np.array([model.joint(each).range for each in joints])
     low, high = ranges.T
     drawn = np.random.default_rng(0).uniform(low, high, (COMPARED, len(ranges)))
-    touch = overlapping(chain, spheres, drawn)
-    for first, second in spheres.pairs[~touch]:
-        reason = f"in contact in none of {COMPARED:,} configurations"
-        left_out.append(LeftOut(names[first], names[second], reason))
-    spheres = spheres._replace(pairs=spheres.pairs[touch])
+    overlap: Any = overlapping(chain, spheres, drawn, touch is not None)
+    kept = overlap.any(axis=0)
+    for row, (first, second) in enumerate(spheres.pairs):
+        if touch is not None:  # spheres reach beyond the geoms, which may be apart where spheres overlap
+            kept[row] = any(touch(names[first], names[second], each) for each in drawn[overlap[:, row]])
+        if not kept[row]:
+            reason = f"in contact in none of {COMPARED:,} configurations"
+            left_out.append(LeftOut(names[first], names[second], reason))
+    spheres = spheres._replace(pairs=spheres.pairs[kept])
     inertia = _greatest_inertia(model, data, tuple(joints))
     stiffness = inertia * bandwidth**2
     return Arm(

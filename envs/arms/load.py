@@ -245,6 +245,11 @@ def _load(
     for pair in set(near) - set(apart):
         tolerances.update(dict.fromkeys(pair, min(FINE, tolerance)))
     xml, excess = _fitted(parsed, ranges, origin, home, distances, tolerances)
+    numbers = {known: body for body, known in parsed.names.items()}
+
+    def touch(first: str, second: str, configuration: Float) -> bool:
+        return bool(_distances(parsed, configuration, [(numbers[first], numbers[second])])[0] <= 0.0)
+
     arm = arm_from_xml(
         name,
         xml,
@@ -254,6 +259,7 @@ def _load(
         velocity_limit=velocity,
         torque_limit=torque,
         exclude={parsed.pair(pair): reason for pair, reason in exclude.items()},
+        touch=touch,
     )
     weight = np.abs(torques(arm.chain, home, np.zeros(1), np.zeros(1)))
     weak = weight > torque

@@ -65,7 +65,7 @@ def cover(
     excess = dict.fromkeys(names, LARGEST_EXCESS)
     for _ in range(SHRINKING):
         spheres = _spheres(names, links, capsules, excess, pairs)
-        close = spheres.pairs[overlapping(chain, spheres, home[None])]
+        close = spheres.pairs[overlapping(chain, spheres, home[None], False)[0]]
         if not len(close):
             return names, spheres, left_out, max(excess.values())
         for group in np.unique(close):
@@ -209,14 +209,19 @@ def _bounding_ball(centre: Float, radius: Float) -> Float:
 
 
 @compiled
-def overlapping(chain: Chain, spheres: Spheres, joints: Float) -> Bool:
-    """Return True for pairs of groups that overlap in one of N configurations, shape (P,)."""
-    found = np.zeros(len(spheres.pairs), np.bool_)
+def overlapping(chain: Chain, spheres: Spheres, joints: Float, every: bool) -> Bool:
+    """Return True where pairs of groups overlap in N configurations, shape (N, P).
+
+    Without `every`, a pair is looked at until it overlaps once.
+    """
+    found = np.zeros((len(joints), len(spheres.pairs)), np.bool_)
+    done = np.zeros(len(spheres.pairs), np.bool_)
     placed = memory(chain, spheres)
     for n in range(len(joints)):
         place(chain, spheres, joints[n], placed)
-        for pair in range(len(found)):
-            if not found[pair]:
+        for pair in range(len(done)):
+            if not done[pair]:
                 least, _, _ = nearest_spheres(spheres, placed, pair, 0.0, 0.0)
-                found[pair] = least < 0.0
+                found[n, pair] = least < 0.0
+                done[pair] = found[n, pair] and not every
     return found
