@@ -34,7 +34,7 @@ STRAIGHT, PROBLEMS = 50, 100
 """Numbers of straight movements without obstacles, and of problems with 1 to 16 obstacles."""
 PROJECTS = {
     "menagerie": "MuJoCo Menagerie 75df466 (each folder has its licence)",
-    "erd": "Gepetto/example-robot-data 8d470d2 (BSD-3-Clause)",
+    "erd": "example-robot-data 6.0.0 (BSD-3-Clause)",
     "bullet": "bulletphysics/bullet3 1b03cbdd (zlib; folders have their own licences)",
     "urdfs": "Daniella1/urdf_files_dataset 81f4cda (MIT; folders have their own licences)",
     "airo": "airo-ugent/airo-models 6c187ea (MIT)",
@@ -230,7 +230,13 @@ def page_table(found: pd.DataFrame) -> str:
     columns = ["arguments", "first_s", "second_s", "spheres", "excess_mm", "straight", "tracking", "solved"]
     heads = ["file", "arguments", "load s", "again s", "spheres", "excess mm", f"straight of {STRAIGHT}"]
     heads += ["tracking mrad", "solved %", "median ms", "95 % ms"]
-    parts = []
+    loaded = found[found.spheres.notna()]
+    bare = int((loaded.arguments == 0).sum())
+    parts = [
+        f"{len(loaded)} of {len(found)} files load, {bare} of them with no argument beside the path. The median of the "
+        f"{int(found.solved.notna().sum())} arms whose movements were measured is {found.solved.median():.0f} % of the "
+        "problems.\n"
+    ]
     for project in dict.fromkeys(found.project):
         rows = found[found.project == project]
         files = [f"{Path(file).parent.name}/{Path(file).name}" for file in rows.file]

@@ -22,26 +22,21 @@ from viapoint.envs.sensors import Looks
 from viapoint.envs.simulator import Simulator
 from viapoint.envs.task import Task
 
-LIMIT_INSTANTS = 64
-"""Instants at which the limits of a plan are checked."""
+LIMIT_INSTANTS = 64  # Instants at which the limits of a plan are checked
+# Greatest number of times that a plan in motion is prolonged, and the greatest remaining factor
 PROLONGED, ENOUGH = 6, 1.0
-"""Greatest number of times that a plan in motion is prolonged, and the greatest remaining factor."""
 MOST_PROLONGED = 1.5
 """Greatest factor each time. Longer plans in motion swing out and need more: the factors would grow without bound."""
 
-History = list[tuple[float, Plan]]
-"""Plans of an episode with the times at which they began, [s]."""
+History = list[tuple[float, Plan]]  # Plans of an episode with the times at which they began, [s]
 
 
 class Recorded(NamedTuple):
     """One episode as it was recorded."""
 
-    scene: Scenes
-    """Scene, with one row."""
-    history: History
-    """Plans."""
-    rollout: Rollout
-    """States at every physics step."""
+    scene: Scenes  # Scene, with one row
+    history: History  # Plans
+    rollout: Rollout  # States at every physics step
 
 
 class Decision(NamedTuple):

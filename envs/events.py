@@ -23,43 +23,30 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sensors import Looks
 from viapoint.envs.task import Task
 
-FORESIGHT = 0.4
-"""Horizon of the predicted clearance, [s]."""
-LOOK = 0.032
-"""Time from one prediction to the next, [s]."""
-GLANCE = 0.064
-"""Time from one glance of the sensor to the next, [s]."""
+FORESIGHT = 0.4  # Horizon of the predicted clearance, [s]
+LOOK = 0.032  # Time from one prediction to the next, [s]
+GLANCE = 0.064  # Time from one glance of the sensor to the next, [s]
+# Something new is seen where this number of points is farther than this from all that are remembered, [m]
 NEW_POINTS, NEW_DISTANCE = 4, 0.04
-"""Something new is seen where this number of points is farther than this from all that are remembered, [m]."""
-NEVER = np.iinfo(np.int64).max // 4
-"""Physics step of an event that does not happen."""
+NEVER = np.iinfo(np.int64).max // 4  # Physics step of an event that does not happen
 
 
 class Event(IntEnum):
     """Event that ended a decision, the `event` of `info`; of simultaneous events, the one of highest rank."""
 
-    HORIZON = 0
-    """The horizon has passed."""
-    TARGET = 1
-    """The target has jumped."""
-    COURSE = 2
-    """An obstacle has changed its course."""
-    CLEARANCE = 3
-    """The predicted clearance has fallen below the margin."""
-    SIGHT = 4
-    """The sensor sees something new."""
-    ARRIVAL = 5
-    """The arm has arrived and settled."""
-    CONTACT = 6
-    """The arm was in contact."""
-    TIME_LIMIT = 7
-    """The time is up."""
-    REACH = 8
-    """The plan leaves the arm's reach; the arm does not start on it."""
-    UNSTABLE = 9
-    """The physics broke down."""
+    HORIZON = 0  # The horizon has passed
+    TARGET = 1  # The target has jumped
+    COURSE = 2  # An obstacle has changed its course
+    CLEARANCE = 3  # The predicted clearance has fallen below the margin
+    SIGHT = 4  # The sensor sees something new
+    ARRIVAL = 5  # The arm has arrived and settled
+    CONTACT = 6  # The arm was in contact
+    TIME_LIMIT = 7  # The time is up
+    REACH = 8  # The plan leaves the arm's reach; the arm does not start on it
+    UNSTABLE = 9  # The physics broke down
 
 
+# Rank of simultaneous events, highest first
 _RANK = (
     Event.TIME_LIMIT,
     Event.TARGET,
@@ -69,7 +56,6 @@ _RANK = (
     Event.ARRIVAL,
     Event.HORIZON,
 )
-"""Rank of simultaneous events, highest first."""
 
 
 class EventPredictor:

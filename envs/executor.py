@@ -30,14 +30,13 @@ from viapoint.envs.task import Task
 BLOCK, SIMILAR = 32, 1.1
 """Greatest number of movements that are executed together, few enough for the processor's cache, and the greatest
 length of one relative to another: all run as long as the longest one."""
-CONTROL_STRIDE = 4
-"""Physics steps between two computed torques; those in between are interpolated linearly."""
+CONTROL_STRIDE = 4  # Physics steps between two computed torques; those in between are interpolated linearly
 
+# Function of rows and a number of steps T that returns references from now on, shape (n, T + 1, D) each
 References = Callable[[Int, int], Motion]
-"""Function of rows and a number of steps T that returns references from now on, shape (n, T + 1, D) each."""
 
+# Joint positions [rad] and references after each step, and contacts before it, in pieces of an episode
 Pieces = list[tuple[Float, Float, Bool]]
-"""Joint positions [rad] and references after each step, and contacts before it, in pieces of an episode."""
 
 
 class Executor:

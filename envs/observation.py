@@ -18,8 +18,7 @@ from viapoint.envs.sensors import Looks
 if TYPE_CHECKING:
     from viapoint.envs.task import Task
 
-BEYOND_LIMIT = 0.1
-"""Margin beyond the joint limits at which observed joints are clipped, [rad]."""
+BEYOND_LIMIT = 0.1  # Margin beyond the joint limits at which observed joints are clipped, [rad]
 
 
 class ObservationLayout:

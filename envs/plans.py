@@ -16,16 +16,13 @@ from viapoint.envs.geometry.compiled import compiled
 Timing = Literal["optimal", "learned"]
 SpaceName = Literal["hand", "joints"]
 
+# Log ratio of neighbouring segments' durations for an action of 1: a factor of four
 LOG_SPLIT = float(np.log(4.0))
-"""Log ratio of neighbouring segments' durations for an action of 1: a factor of four."""
-MOST_VIAS = 16
-"""Greatest number of via-points of an action; more add no new movements in practice."""
+MOST_VIAS = 16  # Greatest number of via-points of an action; more add no new movements in practice
+# Bounds of the duration range, [s] in hand space, factors in joint space
 SHORTEST_DURATION, LONGEST_DURATION = 0.05, 60.0
-"""Bounds of the duration range, [s] in hand space, factors in joint space."""
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)
-"""Nodes and weights of Gauss-Legendre quadrature."""
-PEAK_INSTANTS = 64
-"""Instants at which the joint rates of a movement are looked at."""
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)  # Nodes and weights of Gauss-Legendre quadrature
+PEAK_INSTANTS = 64  # Instants at which the joint rates of a movement are looked at
 
 
 class Plan(NamedTuple):
@@ -78,12 +75,9 @@ class Plan(NamedTuple):
 class Motion(NamedTuple):
     """States of references, shape (..., D) each."""
 
-    position: Float
-    """Position."""
-    velocity: Float
-    """Velocity."""
-    acceleration: Float
-    """Acceleration."""
+    position: Float  # Position
+    velocity: Float  # Velocity
+    acceleration: Float  # Acceleration
 
     @classmethod
     def at_rest(cls, position: Float) -> Motion:
@@ -94,14 +88,10 @@ class Motion(NamedTuple):
 class Movements(NamedTuple):
     """N minimum-jerk movements as :class:`~viapoint.primitives.Trajectory` has them, for compiled functions."""
 
-    coefficients: Float
-    """Coefficients of powers of unit time, shape (N, 6, S, D)."""
-    starts: Float
-    """First instant of each segment, shape (N, S), [s]."""
-    rates: Float
-    """Rate of unit time in each segment, shape (N, S), [1/s]."""
-    end: Float
-    """Last instant, shape (N, 1), [s]."""
+    coefficients: Float  # Coefficients of powers of unit time, shape (N, 6, S, D)
+    starts: Float  # First instant of each segment, shape (N, S), [s]
+    rates: Float  # Rate of unit time in each segment, shape (N, S), [1/s]
+    end: Float  # Last instant, shape (N, 1), [s]
 
     @classmethod
     def of(cls, plan: Plan) -> Movements:
@@ -185,18 +175,14 @@ class ActionLayout:
     """
 
     space: SpaceName
-    names_of_axes: tuple[str, ...]
-    """Names of the components of an offset: D of them."""
-    n_via: int = 1
-    """Number of via-points K, 0 to :data:`MOST_VIAS`."""
+    names_of_axes: tuple[str, ...]  # Names of the components of an offset: D of them
+    n_via: int = 1  # Number of via-points K, 0 to :data:`MOST_VIAS`
+    # `optimal`: passage times of least jerk (Flash & Hogan 1985, Eq. C16); `learned`: part of the action.
     timing: Timing = "optimal"
-    """`optimal`: passage times of least jerk (Flash & Hogan 1985, Eq. C16); `learned`: part of the action."""
+    # Shortest and longest total duration, [s] or relative; an action of 0 is their geometric mean
     duration_range: tuple[float, float]
-    """Shortest and longest total duration, [s] or relative; an action of 0 is their geometric mean."""
-    via_scale: tuple[float, ...]
-    """Largest offset of each component, [m] or [rad]."""
-    rate_limit: tuple[float, ...] = ()
-    """Velocity limits of the joints in joint space, [rad/s]."""
+    via_scale: tuple[float, ...]  # Largest offset of each component, [m] or [rad]
+    rate_limit: tuple[float, ...] = ()  # Velocity limits of the joints in joint space, [rad/s]
 
     def __post_init__(self) -> None:
         """Check all fields."""
@@ -360,8 +346,7 @@ def turned(offset: Float, line: Float) -> Float:
     return np.stack((u * x - v * y, u * y + v * x), axis=-1)
 
 
-MAX_START_OFFSET = 1e-3
-"""Greatest distance of a plan's beginning from the present reference, [m] or [rad]."""
+MAX_START_OFFSET = 1e-3  # Greatest distance of a plan's beginning from the present reference, [m] or [rad]
 
 
 def checked_plan(plan: Plan, start: Float) -> Plan:

@@ -6,12 +6,13 @@ from typing import Any
 
 import gymnasium as gym
 
+# Events that end a decision in the tasks with replanning
 EVENTS = ("horizon", "target", "course", "clearance")
-"""Events that end a decision in the tasks with replanning."""
+# Keyword arguments that turn a task of whole movements into one of control steps
 STEPWISE: dict[str, Any] = {"decide_at": "steps", "reward_weights": {"progress": 1.0}}
-"""Keyword arguments that turn a task of whole movements into one of control steps."""
 PANDA_OBSTACLES: dict[str, Any] = {"arm": "panda", "n_obstacles": (1, 16)}
 
+# Names of tasks and the keyword arguments in which they differ from the defaults
 NAMED: dict[str, dict[str, Any]] = {
     "PlanarReach": {"n_obstacles": 0},
     "PlanarObstacles": {},
@@ -31,7 +32,6 @@ NAMED: dict[str, dict[str, Any]] = {
     "PlanarSensed": {"sensor": "rays"},
     "PandaSensed": {**PANDA_OBSTACLES, "sensor": "camera"},
 }
-"""Names of tasks and the keyword arguments in which they differ from the defaults."""
 TASKS: dict[str, dict[str, Any]] = {
     **{f"viapoint/{name}-v0": kwargs for name, kwargs in NAMED.items()},
     **{f"viapoint/{name}Step-v0": {**kwargs, **STEPWISE} for name, kwargs in NAMED.items()},

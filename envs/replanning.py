@@ -16,31 +16,23 @@ from viapoint.envs.common.arrays import norm, put, take
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.plans import ActionLayout, Motion, Plan, turned
 
+# Jerk with which a plan follows a goal that moves a little, [m/s^3] or [rad/s^3]: 60 distance / time^3
 CORRECTION_JERK = 10.0
-"""Jerk with which a plan follows a goal that moves a little, [m/s^3] or [rad/s^3]: 60 distance / time^3."""
+# Distance of a new goal from the old one below which the plan changes in proportion, [m] or [rad]
 NEARBY = {"hand": 0.02, "joints": 0.05}
-"""Distance of a new goal from the old one below which the plan changes in proportion, [m] or [rad]."""
 
 
 class NominalPlan(NamedTuple):
     """Plans that N arms follow on a zero action, in coordinates of the space."""
 
-    begun: Bool
-    """True if a movement is under way; otherwise the nominal plan is the straight movement."""
-    changed: Bool
-    """True if the goal differs from that of the plan under way."""
-    jumped: Bool
-    """True if it differs so much that the default is the smoothest movement to it."""
-    state: Motion
-    """Present command."""
-    start: Float
-    """Start of the episode, shape (N, D)."""
-    goal: Float
-    """Present goal, shape (N, D)."""
-    vias: Float
-    """Via-points, shape (N, K, D)."""
-    remaining: Float
-    """Remaining duration, shape (N,), [s]; 0 where the arm rests at its goal."""
+    begun: Bool  # True if a movement is under way; otherwise the nominal plan is the straight movement
+    changed: Bool  # True if the goal differs from that of the plan under way
+    jumped: Bool  # True if it differs so much that the default is the smoothest movement to it
+    state: Motion  # Present command
+    start: Float  # Start of the episode, shape (N, D)
+    goal: Float  # Present goal, shape (N, D)
+    vias: Float  # Via-points, shape (N, K, D)
+    remaining: Float  # Remaining duration, shape (N,), [s]; 0 where the arm rests at its goal
 
 
 def nominal_plan(

@@ -11,10 +11,8 @@ from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.outcome import Outcome, straight_jerk_cost
 
-CLEARANCE_RANGE = (-0.05, 0.01)
-"""Range in which clearance changes the reward, [m]."""
-CLEARANCE_UNIT = 0.05
-"""Unit of the clearance term, [m]."""
+CLEARANCE_RANGE = (-0.05, 0.01)  # Range in which clearance changes the reward, [m]
+CLEARANCE_UNIT = 0.05  # Unit of the clearance term, [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +47,8 @@ class RewardWeights:
             object.__setattr__(self, field.name, value)
 
 
+# Names of the terms of the reward in infos
 TERMS = tuple(f"reward_{field.name}" for field in dataclasses.fields(RewardWeights))
-"""Names of the terms of the reward in infos."""
 
 
 def reward_terms(

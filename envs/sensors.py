@@ -31,42 +31,29 @@ from viapoint.envs.geometry.distance import point_distance_and_normal
 from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, POINT_CLOUD, Obstacles, bounding_boxes
 
 Mount = Literal["world", "hand"]
-MOUNTS = ("world", "hand")
-"""Frames in which the pose of a sensor may be given."""
-MOST_RAYS = 65_536
-"""Greatest number of rays of a sensor."""
-MOST_LOOKS = 64
-"""Greatest number of looks that are remembered."""
-WIDEST_IMAGE = 2.9
-"""Greatest field of view of an image, [rad]: its rays meet a plane."""
-TOUCH = 1e-5
-"""Distance from a surface at which a ray has met it, [m]."""
-MOST_STEPS = 100
-"""Greatest number of steps along a ray towards one obstacle."""
+MOUNTS = ("world", "hand")  # Frames in which the pose of a sensor may be given
+MOST_RAYS = 65_536  # Greatest number of rays of a sensor
+MOST_LOOKS = 64  # Greatest number of looks that are remembered
+WIDEST_IMAGE = 2.9  # Greatest field of view of an image, [rad]: its rays meet a plane
+TOUCH = 1e-5  # Distance from a surface at which a ray has met it, [m]
+MOST_STEPS = 100  # Greatest number of steps along a ray towards one obstacle
 
 
 class Readings(NamedTuple):
     """Readings of R rays in N scenes."""
 
-    ranges: Float
-    """Distances along the rays, the greatest range where nothing is met, shape (N, R), [m]."""
-    points: Float
-    """Ends of the rays in the world, shape (N, R, 3), [m]."""
-    seen: Int
-    """Row of the obstacle that a ray meets, -1 for none, shape (N, R); not part of the observation."""
-    eye: Float
-    """Place of the sensor, shape (N, 3), [m]."""
+    ranges: Float  # Distances along the rays, the greatest range where nothing is met, shape (N, R), [m]
+    points: Float  # Ends of the rays in the world, shape (N, R, 3), [m]
+    seen: Int  # Row of the obstacle that a ray meets, -1 for none, shape (N, R); not part of the observation
+    eye: Float  # Place of the sensor, shape (N, 3), [m]
 
 
 class Looks(NamedTuple):
     """Readings of the last L looks of a sensor in N scenes, the newest first; looks not yet made have met nothing."""
 
-    eyes: Float
-    """Places of the sensor, shape (N, L, 3), [m]."""
-    ranges: Float
-    """Distances along the rays, shape (N, L, R), [m]."""
-    points: Float
-    """Ends of the rays in the world, shape (N, L, R, 3), [m]."""
+    eyes: Float  # Places of the sensor, shape (N, L, 3), [m]
+    ranges: Float  # Distances along the rays, shape (N, L, R), [m]
+    points: Float  # Ends of the rays in the world, shape (N, L, R, 3), [m]
 
     @classmethod
     def none(cls, sensor: Sensor, number: int) -> Looks:
@@ -270,8 +257,7 @@ class Sensor:
         return np.where((seen < 0) | (third < self.dropped), self.range, noisy)
 
 
-NAMED = ("rays", "camera", "hand_rays", "hand_camera")
-"""Names of usual sensors, see :func:`named_sensor`."""
+NAMED = ("rays", "camera", "hand_rays", "hand_camera")  # Names of usual sensors, see :func:`named_sensor`
 
 
 def named_sensor(name: str, arm: Arm, foot: tuple[float, float, float], scale: float) -> Sensor:
@@ -311,8 +297,7 @@ def named_sensor(name: str, arm: Arm, foot: tuple[float, float, float], scale: f
     raise ValueError(f"sensor must be one of {', '.join(NAMED)}, got {name!r}")
 
 
-GOLDEN = 0x9E3779B97F4A7C15
-"""Odd number near 2^64 divided by the golden ratio, the step of SplitMix64."""
+GOLDEN = 0x9E3779B97F4A7C15  # Odd number near 2^64 divided by the golden ratio, the step of SplitMix64
 
 
 def _uniform(bits: Any) -> Float:

@@ -13,10 +13,9 @@ from viapoint.envs.arms.arm import WAITING, Arm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.obstacles import MESH, Obstacles, geom_fields, geom_meshes, quaternions_of
 
+# Parts of a control sequence with moving obstacles: controls, then the obstacles' positions
 MOVING = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
-"""Parts of a control sequence with moving obstacles: controls, then the obstacles' positions."""
-MOST_BETWEEN = 64
-"""Greatest number of states between two physics steps that are checked for contact."""
+MOST_BETWEEN = 64  # Greatest number of states between two physics steps that are checked for contact
 
 
 class Simulator:

@@ -11,8 +11,8 @@ from viapoint.envs.arms.inverse_kinematics import planar_joints, planar_motion, 
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.plans import Motion, SpaceName
 
+# Greatest distance of the hand from a reference within reach, [m], and of a joint beyond its range, [rad]
 REACH_TOLERANCE = 1e-9
-"""Greatest distance of the hand from a reference within reach, [m], and of a joint beyond its range, [rad]."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ class HandPlane:
         return found.reshape(coordinates.shape[:-1])
 
 
+# Space in which a movement is a minimum-jerk trajectory, with coordinates of shape (..., D)
 Space = JointSpace | HandPlane
-"""Space in which a movement is a minimum-jerk trajectory, with coordinates of shape (..., D)."""
 
 
 def space_of(arm: Arm, name: SpaceName) -> Space:

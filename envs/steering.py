@@ -18,8 +18,7 @@ import numpy as np
 from viapoint.envs.common.types import Float
 from viapoint.envs.plans import Motion, SpaceName, turned
 
-QUADRATURE = 12
-"""Gauss-Legendre nodes for the jerk cost of a control step."""
+QUADRATURE = 12  # Gauss-Legendre nodes for the jerk cost of a control step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,16 +30,11 @@ class Steering:
     """
 
     space: SpaceName
-    names: tuple[str, ...]
-    """Names of the components, in order."""
-    top_speed: tuple[float, ...]
-    """Velocity that an action of 1 stands for, [m/s] or [rad/s]."""
-    bandwidth: float
-    """Bandwidth w of the filter, [rad/s]."""
-    physics_steps: int
-    """Physics steps S of a control step."""
-    timestep: float
-    """Length of a physics step, [s]."""
+    names: tuple[str, ...]  # Names of the components, in order
+    top_speed: tuple[float, ...]  # Velocity that an action of 1 stands for, [m/s] or [rad/s]
+    bandwidth: float  # Bandwidth w of the filter, [rad/s]
+    physics_steps: int  # Physics steps S of a control step
+    timestep: float  # Length of a physics step, [s]
 
     @property
     def control_step(self) -> float:

@@ -33,28 +33,23 @@ from viapoint.envs.spaces import Space, space_of
 from viapoint.envs.steering import Steering
 
 Trigger = Literal["horizon", "target", "course", "clearance", "sight"]
-TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)
-"""Events that may end a decision before the goal."""
+TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)  # Events that may end a decision before the goal
+# Values of `decide_at` with one decision for a movement, and with one in every control step
 END, STEPS = "end", "steps"
-"""Values of `decide_at` with one decision for a movement, and with one in every control step."""
-MOST_OBSTACLES = 256
-"""Greatest number of obstacles in a scene that is given."""
-PLANE_SHAPES = ("cylinder", "box")
-"""Default shapes of obstacles in the plane."""
-SPACE_SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")
-"""Default shapes of obstacles in space."""
+MOST_OBSTACLES = 256  # Greatest number of obstacles in a scene that is given
+PLANE_SHAPES = ("cylinder", "box")  # Default shapes of obstacles in the plane
+SPACE_SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")  # Default shapes of obstacles in space
+# Largest offsets of via-points along and across the straight line of the hand, [m]
 HAND_OFFSETS = (0.15, 0.25)
-"""Largest offsets of via-points along and across the straight line of the hand, [m]."""
+# Largest offset of a joint at a via-point: a share of its range, and a bound, [rad]
 RANGE_SHARE, LARGEST_OFFSET = 0.35, 1.0
-"""Largest offset of a joint at a via-point: a share of its range, and a bound, [rad]."""
-JOINT_MOVEMENT = 5.0
-"""Time that a movement in joint space is given where time is limited, [s]."""
+JOINT_MOVEMENT = 5.0  # Time that a movement in joint space is given where time is limited, [s]
+# Top speed of the hand where it is steered, [m/s], and bandwidth of the reference, [rad/s]
 HAND_SPEED, HAND_BANDWIDTH = 1.5, 25.0
-"""Top speed of the hand where it is steered, [m/s], and bandwidth of the reference, [rad/s]."""
+# Top speed of the joints where they are steered, as a share of their limits, and bandwidth, [rad/s]
 JOINT_SPEED_SHARE, JOINT_BANDWIDTH = 0.5, 12.0
-"""Top speed of the joints where they are steered, as a share of their limits, and bandwidth, [rad/s]."""
+# Default duration range by space: seconds, and multiples of the shortest movement that the limits allow
 DURATIONS: dict[str, tuple[float, float]] = {"hand": (0.6, 1.2), "joints": (1.1, 2.5)}
-"""Default duration range by space: seconds, and multiples of the shortest movement that the limits allow."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,8 +35,7 @@ from viapoint.envs.task import Task
 
 SINGLE_METADATA: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
 METADATA: dict[str, Any] = {**SINGLE_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}
-LEAST_SHARE = 4
-"""Fewest environments for which a thread is worth its while."""
+LEAST_SHARE = 4  # Fewest environments for which a thread is worth its while
 
 
 class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):

@@ -20,8 +20,7 @@ from .array_api import (
     to_numpy,
 )
 
-Ends = dict[str, Boundary]
-"""The four boundary values by name, in the order of END_NAMES."""
+Ends = dict[str, Boundary]  # The four boundary values by name, in the order of END_NAMES
 
 # Distance of waypoints that count as equal, in units of the rounding of their greatest coordinate.
 _EQUAL = 64.0

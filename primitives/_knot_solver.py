@@ -26,14 +26,12 @@ from ._hermite_tables import coefficient_table, energy_table, stiffness_table
 from ._weighted_solver import rounding_slack, weighted_coefficients
 from .array_api import FREE, Array, Namespace, broadcast_to, constant, is_given, like, to_numpy, unit_factors
 
-Entry: TypeAlias = Any
-"""An array or a Python float."""
+Entry: TypeAlias = Any  # An array or a Python float
 
+# states[k][i - 1] = i-th time derivative at knot k: an array, None for zero, FREE for unknown
 States: TypeAlias = list[list[Any]]
-"""states[k][i - 1] = i-th time derivative at knot k: an array, None for zero, FREE for unknown."""
 
-Nodes: TypeAlias = dict[tuple[int, int], int]
-"""Row of each unknown states[k][i] in Eq. 1, by (k, i)."""
+Nodes: TypeAlias = dict[tuple[int, int], int]  # Row of each unknown states[k][i] in Eq. 1, by (k, i).
 
 # Power of the machine epsilon that is the least ratio of two durations of a movement for the normal equations. Their
 # relative error is about epsilon times the square of the inverse ratio: below 1e-9, in single precision 1e-4.

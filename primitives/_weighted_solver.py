@@ -41,11 +41,9 @@ import numpy as np
 from ._hermite_tables import mode_table, series_table
 from .array_api import FREE, Array, Namespace, is_given
 
-Entry: TypeAlias = Any
-"""An array or a Python float."""
+Entry: TypeAlias = Any  # An array or a Python float
 
-Column: TypeAlias = tuple[int, int]
-"""Unknown states[k][i], by (k, i)."""
+Column: TypeAlias = tuple[int, int]  # Unknown states[k][i], by (k, i)
 
 # Tolerance of waypoints, relative to their greatest coordinate.
 _ROUNDING = 64.0 * 2.0**-52

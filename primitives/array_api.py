@@ -18,14 +18,12 @@ from typing import Any, Final, Literal, TypeAlias, TypeGuard
 
 import numpy as np
 
+# A numpy.ndarray or torch.Tensor of a floating dtype; arguments may be anything that numpy.asarray accepts
 Array: TypeAlias = Any
-"""A numpy.ndarray or torch.Tensor of a floating dtype; arguments may be anything that numpy.asarray accepts."""
 
-Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
-"""A NumPy array in double precision."""
+Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]  # A NumPy array in double precision
 
-Namespace: TypeAlias = Any
-"""The Array API functions of an array: numpy, or array_api_compat.torch."""
+Namespace: TypeAlias = Any  # The Array API functions of an array: numpy, or array_api_compat.torch
 
 
 class Free(enum.Enum):
@@ -49,8 +47,8 @@ class Free(enum.Enum):
 FREE: Final = Free.FREE
 """Boundary value that minimisation of the cost determines (natural boundary condition)."""
 
+# A given boundary value, None for rest (zero), or FREE
 Boundary: TypeAlias = Array | Literal[Free.FREE] | None
-"""A given boundary value, None for rest (zero), or FREE."""
 
 _PLAIN = (np.ndarray, float, int, list, tuple, np.generic)
 

@@ -32,11 +32,9 @@ from .array_api import (
 from .minimum_jerk import through
 from .trajectory import Trajectory
 
-MOST_VIA_POINTS = 8
-"""Greatest number of via-points of a fit."""
+MOST_VIA_POINTS = 8  # Greatest number of via-points of a fit
 
-USUAL_RANGE = (0, 3)
-"""Fewest and most via-points among which n_via=None chooses."""
+USUAL_RANGE = (0, 3)  # Fewest and most via-points among which n_via=None chooses
 
 # Time before the first and after the last sample in which a movement may begin and end, in lengths of the recording.
 _BEYOND = 0.25
@@ -127,10 +125,8 @@ _Recordings: TypeAlias = tuple[list[tuple[Floats, Floats]], tuple[int, ...], Arr
 class _Fit(NamedTuple):
     """Fit of one movement."""
 
-    knots: Floats
-    """Times of start, via-points and goal, shape (K + 2,) [s]."""
-    points: Floats
-    """Start, via-points and goal, shape (K + 2, D) [m]."""
+    knots: Floats  # Times of start, via-points and goal, shape (K + 2,) [s]
+    points: Floats  # Start, via-points and goal, shape (K + 2, D) [m]
     r_squared: float
     noise: float
     bic: float

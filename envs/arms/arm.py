@@ -18,16 +18,11 @@ from viapoint.envs.geometry.obstacles import add_to_model
 from viapoint.envs.geometry.shapes import as_obstacle
 from viapoint.envs.plans import SpaceName
 
-HIDDEN_GROUP = 5
-"""Group of geoms that MuJoCo does not draw."""
-COMPARED = 100_000
-"""Number of configurations in which bodies that never touch are looked for."""
-SAMPLED = 64
-"""Configurations at which the greatest inertia of the joints is looked for."""
-OBSTACLE_COLOUR = (0.83, 0.52, 0.30, 1.0)
-"""Colour of obstacles in pictures."""
-WAITING = (0.0, 0.0, -10.0)
-"""Place of obstacles that are absent, [m]."""
+HIDDEN_GROUP = 5  # Group of geoms that MuJoCo does not draw
+COMPARED = 100_000  # Number of configurations in which bodies that never touch are looked for
+SAMPLED = 64  # Configurations at which the greatest inertia of the joints is looked for
+OBSTACLE_COLOUR = (0.83, 0.52, 0.30, 1.0)  # Colour of obstacles in pictures
+WAITING = (0.0, 0.0, -10.0)  # Place of obstacles that are absent, [m]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

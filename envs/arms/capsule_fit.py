@@ -24,49 +24,38 @@ from viapoint.envs.geometry.shapes import ConvexMesh
 
 Geom = mujoco.mjtGeom
 
-ROUNDING = 1e-6
-"""Added to the radius, so that rounding leaves nothing outside, [m]."""
-SHORTEST = 1e-3
-"""Length of the axis below which a capsule becomes a sphere, [m]."""
+ROUNDING = 1e-6  # Added to the radius, so that rounding leaves nothing outside, [m]
+SHORTEST = 1e-3  # Length of the axis below which a capsule becomes a sphere, [m]
+# Corners of each ring of the polytope around an ellipsoid, and half of those of the prism around a cylinder
 RIM_POINTS = 24
-"""Corners of each ring of the polytope around an ellipsoid, and half of those of the prism around a cylinder."""
+# Places of the planes that cut a body, as shares of its length along a principal axis
 CUTS = (0.35, 0.5, 0.65)
-"""Places of the planes that cut a body, as shares of its length along a principal axis."""
-LEAST_SHARE = 0.3
-"""Least length along an axis across which a body is cut, as a share of the greatest."""
+LEAST_SHARE = 0.3  # Least length along an axis across which a body is cut, as a share of the greatest
+# First and last step of the search for the ends, and last one where cuts are compared, as shares of the size
 FIRST_STEP, LAST_STEP, COARSE_STEP = 0.25, 5e-4, 0.05
-"""First and last step of the search for the ends, and last one where cuts are compared, as shares of the size."""
-MOST_CAPSULES = 48
-"""Greatest number of capsules for one geom."""
+MOST_CAPSULES = 48  # Greatest number of capsules for one geom
 _ONE_WAY = np.concatenate((np.eye(6), np.kron([[1.0, 1.0], [1.0, -1.0]], np.eye(3))))
+# Directions in which the search moves one end of a capsule, or both, shape (24, 2, 3)
 MOVES = np.concatenate((_ONE_WAY, -_ONE_WAY)).reshape(-1, 2, 3)
-"""Directions in which the search moves one end of a capsule, or both, shape (24, 2, 3)."""
 
 
 class FittedCapsule(NamedTuple):
     """Capsule, or sphere, that contains a geom or a piece of it."""
 
-    ends: Float
-    """Ends of the axis, shape (2, 3), equal for a sphere, [m]."""
-    radius: float
-    """Radius, [m]."""
-    excess: float
-    """Greatest distance of a point of the capsule from the geom, [m]."""
+    ends: Float  # Ends of the axis, shape (2, 3), equal for a sphere, [m]
+    radius: float  # Radius, [m]
+    excess: float  # Greatest distance of a point of the capsule from the geom, [m]
+    # Corners of the piece of the geom that the capsule was fitted to, shape (n, 3), [m]; none if it is exact
     corners: Float
-    """Corners of the piece of the geom that the capsule was fitted to, shape (n, 3), [m]; none if it is exact."""
-    geom: int = -1
-    """Number of the geom."""
+    geom: int = -1  # Number of the geom
 
 
 class Body(NamedTuple):
     """Convex body."""
 
-    shape: ConvexMesh
-    """Shape that gives signed distances."""
-    normals: Float
-    """Outward normals of the faces, shape (F, 3)."""
-    offsets: Float
-    """Distances of the faces from the origin along their normals, shape (F,), [m]."""
+    shape: ConvexMesh  # Shape that gives signed distances
+    normals: Float  # Outward normals of the faces, shape (F, 3)
+    offsets: Float  # Distances of the faces from the origin along their normals, shape (F,), [m]
 
 
 def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[FittedCapsule]:

@@ -11,18 +11,17 @@ import numpy as np
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
 
+# Types of joints that an arm may have
 MOVES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-"""Types of joints that an arm may have."""
+# Usual names of tools, the most telling first; prefixes that end in `_`, `/` or `:` may precede them
 TOOL_NAMES = (
     r"attachment(_site)?", r"tcp", r"tool\d*(_?center)?(_?(point|frame|link))?", r"ee(f|_?site|_?link|_?frame)?",
     r"end_?effector.*", r"grip(per)?(_?(site|link|base|center))?", r"pinch(_?site)?", r"grasp(_?(site|target|frame))?",
     r"(right_|left_)?hand(_?(site|link))?", r"flange.*", r"link_(tcp|eef)",
 )  # fmt: skip
-"""Usual names of tools, the most telling first; prefixes that end in `_`, `/` or `:` may precede them."""
 GRIPPERS = re.compile(r"grip|jaw|finger|fngr|claw|knuckle", re.IGNORECASE)
 """Words in the names of bodies and joints of a gripper, which is not part of a chain whose tool has no usual name."""
-LEAST_CHAIN = 3
-"""Least number of joints of a branch that is an arm and not a finger."""
+LEAST_CHAIN = 3  # Least number of joints of a branch that is an arm and not a finger
 KNOWN_VELOCITIES: dict[str, tuple[float, ...]] = {
     "panda": (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),
     "fr3": (2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
@@ -43,21 +42,17 @@ KNOWN_VELOCITIES: dict[str, tuple[float, ...]] = {
 """Velocity limits of well-known arms by a part of their name, [rad/s] or [m/s]: data sheets of Franka Robotics (Panda,
 FR3), Universal Robots (e-Series), KUKA (LBR iiwa 14 R820), Kinova (Gen3), UFACTORY (xArm 7, Lite 6), Rethink Robotics
 (Sawyer), Flexiv (Rizon 4) and AgileX (PiPER); URDF files of Unitree (Z1), PAL Robotics (TIAGo) and Kinova (Jaco)."""
+# Torque limits of well-known arms that MuJoCo models often lack, [N m]: data sheet of KUKA (LBR iiwa 14 R820)
 KNOWN_TORQUES: dict[str, tuple[float, ...]] = {"iiwa14": (320.0, 320.0, 176.0, 176.0, 110.0, 40.0, 40.0)}
-"""Torque limits of well-known arms that MuJoCo models often lack, [N m]: data sheet of KUKA (LBR iiwa 14 R820)."""
 
 
 class Tool(NamedTuple):
     """Frame of the tool."""
 
-    body: int
-    """Body that carries it."""
-    position: Float
-    """Place in the frame of the body, shape (3,), [m]."""
-    quaternion: Float
-    """Orientation in this frame, shape (4,)."""
-    name: str
-    """Name of the site or the body, for the report."""
+    body: int  # Body that carries it
+    position: Float  # Place in the frame of the body, shape (3,), [m]
+    quaternion: Float  # Orientation in this frame, shape (4,)
+    name: str  # Name of the site or the body, for the report
 
 
 def choose_tool(model: mujoco.MjModel, given: Any, base: str | None) -> Tool:

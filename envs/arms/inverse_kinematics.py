@@ -14,22 +14,16 @@ from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.common.validation import finite_array, unit_quaternion, whole_number
 from viapoint.envs.geometry.compiled import compiled, kernel
 
-ITERATIONS = 80
-"""Greatest number of iterations from one seed."""
+ITERATIONS = 80  # Greatest number of iterations from one seed
+# Greatest distance from the target, [m], and greatest angle, [rad], of a solution
 PLACE_TOLERANCE, ANGLE_TOLERANCE = 1e-6, 1e-5
-"""Greatest distance from the target, [m], and greatest angle, [rad], of a solution."""
-LONGEST_STEP = 0.5
-"""Greatest error that one iteration corrects, [m] and [rad] together."""
-DAMPING = 1e-2
-"""Damping for errors of 1; it falls with the error, so that the last iterations converge fast."""
-STALLED = 1e-9
-"""Greatest step of the joints that ends the iterations, [rad]."""
-SAME = 1e-3
-"""Greatest difference of joints in solutions that count as the same, [rad]."""
+LONGEST_STEP = 0.5  # Greatest error that one iteration corrects, [m] and [rad] together
+DAMPING = 1e-2  # Damping for errors of 1; it falls with the error, so that the last iterations converge fast
+STALLED = 1e-9  # Greatest step of the joints that ends the iterations, [rad]
+SAME = 1e-3  # Greatest difference of joints in solutions that count as the same, [rad]
 NEAREST, INSIDE = 8, 1e-6
 """Number of configurations from which the nearest place is looked for, and their distance from the limits, [rad]."""
-REACHED = 1e-9
-"""Greatest distance of the hand from a target in the plane, [m]."""
+REACHED = 1e-9  # Greatest distance of the hand from a target in the plane, [m]
 
 
 @compiled

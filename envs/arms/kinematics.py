@@ -15,33 +15,23 @@ from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 
-Vector = tuple[float, float, float]
-"""Three components."""
-PART = 16
-"""Greatest number of spheres of a part of a group."""
-LIMIT_SHARE = 0.97
-"""Share of the velocity and torque limits that plans may use; feedback uses the rest."""
+Vector = tuple[float, float, float]  # Three components
+PART = 16  # Greatest number of spheres of a part of a group
+LIMIT_SHARE = 0.97  # Share of the velocity and torque limits that plans may use; feedback uses the rest
+# Least share of a joint's torque limit that counts as available for motion, however heavy the arm is
 LEAST_TORQUE_SHARE = 0.01
-"""Least share of a joint's torque limit that counts as available for motion, however heavy the arm is."""
-TORQUE_STRIDE = 2
-"""Torques are looked at in every second configuration: they change slowly."""
+TORQUE_STRIDE = 2  # Torques are looked at in every second configuration: they change slowly
 
 
 class FirstTwo(NamedTuple):
     """Angles and lengths of an arm of two hinges with vertical axes."""
 
-    upper_angle: float
-    """Angle of the upper arm in the frame of the shoulder, [rad]."""
-    fore_angle: float
-    """Angle of the forearm in the frame of the elbow, [rad]."""
-    elbow: float
-    """Angle of the frame of the elbow in that of the shoulder, [rad]."""
-    base: float
-    """Angle of the frame of the shoulder in the world, [rad]."""
-    upper: float
-    """Length of the upper arm, [m]."""
-    fore: float
-    """Length of the forearm, [m]."""
+    upper_angle: float  # Angle of the upper arm in the frame of the shoulder, [rad]
+    fore_angle: float  # Angle of the forearm in the frame of the elbow, [rad]
+    elbow: float  # Angle of the frame of the elbow in that of the shoulder, [rad]
+    base: float  # Angle of the frame of the shoulder in the world, [rad]
+    upper: float  # Length of the upper arm, [m]
+    fore: float  # Length of the forearm, [m]
 
     @classmethod
     def of(cls, origin: Float, rotation: Float, tool_origin: Float) -> FirstTwo:
@@ -63,49 +53,34 @@ class Chain(NamedTuple):
     its z axis is the axis of the joint.
     """
 
+    # Origin of the frame of each joint at 0, in the frame of the link before, shape (J, 3), [m]
     origin: Float
-    """Origin of the frame of each joint at 0, in the frame of the link before, shape (J, 3), [m]."""
-    rotation: Float
-    """Axes of this frame as columns, in the frame of the link before, shape (J, 3, 3)."""
-    sliding: Bool
-    """True for joints that slide along their z axis, False for hinges about it, shape (J,)."""
-    tool_origin: Float
-    """Origin of the tool's frame in that of the last link, shape (3,), [m]."""
-    tool_rotation: Float
-    """Axes of the tool's frame as columns, shape (3, 3)."""
-    mass: Float
-    """Mass of each moving link with all that is fixed to it, shape (J,), [kg]."""
-    centre: Float
-    """Centre of mass in the link's frame, shape (J, 3), [m]."""
+    rotation: Float  # Axes of this frame as columns, in the frame of the link before, shape (J, 3, 3)
+    sliding: Bool  # True for joints that slide along their z axis, False for hinges about it, shape (J,)
+    tool_origin: Float  # Origin of the tool's frame in that of the last link, shape (3,), [m]
+    tool_rotation: Float  # Axes of the tool's frame as columns, shape (3, 3)
+    mass: Float  # Mass of each moving link with all that is fixed to it, shape (J,), [kg]
+    centre: Float  # Centre of mass in the link's frame, shape (J, 3), [m]
+    # Rotational inertia about the centre of mass, in the link's frame, shape (J, 3, 3), [kg m^2]
     inertia: Float
-    """Rotational inertia about the centre of mass, in the link's frame, shape (J, 3, 3), [kg m^2]."""
-    armature: Float
-    """Inertia of the motors seen at the joints, shape (J,), [kg m^2] or [kg]."""
-    damping: Float
-    """Viscous friction of the joints, shape (J,), [N m s/rad] or [N s/m]."""
-    gravity: Float
-    """Gravitational acceleration, shape (3,), [m/s^2]."""
+    armature: Float  # Inertia of the motors seen at the joints, shape (J,), [kg m^2] or [kg]
+    damping: Float  # Viscous friction of the joints, shape (J,), [N m s/rad] or [N s/m]
+    gravity: Float  # Gravitational acceleration, shape (3,), [m/s^2]
+    # Angles and lengths of the first two links, for the inverse kinematics of an arm in the plane
     first_two: FirstTwo
-    """Angles and lengths of the first two links, for the inverse kinematics of an arm in the plane."""
 
 
 class Spheres(NamedTuple):
     """Spheres that cover an arm, in G groups; a group is rigid and belongs to one body of the model."""
 
-    centre: Float
-    """Centres in the frame of the link, shape (S, 3), [m]."""
-    radius: Float
-    """Radii, shape (S,), [m]."""
-    first: Int
-    """Index of the first sphere of each group, and the number of spheres, shape (G + 1,)."""
-    link: Int
-    """Link that each group moves with, shape (G,); 0 for the base."""
+    centre: Float  # Centres in the frame of the link, shape (S, 3), [m]
+    radius: Float  # Radii, shape (S,), [m]
+    first: Int  # Index of the first sphere of each group, and the number of spheres, shape (G + 1,)
+    link: Int  # Link that each group moves with, shape (G,); 0 for the base
+    # Centre of a bounding sphere of each group and part, in the frame of the link, shape (G + C, 3), [m]
     ball_centre: Float
-    """Centre of a bounding sphere of each group and part, in the frame of the link, shape (G + C, 3), [m]."""
-    ball_radius: Float
-    """Radius of this sphere, shape (G + C,), [m]."""
-    pairs: Int
-    """Pairs of groups that must not touch one another, shape (P, 2)."""
+    ball_radius: Float  # Radius of this sphere, shape (G + C,), [m]
+    pairs: Int  # Pairs of groups that must not touch one another, shape (P, 2)
     part: Int
     """Row of the bounding sphere of the first part of each group, and the number of rows, shape (G + 1,).
 

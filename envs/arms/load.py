@@ -36,66 +36,50 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least
 from viapoint.envs.geometry.obstacles import quaternions_of
 
-HOMES = 64
-"""Number of random configurations among which a home is looked for."""
-INSET = 0.1
-"""Least distance of home from the joint limits, as a share of the ranges."""
-LEAST_GAP = 0.002
-"""Distance of bodies at home below which another home is looked for, [m]."""
-DEFAULT_VELOCITY_LIMIT = 2.0
-"""Velocity limit of joints without one, [rad/s] or [m/s]."""
+HOMES = 64  # Number of random configurations among which a home is looked for
+INSET = 0.1  # Least distance of home from the joint limits, as a share of the ranges
+LEAST_GAP = 0.002  # Distance of bodies at home below which another home is looked for, [m]
+DEFAULT_VELOCITY_LIMIT = 2.0  # Velocity limit of joints without one, [rad/s] or [m/s]
 WEIGHTS, LEAST_TORQUE = 3.0, 1.0
 """Torque limit of joints without one, as a multiple of the torque that gravity needs, and at least, [N m] or [N]."""
-WEIGHED = 200
-"""Number of configurations in which the arm is weighed."""
+WEIGHED = 200  # Number of configurations in which the arm is weighed
+# Numbers of configurations in which bodies that are always near are looked for, and contacts of these
 LOOKED_AT, NEAR_LOOKED_AT = 16, 1000
-"""Numbers of configurations in which bodies that are always near are looked for, and contacts of these."""
+# Distance within which bodies are near in at least half of the configurations, and tolerance for these, [m]
 NEAR, FINE = 0.03, 0.005
-"""Distance within which bodies are near in at least half of the configurations, and tolerance for these, [m]."""
-WARNING = "warning: "
-"""Beginning of notes that are told as warnings, too."""
+WARNING = "warning: "  # Beginning of notes that are told as warnings, too
+# Names of files that do not tell the arm; it gets the name of the model
 GENERIC_NAMES = ("arm", "model", "robot", "scene")
-"""Names of files that do not tell the arm; it gets the name of the model."""
-MIN_JOINTS = 2
-"""Least number of joints."""
-MIN_TOLERANCE, MAX_TOLERANCE = 0.005, 1.0
-"""Bounds of the tolerance of fitted capsules, [m]."""
-BASE_SHARE = 0.05
-"""Least tolerance of geoms of the base, as a share of their size: bases may be large."""
+MIN_JOINTS = 2  # Least number of joints
+MIN_TOLERANCE, MAX_TOLERANCE = 0.005, 1.0  # Bounds of the tolerance of fitted capsules, [m]
+BASE_SHARE = 0.05  # Least tolerance of geoms of the base, as a share of their size: bases may be large
+# Distance at home that capsules leave between bodies, as a share of that of the geoms, and at most, [m]
 LEFT_SHARE, LEFT_MOST = 0.25, 0.002
-"""Distance at home that capsules leave between bodies, as a share of that of the geoms, and at most, [m]."""
-LEAST_EXCESS = 0.001
-"""Excess of capsules below which they are not split, [m]."""
-MIN_INERTIA = 1e-12
-"""Least principal moment of inertia of a body, [kg m^2]."""
+LEAST_EXCESS = 0.001  # Excess of capsules below which they are not split, [m]
+MIN_INERTIA = 1e-12  # Least principal moment of inertia of a body, [kg m^2]
+# Relative margin of the triangle inequality of principal moments; the text of a model keeps six digits
 INERTIA_MARGIN = 2e-5
-"""Relative margin of the triangle inequality of principal moments; the text of a model keeps six digits."""
+# Transmissions of actuators that drive a joint directly
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-"""Transmissions of actuators that drive a joint directly."""
-RESERVED = ("", "world", "meshes")
-"""Names that bodies of the arm cannot have, beside those of obstacles."""
+RESERVED = ("", "world", "meshes")  # Names that bodies of the arm cannot have, beside those of obstacles
 
-Pair = tuple[int, int]
-"""Numbers of two bodies, the first one first in the file."""
+Pair = tuple[int, int]  # Numbers of two bodies, the first one first in the file
 
 
 class Parsed(NamedTuple):
     """Arm in the form of its file."""
 
-    model: mujoco.MjModel
-    """Model of the file."""
+    model: mujoco.MjModel  # Model of the file
+    # Places with the arm's joints at 0, and all others as in the first keyframe or at their reference
     rest: mujoco.MjData
-    """Places with the arm's joints at 0, and all others as in the first keyframe or at their reference."""
-    moved: mujoco.MjData
-    """Places in any configuration."""
+    moved: mujoco.MjData  # Places in any configuration
     joints: tuple[str, ...]
     tool: Tool
-    links: dict[int, int]
-    """Link of each body of the arm, 0 for the base, in the order of the file."""
+    links: dict[int, int]  # Link of each body of the arm, 0 for the base, in the order of the file
+    # Names of these bodies in the model of the arm: those of the file, where it has free ones
     names: dict[int, str]
-    """Names of these bodies in the model of the arm: those of the file, where it has free ones."""
+    # Geoms of each of these bodies that count for collisions; bodies without any are left out
     geoms: dict[int, list[int]]
-    """Geoms of each of these bodies that count for collisions; bodies without any are left out."""
 
     def pair(self, bodies: Pair) -> frozenset[str]:
         """Return the names of a pair of bodies."""

@@ -14,10 +14,9 @@ from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
 from viapoint.envs.arms.load import load_arm
 from viapoint.envs.arms.stored import read_arm
 
-ARM_FILES = (".xml", ".mjcf", ".urdf")
-"""Suffixes of files of arms."""
+ARM_FILES = (".xml", ".mjcf", ".urdf")  # Suffixes of files of arms
+# Joint positions at home, [rad]: Franka's ready pose
 PANDA_HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
-"""Joint positions at home, [rad]: Franka's ready pose."""
 
 
 @functools.cache

@@ -14,14 +14,10 @@ from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import memory, nearest_spheres, place
 from viapoint.envs.geometry.compiled import compiled
 
-LARGEST_EXCESS = 0.005
-"""Greatest distance by which a sphere may stick out of a capsule, [m]."""
-SHRUNK = 0.5
-"""Factor on this distance for bodies whose spheres overlap at home although their geoms do not."""
-SHRINKING = 6
-"""Greatest number of times that it is applied."""
-ROUNDS = 2000
-"""Iterations for bounding balls."""
+LARGEST_EXCESS = 0.005  # Greatest distance by which a sphere may stick out of a capsule, [m]
+SHRUNK = 0.5  # Factor on this distance for bodies whose spheres overlap at home although their geoms do not
+SHRINKING = 6  # Greatest number of times that it is applied
+ROUNDS = 2000  # Iterations for bounding balls
 
 
 class Capsule(NamedTuple):

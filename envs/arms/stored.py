@@ -26,10 +26,8 @@ import numpy as np
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
 from viapoint.envs.arms.spheres import LeftOut
 
-MARK = "viapoint_arm"
-"""Name of the text element with the choices."""
-COPY = "arm.xml"
-"""Name of a copy in the folder of a run or a model."""
+MARK = "viapoint_arm"  # Name of the text element with the choices
+COPY = "arm.xml"  # Name of a copy in the folder of a run or a model
 
 
 def keep_arm(folder: Path, arm: Arm) -> None:

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-READ_MESHES = (".stl", ".obj", ".msh")
-"""Suffixes of meshes that MuJoCo reads."""
+READ_MESHES = (".stl", ".obj", ".msh")  # Suffixes of meshes that MuJoCo reads
+# Options of MuJoCo's compiler: links without inertia get little, and fixed links stay bodies
 COMPILER = {
     "balanceinertia": "true",
     "boundmass": "1e-4",
@@ -20,30 +20,21 @@ COMPILER = {
     "fusestatic": "false",
     "strippath": "false",
 }
-"""Options of MuJoCo's compiler: links without inertia get little, and fixed links stay bodies."""
-INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-"""Entries of an inertia."""
-BALL = 0.05
-"""Radius of the ball whose inertia a link gets that has none, [m]."""
-LEFT_OUT = ("transmission", "gazebo", "material")
-"""Elements that MuJoCo does not need."""
+INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")  # Entries of an inertia
+BALL = 0.05  # Radius of the ball whose inertia a link gets that has none, [m]
+LEFT_OUT = ("transmission", "gazebo", "material")  # Elements that MuJoCo does not need
 
 
 class Urdf(NamedTuple):
     """Content of a URDF file."""
 
-    text: str
-    """Text for MuJoCo."""
-    name: str
-    """Name of the robot."""
-    assets: dict[str, bytes]
-    """Meshes that MuJoCo cannot read as they are, by the names in the text."""
-    velocity_limits: dict[str, float]
-    """Velocity limits of joints by name, [rad/s] or [m/s]."""
+    text: str  # Text for MuJoCo
+    name: str  # Name of the robot
+    assets: dict[str, bytes]  # Meshes that MuJoCo cannot read as they are, by the names in the text
+    velocity_limits: dict[str, float]  # Velocity limits of joints by name, [rad/s] or [m/s]
+    # Pairs of links that are not compared, from an SRDF file beside it
     never_touch: tuple[tuple[str, str], ...]
-    """Pairs of links that are not compared, from an SRDF file beside it."""
-    notes: tuple[str, ...]
-    """Parts that were left out."""
+    notes: tuple[str, ...]  # Parts that were left out
 
 
 def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-Colour = tuple[float, float, float]
-"""Red, green and blue in [0, 1]."""
+Colour = tuple[float, float, float]  # Red, green and blue in [0, 1]
 
 
 class Palette(NamedTuple):

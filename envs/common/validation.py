@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from viapoint.envs.common.types import Float, Int
 
 Record = TypeVar("Record")
-UNIT_TOLERANCE = 1e-3
-"""Greatest error of a quaternion's length; smaller ones are corrected."""
+UNIT_TOLERANCE = 1e-3  # Greatest error of a quaternion's length; smaller ones are corrected
 
 
 def record_of(name: str, kind: type[Record], value: Any) -> Record:

@@ -18,33 +18,25 @@ from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 from viapoint.envs.geometry.distance import point_distance
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 
-FAR = 1.0
-"""Greatest clearance that is reported, [m]; farther obstacles do not matter."""
+FAR = 1.0  # Greatest clearance that is reported, [m]; farther obstacles do not matter
+# Way beyond the least clearance so far up to which a movement looks for more, to skip configurations, [m]
 WINDOW = 0.1
-"""Way beyond the least clearance so far up to which a movement looks for more, to skip configurations, [m]."""
-COARSE = 16
-"""Configurations from one to the next that a first, coarse look at a movement takes."""
+COARSE = 16  # Configurations from one to the next that a first, coarse look at a movement takes
 
 
 class Placed(NamedTuple):
     """World places of an arm's parts in one configuration; memory that compiled functions use again and again."""
 
-    rotation: Float
-    """Axes of the links' frames, shape (J + 1, 3, 3)."""
-    origin: Float
-    """Origins of the links' frames, shape (J + 1, 3), [m]."""
+    rotation: Float  # Axes of the links' frames, shape (J + 1, 3, 3)
+    origin: Float  # Origins of the links' frames, shape (J + 1, 3), [m]
+    # Centres of the bounding balls of groups, and of the parts of known groups, shape (G + C, 3), [m]
     ball: Float
-    """Centres of the bounding balls of groups, and of the parts of known groups, shape (G + C, 3), [m]."""
-    centre: Float
-    """Centres of the spheres of known groups, shape (S, 3), [m]."""
-    known: Bool
-    """True for groups whose spheres are placed, shape (G,)."""
+    centre: Float  # Centres of the spheres of known groups, shape (S, 3), [m]
+    known: Bool  # True for groups whose spheres are placed, shape (G,)
+    # Bound of the way of the spheres of links 0 to J since another configuration, shape (J + 1,), [m]
     way: Float
-    """Bound of the way of the spheres of links 0 to J since another configuration, shape (J + 1,), [m]."""
-    apart: Float
-    """Lower bounds of the clearance of groups from obstacles in a movement, shape (G,), [m]."""
-    pair_apart: Float
-    """Lower bounds of the clearance of pairs of groups in a movement, shape (P,), [m]."""
+    apart: Float  # Lower bounds of the clearance of groups from obstacles in a movement, shape (G,), [m]
+    pair_apart: Float  # Lower bounds of the clearance of pairs of groups in a movement, shape (P,), [m]
 
 
 @compiled

@@ -11,8 +11,7 @@ import numpy as np
 from viapoint.envs.common.types import Float, Int
 from viapoint.envs.geometry.compiled import TINY, kernel
 
-LEAF = 16
-"""Greatest number of points of a leaf of the tree."""
+LEAF = 16  # Greatest number of points of a leaf of the tree
 
 
 class Clouds(NamedTuple):
@@ -22,16 +21,12 @@ class Clouds(NamedTuple):
     2 i + 1. Leaf j of a cloud of K points holds those from j K // L to (j + 1) K // L.
     """
 
-    points: Float
-    """Points of all clouds, neighbours near one another, shape (P, 3), [m]."""
-    radius: Float
-    """Radius of the spheres around the points, shape (C,), [m]."""
-    first: Int
-    """Index of the first point of each cloud, and the number of all points, shape (C + 1,)."""
-    node: Int
-    """Index of node 0 of each tree, and the number of all nodes, shape (C + 1,)."""
+    points: Float  # Points of all clouds, neighbours near one another, shape (P, 3), [m]
+    radius: Float  # Radius of the spheres around the points, shape (C,), [m]
+    first: Int  # Index of the first point of each cloud, and the number of all points, shape (C + 1,)
+    node: Int  # Index of node 0 of each tree, and the number of all nodes, shape (C + 1,)
+    # Least and greatest corner of the box of each node, shape (nodes, 6), [m]; node 0 of each tree has none
     boxes: Float
-    """Least and greatest corner of the box of each node, shape (nodes, 6), [m]; node 0 of each tree has none."""
 
 
 @kernel

@@ -7,12 +7,11 @@ from typing import Any, TypeVar, cast
 
 from numba import njit
 
-TINY = 1e-12
-"""Length below which a vector has no direction, [m]."""
+TINY = 1e-12  # Length below which a vector has no direction, [m]
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+# Optimisations of arithmetic that are allowed; NaN and infinity keep their meaning
 FASTMATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
-"""Optimisations of arithmetic that are allowed; NaN and infinity keep their meaning."""
 KERNEL: dict[str, Any] = {"nogil": True, "fastmath": FASTMATH, "error_model": "numpy", "_nrt": False}
 """Options of functions that make no arrays. Without `_nrt`, Numba does not count references to arrays, which takes 5 ns
 for each array and call. Divisions by zero give infinity instead of an exception."""

@@ -12,15 +12,12 @@ import numpy as np
 from viapoint.envs.common.types import Float, Int
 from viapoint.envs.geometry.compiled import TINY, kernel
 
-FAR = 1e6
-"""Distance beyond everything, [m]."""
-DENT = 1e-6
-"""Depth of a vertex below the hull from which a mesh is not convex, as a share of the mesh's size."""
+FAR = 1e6  # Distance beyond everything, [m]
+DENT = 1e-6  # Depth of a vertex below the hull from which a mesh is not convex, as a share of the mesh's size
 COPLANAR = 2e-7
 """Distance between neighbouring faces within which they are one face, as a share of the mesh's size: several times the
 rounding of vertices in single precision."""
-HULL_HINT = "ConvexMesh.hull(vertices) is the convex hull"
-"""Hint of error messages."""
+HULL_HINT = "ConvexMesh.hull(vertices) is the convex hull"  # Hint of error messages
 SLIVER = 1e-12
 """Area of triangles that are left out, as a share of the square of the mesh's size; their neighbours cover them."""
 
@@ -28,12 +25,9 @@ SLIVER = 1e-12
 class Meshes(NamedTuple):
     """Packed arrays of M convex meshes, each in a frame of its own."""
 
-    first: Int
-    """Index of the first face of each mesh, and the number of all faces, shape (M + 1,)."""
-    corners: Float
-    """Corners of all triangles, counterclockwise as seen from outside, shape (F, 3, 3), [m]."""
-    normals: Float
-    """Outward unit normals of all triangles, shape (F, 3)."""
+    first: Int  # Index of the first face of each mesh, and the number of all faces, shape (M + 1,)
+    corners: Float  # Corners of all triangles, counterclockwise as seen from outside, shape (F, 3, 3), [m]
+    normals: Float  # Outward unit normals of all triangles, shape (F, 3)
 
 
 @kernel

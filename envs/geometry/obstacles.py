@@ -39,12 +39,10 @@ __all__ = [
 POSE_SIZE = 16
 """Numbers of an obstacle in an observation after those of its kind: centre 3, axes 6, half lengths 3, velocity 3,
 present 1."""
-EXTENT = 1.0
-"""Half length of the cube that stands for a half-space in observations, [m]."""
+EXTENT = 1.0  # Half length of the cube that stands for a half-space in observations, [m]
+# Matrices of bounding boxes by kind, see :attr:`Shape.box`
 BOXES = np.array([shape.box for shape in SHAPES], np.float64)
-"""Matrices of bounding boxes by kind, see :attr:`Shape.box`."""
-GEOMS = np.array([shape.geom for shape in SHAPES])
-"""MuJoCo's geoms by kind."""
+GEOMS = np.array([shape.geom for shape in SHAPES])  # MuJoCo's geoms by kind
 
 Table = TypeVar("Table", Meshes, Clouds)
 

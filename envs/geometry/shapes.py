@@ -36,21 +36,18 @@ from viapoint.envs.geometry.meshes import (
     mesh_distance,
 )
 
+# Kinds of obstacles; the number of a kind is its place in this table
 KINDS = ("sphere", "capsule", "cylinder", "box", "half_space", "convex_mesh", "point_cloud")
-"""Kinds of obstacles; the number of a kind is its place in this table."""
 SPHERE, CAPSULE, CYLINDER, BOX, HALF_SPACE, MESH, POINT_CLOUD = range(len(KINDS))
-ABSENT = -1
-"""Kind of a row that holds no obstacle."""
+ABSENT = -1  # Kind of a row that holds no obstacle
+# Kinds whose first size is an index of a table, and whose second is the radius of a bounding sphere
 IN_TABLES = (MESH, POINT_CLOUD)
-"""Kinds whose first size is an index of a table, and whose second is the radius of a bounding sphere."""
+# Kinds that are known by their sizes alone
 PLAIN_KINDS = tuple(kind for number, kind in enumerate(KINDS) if number not in IN_TABLES)
-"""Kinds that are known by their sizes alone."""
-LEAST_SPACING = 1e-6
-"""Least edge of the cubes of :meth:`PointCloud.covering`, [m]."""
+LEAST_SPACING = 1e-6  # Least edge of the cubes of :meth:`PointCloud.covering`, [m]
 
 Matrix = tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]
-Distance = tuple[float, float, float, float]
-"""Signed distance, [m], and the components of its gradient."""
+Distance = tuple[float, float, float, float]  # Signed distance, [m], and the components of its gradient
 
 
 @kernel
@@ -512,8 +509,8 @@ class PointCloud(Shape):
 
 SHAPES: tuple[type[Shape], ...] = (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
 """Classes of the kinds, in the order of KINDS."""
+# Meshes that have a name of their own, see :func:`register_mesh`
 REGISTERED_MESHES: dict[str, ConvexMesh] = {}
-"""Meshes that have a name of their own, see :func:`register_mesh`."""
 
 
 def register_mesh(name: str, vertices: Any, faces: Any = None) -> None:

@@ -20,10 +20,8 @@ from mujoco.rendering.classic import gl_context
 
 from viapoint.envs.common.types import Frame
 
-MAX_SIDE = 8192
-"""Longest side of a supersampled picture, in pixels; OpenGL may not support larger ones."""
-MAX_GEOMS = 2000
-"""Greatest number of shapes in a scene."""
+MAX_SIDE = 8192  # Longest side of a supersampled picture, in pixels; OpenGL may not support larger ones
+MAX_GEOMS = 2000  # Greatest number of shapes in a scene
 INSTALL = "on Debian and Ubuntu: apt-get install libegl1 libgl1"
 
 

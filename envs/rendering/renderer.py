@@ -16,12 +16,9 @@ from viapoint.envs.task import Task
 
 __all__ = ["RENDER_MODES", "EpisodeRenderer", "GLUnavailableError", "frame_steps", "picture_of"]
 
-RENDER_MODES = ["human", "rgb_array", "rgb_array_list"]
-"""Values of `render_mode` besides None."""
-STILL_SUPERSAMPLING = 2
-"""Supersampling of single pictures; frames of films have none, because it takes time."""
-POINTS = 60
-"""Points along a planned path."""
+RENDER_MODES = ["human", "rgb_array", "rgb_array_list"]  # Values of `render_mode` besides None
+STILL_SUPERSAMPLING = 2  # Supersampling of single pictures; frames of films have none, because it takes time
+POINTS = 60  # Points along a planned path
 
 
 def frame_steps(times: Float, fps: int) -> Int:

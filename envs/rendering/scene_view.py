@@ -15,49 +15,35 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes
 from viapoint.envs.simulator import Simulator
 
-Geom = Any
-"""Decorative geom of a scene."""
+Geom = Any  # Decorative geom of a scene
 
-MATT, GLOWING = 0.0, 1.0
-"""Emission relative to the colour: lines glow, bodies are lit."""
+MATT, GLOWING = 0.0, 1.0  # Emission relative to the colour: lines glow, bodies are lit
 CAMERA = "view"
+# Radii of the planned, the executed and a replaced path, [m]; the planned one shows as a rim of the executed
 PLAN, DONE, REPLACED = 0.0065, 0.0030, 0.0045
-"""Radii of the planned, the executed and a replaced path, [m]; the planned one shows as a rim of the executed."""
-SPACING = 0.011
-"""Distance of the points of a drawn path, [m]."""
+SPACING = 0.011  # Distance of the points of a drawn path, [m]
+# Radius of the points that a sensor has met, [m], and how many of them are drawn at most
 SEEN, MOST_SEEN = 0.004, 600
-"""Radius of the points that a sensor has met, [m], and how many of them are drawn at most."""
+# Half lengths of the board that stands for a half-space, [m], and its opacity
 HALF_SPACE_BOARD, GLASSY = (1.0, 1.0, 0.002), 0.4
-"""Half lengths of the board that stands for a half-space, [m], and its opacity."""
-BELOW_SURFACE = 0.008
-"""Depth of this board, [m]: a floor at the height of the table is hidden by it."""
-ABOVE_TABLE = 0.001
-"""Height of paths of the plane above the table, [m]."""
+BELOW_SURFACE = 0.008  # Depth of this board, [m]: a floor at the height of the table is hidden by it
+ABOVE_TABLE = 0.001  # Height of paths of the plane above the table, [m]
+# Colour of a replaced plan
 FADED: Colour = tuple(0.6 * a + 0.4 * b for a, b in zip(PALETTE.plan, PALETTE.table, strict=True))  # type: ignore[assignment]
-"""Colour of a replaced plan."""
 
 
 class Picture(NamedTuple):
     """Arm, obstacles and paths of one picture."""
 
-    joints: Float
-    """Joint positions, shape (J,), [rad]."""
-    obstacles: Obstacles
-    """Obstacles at their present places, of one scene."""
-    ends: tuple[Float, Float]
-    """Hand positions at start and goal, shape (3,) each, [m]."""
-    planned: Float
-    """Planned path of the hand, shape (n, 3), [m]; empty for none."""
-    vias: Float
-    """Via-points of the hand, shape (K, 3), [m]."""
-    done: Float
-    """Executed path of the hand so far, shape (T, 3), [m]."""
-    touched: int
-    """Index into the executed path of the first contact; its length without contact."""
-    replaced: Sequence[Float]
-    """Paths of plans that were replaced, shape (n, 3) each, [m]."""
-    seen: Float
-    """Points that a sensor has met, shape (M, 3), [m]."""
+    joints: Float  # Joint positions, shape (J,), [rad]
+    obstacles: Obstacles  # Obstacles at their present places, of one scene
+    ends: tuple[Float, Float]  # Hand positions at start and goal, shape (3,) each, [m]
+    planned: Float  # Planned path of the hand, shape (n, 3), [m]; empty for none
+    vias: Float  # Via-points of the hand, shape (K, 3), [m]
+    done: Float  # Executed path of the hand so far, shape (T, 3), [m]
+    touched: int  # Index into the executed path of the first contact; its length without contact
+    replaced: Sequence[Float]  # Paths of plans that were replaced, shape (n, 3) each, [m]
+    seen: Float  # Points that a sensor has met, shape (M, 3), [m]
 
 
 class SceneView:
@@ -66,8 +52,7 @@ class SceneView:
     It uses a simulator of one simulation alone.
     """
 
-    scene: mujoco.MjvScene
-    """Scene to write, which belongs to the screen that shows it."""
+    scene: mujoco.MjvScene  # Scene to write, which belongs to the screen that shows it
 
     def __init__(self, simulator: Simulator, width: int, height: int) -> None:
         self._simulator = simulator

@@ -14,24 +14,19 @@ from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.obstacles import ABSENT
 from viapoint.envs.scenes.scene import NEVER, Scenes
 
-PAIRS, TRIES = 3, 6
-"""Pairs of start and goal for a layout, and attempts at each end."""
+PAIRS, TRIES = 3, 6  # Pairs of start and goal for a layout, and attempts at each end
+# Share of starts at home or near it, and of these and starts in places of goals; others are free ones
 HOME, REACHING = 0.4, 0.8
-"""Share of starts at home or near it, and of these and starts in places of goals; others are free ones."""
-FREE_GOALS = 0.1
-"""Share of goals that are free configurations, where the layout has places."""
+FREE_GOALS = 0.1  # Share of goals that are free configurations, where the layout has places
+# Share of pairs whose start and goal are exchanged, where the layout has no places of starts
 EXCHANGED = 0.25
-"""Share of pairs whose start and goal are exchanged, where the layout has no places of starts."""
-JITTER = 0.3
-"""Greatest deviation from home of half of the starts there, [rad]."""
+JITTER = 0.3  # Greatest deviation from home of half of the starts there, [rad]
+# Least clearance of the arm from itself at ends, [m], and the share of that at home that it is at most
 SELF_MARGIN, HOME_SHARE = 0.005, 0.5
-"""Least clearance of the arm from itself at ends, [m], and the share of that at home that it is at most."""
-INSTANTS = 32
-"""Parts of the straight movement between which it is looked at."""
-ROLL = 0.3
-"""Greatest deviation of the tool's roll about its axis from quarter turns, [rad]."""
+INSTANTS = 32  # Parts of the straight movement between which it is looked at
+ROLL = 0.3  # Greatest deviation of the tool's roll about its axis from quarter turns, [rad]
+# Spread around home of the seeds of inverse kinematics, as a share of the ranges of the joints
 SEED_SPREAD = 0.3
-"""Spread around home of the seeds of inverse kinematics, as a share of the ranges of the joints."""
 BLOCKED, FREE, OUT_OF_REACH = 1, 0, -1
 """Outcome of a straight movement."""
 
@@ -41,50 +36,32 @@ class Setting(NamedTuple):
 
     chain: Chain
     spheres: Spheres
-    joint_range: Float
-    """Ranges of the joints, shape (J, 2), [rad] or [m]."""
-    inner_range: Float
-    """Ranges of the joints at ends, shape (J, 2), [rad] or [m]."""
-    home: Float
-    """Shape (J,), [rad] or [m]."""
-    bearing: float
-    """Bearing of the tool at home, seen from the axis of the first joint, [rad]."""
-    plane: bool
-    """True for an arm of two joints in the plane."""
-    of_hand: bool
-    """True if movements are planned in hand space, False for joint space."""
-    margin: float
-    """Least clearance of ends from obstacles, [m]."""
-    self_margin: float
-    """Least clearance of ends from the arm itself, [m]."""
-    least_way: float
-    """Least length of the way from start to goal in joint space, [rad]."""
-    n_jumps: tuple[int, int]
-    """Fewest and most jumps of the target."""
+    joint_range: Float  # Ranges of the joints, shape (J, 2), [rad] or [m]
+    inner_range: Float  # Ranges of the joints at ends, shape (J, 2), [rad] or [m]
+    home: Float  # Shape (J,), [rad] or [m]
+    bearing: float  # Bearing of the tool at home, seen from the axis of the first joint, [rad]
+    plane: bool  # True for an arm of two joints in the plane
+    of_hand: bool  # True if movements are planned in hand space, False for joint space
+    margin: float  # Least clearance of ends from obstacles, [m]
+    self_margin: float  # Least clearance of ends from the arm itself, [m]
+    least_way: float  # Least length of the way from start to goal in joint space, [rad]
+    n_jumps: tuple[int, int]  # Fewest and most jumps of the target
+    # Shortest and longest duration of movements, relative to that of the zero action
     relative_durations: tuple[float, float]
-    """Shortest and longest duration of movements, relative to that of the zero action."""
 
 
 class Draft(NamedTuple):
     """N scenes that are being drawn: one attempt at each, with a layout as padded tables, and memory."""
 
     setting: Setting
-    scenes: Scenes
-    """Scenes with W obstacles each, which compiled functions change in place."""
-    rows: Float
-    """Obstacles of the layouts, shape (N, W, ROW)."""
-    n_rows: Int
-    """Numbers of obstacles, shape (N,); -1 for scenes whose obstacles are given."""
-    keep: Int
-    """Numbers of obstacles that are kept, or 0, shape (N,)."""
-    places: Float
-    """Places of starts, then those of goals, shape (N, 2, P, PLACE)."""
-    n_places: Int
-    """Numbers of both, shape (N, 2)."""
-    fixed: Bool
-    """True for starts and goals that are given, shape (N, 2)."""
-    numbers: Float
-    """Uniform random numbers, shape (N, PAIRS, 2, :func:`numbers_of_end`)."""
+    scenes: Scenes  # Scenes with W obstacles each, which compiled functions change in place
+    rows: Float  # Obstacles of the layouts, shape (N, W, ROW)
+    n_rows: Int  # Numbers of obstacles, shape (N,); -1 for scenes whose obstacles are given
+    keep: Int  # Numbers of obstacles that are kept, or 0, shape (N,)
+    places: Float  # Places of starts, then those of goals, shape (N, 2, P, PLACE)
+    n_places: Int  # Numbers of both, shape (N, 2)
+    fixed: Bool  # True for starts and goals that are given, shape (N, 2)
+    numbers: Float  # Uniform random numbers, shape (N, PAIRS, 2, :func:`numbers_of_end`)
     placed: Placed
     at_start: Placed
     at_goal: Placed

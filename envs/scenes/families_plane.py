@@ -12,28 +12,20 @@ import numpy as np
 
 from viapoint.envs.scenes.layout import Furniture, Layout, Room, between, centred, mix, sign
 
-WORKSPACE = (-0.45, 0.35, 0.15, 0.60)
-"""Least and greatest x, least and greatest y of starts and goals, [m]."""
-REACH = (0.206, 0.645)
-"""Least and greatest distance of the straight line from the shoulder, [m]."""
-DISTANCE = (0.25, 0.45)
-"""Distance of start and goal, [m]."""
-DRAWS = 200
-"""Attempts at start and goal."""
-POST_RADIUS = (0.012, 0.045)
-"""[m]"""
+WORKSPACE = (-0.45, 0.35, 0.15, 0.60)  # Least and greatest x, least and greatest y of starts and goals, [m]
+REACH = (0.206, 0.645)  # Least and greatest distance of the straight line from the shoulder, [m]
+DISTANCE = (0.25, 0.45)  # Distance of start and goal, [m]
+DRAWS = 200  # Attempts at start and goal
+POST_RADIUS = (0.012, 0.045)  # [m]
+# Bars of clutter, [m]; the rows of lights of Flash & Hogan 1985 were up to 0.25 m long
 BAR_HALF_WIDTH, BAR_HALF_LENGTH = (0.006, 0.010), (0.05, 0.125)
-"""Bars of clutter, [m]; the rows of lights of Flash & Hogan 1985 were up to 0.25 m long."""
-WALL_HALF_WIDTH = (0.007, 0.011)
-"""Bars of structures, [m]."""
-TILT = 0.6
-"""Greatest angle between a bar of clutter and the perpendicular of the straight line, [rad]."""
-IN_THE_WAY = 0.03
-"""Greatest distance of the first obstacle from the straight line, [m]."""
+WALL_HALF_WIDTH = (0.007, 0.011)  # Bars of structures, [m]
+TILT = 0.6  # Greatest angle between a bar of clutter and the perpendicular of the straight line, [rad]
+IN_THE_WAY = 0.03  # Greatest distance of the first obstacle from the straight line, [m]
+# Least distance of the next two from the line, what it grows by for every two more, and its range, [m]
 NEAREST, STEP, SPREAD = 0.05, 0.05, 0.08
-"""Least distance of the next two from the line, what it grows by for every two more, and its range, [m]."""
+# Greatest distance of other obstacles from the forearm on the line, where links must clear, too, [m]
 ASIDE = 0.12
-"""Greatest distance of other obstacles from the forearm on the line, where links must clear, too, [m]."""
 
 Point = tuple[float, float]
 

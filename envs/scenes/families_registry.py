@@ -15,24 +15,22 @@ from viapoint.envs.geometry.shapes import IN_TABLES, KINDS, PLAIN_KINDS, Shape, 
 from viapoint.envs.scenes import families_plane, families_space
 from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Layout, Place, Room, most_rows
 
+# Function of a random generator and a room that returns a layout, see :func:`register_scene_family`
 Build = Callable[[np.random.Generator, Room], Any]
-"""Function of a random generator and a room that returns a layout, see :func:`register_scene_family`."""
 
 
 @dataclass(frozen=True)
 class SceneFamily:
     """Kind of scenes that have a name."""
 
-    build: Build
-    """Function that draws a layout."""
-    n_obstacles: int = 1
-    """Least number of obstacles that a scene must have room for."""
-    kinds: tuple[str, ...] = ("box",)
-    """Kinds of obstacles that the family needs."""
+    build: Build  # Function that draws a layout
+    n_obstacles: int = 1  # Least number of obstacles that a scene must have room for
+    kinds: tuple[str, ...] = ("box",)  # Kinds of obstacles that the family needs
+    # True if the family is one of those of training by default; those shipped without are hard
     trained: bool = False
-    """True if the family is one of those of training by default; those shipped without are hard."""
 
 
+# Families by their place, True for the plane and False for space, and their name
 FAMILIES: dict[tuple[bool, str], SceneFamily] = {
     (True, "clutter"): SceneFamily(families_plane.clutter, 1, (), trained=True),
     (True, "gate"): SceneFamily(families_plane.gate, 2),
@@ -49,7 +47,6 @@ FAMILIES: dict[tuple[bool, str], SceneFamily] = {
     (False, "cage"): SceneFamily(families_space.cage, 6),
     (False, "wall_window"): SceneFamily(families_space.wall_window, 4),
 }
-"""Families by their place, True for the plane and False for space, and their name."""
 
 
 def scene_families(plane: bool) -> Mapping[str, SceneFamily]:

@@ -13,16 +13,11 @@ import numpy as np
 
 from viapoint.envs.scenes.layout import Furniture, Layout, Room, Vector, between, centred, sign
 
-THICKNESS = 0.015
-"""Half thickness of boards and walls, [m]."""
-FORWARDS, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
-"""Approaches of the tool."""
-CONE = 0.4
-"""Greatest angle between the tool and a horizontal approach, [rad]."""
-HAND_ROOM = 0.07
-"""Least distance of the tool from boards and walls beside it, [m]."""
-THING_RADIUS, THING_HALF_HEIGHT = (0.02, 0.05), (0.04, 0.12)
-"""Sizes of things that stand in furniture, [m]."""
+THICKNESS = 0.015  # Half thickness of boards and walls, [m]
+FORWARDS, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)  # Approaches of the tool
+CONE = 0.4  # Greatest angle between the tool and a horizontal approach, [rad]
+HAND_ROOM = 0.07  # Least distance of the tool from boards and walls beside it, [m]
+THING_RADIUS, THING_HALF_HEIGHT = (0.02, 0.05), (0.04, 0.12)  # Sizes of things that stand in furniture, [m]
 
 
 def shelf(rng: np.random.Generator, room: Room) -> Layout:

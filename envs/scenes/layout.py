@@ -10,14 +10,11 @@ import numpy as np
 
 from viapoint.envs.geometry.obstacles import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
 
-ROW = 16
-"""Numbers of an obstacle in a layout: kind, centre, rotation matrix row by row, sizes."""
+ROW = 16  # Numbers of an obstacle in a layout: kind, centre, rotation matrix row by row, sizes
 PLACE = 12
 """Numbers of a place in a layout: position, approach, half sizes, cosine and sine of the yaw, angle of the cone."""
-MOST_PLACES = 8
-"""Greatest number of places of starts, or of goals, of a layout."""
-TALL = 0.1
-"""Half height above which obstacles in the plane are in the way of the links, [m]."""
+MOST_PLACES = 8  # Greatest number of places of starts, or of goals, of a layout
+TALL = 0.1  # Half height above which obstacles in the plane are in the way of the links, [m]
 
 Vector = tuple[float, float, float]
 NOWHERE = (0.0, 0.0, 0.0)
@@ -87,14 +84,12 @@ class Room(NamedTuple):
 class Layout(NamedTuple):
     """Obstacles and places of a scene; :class:`Furniture` builds it."""
 
-    rows: list[float]
-    """ROW numbers for each obstacle."""
-    goals: list[float]
-    """PLACE numbers for each place of goals; without any, goals are free configurations."""
+    rows: list[float]  # ROW numbers for each obstacle
+    goals: list[float]  # PLACE numbers for each place of goals; without any, goals are free configurations
+    # PLACE numbers for each place of starts; without any, starts are home, in a place of goals, or free
     starts: list[float]
-    """PLACE numbers for each place of starts; without any, starts are home, in a place of goals, or free."""
+    # Number of obstacles that are kept, the first ones that leave both ends free; 0 if they belong together
     keep: int = 0
-    """Number of obstacles that are kept, the first ones that leave both ends free; 0 if they belong together."""
 
 
 class Place(NamedTuple):

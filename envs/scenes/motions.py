@@ -14,32 +14,25 @@ from viapoint.envs.scenes.ends import Draft, is_end, is_row_clear
 from viapoint.envs.scenes.layout import mix
 from viapoint.envs.scenes.scene import MOST_JUMPS, NEVER
 
-CANDIDATES = 8
-"""Candidates for a jump, or for the course of an obstacle."""
-COURSE_NUMBERS = 9
-"""Random numbers of a candidate for the course of an obstacle."""
+CANDIDATES = 8  # Candidates for a jump, or for the course of an obstacle
+COURSE_NUMBERS = 9  # Random numbers of a candidate for the course of an obstacle
+# Time of the first jump, and from a jump to the next, relative to the centre duration
 FIRST_JUMP, NEXT_JUMP = (0.1, 0.7), (0.4, 0.9)
-"""Time of the first jump, and from a jump to the next, relative to the centre duration."""
+# Distance from a target to the next in hand space, [m], and in joint space, [rad]
 JUMP_OF_HAND, JUMP_OF_JOINTS = (0.10, 0.30), (0.25, 0.75)
-"""Distance from a target to the next in hand space, [m], and in joint space, [rad]."""
-SPEED = (0.05, 0.30)
-"""Speed of obstacles, [m/s]."""
-STEEPNESS = 0.5
-"""Greatest height that an obstacle in space gains, relative to its way."""
+SPEED = (0.05, 0.30)  # Speed of obstacles, [m/s]
+STEEPNESS = 0.5  # Greatest height that an obstacle in space gains, relative to its way
+# Share of obstacles that turn, and the time of the turn, relative to the centre duration
 TURNING, TURN = 0.5, (0.2, 0.7)
-"""Share of obstacles that turn, and the time of the turn, relative to the centre duration."""
-MEETING = (0.25, 0.6)
-"""Time at which an obstacle is where it was drawn, relative to the centre duration."""
+MEETING = (0.25, 0.6)  # Time at which an obstacle is where it was drawn, relative to the centre duration
+# Least clearance of the start at first, of the goal while movements may end, and of targets that appear, [m]
 MARGIN = 0.015
-"""Least clearance of the start at first, of the goal while movements may end, and of targets that appear, [m]."""
-FARTHEST = 1.5
-"""Greatest coordinate of a moving obstacle at the beginning, [m]."""
+FARTHEST = 1.5  # Greatest coordinate of a moving obstacle at the beginning, [m]
 BEGINNING, BEGINNING_TIMES = 0.2, 3
 """Time that the start stays free, relative to the centre duration, and number of times at which this is checked."""
+# Time until which the goal stays free, relative to the longest duration, and number of times
 ENDING, ENDING_TIMES = 1.2, 10
-"""Time until which the goal stays free, relative to the longest duration, and number of times."""
-PASSED = 8
-"""Parts of the way to a new target between which it is looked at."""
+PASSED = 8  # Parts of the way to a new target between which it is looked at
 
 
 _mixed = compiled(mix)

@@ -35,12 +35,9 @@ from viapoint.envs.scenes.scene import (
     resting,
 )
 
-OPTIONS = (*ENDS, "obstacles", "jumps", "turns")
-"""Options of `reset` that give a scene, or a part of one."""
-FORMAT = "viapoint-scene"
-"""Value of the key `format` of a scene file."""
-REACHED = 1e-6
-"""Greatest distance of the hand from a given place, [m]."""
+OPTIONS = (*ENDS, "obstacles", "jumps", "turns")  # Options of `reset` that give a scene, or a part of one
+FORMAT = "viapoint-scene"  # Value of the key `format` of a scene file
+REACHED = 1e-6  # Greatest distance of the hand from a given place, [m]
 
 
 class Pose(NamedTuple):

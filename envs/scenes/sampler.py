@@ -44,26 +44,21 @@ from viapoint.envs.scenes.scene import ENDS, Scenes, resting
 if TYPE_CHECKING:
     from viapoint.envs.task import Task
 
+# Half heights of obstacles in the plane that the hand alone must clear, and that links must clear, too, [m]
 LOW_HALF_HEIGHT, TALL_HALF_HEIGHT = 0.04, 0.3
-"""Half heights of obstacles in the plane that the hand alone must clear, and that links must clear, too, [m]."""
-PLANE_MARGIN, SPACE_MARGIN = 0.025, 0.02
-"""Least clearance of starts and goals from obstacles, [m]."""
+PLANE_MARGIN, SPACE_MARGIN = 0.025, 0.02  # Least clearance of starts and goals from obstacles, [m]
+# Least distance of ends from the joint limits, [rad] or [m]; at most a tenth of the range
 LIMIT_MARGIN = 0.02
-"""Least distance of ends from the joint limits, [rad] or [m]; at most a tenth of the range."""
-LEAST_WAY = 0.5
-"""Least length of the way from start to goal in joint space, [rad]."""
+LEAST_WAY = 0.5  # Least length of the way from start to goal in joint space, [rad]
+# Reaches of the tools of the reference arms, measured from joint 2, [m]
 PLANE_REACH, SPACE_REACH = 0.6755, 0.947
-"""Reaches of the tools of the reference arms, measured from joint 2, [m]."""
-SHOULDER = 0.333
-"""Height of joint 2 of the reference arm in space, [m]."""
-REACH_SAMPLES = 2000
-"""Configurations among which the reach of an arm is looked for."""
+SHOULDER = 0.333  # Height of joint 2 of the reference arm in space, [m]
+REACH_SAMPLES = 2000  # Configurations among which the reach of an arm is looked for
+# Greatest number of obstacles that are drawn, unless a task asks for more in every scene; more can be given
 MOST_DRAWN = 32
-"""Greatest number of obstacles that are drawn, unless a task asks for more in every scene; more can be given."""
-VIEW_MARGIN = 0.01
-"""Least distance of obstacles from a sensor that does not move, [m]."""
+VIEW_MARGIN = 0.01  # Least distance of obstacles from a sensor that does not move, [m]
+# Layouts that are drawn for a scene at most, and layouts after which another family is tried
 ATTEMPTS, FAMILY_ATTEMPTS = 1000, 50
-"""Layouts that are drawn for a scene at most, and layouts after which another family is tried."""
 
 
 class SceneSampler:

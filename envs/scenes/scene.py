@@ -14,20 +14,13 @@ from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.envs.geometry.obstacles import HALF_SPACE, Obstacles, no_obstacles
 from viapoint.envs.geometry.shapes import IN_TABLES
 
-MOST_JUMPS = 4
-"""Greatest number of jumps of the target in an episode."""
-ENDS = ("start", "goal")
-"""Names of the ends of a movement."""
-NEVER = 1e9
-"""Time of a change that does not happen, [s]."""
-ROUNDING = 1e-9
-"""Rounding error of times, [s], and joint positions, [rad]."""
-LEAST_APART = 0.02
-"""Least difference of start and goal in the joint that moves most, [rad] or [m]."""
-FARTHEST = 2.0
-"""Greatest coordinate of an obstacle's centre, and greatest size, [m]; half-spaces have none."""
-FASTEST = 1.0
-"""Greatest speed of an obstacle, [m/s]."""
+MOST_JUMPS = 4  # Greatest number of jumps of the target in an episode
+ENDS = ("start", "goal")  # Names of the ends of a movement
+NEVER = 1e9  # Time of a change that does not happen, [s]
+ROUNDING = 1e-9  # Rounding error of times, [s], and joint positions, [rad]
+LEAST_APART = 0.02  # Least difference of start and goal in the joint that moves most, [rad] or [m]
+FARTHEST = 2.0  # Greatest coordinate of an obstacle's centre, and greatest size, [m]; half-spaces have none
+FASTEST = 1.0  # Greatest speed of an obstacle, [m/s]
 
 
 class Scenes(NamedTuple):

@@ -28,13 +28,13 @@ from ..array_api import FREE, Floats, ordered_sum
 from ..trajectory import connect
 from .rest_to_rest import SHORTEST
 
+# (goal velocity FREE, goal acceleration FREE) -> q and the coefficients of g
 _GREEN: dict[tuple[bool, bool], tuple[int, tuple[float, ...]]] = {
     (False, False): (5, (1.0,)),
     (False, True): (4, (1.0, -4.0 / 9.0)),
     (True, False): (2, (1.0, -4.0 / 3.0, 1.0 / 2.0, -1.0 / 16.0)),
     (True, True): (2, (1.0, -7.0 / 9.0, 2.0 / 9.0, -1.0 / 36.0)),
 }
-"""(goal velocity FREE, goal acceleration FREE) -> q and the coefficients of g."""
 
 # Estimated relative error of the shorter fraction above which a movement is expanded around both ends.
 _DOUBT = 1e-13

@@ -23,11 +23,10 @@ import numpy as np
 
 from ..array_api import Array, Namespace, like, ordered_sum, to_numpy
 
-Number: TypeAlias = Any
-"""A float, or an array with one entry per movement; both give the same bits."""
+Number: TypeAlias = Any  # A float, or an array with one entry per movement; both give the same bits
 
+# Least fraction of a via-point apart from its neighbour; a higher power of it must not underflow
 SHORTEST = 1e-40
-"""Least fraction of a via-point apart from its neighbour; a higher power of it must not underflow."""
 
 # Newton steps; the start is within 34 % of the root everywhere, and after five the error is 2e-16 (measured).
 _STEPS = 5
