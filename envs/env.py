@@ -90,7 +90,8 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         if self._over:
             raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
         decision = self.batch.execute_actions([action])
-        terminated, truncated = bool(decision.terminated[0]), bool(decision.truncated[0])
+        terminated = bool(decision.terminated[0])
+        truncated = bool(decision.truncated[0])
         self._over = terminated or truncated
         seen = {name: part[0] for name, part in decision.observation.items()}
         values = {name: value[0].item() for name, value in decision.info.items()}

@@ -105,7 +105,8 @@ class Episodes:
         self._moving = bool(self.scenes.obstacles.velocity.any() or self.scenes.turn_velocity.any())
         self.executor.begin(rows, scenes.start, scenes.obstacles_at(np.zeros(len(rows))))
         space = self.task.space
-        start, goal = space.coordinates(scenes.start), space.coordinates(scenes.goal)
+        start = space.coordinates(scenes.start)
+        goal = space.coordinates(scenes.goal)
         self._start[rows] = start
         self._zero_duration[rows] = self.task.action.zero_duration(start, goal)
         waiting = np.repeat(start[:, None], self.plan.waypoints.shape[1], axis=1)
@@ -205,7 +206,9 @@ class Episodes:
 
     def recorded(self, row: int) -> Recorded:
         """Return the running episode of one environment; where it has not moved yet, the one before if it is kept."""
-        scene, history, pieces = self.scenes.take([row]), self.history[row], self.executor.past[row]
+        scene = self.scenes.take([row])
+        history = self.history[row]
+        pieces = self.executor.past[row]
         if not self.executor.state.steps[row] and self._finished is not None:
             rows, scenes, records = self._finished
             for i in np.flatnonzero(rows == row):
@@ -219,7 +222,8 @@ class Episodes:
         """Follow plans, new ones where they were revised, until the decisions end."""
         state, scenes = self.executor.state, self.scenes
         first = ~self.begun
-        before, begin = self._outcome(np.zeros(len(first), bool)), state.steps.copy()
+        before = self._outcome(np.zeros(len(first), bool))
+        begin = state.steps.copy()
         self._adopt(plan, np.flatnonzero(revised))
         step, event, final = self._events(self.plan, self._began, begin, scenes, self.goals, self.looks)
         last = np.where(state.reachable & active, step, begin)
@@ -273,7 +277,8 @@ class Episodes:
             state = Motion(plan.waypoints[rows, 0], plan.velocity[rows], plan.acceleration[rows])
             put(slower, rows, timed(plan.waypoints[rows], slower.duration[rows], state))
             again, inside[rows] = self._look_at(Movements.of(slower.take(rows)))
-            rows, again = rows[again > ENOUGH], np.minimum(again[again > ENOUGH], MOST_PROLONGED)
+            rows = rows[again > ENOUGH]
+            again = np.minimum(again[again > ENOUGH], MOST_PROLONGED)
             stretch[rows] *= again
             slower.durations[rows] *= again[:, None]
         within = np.ones(len(stretch), bool)
@@ -304,12 +309,14 @@ class Episodes:
             self._run(rows, np.minimum(last[rows], next_step(turns[rows], now)) - now, self._references)
             movements, began = take(self._movements, rows), self._began[rows]
             done = state.steps[rows] - began
-            begin, end = np.asarray((now - began) * timestep), np.asarray(done * timestep)
+            begin = np.asarray((now - began) * timestep)
+            end = np.asarray(done * timestep)
             state.jerk_cost[rows] += jerk_cost_between(movements, begin, end)
 
     def _run(self, rows: Int, steps: Int, references: References) -> None:
         """Execute references in some episodes for a number of physics steps each, shape (n,)."""
-        scenes, now = self.scenes.take(rows), self.executor.state.steps[rows]
+        scenes = self.scenes.take(rows)
+        now = self.executor.state.steps[rows]
         obstacles = scenes.obstacles_at(np.asarray(now * self.simulator.timestep))
         goals = scenes.goals(np.asarray((now + steps) * self.simulator.timestep))
         goal = self.task.space.coordinates(goals)
@@ -327,7 +334,8 @@ class Episodes:
         """Follow velocities for one control step; where the references leave the reach, the arm stays."""
         task, state = self.task, self.executor.state
         steering, first = task.steering, state.steps == 0
-        before, begin = self._outcome(np.zeros(len(first), bool)), state.steps.copy()
+        before = self._outcome(np.zeros(len(first), bool))
+        begin = state.steps.copy()
         velocity = steering.decode(wanted, self._start, self.goals(self.time))
         number = steering.physics_steps
         ahead = steering.follow(self._motion, velocity, number)

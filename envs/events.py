@@ -93,12 +93,14 @@ class EventPredictor:
             Without contact: steps before which the decisions end; the :class:`Event` of each; True where the arm has
             arrived and no change is left.
         """
-        jump, turn = self.steps(scenes.jump_times), self.steps(scenes.turn_time)
+        jump = self.steps(scenes.jump_times)
+        turn = self.steps(scenes.turn_time)
         moving_until = began + self.steps(plan.duration)
         arrival = np.maximum(began + self.steps(plan.duration + SETTLING), now + 1)
         away = np.abs(plan.waypoints[:, -1] - goal(arrival * self.timestep)).max(axis=-1)
         there = away < MAX_START_OFFSET  # a plan of a user may have rounded its end
-        after_jump, after_turn = next_step(jump, arrival), next_step(turn, arrival)
+        after_jump = next_step(jump, arrival)
+        after_turn = next_step(turn, arrival)
         # At rest at the goal, the arm waits for what is still to come.
         waits = there & (np.minimum(after_jump, after_turn) < NEVER) & (len(self.triggers) > 0)
         ends = {Event.TIME_LIMIT: np.maximum(np.full(len(now), self.limit), now + 1)}
@@ -127,7 +129,8 @@ class EventPredictor:
         found = np.full(len(now), NEVER)
         if "clearance" not in self.triggers or not scenes.obstacles.present.any():
             return found
-        every, ahead = max(round(LOOK / self.timestep), 1), round(FORESIGHT / LOOK)
+        every = max(round(LOOK / self.timestep), 1)
+        ahead = round(FORESIGHT / LOOK)
         turns = self.steps(scenes.turn_time)
         # Pieces of the episodes in which the obstacles keep their velocity
         pieces = []

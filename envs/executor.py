@@ -101,7 +101,8 @@ class Executor:
             joints, planned, contact = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
         else:  # at rest at the start
             joints = scene.start.copy()
-            planned, contact = self.space.coordinates(joints), np.zeros(1, bool)
+            planned = self.space.coordinates(joints)
+            contact = np.zeros(1, bool)
         time = np.asarray(self.simulator.timestep * np.arange(1, len(joints) + 1))
         every = scene.take(np.zeros(len(time), np.int64)).obstacles_at(time)
         clearance = configuration_clearances(arm.chain, arm.spheres, joints, every, np.zeros(len(time)))
@@ -281,7 +282,8 @@ def _measure(
             for j in range(executed.shape[1]):
                 rate = max(rate, abs(executed[k, j] - before[j]) / timestep)
                 before[j] = executed[k, j]
-                low, high = joint_range[j, 0] - LIMIT_TOLERANCE, joint_range[j, 1] + LIMIT_TOLERANCE
+                low = joint_range[j, 0] - LIMIT_TOLERANCE
+                high = joint_range[j, 1] + LIMIT_TOLERANCE
                 if executed[k, j] < low or executed[k, j] > high:
                     state.within[row] = False
             state.deviation[row] += away

@@ -57,7 +57,8 @@ class ObservationLayout:
             if sensor.looks > 1:
                 found["eyes"] = _box(FARTHEST, 3 * sensor.looks)
         elif self.n_rows:
-            kinds, pose = np.zeros(len(task.shapes)), [FARTHEST] * 3 + [1.0] * 6
+            kinds = np.zeros(len(task.shapes))
+            pose = [FARTHEST] * 3 + [1.0] * 6
             sizes = [FARTHEST] * 3
             lowest = np.concatenate((kinds, -np.array(pose), np.zeros(3), [-FASTEST] * 3, [0.0]))
             highest = np.concatenate((kinds + 1.0, pose, sizes, [FASTEST] * 3, [1.0]))

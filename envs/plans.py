@@ -115,7 +115,9 @@ def _sampled(movements: Movements, times: Float) -> tuple[Float, Float, Float]:
     """Return position, velocity and acceleration, see :meth:`Movements.sample`."""
     number, _, segments, dimension = movements.coefficients.shape
     shape = (number, times.shape[1], dimension)
-    position, velocity, acceleration = np.empty(shape), np.empty(shape), np.empty(shape)
+    position = np.empty(shape)
+    velocity = np.empty(shape)
+    acceleration = np.empty(shape)
     for i in range(number):
         c = movements.coefficients[i]
         for k in range(times.shape[1]):
@@ -151,7 +153,8 @@ def jerk_cost_between(movements: Movements, begin: Float, end: Float) -> Float:
         for s in range(segments):
             first, rate = movements.starts[i, s], movements.rates[i, s]
             last = movements.starts[i, s + 1] if s + 1 < segments else movements.end[i, 0]
-            low, high = max(begin[i], first), min(end[i], last)
+            low = max(begin[i], first)
+            high = min(end[i], last)
             half = 0.5 * max(high - low, 0.0)
             for node in range(3):
                 u = (low + half * (1.0 + NODES[node]) - first) * rate

@@ -314,7 +314,8 @@ def _towards(direction: Float) -> tuple[float, float, float, float]:
     yaw = math.atan2(direction[1], direction[0])
     pitch = -math.atan2(direction[2], math.hypot(direction[0], direction[1]))
     a, b = math.cos(0.5 * yaw), math.sin(0.5 * yaw)
-    c, d = math.cos(0.5 * pitch), math.sin(0.5 * pitch)
+    c = math.cos(0.5 * pitch)
+    d = math.sin(0.5 * pitch)
     return a * c, -b * d, a * d, b * c
 
 
@@ -352,7 +353,8 @@ def _cast(
                     if half_square < 0.0:
                         continue
                     half = math.sqrt(half_square)
-                    first, last = max(middle - half, 0.0), min(middle + half, last)
+                    first = max(middle - half, 0.0)
+                    last = min(middle + half, last)
                 way = first
                 for _ in range(MOST_STEPS):
                     if way >= last:

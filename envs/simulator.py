@@ -57,7 +57,8 @@ class Simulator:
             return
         for name, values in geom_fields(obstacles).items():
             self._fields[name][np.ix_(sims, self._geoms)] = values
-        position, quaternion = obstacles.centre.copy(), quaternions_of(obstacles.rotation)
+        position = obstacles.centre.copy()
+        quaternion = quaternions_of(obstacles.rotation)
         names = geom_meshes(obstacles)
         for scene, row in np.argwhere(obstacles.kind == MESH):
             # MuJoCo gives the geom of a mesh a frame of its own, along the axes of inertia.

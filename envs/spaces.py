@@ -70,7 +70,8 @@ class HandPlane:
 
     def inside(self, coordinates: Float) -> Bool:
         """Return True where the hand reaches the coordinates with joints within their ranges."""
-        chain, limits = self.arm.chain, self.arm.joint_range + REACH_TOLERANCE * np.array([-1.0, 1.0])
+        chain = self.arm.chain
+        limits = self.arm.joint_range + REACH_TOLERANCE * np.array([-1.0, 1.0])
         flat = np.ascontiguousarray(coordinates.reshape(-1, 2))
         _, found = planar_solutions(chain, limits, flat)
         return found.reshape(coordinates.shape[:-1])

@@ -148,7 +148,9 @@ def evaluate(
         out = [np.empty((*batch, time.shape[-1], dimension), coefficients.dtype) for _ in orders]
     buffer = None
     for where, where_time, where_starts in _blocks(coefficients, starts, time):
-        at, begin, rate = time[where_time], starts[where_starts], rates[where_starts]
+        at = time[where_time]
+        begin = starts[where_starts]
+        rate = rates[where_starts]
         shape = np.broadcast(at[..., :1], begin[..., :1]).shape[:-1]
         if buffer is None or buffer.shape[2:-1] != shape:  # one buffer for all blocks but a shorter last one
             buffer = _buffer((degree + 1, segments, *shape, time.shape[-1]), starts.dtype)
@@ -161,7 +163,8 @@ def evaluate(
 def _blocks(coefficients: Any, starts: Any, time: Any) -> list[tuple[Any, Any, Any]]:
     """Return indices of each block of the batch, and of the block in `time` and in `starts` (all, if shared)."""
     batch, shared = coefficients.shape[:-3], ((), (1,))
-    own_time, own_starts = time.shape[:-1] not in shared, starts.shape[:-1] not in shared
+    own_time = time.shape[:-1] not in shared
+    own_starts = starts.shape[:-1] not in shared
     fitting = time.shape[:-1] in (*shared, batch) and starts.shape[:-1] in (*shared, batch)
     if len(batch) != 1 or not fitting or not (own_time or own_starts):
         return [(..., ..., ...)]

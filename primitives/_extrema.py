@@ -95,7 +95,8 @@ def _read(trajectory: Trajectory, coefficients: Array, place: tuple[Any, Floats]
     chosen = segment[..., None, None, :] == np.arange(segments)[:, None]  # (..., 1, S, D or 1)
     basis = chosen * u[..., None, None, :] ** np.arange(powers)[:, None, None]
     values = xp.sum(xp.sum(like(xp, basis, coefficients) * coefficients, axis=-2), axis=-2)
-    starts, rates = to_numpy(trajectory.starts), to_numpy(trajectory.rates)
+    starts = to_numpy(trajectory.starts)
+    rates = to_numpy(trajectory.rates)
     spans = np.where(rates > 0, 1.0 / np.where(rates > 0, rates, 1.0), 0.0)
     shape = (*segment.shape[:-1], segments)
     start = np.take_along_axis(np.broadcast_to(starts, shape), segment, axis=-1)

@@ -114,7 +114,8 @@ def least_cost_coefficients(
     The waypoints (..., S + 1, D) have the full batch shape; durations (..., S) may be shared by the batch. They may be
     0 between waypoints that are equal within rounding; the via-points after such segments are dropped.
     """
-    segments, eps = durations.shape[-1], float(xp.finfo(durations.dtype).eps)
+    segments = durations.shape[-1]
+    eps = float(xp.finfo(durations.dtype).eps)
     if not _is_extreme(to_numpy(durations), eps).any():
         return _banded_coefficients(xp, order, waypoints, durations, states)
     *batch, knots, dimension = waypoints.shape
@@ -178,7 +179,8 @@ def _weighted_coefficients(
     double = [[xp.astype(value, xp.float64) if is_given(value) else value for value in row] for row in given]
     (waypoints, durations), *states = double
     total = xp.sum(durations, axis=-1)
-    points, pace = to_numpy(waypoints), to_numpy(total)[:, None]
+    points = to_numpy(waypoints)
+    pace = to_numpy(total)[:, None]
     ends = []
     for state in (states[0], states[-1]):
         scaled = [to_numpy(v) * pace ** (i + 1) if is_given(v) else v for i, v in enumerate(state)]

@@ -164,7 +164,8 @@ def _origins(xp: Namespace, lengths: Array, steps: Array, states: Any) -> dict[C
     origins = {}
     for k, state in enumerate(states):
         if state[0] is FREE:
-            left, right = max(k - 1, 0), min(k, len(steps) - 1)
+            left = max(k - 1, 0)
+            right = min(k, len(steps) - 1)
             origins[k, 0] = xp.where(lengths[left] < lengths[right], means[left], means[right])
     return origins
 
@@ -213,7 +214,8 @@ def _eliminate(rows: list[_Row], column: Column, rotations: list[_Rotation]) -> 
         weight = pivot.weight + product * c
         share, t = pivot.weight / weight, product / weight
         for key in pivot.entries.keys() | other.entries.keys():
-            before, entry = pivot.entries.get(key, 0.0), other.entries.get(key, 0.0)
+            before = pivot.entries.get(key, 0.0)
+            entry = other.entries.get(key, 0.0)
             other.entries[key] = entry - c * before
             pivot.entries[key] = share * before + t * entry
         rest = other.rest

@@ -381,7 +381,8 @@ def _fit(time: Floats, position: Floats, n_via: int, free_ends: bool) -> _Fit:
     basis = _basis(knots[None], samples[0])[0]
     points = np.linalg.lstsq(basis, samples[1])[0]
     residual = float(np.square(basis @ points - samples[1]).sum())
-    count, parameters = position.size, points.size + n_via + 2 * free_ends
+    count = position.size
+    parameters = points.size + n_via + 2 * free_ends
     variance = max(residual / count, _ROUNDING**2) * size**2
     return _Fit(
         knots=first + length * knots,

@@ -175,7 +175,8 @@ def _solve(points: Any, ends: list[Any], moving: bool) -> Any:
     ends = ends if moving else [None] * 4
     cost = PassageCost.from_points(points, ends, slack)
     guess, bound = _from_fewer_points(points, ends, moving)
-    fractions, converged = np.empty((count, knots - 1)), np.empty(count, dtype=bool)
+    fractions = np.empty((count, knots - 1))
+    converged = np.empty(count, dtype=bool)
     size = max(1, _ENTRIES // knots**2)
     for first in range(0, count, size):
         rows = slice(first, first + size)
@@ -203,7 +204,8 @@ def _from_fewer_points(points: Any, ends: list[Any], moving: bool) -> tuple[Any,
     left_out[:, 1:-1] = chord[:, :-1] < _NEAR * chord.max(axis=1, keepdims=True)
     if not moving:
         left_out[:, 1] = False  # where a movement from rest begins, it is not level with anything
-    result, cost = np.full((count, knots - 1), np.nan), np.full(count, np.nan)
+    result = np.full((count, knots - 1), np.nan)
+    cost = np.full(count, np.nan)
     for pattern in np.unique(left_out[left_out.any(axis=1)], axis=0):
         where = np.flatnonzero((left_out == pattern).all(axis=1))
         kept = np.flatnonzero(~pattern)
@@ -229,7 +231,9 @@ def _level_time(coefficients: Any, step: Any) -> Any:
     along = ordered_sum(coefficients * step[:, None], -1)
     along[:, 0] = -ordered_sum(step * step, -1)
     with np.errstate(all="ignore"):
-        target, slope, curve = -along[:, 0], along[:, 1], along[:, 2]
+        target = -along[:, 0]
+        slope = along[:, 1]
+        curve = along[:, 2]
         u = 2.0 * target / (slope + np.sqrt(slope * slope + 4.0 * curve * target))
         for _ in range(_LEVEL_STEPS):
             u = u - evaluate(along, u) / evaluate(differentiate(along), u)

@@ -75,7 +75,8 @@ def retarget(
         arrival=tuple(arrival.shape),
         **end_shapes(points, trajectory.dimension),
     )
-    time, arrival = broadcast_to(xp, time, batch), broadcast_to(xp, arrival, batch)
+    time = broadcast_to(xp, time, batch)
+    arrival = broadcast_to(xp, arrival, batch)
     end = broadcast_to(xp, trajectory.duration, batch)
     require(time >= 0, "time", time, "must not be negative")
     under_way = (time < end) | ((time <= 0) & (end <= 0))
@@ -88,7 +89,8 @@ def retarget(
     position, *motion = (value[..., 0, :] for value in trajectory.sample(time[..., None], (0, 1, 2)))
     goal, *final = targets.values()
     states: dict[str, Any] = dict(zip(END_NAMES, (*motion, *final), strict=True))
-    passed, shape = [position, goal] if via is None else [position, via, goal], (*batch, trajectory.dimension)
+    passed = [position, goal] if via is None else [position, via, goal]
+    shape = (*batch, trajectory.dimension)
     waypoints = xp.stack([broadcast_to(xp, point, shape) for point in passed], axis=-2)
     remaining = arrival - time
     durations = remaining[..., None] if via is None else passage_durations(waypoints, remaining, **states)

@@ -101,7 +101,8 @@ def curvature(trajectory: Trajectory, time: Array) -> Array:
         raise ValueError(f"trajectory must have dimension 2 or 3 for a curvature, got {trajectory.dimension}")
     xp = trajectory.namespace
     velocity, acceleration = trajectory.sample(time, (1, 2))
-    slower, flatter = unit_factors(xp, velocity), unit_factors(xp, acceleration)
+    slower = unit_factors(xp, velocity)
+    flatter = unit_factors(xp, acceleration)
     velocity, acceleration = velocity * slower, acceleration * flatter
     if trajectory.dimension == 2:
         turn = velocity[..., 0] * acceleration[..., 1] - velocity[..., 1] * acceleration[..., 0]
@@ -286,7 +287,8 @@ def _speed_events(trajectory: Trajectory, *, rising_after: bool) -> SpeedEvents:
     found = (before < 0) & (after > 0) if rising_after else (before > 0) & (after < 0)
     count = int(found.sum(axis=-1).max(initial=0))
     order = np.argsort(~found, axis=-1, kind="stable")[..., :count]
-    place, exists = np.take_along_axis(times, order, axis=-1), np.take_along_axis(found, order, axis=-1)
+    place = np.take_along_axis(times, order, axis=-1)
+    exists = np.take_along_axis(found, order, axis=-1)
     time = like(xp, np.where(exists, place, 0.0), trajectory.coefficients)
     missing = like(xp, np.where(exists, 0.0, np.nan), trajectory.coefficients)
     value = speed(trajectory, time) if count else time

@@ -273,14 +273,17 @@ def _chain(
             moved[of_body[carrier] - 1].append(body)
         elif carrier == 0 and (collides & (model.geom_bodyid == body)).any():
             links[model.body(body).name] = 0
-    mass, centre, inertia = np.zeros(len(joints)), np.zeros((len(joints), 3)), np.zeros((len(joints), 3, 3))
+    mass = np.zeros(len(joints))
+    centre = np.zeros((len(joints), 3))
+    inertia = np.zeros((len(joints), 3, 3))
     for link, bodies in enumerate(moved):
         turn, place = frames[link + 1]
         mass[link] = model.body_mass[bodies].sum()
         middle = (model.body_mass[bodies, None] * data.xipos[bodies]).sum(axis=0) / mass[link]
         centre[link] = turn.T @ (middle - place)
         inertia[link] = turn.T @ _inertia(model, data, bodies, middle) @ turn
-    origin, rotation = np.zeros((len(joints), 3)), np.zeros((len(joints), 3, 3))
+    origin = np.zeros((len(joints), 3))
+    rotation = np.zeros((len(joints), 3, 3))
     for link, (turn, place) in enumerate(frames[1:]):
         before, start = frames[link]
         origin[link] = _rounded(before.T @ (place - start))
@@ -318,7 +321,8 @@ def _capsules(
         name = model.body(model.geom_bodyid[geom]).name
         if name not in links or not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
             continue
-        kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
+        kind = mujoco.mjtGeom(int(model.geom_type[geom]))
+        size = model.geom_size[geom]
         if kind not in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE):
             raise ValueError(
                 f"collision geoms must be capsules or spheres, geom {model.geom(geom).name!r} is none"

@@ -67,7 +67,8 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
     Raises:
         ValueError: The geom is of another type, or is flat.
     """
-    size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
+    size = model.geom_size[geom]
+    kind = Geom(int(model.geom_type[geom]))
     if kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE):
         half = size[1] if kind == Geom.mjGEOM_CAPSULE else 0.0
         ends = np.array([(0.0, 0.0, -half), (0.0, 0.0, half)])
@@ -95,7 +96,8 @@ def polytope_around(model: mujoco.MjModel, geom: int) -> tuple[Float, float]:
     Raises:
         ValueError: The geom is neither of these, nor a cylinder or an ellipsoid.
     """
-    size, kind = model.geom_size[geom], Geom(int(model.geom_type[geom]))
+    size = model.geom_size[geom]
+    kind = Geom(int(model.geom_type[geom]))
     if kind == Geom.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
         first = model.mesh_vertadr[mesh]
@@ -185,7 +187,8 @@ def _refine(
     offsets of its faces. The last step is a share of the size, [m].
     """
     probe, best = np.empty((2, 3)), np.empty((2, 3))
-    step, least = FIRST_STEP * size, _excess(ends, corners, body, np.inf)
+    step = FIRST_STEP * size
+    least = _excess(ends, corners, body, np.inf)
     while step > last_step * size:
         lowest = least - 1e-9  # less of an improvement is rounding
         for move in range(len(moves)):
@@ -267,13 +270,16 @@ def _cut(corners: Float, triangles: Float, normal: Float, offset: float) -> tupl
     edges = np.concatenate((triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]))
     edges = np.unique(np.sort(edges, axis=1), axis=0)
     height = corners @ normal - offset
-    first, second = height[edges[:, 0]], height[edges[:, 1]]
+    first = height[edges[:, 0]]
+    second = height[edges[:, 1]]
     crosses = first * second < 0.0
     share = first[crosses] / (first[crosses] - second[crosses])
-    start, end = corners[edges[crosses, 0]], corners[edges[crosses, 1]]
+    start = corners[edges[crosses, 0]]
+    end = corners[edges[crosses, 1]]
     between = start + share[:, None] * (end - start)
     # Corners on the plane belong to both pieces.
-    below, above = corners[height <= ROUNDING], corners[height >= -ROUNDING]
+    below = corners[height <= ROUNDING]
+    above = corners[height >= -ROUNDING]
     return np.concatenate((below, between)), np.concatenate((above, between))
 
 

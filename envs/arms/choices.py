@@ -206,7 +206,8 @@ def _is_branch(model: mujoco.MjModel, body: int, below: dict[int, int]) -> bool:
 
 def _is_gripper(model: mujoco.MjModel, body: int) -> bool:
     """Return True if a joint of a body is named after a part of a gripper; or the body, where nothing moves on it."""
-    first, number = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+    first = int(model.body_jntadr[body])
+    number = int(model.body_jntnum[body])
     names = [model.joint(joint).name for joint in range(first, first + number)]
     if names and _joints_below(model, body) == number:
         names.append(model.body(body).name)
@@ -215,7 +216,8 @@ def _is_gripper(model: mujoco.MjModel, body: int) -> bool:
 
 def _joints_below(model: mujoco.MjModel, body: int) -> int:
     """Return the greatest number of hinges and slides on a way from a body to a leaf, its own included."""
-    first, number = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+    first = int(model.body_jntadr[body])
+    number = int(model.body_jntnum[body])
     own = sum(model.jnt_type[joint] in MOVES for joint in range(first, first + number))
     return own + max((_joints_below(model, each) for each in _children(model, body)), default=0)
 

@@ -87,7 +87,9 @@ def descend(
                     x += rotation[last, 0, k] * turn
                     y += rotation[last, 1, k] * turn
                     z += rotation[last, 2, k] * turn
-                u, v, w = axes[0, column], axes[1, column], axes[2, column]
+                u = axes[0, column]
+                v = axes[1, column]
+                w = axes[2, column]
                 trace += x * u + y * v + z * w
                 error[3] += 0.5 * (y * w - z * v)
                 error[4] += 0.5 * (z * u - x * w)
@@ -134,7 +136,8 @@ def solve_planar(chain: Chain, joint_range: Float, x: float, y: float, joints: F
     Out of reach, the elbow is as straight or as bent as it can be, and the result is False.
     """
     first, second, turn, base, upper, fore = chain.first_two
-    u, v = x - chain.origin[0, 0], y - chain.origin[0, 1]
+    u = x - chain.origin[0, 0]
+    v = y - chain.origin[0, 1]
     # Law of cosines for the angle between the links.
     cosine = (u * u + v * v - upper * upper - fore * fore) / (2.0 * upper * fore)
     bend = np.arccos(min(max(cosine, -1.0), 1.0))
@@ -144,7 +147,8 @@ def solve_planar(chain: Chain, joint_range: Float, x: float, y: float, joints: F
     joints[1] = min(max(bend - offset, joint_range[1, 0]), joint_range[1, 1])
     bend = joints[1] + offset
     # Angle from the upper arm to the tool, seen from the shoulder.
-    along, across = upper + fore * np.cos(bend), fore * np.sin(bend)
+    along = upper + fore * np.cos(bend)
+    across = fore * np.sin(bend)
     angle = np.arctan2(v, u) - np.arctan2(across, along) - base - first
     middle = 0.5 * (joint_range[0, 0] + joint_range[0, 1])
     joints[0] = angle - 2.0 * np.pi * np.round((angle - middle) / (2.0 * np.pi))
@@ -161,9 +165,11 @@ def planar_limits(chain: Chain, joint_range: Float) -> Float:
     """
     first, second, turn, base, _, _ = chain.first_two
     offset = turn + second - first
-    low, high = joint_range[1, 0] + offset, joint_range[1, 1] + offset
+    low = joint_range[1, 0] + offset
+    high = joint_range[1, 1] + offset
     side = 1.0 if low + high >= 0.0 else -1.0
-    nearest, farthest = max(min(side * low, side * high), 0.0), min(max(side * low, side * high), np.pi)
+    nearest = max(min(side * low, side * high), 0.0)
+    farthest = min(max(side * low, side * high), np.pi)
     middle = base + first + 0.5 * (joint_range[0, 0] + joint_range[0, 1])
     half = min(0.5 * (joint_range[0, 1] - joint_range[0, 0]), np.pi)
     return np.array([np.cos(farthest), np.cos(nearest), side, np.cos(middle), np.sin(middle), np.cos(half)])
@@ -173,14 +179,17 @@ def planar_limits(chain: Chain, joint_range: Float) -> Float:
 def in_planar_reach(chain: Chain, limits: Float, x: float, y: float) -> bool:
     """Return True where :func:`solve_planar` finds joints; without angles it takes a twentieth of the time."""
     upper, fore = chain.first_two.upper, chain.first_two.fore
-    u, v = x - chain.origin[0, 0], y - chain.origin[0, 1]
+    u = x - chain.origin[0, 0]
+    v = y - chain.origin[0, 1]
     square = u * u + v * v
     cosine = (square - upper * upper - fore * fore) / (2.0 * upper * fore)
     if cosine < limits[0] or cosine > limits[1]:
         return False
-    along, across = upper + fore * cosine, limits[2] * fore * math.sqrt(max(1.0 - cosine * cosine, 0.0))
+    along = upper + fore * cosine
+    across = limits[2] * fore * math.sqrt(max(1.0 - cosine * cosine, 0.0))
     # Direction of the upper arm, times the squared distance.
-    p, q = u * along + v * across, v * along - u * across
+    p = u * along + v * across
+    q = v * along - u * across
     return bool(p * limits[3] + q * limits[4] >= limits[5] * square)
 
 
@@ -216,7 +225,10 @@ def _planar_motion(
         solve_planar(chain, joint_range, position[i, 0], position[i, 1], joints[i])
         one = base + joints[i, 0] + first
         other = base + joints[i, 0] + turn + joints[i, 1] + second
-        c1, s1, c2, s2 = np.cos(one), np.sin(one), np.cos(other), np.sin(other)
+        c1 = np.cos(one)
+        s1 = np.sin(one)
+        c2 = np.cos(other)
+        s2 = np.sin(other)
         sine = c1 * s2 - s1 * c2
         sine = sine if abs(sine) > 1e-9 else 1e-9
         x, y = velocity[i, 0], velocity[i, 1]
@@ -308,7 +320,8 @@ def inverse_kinematics(
     low, high = arm.joint_range.T
     begin = np.concatenate((first[None], rng.uniform(low, high, (number - 1, len(low)))))
     joints = len(low)
-    rotation, origin = np.empty((joints + 1, 3, 3)), np.empty((joints + 1, 3))
+    rotation = np.empty((joints + 1, 3, 3))
+    origin = np.empty((joints + 1, 3))
     found: list[Float] = []
     for configuration in begin.copy():
         error = descend(

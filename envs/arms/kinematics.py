@@ -104,9 +104,12 @@ def link_frames(chain: Chain, joints: Float, rotation: Float, origin: Float) -> 
         if slides:
             shift = joints[j]
         else:
-            cosine, sine = math.cos(joints[j]), math.sin(joints[j])
+            cosine = math.cos(joints[j])
+            sine = math.sin(joints[j])
         for row in range(3):
-            a, b, c = rotation[j, row, 0], rotation[j, row, 1], rotation[j, row, 2]
+            a = rotation[j, row, 0]
+            b = rotation[j, row, 1]
+            c = rotation[j, row, 2]
             # A row of the frame of the joint at 0, and then turned about its z axis.
             x = a * fixed[j, 0, 0] + b * fixed[j, 1, 0] + c * fixed[j, 2, 0]
             y = a * fixed[j, 0, 1] + b * fixed[j, 1, 1] + c * fixed[j, 2, 1]
@@ -146,7 +149,9 @@ def point_jacobian(
         jacobian[1, j] = 0.0
         jacobian[2, j] = 0.0
     for j in range(link):
-        u, v, w = rotation[j + 1, 0, 2], rotation[j + 1, 1, 2], rotation[j + 1, 2, 2]
+        u = rotation[j + 1, 0, 2]
+        v = rotation[j + 1, 1, 2]
+        w = rotation[j + 1, 2, 2]
         if not chain.sliding[j]:
             arm = (x - origin[j + 1, 0], y - origin[j + 1, 1], z - origin[j + 1, 2])
             u, v, w = _cross((u, v, w), arm)
@@ -364,7 +369,8 @@ def _all_frames(chain: Chain, joints: Float) -> tuple[Float, Float]:
 def _all_tools(chain: Chain, joints: Float) -> tuple[Float, Float]:
     """Return places and axes of the tool for N configurations, see :func:`forward`."""
     number, last = joints.shape
-    rotation, origin = np.empty((last + 1, 3, 3)), np.empty((last + 1, 3))
+    rotation = np.empty((last + 1, 3, 3))
+    origin = np.empty((last + 1, 3))
     places, axes = np.empty((number, 3)), np.empty((number, 3, 3))
     for n in range(number):
         places[n, 0], places[n, 1], places[n, 2] = tool_position(chain, joints[n], rotation, origin)

@@ -601,7 +601,8 @@ def _fitted(
             break
         coarse: set[tuple[int, int]] = set()
         for (first, i), (second, j) in near:
-            one, other = fits[first][i].excess, fits[second][j].excess
+            one = fits[first][i].excess
+            other = fits[second][j].excess
             if max(one, other) < LEAST_EXCESS:
                 raise ValueError(
                     f"the bodies {parsed.names[first]!r} and {parsed.names[second]!r} are "
@@ -643,7 +644,8 @@ def _near_capsules(
     found = []
     for (first, second), distance in distances.items():
         least = min(LEFT_SHARE * distance, LEFT_MOST)
-        one, other = model.body(parsed.names[first]), model.body(parsed.names[second])
+        one = model.body(parsed.names[first])
+        other = model.body(parsed.names[second])
         for i, j in itertools.product(range(int(one.geomnum[0])), range(int(other.geomnum[0]))):
             geoms = int(one.geomadr[0]) + i, int(other.geomadr[0]) + j
             if mujoco.mj_geomDistance(model, data, *geoms, 0.01, None) < least:
@@ -670,7 +672,9 @@ def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[Fi
         above = link - 1 if body in carriers else link
         if above:
             before = carriers[above - 1]
-            parent, axes, start = written[before], rest.xmat[before].reshape(3, 3), rest.xpos[before]
+            parent = written[before]
+            axes = rest.xmat[before].reshape(3, 3)
+            start = rest.xpos[before]
         written[body] = parent.add_body(
             name=parsed.names[body],
             pos=axes.T @ (rest.xpos[body] - start),
@@ -704,8 +708,11 @@ def _add_inertia(written: Any, model: mujoco.MjModel, body: int) -> None:
     largest = int(moments.argmax())
     moments[largest] = min(moments[largest], (1.0 - INERTIA_MARGIN) * (moments.sum() - moments[largest]))
     if model.body_mass[body] > 0.0:
-        written.mass, written.inertia, written.explicitinertial = model.body_mass[body], moments, True
-        written.ipos, written.iquat = model.body_ipos[body], model.body_iquat[body]
+        written.mass = model.body_mass[body]
+        written.inertia = moments
+        written.explicitinertial = True
+        written.ipos = model.body_ipos[body]
+        written.iquat = model.body_iquat[body]
 
 
 def _add_joint(written: Any, parsed: Parsed, index: int, ranges: Float) -> None:

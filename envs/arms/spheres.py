@@ -149,7 +149,8 @@ def grouped(
         spheres.append(np.column_stack((centre, radius)))
         first.append(first[-1] + len(centre))
         part.append(len(links) + len(part_balls))
-    every, around = np.concatenate(spheres), np.array(balls + part_balls)
+    every = np.concatenate(spheres)
+    around = np.array(balls + part_balls)
     return Spheres(
         centre=np.array(every[:, :3], order="C"),
         radius=np.array(every[:, 3], order="C"),

@@ -97,7 +97,8 @@ def _root(path: Path) -> ET.Element:
 
 def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
     """Replace an inertia that no body has by that of a ball of the same mass."""
-    inertia, mass = link.find("inertial/inertia"), link.find("inertial/mass")
+    inertia = link.find("inertial/inertia")
+    mass = link.find("inertial/mass")
     if inertia is None or mass is None:
         return
     xx, xy, xz, yy, yz, zz = (float(inertia.get(name, 0.0)) for name in INERTIA)

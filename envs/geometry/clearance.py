@@ -117,7 +117,9 @@ def group_clearance(
     place_group(spheres, group, placed)
     for sphere in range(spheres.first[group], spheres.first[group + 1]):
         radius = spheres.radius[sphere]
-        x, y, z = placed.centre[sphere, 0], placed.centre[sphere, 1], placed.centre[sphere, 2]
+        x = placed.centre[sphere, 0]
+        y = placed.centre[sphere, 1]
+        z = placed.centre[sphere, 2]
         distance = point_distance(obstacles, scene, row, x, y, z, time, least + radius) - radius
         if distance < least:
             least = distance
@@ -142,7 +144,9 @@ def nearest_obstacle(
 
     The arguments are those of :func:`obstacle_clearance`.
     """
-    x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
+    x = placed.ball[group, 0]
+    y = placed.ball[group, 1]
+    z = placed.ball[group, 2]
     size = spheres.ball_radius[group]
     for row in range(obstacles.kind.shape[1]):
         if obstacles.kind[scene, row] == ABSENT:
@@ -364,7 +368,8 @@ def _move(reach: Float, first: Float, second: Float, drift: float, spheres: Sphe
     for group in range(len(placed.apart)):
         placed.apart[group] -= way[spheres.link[group]] + drift
     for pair in range(len(placed.pair_apart)):
-        one, other = spheres.link[spheres.pairs[pair, 0]], spheres.link[spheres.pairs[pair, 1]]
+        one = spheres.link[spheres.pairs[pair, 0]]
+        other = spheres.link[spheres.pairs[pair, 1]]
         placed.pair_apart[pair] -= abs(way[other] - way[one])
 
 
@@ -403,7 +408,9 @@ def row_clearance(
     for group in range(len(spheres.link)):
         if spheres.link[group] < link:  # the base, or links that are not asked for
             continue
-        x, y, z = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
+        x = placed.ball[group, 0]
+        y = placed.ball[group, 1]
+        z = placed.ball[group, 2]
         size = spheres.ball_radius[group]
         if point_distance(obstacles, scene, row, x, y, z, time, least + size) - size < least:
             least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)

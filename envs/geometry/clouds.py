@@ -164,6 +164,7 @@ def split_clouds(clouds: Clouds) -> list[Clouds]:
     for i in range(len(clouds.radius)):
         points = clouds.points[clouds.first[i] : clouds.first[i + 1]]
         boxes = clouds.boxes[clouds.node[i] : clouds.node[i + 1]]
-        first, node = np.array([0, len(points)]), np.array([0, len(boxes)])
+        first = np.array([0, len(points)])
+        node = np.array([0, len(boxes)])
         found.append(Clouds(points, clouds.radius[i : i + 1], first, node, boxes))
     return found

@@ -48,7 +48,9 @@ def mesh_distance(
         height = _height(meshes, face, x, y, z)
         if height > highest:
             highest, top = height, face
-    nx, ny, nz = meshes.normals[top, 0], meshes.normals[top, 1], meshes.normals[top, 2]
+    nx = meshes.normals[top, 0]
+    ny = meshes.normals[top, 1]
+    nz = meshes.normals[top, 2]
     if highest <= 0.0 or highest > limit:  # inside, or a lower bound that is enough
         return highest, nx, ny, nz
     least = FAR * FAR
@@ -86,7 +88,9 @@ def _from_triangle(
     The foot of the perpendicular is the nearest point, unless it lies beyond an edge; then the nearest point is on
     such an edge.
     """
-    nx, ny, nz = meshes.normals[face, 0], meshes.normals[face, 1], meshes.normals[face, 2]
+    nx = meshes.normals[face, 0]
+    ny = meshes.normals[face, 1]
+    nz = meshes.normals[face, 2]
     least = FAR * FAR
     dx, dy, dz = height * nx, height * ny, height * nz
     for corner in range(3):
@@ -103,7 +107,9 @@ def _from_triangle(
             continue
         share = (px * ex + py * ey + pz * ez) / (ex * ex + ey * ey + ez * ez)
         share = min(max(share, 0.0), 1.0)
-        gx, gy, gz = px - share * ex, py - share * ey, pz - share * ez
+        gx = px - share * ex
+        gy = py - share * ey
+        gz = pz - share * ez
         square = gx * gx + gy * gy + gz * gz
         if square < least:
             least = square

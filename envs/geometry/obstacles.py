@@ -188,7 +188,8 @@ def unpack(obstacles: Obstacles, scene: int) -> list[Shape]:
     found = list[Shape]()
     quaternions = quaternions_of(obstacles.rotation[scene])
     for row in np.flatnonzero(obstacles.kind[scene] != ABSENT):
-        shape, size = SHAPES[obstacles.kind[scene, row]], obstacles.size[scene, row]
+        shape = SHAPES[obstacles.kind[scene, row]]
+        size = obstacles.size[scene, row]
         values: dict[str, Any] = {
             "position": obstacles.centre[scene, row],
             "quaternion": quaternions[row],
@@ -326,7 +327,9 @@ def obstacles_from_rows(rows: Float, kinds: Sequence[str]) -> Obstacles:
     if ((kind == POINT_CLOUD) | ((kind == MESH) & (table < 0))).any():
         raise ValueError("rows do not describe point clouds, and meshes without a name")
     values = rows[present][:, len(kinds) :].astype(np.float64)
-    centre, half, velocity = values[:, :3], values[:, 9:12], values[:, 12:15]
+    centre = values[:, :3]
+    half = values[:, 9:12]
+    velocity = values[:, 12:15]
     # Rows in single precision have axes that are not quite orthonormal.
     first = values[:, 3:6] / np.linalg.norm(values[:, 3:6], axis=-1, keepdims=True)
     third = np.cross(first, values[:, 6:9])  # orthogonal to the first whatever the second is

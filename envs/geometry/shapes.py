@@ -92,9 +92,13 @@ def cylinder_distance(radius: float, half_length: float, x: float, y: float, z: 
 @kernel
 def box_distance(a: float, b: float, c: float, x: float, y: float, z: float) -> Distance:
     """Return the signed distance of a point from a box with half lengths a, b and c, and its gradient."""
-    over_x, over_y, over_z = abs(x) - a, abs(y) - b, abs(z) - c
+    over_x = abs(x) - a
+    over_y = abs(y) - b
+    over_z = abs(z) - c
     nearest = max(over_x, over_y, over_z)
-    nx, ny, nz = max(over_x, 0.0), max(over_y, 0.0), max(over_z, 0.0)
+    nx = max(over_x, 0.0)
+    ny = max(over_y, 0.0)
+    nz = max(over_z, 0.0)
     outside = math.sqrt(nx * nx + ny * ny + nz * nz)
     distance = outside + min(nearest, 0.0)
     if outside < TINY:
@@ -151,7 +155,9 @@ def _distances(
 ) -> None:  # fmt: skip
     """Fill in the signed distances of points, shape (M, 3), from one shape."""
     for i in range(len(points)):
-        dx, dy, dz = points[i, 0] - position[0], points[i, 1] - position[1], points[i, 2] - position[2]
+        dx = points[i, 0] - position[0]
+        dy = points[i, 1] - position[1]
+        dz = points[i, 2] - position[2]
         x = rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz
         y = rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz
         z = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz

@@ -213,7 +213,9 @@ def _make_room(draft: Draft, scene: int) -> bool:
 
     If the obstacles of the layout belong together, none may touch an end.
     """
-    setting, obstacles, keep = draft.setting, draft.scenes.obstacles, draft.keep[scene]
+    setting = draft.setting
+    obstacles = draft.scenes.obstacles
+    keep = draft.keep[scene]
     place(setting.chain, setting.spheres, draft.scenes.start[scene], draft.at_start)
     place(setting.chain, setting.spheres, draft.scenes.goal[scene], draft.at_goal)
     count = 0
@@ -241,7 +243,9 @@ def _make_room(draft: Draft, scene: int) -> bool:
 @compiled
 def straight_movement(draft: Draft, scene: int) -> int:
     """Return what becomes of the straight movement: FREE, BLOCKED by an obstacle, or OUT_OF_REACH."""
-    setting, start, goal = draft.setting, draft.scenes.start[scene], draft.scenes.goal[scene]
+    setting = draft.setting
+    start = draft.scenes.start[scene]
+    goal = draft.scenes.goal[scene]
     placed, joints = draft.placed, np.empty(len(start))
     x, y, u, v = 0.0, 0.0, 0.0, 0.0
     if setting.of_hand:
@@ -351,7 +355,8 @@ def _tool_axes(approach: Float, cone: float, numbers: Float, axes: Float) -> Non
     cosine = 1.0 - (1.0 - np.cos(cone)) * numbers[0]
     sine = np.sqrt(max(1.0 - cosine * cosine, 0.0))
     angle = 2.0 * np.pi * numbers[1]
-    u, v = sine * np.cos(angle), sine * np.sin(angle)
+    u = sine * np.cos(angle)
+    v = sine * np.sin(angle)
     x = u * axes[0, 0] + v * axes[0, 1] + cosine * axes[0, 2]
     y = u * axes[1, 0] + v * axes[1, 1] + cosine * axes[1, 2]
     z = u * axes[2, 0] + v * axes[2, 1] + cosine * axes[2, 2]

@@ -42,7 +42,8 @@ def clutter(rng: np.random.Generator, room: Room) -> Layout:
     side = sign(rng)
     for row, numbers in enumerate(rng.random((count + spare, 7)).tolist()):
         along, across, kind, size, half, tilt, share = numbers
-        x, y = length * (0.2 + 0.6 * along), IN_THE_WAY * (2.0 * across - 1.0)
+        x = length * (0.2 + 0.6 * along)
+        y = IN_THE_WAY * (2.0 * across - 1.0)
         if row >= in_the_way:
             # Near to far in turns on both sides, so that together they close more ways around.
             side = -side
@@ -130,7 +131,8 @@ def oblique_bar(rng: np.random.Generator, room: Room) -> Layout:
         furniture.bar(x, y, heading + side, (gap, gap + _length(rng, room)), half_width)
     if not room.tall:
         shift = sign(rng) * between(rng, 0.07, 0.12)
-        x, y = x - shift * math.sin(heading), y + shift * math.cos(heading)
+        x = x - shift * math.sin(heading)
+        y = y + shift * math.cos(heading)
         furniture.bar(x, y, heading, (gap, gap + _length(rng, room)), half_width)
     return furniture.layout()
 
@@ -183,7 +185,8 @@ def _passage(rng: np.random.Generator, furniture: Furniture, length: float) -> t
 def _along_line(rng: np.random.Generator, room: Room) -> tuple[Furniture, float]:
     """Return furniture with start and goal of the hand only, and their distance, [m]."""
     start, goal = _ends(rng, room)
-    x, y = goal[0] - start[0], goal[1] - start[1]
+    x = goal[0] - start[0]
+    y = goal[1] - start[1]
     length = math.hypot(x, y)
     furniture = Furniture(room, start[0], start[1], math.atan2(y, x))
     furniture.start((0.0, 0.0, 0.0))
@@ -212,7 +215,8 @@ def _within_reach(one: Point, other: Point) -> bool:
         return False
     if math.hypot(*one) > REACH[1] or math.hypot(*other) > REACH[1]:
         return False
-    x, y = other[0] - one[0], other[1] - one[1]
+    x = other[0] - one[0]
+    y = other[1] - one[1]
     foot = -(one[0] * x + one[1] * y) / (x * x + y * y)
     foot = min(max(foot, 0.0), 1.0)
     return math.hypot(one[0] + foot * x, one[1] + foot * y) > REACH[0]

@@ -23,7 +23,8 @@ THING_RADIUS, THING_HALF_HEIGHT = (0.02, 0.05), (0.04, 0.12)  # Sizes of things 
 def shelf(rng: np.random.Generator, room: Room) -> Layout:
     """Return a shelf of up to four compartments, closed or with posts, with things in it."""
     furniture = _in_front(rng, room, 0.35, 0.65)
-    half_depth, half_width = between(rng, 0.12, 0.30), between(rng, 0.25, 0.55)
+    half_depth = between(rng, 0.12, 0.30)
+    half_width = between(rng, 0.25, 0.55)
     compartments = min(1 + int(4 * rng.random()), room.most - 3)  # a board more, and two walls
     gap, lowest = between(rng, 0.22, 0.42), between(rng, -0.30, 0.45)
     for board in range(compartments + 1):
@@ -55,7 +56,8 @@ def table(rng: np.random.Generator, room: Room) -> Layout:
     """Return a table with things on it; one reaches over it and under it."""
     furniture = _in_front(rng, room, 0.30, 0.50)
     height = between(rng, 0.05, 0.50)
-    half_depth, half_width = between(rng, 0.2, 0.5), between(rng, 0.4, 0.8)
+    half_depth = between(rng, 0.2, 0.5)
+    half_width = between(rng, 0.4, 0.8)
     furniture.box((half_depth, 0.0, height), (half_depth, half_width, THICKNESS))
     if furniture.left > 6:  # four legs, the floor and things
         for x in (0.03, 2.0 * half_depth - 0.03):
@@ -73,7 +75,8 @@ def table(rng: np.random.Generator, room: Room) -> Layout:
 def bin_(rng: np.random.Generator, room: Room) -> Layout:
     """Return an open box with things in it; one reaches into it from above, or waits above it."""
     furniture = _in_front(rng, room, 0.25, 0.45)
-    half_depth, half_width = between(rng, 0.14, 0.30), between(rng, 0.14, 0.35)
+    half_depth = between(rng, 0.14, 0.30)
+    half_width = between(rng, 0.14, 0.35)
     half_height = between(rng, 0.06, 0.16)
     lowest = between(rng, 0.0, 0.35) if rng.random() < 0.6 else between(rng, -0.3, 0.0)
     middle = lowest + half_height
@@ -95,8 +98,10 @@ def bin_(rng: np.random.Generator, room: Room) -> Layout:
 def cage(rng: np.random.Generator, room: Room) -> Layout:
     """Return a box that is open towards the arm but for bars; one reaches between them."""
     furniture = _in_front(rng, room, 0.30, 0.50, twist=0.3)
-    half_depth, half_width = between(rng, 0.2, 0.38), between(rng, 0.25, 0.42)
-    half_height, middle = between(rng, 0.25, 0.42), between(rng, 0.30, 0.65)
+    half_depth = between(rng, 0.2, 0.38)
+    half_width = between(rng, 0.25, 0.42)
+    half_height = between(rng, 0.25, 0.42)
+    middle = between(rng, 0.30, 0.65)
     lowest, highest = middle - half_height, middle + half_height
     furniture.box((half_depth, 0.0, lowest), (half_depth, half_width, THICKNESS))
     _walls(furniture, half_depth, half_width, middle, half_height)
@@ -115,7 +120,8 @@ def cage(rng: np.random.Generator, room: Room) -> Layout:
 def wall_window(rng: np.random.Generator, room: Room) -> Layout:
     """Return a wall with a window through which one reaches."""
     furniture = _in_front(rng, room, 0.35, 0.55, twist=0.3)
-    half_width, half_height = between(rng, 0.14, 0.22), between(rng, 0.13, 0.20)
+    half_width = between(rng, 0.14, 0.22)
+    half_height = between(rng, 0.13, 0.20)
     y, z = centred(rng, 0.15), between(rng, 0.3, 0.6)
     far = between(rng, 0.2, 0.4)
     for side in (-1.0, 1.0):
@@ -131,7 +137,8 @@ def wall_window(rng: np.random.Generator, room: Room) -> Layout:
 def gate(rng: np.random.Generator, room: Room) -> Layout:
     """Return two posts with a lintel on them; one reaches between the posts, or stands beside them."""
     furniture = _in_front(rng, room, 0.35, 0.60)
-    half_width, height = between(rng, 0.14, 0.24), between(rng, 0.35, 0.85)
+    half_width = between(rng, 0.14, 0.24)
+    height = between(rng, 0.35, 0.85)
     radius = between(rng, 0.02, 0.05)
     round_posts = "cylinder" in room.kinds and rng.random() < 0.5
     for y in (-half_width - radius, half_width + radius):
@@ -153,8 +160,10 @@ def gate(rng: np.random.Generator, room: Room) -> Layout:
 def tunnel(rng: np.random.Generator, room: Room) -> Layout:
     """Return a passage between two walls under a roof; one reaches into it."""
     furniture = _in_front(rng, room, 0.30, 0.55)
-    half_depth, half_width = between(rng, 0.12, 0.28), between(rng, 0.13, 0.22)
-    half_height, middle = between(rng, 0.12, 0.20), between(rng, 0.20, 0.60)
+    half_depth = between(rng, 0.12, 0.28)
+    half_width = between(rng, 0.13, 0.22)
+    half_height = between(rng, 0.12, 0.20)
+    middle = between(rng, 0.20, 0.60)
     _walls(furniture, half_depth, half_width, middle, half_height)
     for height in (middle - half_height, middle + half_height):
         furniture.box((half_depth, 0.0, height), (half_depth, half_width, THICKNESS))
@@ -173,7 +182,8 @@ def clutter(rng: np.random.Generator, room: Room) -> Layout:
         return furniture.layout()
     kinds = room.allowed("sphere", "capsule", "cylinder", "box")
     for _ in range(count + 2 + count // 2):
-        bearing, distance = between(rng, *room.turn), between(rng, 0.25, 0.75)
+        bearing = between(rng, *room.turn)
+        distance = between(rng, 0.25, 0.75)
         height = between(rng, 0.05, 0.85)
         centre = (distance * math.cos(bearing), distance * math.sin(bearing), height)
         _separate(rng, furniture, kinds[int(len(kinds) * rng.random())], centre)
@@ -185,8 +195,10 @@ def clutter(rng: np.random.Generator, room: Room) -> Layout:
 
 def _in_front(rng: np.random.Generator, room: Room, near: float, far: float, twist: float = 0.5) -> Furniture:
     """Return furniture without parts whose front is somewhere around the arm, at a distance from it."""
-    bearing, distance = between(rng, *room.turn), between(rng, near, far)
-    x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+    bearing = between(rng, *room.turn)
+    distance = between(rng, near, far)
+    x = distance * math.cos(bearing)
+    y = distance * math.sin(bearing)
     return Furniture(room, x, y, bearing + centred(rng, twist))
 
 
@@ -204,8 +216,10 @@ def _things(
     """Add things that stand on a board, as many as there are rows left for."""
     kinds = [kind for kind in ("cylinder", "box") if kind in furniture.room.kinds]
     for _ in range(min(count, furniture.left)):
-        half_height, radius = between(rng, *THING_HALF_HEIGHT), between(rng, *THING_RADIUS)
-        x, y = depth * between(rng, 0.1, 0.9), centred(rng, 0.85 * half_width)
+        half_height = between(rng, *THING_HALF_HEIGHT)
+        radius = between(rng, *THING_RADIUS)
+        x = depth * between(rng, 0.1, 0.9)
+        y = centred(rng, 0.85 * half_width)
         centre = (x, y, board + THICKNESS + half_height)
         if kinds[int(len(kinds) * rng.random())] == "cylinder":
             furniture.cylinder(centre, radius, half_height)

@@ -175,7 +175,8 @@ class Furniture:
         self, centre: Vector, radius: float, half_length: float, heading: float, rise: float = 0.0
     ) -> None:
         """Add a capsule whose axis has a heading and rises by an angle from the horizontal."""
-        c, s = math.cos(self._yaw + heading), math.sin(self._yaw + heading)
+        c = math.cos(self._yaw + heading)
+        s = math.sin(self._yaw + heading)
         u, v = math.cos(rise), math.sin(rise)
         # Columns: horizontal axis across, the third axis times it, and the axis of the capsule.
         rotation = (-s, -v * c, u * c, c, -v * s, u * s, 0.0, u, v)

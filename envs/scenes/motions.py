@@ -175,8 +175,10 @@ def _jump(draft: Draft, start: Float, before: Float, u: Float, target: Float) ->
         return True
     x, y, _ = tool_position(setting.chain, before, placed.rotation, placed.origin)
     a, b, _ = tool_position(setting.chain, start, placed.rotation, placed.origin)
-    length, angle = _mixed(JUMP_OF_HAND, u[0]), 2.0 * np.pi * u[1]
-    to_x, to_y = x + length * np.cos(angle), y + length * np.sin(angle)
+    length = _mixed(JUMP_OF_HAND, u[0])
+    angle = 2.0 * np.pi * u[1]
+    to_x = x + length * np.cos(angle)
+    to_y = y + length * np.sin(angle)
     # The hand is between the start and the target before: its way is between the ways from there.
     for k in range(PASSED + 1):
         share = k / PASSED

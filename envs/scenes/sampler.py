@@ -278,7 +278,8 @@ def room_of(arm: Arm, kinds: tuple[str, ...], n_obstacles: tuple[int, int], tall
 def _links(arm: Arm, scale: float) -> tuple[float, float]:
     """Return the lengths of the links of an arm in the plane, see :class:`Room`."""
     _, origin = link_poses(arm.chain, planar_joints(arm, arm.hand(arm.home)[:2]))
-    upper, fore = origin[2] - origin[1], arm.hand(arm.home) - origin[2]
+    upper = origin[2] - origin[1]
+    fore = arm.hand(arm.home) - origin[2]
     left = upper[0] * fore[1] - upper[1] * fore[0] < 0.0
     lengths = float(norm(upper[:2])) / scale, float(norm(fore[:2])) / scale
     return -lengths[0] if left else lengths[0], lengths[1]

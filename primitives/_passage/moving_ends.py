@@ -106,7 +106,8 @@ class _Expansion:
         step = u
         for _ in range(_STEPS):
             r, dr, ddr = (evaluate(path, u[:, None]) for path in paths)
-            square, change = ordered_sum(r * r, 1), ordered_sum(r * dr, 1)
+            square = ordered_sum(r * r, 1)
+            change = ordered_sum(r * dr, 1)
             w, b = evaluate(weight, u), evaluate(both, u)
             value = square * w - b * change
             slope = square * evaluate(differentiate(weight), u) - b * ordered_sum(dr * dr + r * ddr, 1)
@@ -187,7 +188,8 @@ def _expand(points: Floats, ends: list[Any], slack: Floats, *, from_goal: bool) 
     first, via, last = (points[:, k] for k in range(3))
     states = [ends[:2], ends[2:]]
     if from_goal:
-        powers, g = (q, 5), np.polynomial.Polynomial(g)(np.polynomial.Polynomial([1.0, -1.0])).coef
+        powers = (q, 5)
+        g = np.polynomial.Polynomial(g)(np.polynomial.Polynomial([1.0, -1.0])).coef
         first, last = last, first
         states = [[-v if isinstance(v, np.ndarray) else v, a] for v, a in reversed(states)]
     free = connect(np, 3, np.stack([first, last], axis=1), np.ones(1), states)

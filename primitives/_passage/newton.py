@@ -151,13 +151,16 @@ def _minimise(cost: PassageCost, start: Floats) -> tuple[Floats, Floats, Any]:
     result = value.copy()
     for _ in range(_ITERATIONS):
         step = _descent_step(gradient, hessian)
-        size, gain = np.abs(step).max(axis=0), -ordered_sum(gradient * step)
+        size = np.abs(step).max(axis=0)
+        gain = -ordered_sum(gradient * step)
         last = size < _CONVERGED_STEP
         z[:, active[last]] += step[:, last]
         # Where waypoints are equal within their tolerance the cost is flat: no step counts.
         done = last | ((gain < _SMALL_GAIN) & (size > _LARGE_STEP))
         converged[active[done]] = True
-        active, step, gain = active[~done], step[:, ~done], gain[~done]
+        active = active[~done]
+        step = step[:, ~done]
+        gain = gain[~done]
         if not active.size:
             break
         state = value[~done], gradient[:, ~done], hessian[..., ~done]
@@ -188,7 +191,10 @@ def _search(
     """
     slope = ordered_sum(gradient * step)
     origin, first = z, value
-    z, value, gradient, hessian = z.copy(), value.copy(), gradient.copy(), hessian.copy()
+    z = z.copy()
+    value = value.copy()
+    gradient = gradient.copy()
+    hessian = hessian.copy()
     waiting = np.arange(z.shape[1])
     length = 1.0
     for _ in range(_HALVINGS):

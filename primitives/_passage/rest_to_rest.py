@@ -60,11 +60,14 @@ def fractions_at_rest(points: Any) -> Any:
     Each pair adds up to 1; the smaller one has full relative accuracy. A via-point on the start or goal has fraction 0.
     """
     places = np.ascontiguousarray(points.transpose(1, 2, 0))
-    legs, whole = places[1:] - places[:-1], places[2] - places[0]
+    legs = places[1:] - places[:-1]
+    whole = places[2] - places[0]
     first, second = ordered_sum(legs.swapaxes(0, 1) ** 2)
     is_late = second < first
     near = np.where(is_late, legs[1], legs[0])
-    a, b, c = ordered_sum(near * whole), ordered_sum(whole * whole), np.minimum(first, second)
+    a = ordered_sum(near * whole)
+    b = ordered_sum(whole * whole)
+    c = np.minimum(first, second)
     # A batch of one would spend its time in the overhead of array operations: Python floats give the same bits.
     arguments = (a, b, c) if len(points) > 1 else (a.item(), b.item(), c.item(), _FLOATS)
     t = nearer_fraction(*arguments)
@@ -96,7 +99,9 @@ def _residual(t: Number, a: Number, b: Number, c: Number) -> tuple[Number, Numbe
     """Return F of Eq. 1, dF/dt, and s, q and w."""
     square = t * t
     cube = square * t
-    s, q, w = 1.0 - 2.0 * t, cube * (10.0 + t * (6.0 * t - 15.0)), cube * (2.0 - t)
+    s = 1.0 - 2.0 * t
+    q = cube * (10.0 + t * (6.0 * t - 15.0))
+    w = cube * (2.0 - t)
     dw = square * (6.0 - 4.0 * t)
     dq = 30.0 * square * ((1.0 - t) * (1.0 - t))
     m = a * s + b * w
@@ -129,7 +134,9 @@ def _root_rates(points: Any, fractions: Any) -> tuple[tuple[Any, Any, Any], Any]
     t = fractions.min(axis=-1)
     near = np.where(is_late, goal - via, via - start)
     whole = goal - start
-    a, b, c = ordered_sum(near * whole), ordered_sum(whole * whole), ordered_sum(near * near)
+    a = ordered_sum(near * whole)
+    b = ordered_sum(whole * whole)
+    c = ordered_sum(near * near)
     _, slope, (s, q, w) = _residual(t, a, b, c)
     extent = b + c
     floor = _FLOOR ** (5.0 / 3.0) * extent + (extent <= 0)  # |dF/dt| falls like |E|^(5/3)

@@ -183,7 +183,8 @@ def find_model(source: str | Path) -> Path:
     Raises:
         ValueError: It is none of them.
     """
-    folder, known = Path(source).expanduser(), ", ".join(SHIPPED_IDS)
+    folder = Path(source).expanduser()
+    known = ", ".join(SHIPPED_IDS)
     if str(source) in SHIPPED_IDS:
         return SHIPPED / folder.name
     if str(source) in gym.registry:

@@ -98,7 +98,8 @@ class SceneExtractor(BaseFeaturesExtractor):
         ranges = observation["ranges"]
         points = observation["points"].reshape(len(ranges), -1, 3)
         step = -(-points.shape[1] // MOST_POINTS)  # of a large image, evenly spaced points
-        points, hit = points[:, ::step], (ranges[:, ::step] < self.most - 1e-4).to(ranges.dtype)
+        points = points[:, ::step]
+        hit = (ranges[:, ::step] < self.most - 1e-4).to(ranges.dtype)
         place = POSITION_SCALE * _turned(axes[:, None], points - origin[:, None])
         about = ends[:, None].expand(-1, points.shape[1], -1)
         encoded = self.each(torch.cat((place, about), dim=-1)) * hit[..., None]

@@ -107,10 +107,12 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
         BadFileError: A file is missing, torn, foreign, or says something that is not allowed.
         ValueError: The environment is another one than the agent needs.
     """
-    path, tensors = folder / "model.json", folder / "weights.safetensors"
+    path = folder / "model.json"
+    tensors = folder / "weights.safetensors"
     record = read_json(path, LARGEST_MODEL_JSON)
     if record.get("format") != FORMAT:
-        found, mine = record.get("format"), importlib.metadata.version("viapoint")
+        found = record.get("format")
+        mine = importlib.metadata.version("viapoint")
         writer = f"was written by viapoint {record.get('viapoint')} and this is {mine}"
         raise BadFileError(path, f"must have format {FORMAT}, got {found!r}; it {writer}")
     arrays = read_arrays(tensors, LARGEST_WEIGHTS)
@@ -192,7 +194,8 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
     hinted: Any = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
     hints = typing.get_type_hints(hinted, localns={"VecEnv": object})
     for name, value in values.items():
-        number, hint = value.item() if isinstance(value, np.generic) else value, hints.get(name, Any)
+        number = value.item() if isinstance(value, np.generic) else value
+        hint = hints.get(name, Any)
         try:
             check_type(number, hint)
         except TypeCheckError as error:

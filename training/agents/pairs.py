@@ -84,7 +84,8 @@ def pairs_of(
     given = Given(setting, moves, obstacles, *bounding_boxes(obstacles))
     features = np.zeros((number, plans, NEAREST, LENGTHS + len(task.shapes)), np.float32)
     gaps = np.full((number, plans, NEAREST), NOWHERE)
-    least, inside = np.full((number, plans), CLEAR), np.ones((number, plans), np.bool_)
+    least = np.full((number, plans), CLEAR)
+    inside = np.ones((number, plans), np.bool_)
     _gather(given, columns, instants, late, features, gaps, least, inside)
     return Pairs(
         torch.from_numpy(features),
@@ -242,7 +243,8 @@ def _gather(
     work = Work(memory.position, memory.joints, memory.placed, np.empty((3, 3)), np.empty(3))
     placed, local = memory.placed, work.local
     gap = np.empty((2, rows, groups))
-    nearest_sphere, nearest_instant = np.empty(gap.shape, np.int64), np.empty(gap.shape, np.int64)
+    nearest_sphere = np.empty(gap.shape, np.int64)
+    nearest_instant = np.empty(gap.shape, np.int64)
     for b in range(number):
         for h in range(plans):
             gap[:] = NOWHERE
@@ -287,7 +289,8 @@ def _gather(
                 if row < 0:
                     break
                 gap[rounded, row, group] = NOWHERE
-                sphere, instant = nearest_sphere[rounded, row, group], nearest_instant[rounded, row, group]
+                sphere = nearest_sphere[rounded, row, group]
+                instant = nearest_instant[rounded, row, group]
                 _place_sphere(given, b, h, row, group, sphere, instant, work, work.places[1])
                 if pair < REFINED and inside[b, h]:
                     _go_closest(given, b, h, row, group, sphere, instant, last, rounded, work)
@@ -321,7 +324,8 @@ class PairNetwork(nn.Module):
 
     def forward(self, pairs: Pairs) -> Tensor:
         """Return the margin of each movement, shape (B, H), [m]; NO_OBSTACLE for scenes without obstacles."""
-        lengths, kind = pairs.features[..., :LENGTHS], pairs.features[..., LENGTHS:]
+        lengths = pairs.features[..., :LENGTHS]
+        kind = pairs.features[..., LENGTHS:]
         values = self.layers(torch.cat((SCALE * lengths, kind), dim=-1))[..., 0]
         values = values + self.nearness[0] * (pairs.distance / UNIT) + self.nearness[1]
         least = torch.where(pairs.present, values * UNIT, NO_OBSTACLE).amin(dim=-1)

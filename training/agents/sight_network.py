@@ -160,7 +160,8 @@ class SightNetwork(nn.Module):
         image = self.of_pixel(image)
         columns = image.shape[-1]
         features = image.flatten(2).transpose(1, 2)  # (B, pixels, features)
-        row, column = inputs.pixel // self.columns, inputs.pixel % self.columns
+        row = inputs.pixel // self.columns
+        column = inputs.pixel % self.columns
         pixel = (row // self.stride) * columns + column // self.stride
         first = torch.arange(len(pixel), device=pixel.device)[:, None, None] * features.shape[1]
         there = functional.embedding(first + pixel, features.flatten(0, 1))

@@ -115,7 +115,8 @@ class ViaRankPolicy(PlanPolicy):
 
     def assess(self, observation: Observation) -> tuple[Float, Float]:
         """Return the best actions of B observations, shape (B, m), and their predicted success, shape (B,)."""
-        problem, sight = Problem.of_observation(observation, self.task), Sight.of(observation, self.task)
+        problem = Problem.of_observation(observation, self.task)
+        sight = Sight.of(observation, self.task)
         actions, success = self.best(problem, sight)
         slope, offset = self.network.calibration.tolist()
         return actions, expit(slope * logit(success) + offset)
@@ -136,7 +137,8 @@ class ViaRankPolicy(PlanPolicy):
                 refined = refined_actions(self.task, there, seeds)
                 more, sure = self.rank(there, some, refined)
                 actions = np.concatenate((actions, refined), axis=1)
-                value, likely = np.concatenate((value, more), axis=1), np.concatenate((likely, sure), axis=1)
+                value = np.concatenate((value, more), axis=1)
+                likely = np.concatenate((likely, sure), axis=1)
             best = np.arange(len(value)), value.argmax(axis=1)
             chosen.append(actions[best])
             success.append(likely[best])
@@ -265,7 +267,8 @@ class ViaRank(PlanAlgorithm):
         observation: Any = self._last_obs
         candidates = self._candidates(n_envs)
         task = self.policy.task
-        problem, sight = Problem.of_observation(observation, task), Sight.of(observation, task)
+        problem = Problem.of_observation(observation, task)
+        sight = Sight.of(observation, task)
         value, _ = self.policy.rank(problem, sight, candidates)
         actions = candidates[np.arange(n_envs), value.argmax(axis=1)]
         return actions, actions
@@ -297,7 +300,8 @@ class ViaRank(PlanAlgorithm):
         """Return new scenes as they are, as they are believed to be, and what is seen of them."""
         scenes = self._sampler([np.random.default_rng(seed) for seed in seeds])
         task = self.policy.task
-        truth, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
+        truth = Problem.of_scenes(scenes, task)
+        sight = Sight.of_scenes(scenes, task)
         return truth, truth._replace(obstacles=thick_points(task, sight)), sight
 
     @torch.no_grad()

@@ -52,7 +52,8 @@ def mcnemar(first: ArrayLike, second: ArrayLike) -> Comparison:
     both are equally likely, b is binomial(b + c, 1/2). Source: McNemar 1947, Psychometrika 12, 153-157.
     """
     a, b = np.asarray(first), np.asarray(second)
-    only_first, only_second = int((a > b).sum()), int((b > a).sum())
+    only_first = int((a > b).sum())
+    only_second = int((b > a).sum())
     differing = only_first + only_second
     return Comparison(
         difference=float(a.mean() - b.mean()),

@@ -241,7 +241,10 @@ class Arena:
         aside = np.array([-line[1], line[0], 0.0]) / max(float(np.hypot(line[0], line[1])), 1e-9)
         if aside @ middle < 0.0:
             aside = -aside
-        shape, sides, least, others = self.new_shapes()[name], [aside, -aside], 0.02, scene.obstacles
+        shape = self.new_shapes()[name]
+        sides = [aside, -aside]
+        least = 0.02
+        others = scene.obstacles
         if name == "wall":  # others may stand in it
             shape, sides, least, others = ve.HalfSpace.facing(-aside), [aside], 0.17, ()
         for way, side in itertools.product(least + 0.02 * np.arange(20), sides):

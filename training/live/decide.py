@@ -194,7 +194,8 @@ def play(
             here = env.task.space.coordinates(rollout.joints[-1])
             if not moved or not decision.info["is_success"][0] or np.abs(here - goal).max() < NEXT_START:
                 return
-            places, rest = scenes.obstacles_at(rollout.time[-1:]).centre[0], np.zeros(3)
+            places = scenes.obstacles_at(rollout.time[-1:]).centre[0]
+            rest = np.zeros(3)
             resting = [
                 dataclasses.replace(shape, position=place, velocity=rest)
                 for shape, place in zip(scene.obstacles, places, strict=False)
@@ -245,7 +246,8 @@ def describe_outcome(info: Mapping[str, Any], in_joints: bool) -> str:
         return f"Failure: the arm touches something after {values['first_contact_time']:.2f} s."
     if not values["reachable"]:
         return "Failure: the plan leaves the arm's reach."
-    clearance, error = 1e3 * values["min_clearance"], 1e3 * values["goal_error"]
+    clearance = 1e3 * values["min_clearance"]
+    error = 1e3 * values["goal_error"]
     near = "" if clearance >= 999.0 * FAR else f", least clearance {clearance:.0f} mm"
     state = "Success: at rest" if values["is_success"] else "Failure:"
     return f"{state} {error:.1f} {'mrad' if in_joints else 'mm'} from the goal after {values['duration']:.2f} s{near}."

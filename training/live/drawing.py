@@ -59,7 +59,8 @@ def tube(points: Float, radius: float) -> Any:
     extents = np.pad(radius * ring, ((1, 1), (0, 0), (0, 0)))
     vertices = np.pad(points, ((1, 1), (0, 0)), mode="edge")[:, None] + extents
     first = SIDES * np.arange(len(points) + 1)[:, None]
-    here, there = first + np.arange(SIDES), first + (np.arange(SIDES) + 1) % SIDES
+    here = first + np.arange(SIDES)
+    there = first + (np.arange(SIDES) + 1) % SIDES
     faces = np.stack((here, there, there + SIDES, here, there + SIDES, here + SIDES), axis=-1)
     return trimesh.Trimesh(vertices.reshape(-1, 3), faces.reshape(-1, 3), process=False)
 
@@ -126,7 +127,8 @@ class ArmDrawing:
 
 def _first_anchor(model: mujoco.MjModel, arm: Arm) -> Float:
     """Return the place of the first joint in a model, [m]."""
-    data, joint = mujoco.MjData(model), model.joint(arm.joint_names[0])
+    data = mujoco.MjData(model)
+    joint = model.joint(arm.joint_names[0])
     data.qpos[joint.qposadr[0]] = 0.0
     mujoco.mj_kinematics(model, data)
     return np.array(data.xanchor[joint.id])
@@ -145,7 +147,8 @@ class View:
         self._nodes: dict[str, Any] = {}
         self._drawn: dict[str, tuple[Any, ...]] = {}
         self._grab = np.zeros(3)
-        lines, centre = (214, 214, 218), (-0.03, 0.35) if self._planar else (0.0, 0.0)
+        lines = (214, 214, 218)
+        centre = (-0.03, 0.35) if self._planar else (0.0, 0.0)
         self._scene.add_grid(
             "/grid", 2.0, 2.0, position=(*centre, self._floor), cell_size=0.1, section_size=0.1,
             cell_color=lines, section_color=lines, section_thickness=1.0, shadow_opacity=0.0,
@@ -177,7 +180,8 @@ class View:
     def draw(self, state: State) -> None:
         """Draw the scene, the plans and the movement; only what has changed is sent."""
         arena, scene, movement, plan = self._arena, state.scene, state.movement, state.plan
-        joints, places = arena.task.space.joints(scene.start), [shape.position for shape in scene.obstacles]
+        joints = arena.task.space.joints(scene.start)
+        places = [shape.position for shape in scene.obstacles]
         done = []
         if movement is not None:
             rollout, now = movement.rollout, state.instant
@@ -199,9 +203,11 @@ class View:
         self._draw_rings(state, goal)
         if plan is None:
             return
-        planned, vias = [self._line(plan)], arena.tool(plan.waypoints[1:-1])
+        planned = [self._line(plan)]
+        vias = arena.tool(plan.waypoints[1:-1])
         if movement is not None and movement.plan is not None and arena.task.replanning:
-            planned, vias = [(arena.path(movement.plan), PALETTE.plan)], vias[:0]
+            planned = [(arena.path(movement.plan), PALETTE.plan)]
+            vias = vias[:0]
         pale = []
         for each in state.proposals if len(state.proposals) > 1 else ():
             path, colour = self._line(each.motion)
@@ -225,7 +231,8 @@ class View:
         self._rings.visible = state.turning and (shape is not None or not self._planar)
         if self._rings.visible:
             turn = self._arena.orientation(state.scene.goal) if shape is None else shape.quaternion
-            self._rings.wxyz, self._rings.position = turn, goal if shape is None else shape.position
+            self._rings.wxyz = turn
+            self._rings.position = goal if shape is None else shape.position
 
     def _draw_arm(self, name: str, joints: Float) -> None:
         if self._is_new(name, joints):
@@ -309,7 +316,9 @@ class View:
 
     def _mesh(self, key: str, mesh: Any, colour: Any, opacity: float | None = None) -> None:
         """Add a mesh, or change the one of this name."""
-        vertices, faces, node = np.float32(mesh.vertices), np.uint32(mesh.faces), self._nodes.get(key)
+        vertices = np.float32(mesh.vertices)
+        faces = np.uint32(mesh.faces)
+        node = self._nodes.get(key)
         if node is not None:
             node.vertices, node.faces, node.color = vertices, faces, _rgb(colour)
             return
@@ -347,10 +356,12 @@ class View:
 
     def _dragged(self, event: Any, kind: str, number: int, normal: Float) -> None:
         """Tell the new position of a node: where the pointer's ray meets the plane in which it moves."""
-        eye, place = np.asarray(event.client.camera.position), np.asarray(event.target.position)
+        eye = np.asarray(event.client.camera.position)
+        place = np.asarray(event.target.position)
         if event.phase == "start":
             self._grab = np.asarray(event.start_position) - place
-        ray, through = np.asarray(event.end_position) - eye, place + self._grab
+        ray = np.asarray(event.end_position) - eye
+        through = place + self._grab
         slope = float(normal @ ray)
         share = float(normal @ (through - eye)) / slope if abs(slope) > 1e-6 else 0.0
         if share <= 0.0:

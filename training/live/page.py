@@ -294,7 +294,8 @@ class Tab:
             state = dataclasses.replace(
                 self.state, method=left[0], n_via=None, by_hand=None, duration=None, before=None
             )
-            state.proposals, state.picked = (decide(self.arena, state, time_limit=1.0),), 0
+            state.proposals = (decide(self.arena, state, time_limit=1.0),)
+            state.picked = 0
             *_, movement = execute(self.arena, state)
             self.compare((*done, (left[0], state.proposals[0].seconds, movement)))
 
@@ -316,7 +317,8 @@ class Tab:
     def save_picture(self) -> None:
         """Save a picture of the present view, rendered by the browser, as a PNG file on white."""
         picture = Image.fromarray(self.client.get_render(800, 1280, transport_format="png", timeout=20.0))
-        ground, file = Image.new("RGBA", picture.size, "white"), io.BytesIO()
+        ground = Image.new("RGBA", picture.size, "white")
+        file = io.BytesIO()
         ground.alpha_composite(picture.convert("RGBA"))
         ground.convert("RGB").save(file, "PNG")
         self.client.send_file_download("viapoint.png", file.getvalue(), save_immediately=True)

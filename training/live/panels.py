@@ -51,7 +51,9 @@ class Panels:
 
     def draw(self, state: State) -> None:
         """Show what was decided, and set the controls."""
-        remark, limit, plan = state.origin, self._arena.limit(state.scene), state.plan
+        remark = state.origin
+        limit = self._arena.limit(state.scene)
+        plan = state.plan
         if limit and state.method == AGENT:
             remark += f" The agent was trained {limit}, so the geometry search decides."
         message = MESSAGE.format("#1b7f4b" if state.good else "#c4202b", html.escape(state.message))
@@ -103,7 +105,8 @@ class Panels:
             executed["speed"] = norm(np.gradient(rollout.hand, time, axis=0))
             executed["clearance"] = rollout.clearance
         for name, plot in self._plots.items():
-            planned, other = np.interp(time, profile["time"], profile[name]), np.full(len(time), np.nan)
+            planned = np.interp(time, profile["time"], profile[name])
+            other = np.full(len(time), np.nan)
             other[0] = planned[0]  # a line without numbers would leave the plot empty
             lines = [planned, executed.get(name, other)]
             if name == "clearance":  # in millimetres, where it is small
@@ -115,7 +118,8 @@ class Panels:
         for name, seconds, movement in state.results:
             info = {key: value[0] for key, value in movement.info.items()}
             success = "yes" if info["is_success"] else "no"
-            clearance, jerk = _millimetres(info["min_clearance"]), _number(info["jerk_ratio"])
+            clearance = _millimetres(info["min_clearance"])
+            jerk = _number(info["jerk_ratio"])
             rows.append((name, success, _number(movement.reward), clearance, jerk, f"{1e3 * seconds:.0f}"))
         names = "method", "success", "reward", "clearance [mm]", "jerk", "decided in [ms]"
         note = "Each row is simulated. Jerk is relative to the straight movement."

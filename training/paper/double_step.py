@@ -163,10 +163,12 @@ def _hands_apart(motion: SimulatedMovements) -> float:
 
 def _jump(movement: DoubleStep) -> float:
     """Return the greatest jump of position, velocity and acceleration at the revision, relative to their peaks."""
-    now, time = np.array([movement.moment]), np.linspace(0.0, movement.arrival, 501)
+    now = np.array([movement.moment])
+    time = np.linspace(0.0, movement.arrival, 501)
     jumps = []
     for nu in range(3):
-        before, scale = movement.first(now, nu), np.abs(movement.first(time, nu)).max()
+        before = movement.first(now, nu)
+        scale = np.abs(movement.first(time, nu)).max()
         for after in (movement.superposed(now, nu), movement.planned(now, nu)):
             jumps.append(float(np.abs(after - before).max() / scale))
     return max(jumps)
@@ -221,7 +223,8 @@ def _replanned(times: int) -> float:
     whole = straight("T1", "T4", 0.8)
     plan, begun, apart = whole, 0.0, 0.0
     for now in np.linspace(0.0, 0.75, times + 1)[1:]:
-        plan, begun = retarget(plan, now - begun, TARGETS["T4"], 0.8 - begun), now
+        plan = retarget(plan, now - begun, TARGETS["T4"], 0.8 - begun)
+        begun = now
         ahead = np.linspace(now, 0.8, 11)
         apart = max(apart, float(np.abs(plan(ahead - now) - whole(ahead)).max()))
     return apart

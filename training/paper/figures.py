@@ -96,7 +96,8 @@ def zero(ax: Axes) -> None:
 def model() -> Figure:
     """Draw Fig. 1: a straight and a curved movement of the model."""
     figure, axes = sheet(3, 2, 10.5, ("A", "", "B"))
-    first, second = straight("T2", "T5", 1.0), curved(*ENDS, *one_via.EXAMPLE)
+    first = straight("T2", "T5", 1.0)
+    second = curved(*ENDS, *one_via.EXAMPLE)
     for ax, movement in ((axes[0], first), (axes[1], second)):
         (profile,) = movements.model_profiles(movement)
         plane(ax[0])
@@ -133,7 +134,8 @@ def straight_movements() -> Figure:
     time = np.linspace(0.0, DURATION, 401)
     movement = diagonals()
     motion = simulate(movement)
-    planned, reached = movement(time, 2), motion.derivative(motion.velocity())
+    planned = movement(time, 2)
+    reached = motion.derivative(motion.velocity())
     for row, ax in enumerate(axes.T):
         plane(ax[0])
         paths(ax[0], motion.planned[row], motion.hand[row])
@@ -254,7 +256,8 @@ def valleys() -> Figure:
     """Draw the region with a speed valley, and its distance in time from the curvature peak."""
     figure, axes = sheet(1, 2, 4.6)
     region, late = axes[0]
-    alongs, heights = np.linspace(0.05, 0.95, 37), np.linspace(0.4, 1.0, 25)
+    alongs = np.linspace(0.05, 0.95, 37)
+    heights = np.linspace(0.4, 1.0, 25)
     region.plot(alongs, [one_via.valley_threshold(along) for along in alongs], **MODEL)
     region.plot(0.5, 9.0 / 32.0, "o", color=THIRD, markersize=3.6)
     label = functools.partial(region.annotate, ha="center", fontsize=6.5)
@@ -284,7 +287,8 @@ def isochrony(avoidance: ObstacleMovements) -> Figure:
     figure, axes = sheet(2, 2, 8.4)
     (over_place, place_residual), (over_height, height_residual) = axes
     shares, lengths = one_via.SHARES, one_via.LENGTHS
-    alongs, heights = np.linspace(0.001, 0.999, 400), np.linspace(0.02, 1.0, 200)
+    alongs = np.linspace(0.001, 0.999, 400)
+    heights = np.linspace(0.02, 1.0, 200)
     for height, width in ((0.1, 0.6), (-one_via.HEIGHT, 2.2), (1.0, 1.1)):
         share = passage_share(curved(*ENDS, alongs, height))
         over_place.plot(alongs, share, color=PALETTE.plan, linewidth=width, label=f"{height:g}")

@@ -108,7 +108,8 @@ def _count_and_compare() -> tuple[int, float]:
 def _closest_approach(motion: SimulatedMovements, vias: Float) -> Float:
     """Return the times at which hands are nearest to via-points (N, 2), as fractions of the durations, shape (N,)."""
     distance = np.linalg.norm(motion.hand - vias[:, None], axis=-1)
-    rows, nearest = np.arange(len(vias)), np.clip(distance.argmin(axis=1), 1, distance.shape[1] - 2)
+    rows = np.arange(len(vias))
+    nearest = np.clip(distance.argmin(axis=1), 1, distance.shape[1] - 2)
     shift, _ = movements.vertex(*(distance[rows, nearest + k] ** 2 for k in (-1, 0, 1)))
     return np.asarray((nearest + shift) * motion.time[1] / motion.duration)
 

@@ -45,9 +45,11 @@ def point_to_point_claims() -> list[Claim]:
     """Return the claims of row 1: straight path and bell-shaped speed."""
     movement = diagonals()
     motion = simulate(movement)
-    peak, arm_peak = relative_peak(movement.peak(1), 1.875), relative_peak(motion.speed().max(axis=1), 1.875)
+    peak = relative_peak(movement.peak(1), 1.875)
+    arm_peak = relative_peak(motion.speed().max(axis=1), 1.875)
     time = motion.time[motion.time <= DURATION]
-    speed, arm_speed = primitives.speed(movement, time), motion.speed()[:, : len(time)]
+    speed = primitives.speed(movement, time)
+    arm_speed = motion.speed()[:, : len(time)]
     skew, arm_skew = (100 * np.abs(each - each[:, ::-1]).max() / each.max() for each in (speed, arm_speed))
     worst = motion.worst
     return [
@@ -79,8 +81,10 @@ def invariance_claims() -> list[Claim]:
 def _invariance(generator: np.random.Generator, count: int, vias: int) -> float:
     """Return the greatest relative difference between the plan of transformed points and the transformed plan."""
     points = generator.normal(size=(count, vias + 2, 2))
-    angle, scale = generator.uniform(-np.pi, np.pi, count), np.exp(generator.normal(size=count))
-    shift, pace = generator.normal(size=(count, 1, 2)), np.exp(generator.normal(size=count))
+    angle = generator.uniform(-np.pi, np.pi, count)
+    scale = np.exp(generator.normal(size=count))
+    shift = generator.normal(size=(count, 1, 2))
+    pace = np.exp(generator.normal(size=count))
     rotation = Rotation.from_euler("z", angle[:, None]).as_matrix()[:, :2, :2]
 
     def image(path: Float) -> Any:
@@ -112,7 +116,8 @@ def joint_claims() -> list[Claim]:
     hand, arm_hand = (
         _differences(speed).max() for speed in (primitives.speed(movement, time), motion.speed())
     )
-    rates, arm_rates = movements.joint_motion(movement).velocity, motion.derivative(motion.joints)
+    rates = movements.joint_motion(movement).velocity
+    arm_rates = motion.derivative(motion.joints)
     joints, arm_joints = (_differences(each).min() for each in (rates, arm_rates))
     places, placed = same_movement_elsewhere()
     peaks = [np.abs(torque).max(axis=1) for torque in (movements.required_torque(places), placed.torque)]
@@ -187,7 +192,8 @@ def alternative_claims() -> list[Claim]:
 
 
 def _joint_space_claims() -> list[Claim]:
-    of_joints, of_hand = joint_space(DIAGONALS), simulate(diagonals())
+    of_joints = joint_space(DIAGONALS)
+    of_hand = simulate(diagonals())
     placed = joint_space(same_movement_elsewhere()[0].sample(2, 0)[0])
     bows, arm_bows = bow(placed.planned), bow(placed.hand)
     return [
@@ -259,7 +265,8 @@ def relative_swing_speed(motion: SimulatedMovements) -> Float:
 
 
 def _repetitive_claims() -> list[Claim]:
-    swing, rest = _swing(_free_acceleration()), point_to_point([0.0], [1.0], 1.0)
+    swing = _swing(_free_acceleration())
+    rest = point_to_point([0.0], [1.0], 1.0)
     hit = point_to_point([0.0], [1.0], 1.0, goal_velocity=FREE, goal_acceleration=FREE)
     motion = simulate(swings())
     middle = (motion.time >= SWING * (SWINGS // 2)) & (motion.time <= SWING * (SWINGS // 2 + 1))
@@ -288,7 +295,8 @@ def _relative_torque(movement: Trajectory) -> float:
 
 def _performance_limited_claims() -> list[Claim]:
     curved = movements.curved("T1", "T4", 0.35, -0.45)
-    brisk, fastest = curved.stretched(minimum_duration(curved, velocity=SPEED_LIMIT)), torque_limited()
+    brisk = curved.stretched(minimum_duration(curved, velocity=SPEED_LIMIT))
+    fastest = torque_limited()
     swift, motion, late = map(simulate, (brisk, fastest, fastest.stretched(HURRY * fastest.duration)))
     used = (np.abs(motion.torque) / movements.ADULT.torque_limit).max()
     return [

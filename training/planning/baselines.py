@@ -67,7 +67,8 @@ class RandomVias:
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return the best of the random actions, see :class:`Method`."""
-        number, size = len(scenes.start), len(self._simulation.task.action_names)
+        number = len(scenes.start)
+        size = len(self._simulation.task.action_names)
         actions = self._generator.uniform(-1.0, 1.0, (number, self._count, size))
         if self._count == 1:
             return actions[:, 0]
@@ -90,7 +91,8 @@ class PlannerMethod:
     def plan(self, scene: Scenes) -> MotionPlan:
         """Return the plan of one scene."""
         task = self._simulation.task
-        start, goal = task.space.coordinates(scene.start)[0], task.space.coordinates(scene.goal)[0]
+        start = task.space.coordinates(scene.start)[0]
+        goal = task.space.coordinates(scene.goal)[0]
         return self._planner(task.arm, start, goal, scene.obstacles, space=task.space_name)
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
@@ -109,7 +111,8 @@ class PlannerMethod:
         """Simulate the plans; those with equally many via-points run together."""
         space = self._simulation.task.space
         counts = decisions[:, 0].astype(np.int64)
-        reward, info = np.zeros(len(decisions)), dict[str, NDArray[Any]]()
+        reward = np.zeros(len(decisions))
+        info = dict[str, NDArray[Any]]()
         for count in np.unique(counts):
             rows = np.flatnonzero(counts == count)
             some = scenes.take(rows)

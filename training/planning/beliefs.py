@@ -93,10 +93,12 @@ def _sight(
     eyes = np.repeat(origin[:, None] if eyes is None else eyes, sensor.n_rays, axis=1)
     hit = ranges < sensor.range - ROUNDING
     if task.space_name == "hand":
-        free, radius = np.stack(ends, axis=1), np.full(2, float(spheres.radius[-1]))
+        free = np.stack(ends, axis=1)
+        radius = np.full(2, float(spheres.radius[-1]))
     else:
         centres = [sphere_centres(task.arm.chain, spheres, each) for each in ends]
-        free, radius = np.concatenate(centres, axis=1), np.tile(spheres.radius, 2)
+        free = np.concatenate(centres, axis=1)
+        radius = np.tile(spheres.radius, 2)
     return Sight(origin, rotation, ranges, points, eyes, hit, free, radius)
 
 
@@ -146,7 +148,8 @@ def _box_around(points: Float, origin: Float, deepest: float) -> Box:
     middle = points.mean(axis=0)
     _, _, axes = np.linalg.svd(np.concatenate((points - middle, np.zeros((3, 3)))), full_matrices=False)
     axes = axes.T
-    local, away = (points - middle) @ axes, (middle - origin) @ axes
+    local = (points - middle) @ axes
+    away = (middle - origin) @ axes
     low, high = local.min(axis=0), local.max(axis=0)
     extent = high - low
     # Rays of a fan lie in a plane: the second axis is the depth of the front, and the third one tells nothing.
@@ -171,7 +174,9 @@ def _outside(points: Float, centre: Float, radius: Float) -> Bool:
     found = np.ones(len(points), np.bool_)
     for k in range(len(points)):
         for i in range(len(centre)):
-            x, y, z = points[k, 0] - centre[i, 0], points[k, 1] - centre[i, 1], points[k, 2] - centre[i, 2]
+            x = points[k, 0] - centre[i, 0]
+            y = points[k, 1] - centre[i, 1]
+            z = points[k, 2] - centre[i, 2]
             if x * x + y * y + z * z < radius[i] * radius[i]:
                 found[k] = False
                 break

@@ -132,14 +132,17 @@ def benchmark_problems() -> list[BenchmarkProblem]:
     for k, count in enumerate(parts["count"]):
         shapes: list[Shape] = []
         for row in range(first, first + count):
-            size, position, quaternion = parts["size"][row], parts["pose"][row, :3], parts["pose"][row, 3:]
+            size = parts["size"][row]
+            position = parts["pose"][row, :3]
+            quaternion = parts["pose"][row, 3:]
             quaternion = quaternion / np.linalg.norm(quaternion)
             if parts["kind"][row] == KINDS[Box]:
                 shapes.append(Box(size, position=position, quaternion=quaternion))
             else:
                 shapes.append(Cylinder(size[0], size[1], position=position, quaternion=quaternion))
         first += count
-        name, number = SETS[parts["set"][k]], int(parts["number"][k])
+        name = SETS[parts["set"][k]]
+        number = int(parts["number"][k])
         problems.append(BenchmarkProblem(name, number, parts["start"][k], parts["goal"][k], tuple(shapes)))
     return problems
 
@@ -188,7 +191,8 @@ def _shapes_of(objects: list[Mapping[str, Any]]) -> Iterator[Shape]:
             place = outer @ _matrix(pose)
             quaternion = np.empty(4)
             mujoco.mju_mat2Quat(quaternion, place[:3, :3].flatten())
-            kind, sizes = primitive["type"], np.array(primitive["dimensions"], dtype=np.float64)
+            kind = primitive["type"]
+            sizes = np.array(primitive["dimensions"], dtype=np.float64)
             if kind == "box":
                 values: dict[str, Any] = {"size": 0.5 * sizes}
             elif kind == "cylinder":

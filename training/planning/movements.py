@@ -208,7 +208,8 @@ def _coefficients(durations: Float, coefficients: Float) -> None:
                 [[-60.0, -36.0, -9.0, 60.0, -24.0, 3.0], [360.0, 192.0, 36.0, -360.0, 168.0, -24.0]],
             ]
         )
-        matrix, right = np.zeros((2 * vias, 2 * vias)), np.zeros((2 * vias, columns))
+        matrix = np.zeros((2 * vias, 2 * vias))
+        right = np.zeros((2 * vias, columns))
         for via in range(vias):
             for side in range(2):
                 segment = via + side

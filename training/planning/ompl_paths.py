@@ -62,7 +62,8 @@ def path_around(arm: Arm, ends: Float, obstacles: Obstacles, margin: float, pati
             line = np.ascontiguousarray(np.linspace(one, other, count))
             return bool(_line_is_clear(arm.chain, arm.spheres, line, obstacles, margin))
 
-    space, bounds = base.RealVectorStateSpace(number), base.RealVectorBounds(number)
+    space = base.RealVectorStateSpace(number)
+    bounds = base.RealVectorBounds(number)
     for i, (low, high) in enumerate(arm.joint_range):
         bounds.setLow(i, float(low))
         bounds.setHigh(i, float(high))

@@ -308,7 +308,8 @@ def checked_motion(
     Its duration is the shortest that the limits allow with `shortest`, otherwise that of the plan, or a longer one if
     the limits need it. `source` is the name of the planner.
     """
-    waypoints, durations = np.asarray(plan.waypoints), np.asarray(plan.durations)
+    waypoints = np.asarray(plan.waypoints)
+    durations = np.asarray(plan.durations)
     duration = float(durations.sum())
     zero = np.zeros(waypoints.shape[1])
     problem = _Problem(
@@ -570,7 +571,8 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
     for count in VIA_COUNTS:
         points = problem.space.coordinates(points_on(path, count))
         durations = np.asarray(primitives.passage_durations(points, 1.0))[None]
-        table, fine = table_with(durations), table_with(durations, FINE_INSTANTS)
+        table = table_with(durations)
+        fine = table_with(durations, FINE_INSTANTS)
         vias = points[None, 1:-1] - problem.start
         _, found = _refined(problem, kept, table, fine, vias, duration, smooth=0.0)
         if found.clearance[0] >= kept:
@@ -594,7 +596,8 @@ def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple
     if least == 0.0:  # a start that is the goal needs a duration, too
         shortest = SHORTEST_DURATION if np.isfinite(arm.velocity_limit).all() else UNLIMITED
         factor = max(factor, shortest / duration)
-    rate, change = motion.velocity / factor, motion.acceleration / factor**2
+    rate = motion.velocity / factor
+    change = motion.acceleration / factor**2
     torque = torques(arm.chain, motion.position, rate, change)
     shares = np.stack((np.abs(rate) / arm.velocity_limit, np.abs(torque) / arm.torque_limit)).max(axis=1)
     limits = Limits(float(shares[0].max()), float(shares[1].max()))

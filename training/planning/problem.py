@@ -99,7 +99,8 @@ class Problem(NamedTuple):
     @classmethod
     def of_scenes(cls, scenes: Scenes, task: Task) -> Problem:
         """Return the problems of scenes at their beginning."""
-        start, goal = task.space.coordinates(scenes.start), task.space.coordinates(scenes.goal)
+        start = task.space.coordinates(scenes.start)
+        goal = task.space.coordinates(scenes.goal)
         rest = np.zeros_like(start)
         return cls(start, rest, rest, goal, scenes.obstacles)
 
@@ -200,7 +201,9 @@ def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = Fa
 
 def _given(task: Task, problem: Problem) -> _Given:
     """Return the plans of zero actions."""
-    layout, line, remaining = task.action, problem.goal - problem.start, problem.remaining
+    layout = task.action
+    line = problem.goal - problem.start
+    remaining = problem.remaining
     shares = np.arange(1, task.n_via + 1)[:, None] / (task.n_via + 1)
     vias = problem.start[:, None] + line[:, None] * shares if problem.vias is None else problem.vias
     length, whole = _straight_movement(task, problem)
@@ -241,8 +244,10 @@ def _expand(
     _, vias, dimension = given.vias.shape
     columns = vias + 3
     every = np.empty((number, plans, columns, dimension))
-    times, duration = np.empty((number, plans), np.int64), np.empty((number, plans))
-    rough, relative = np.empty((number, plans)), np.empty((number, plans))
+    times = np.empty((number, plans), np.int64)
+    duration = np.empty((number, plans))
+    rough = np.empty((number, plans))
+    relative = np.empty((number, plans))
     fast = np.zeros((number, plans), np.bool_)
     gram = np.empty((columns, columns))
     for b in range(number):
@@ -287,7 +292,8 @@ def _place_vias(given: _Given, b: int, action: Float, offsets: Float) -> None:
         if given.of_hand:  # offsets along and across the line
             length = math.sqrt(line[0] * line[0] + line[1] * line[1])
             x, y = line[0] / length, line[1] / length
-            along, across = action[2 * k] * given.via_scale[0], action[2 * k + 1] * given.via_scale[1]
+            along = action[2 * k] * given.via_scale[0]
+            across = action[2 * k + 1] * given.via_scale[1]
             offsets[k, 0] += along * x - across * y
             offsets[k, 1] += along * y + across * x
     for d in range(dimension):

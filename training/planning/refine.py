@@ -168,13 +168,19 @@ def _pull(
 ) -> None:
     """Add to `work.pull` the derivative of the way of a sphere in a direction (x, y, z) by the joints, times a sign."""
     placed, sliding = work.placed, setting.chain.sliding
-    u, v, w = placed.centre[sphere, 0], placed.centre[sphere, 1], placed.centre[sphere, 2]
+    u = placed.centre[sphere, 0]
+    v = placed.centre[sphere, 1]
+    w = placed.centre[sphere, 2]
     for j in range(link):
-        a, b, c = placed.rotation[j + 1, 0, 2], placed.rotation[j + 1, 1, 2], placed.rotation[j + 1, 2, 2]
+        a = placed.rotation[j + 1, 0, 2]
+        b = placed.rotation[j + 1, 1, 2]
+        c = placed.rotation[j + 1, 2, 2]
         if sliding[j]:
             way = a * x + b * y + c * z
         else:
-            p, q, r = u - placed.origin[j + 1, 0], v - placed.origin[j + 1, 1], w - placed.origin[j + 1, 2]
+            p = u - placed.origin[j + 1, 0]
+            q = v - placed.origin[j + 1, 1]
+            r = w - placed.origin[j + 1, 2]
             way = x * (b * r - c * q) + y * (c * p - a * r) + z * (a * q - b * p)
         work.pull[j] += sign * way
 
@@ -188,7 +194,9 @@ def _add_obstacles(
     for group in range(len(spheres.link)):
         if spheres.link[group] == 0:
             continue
-        u, v, w = placed.ball[group, 0], placed.ball[group, 1], placed.ball[group, 2]
+        u = placed.ball[group, 0]
+        v = placed.ball[group, 1]
+        w = placed.ball[group, 2]
         size = spheres.ball_radius[group]
         # After a far look, no obstacle matters to a group before its ball has come as much nearer.
         seen = work.seen[group]
@@ -207,7 +215,9 @@ def _add_obstacles(
             least, sphere = group_clearance(spheres, placed, group, obstacles, scene, row, time, wanted, -1e9)
             if sphere < 0:
                 continue
-            x, y, z = placed.centre[sphere, 0], placed.centre[sphere, 1], placed.centre[sphere, 2]
+            x = placed.centre[sphere, 0]
+            y = placed.centre[sphere, 1]
+            z = placed.centre[sphere, 2]
             _, a, b, c = point_distance_and_normal(obstacles, scene, row, x, y, z, time, 1e9)
             work.pull[:] = 0.0
             _pull(setting, work, sphere, spheres.link[group], a, b, c, -1.0)
@@ -246,7 +256,8 @@ def _add_ranges(setting: Setting, reached: bool, work: _Work) -> tuple[float, fl
     """Add what is missing to the margin from the joint limits; return the sum of squares, and the least distance."""
     total, nearest, joints, limits = 0.0, RANGE_MARGIN, work.joints, setting.joint_range
     for j in range(len(joints)):
-        low, high = limits[j, 0] + RANGE_MARGIN - joints[j], joints[j] - limits[j, 1] + RANGE_MARGIN
+        low = limits[j, 0] + RANGE_MARGIN - joints[j]
+        high = joints[j] - limits[j, 1] + RANGE_MARGIN
         missing = max(low, high)
         if missing > 0.0 and (reached or j == 0):
             work.pull[:] = 0.0
@@ -353,9 +364,12 @@ def _refine(
     columns, dimension = offsets.shape
     vias = columns - 3
     size = vias * dimension
-    hessian, other_hessian = np.empty((size, size)), np.empty((size, size))
+    hessian = np.empty((size, size))
+    other_hessian = np.empty((size, size))
     gradient, other_gradient = np.empty(size), np.empty(size)
-    system, step, trial = np.empty((size, size)), np.empty(size), offsets.copy()
+    system = np.empty((size, size))
+    step = np.empty(size)
+    trial = offsets.copy()
     longest = LONGEST_STEP[1] if setting.of_hand else LONGEST_STEP[0]
     times, _ = best_times(table, offsets, work.gram)
     movement = Movement(table, times, start, offsets, duration)
@@ -376,7 +390,8 @@ def _refine(
             for d in range(dimension):
                 trial[a, d] = offsets[a, d] + factor * step[a * dimension + d]
                 if not setting.of_hand:
-                    low, high = setting.joint_range[d, 0] - start[d], setting.joint_range[d, 1] - start[d]
+                    low = setting.joint_range[d, 0] - start[d]
+                    high = setting.joint_range[d, 1] - start[d]
                     trial[a, d] = min(max(trial[a, d], low), high)
         other, _ = best_times(table, trial, work.gram)
         movement = Movement(table, other, start, trial, duration)
@@ -446,7 +461,8 @@ def refine_seeds(
     stages = len(aims)
     offsets = np.empty((stages, vias + 3, dimension))
     offsets[:, vias:] = fixed
-    times, trial = np.empty(stages, np.int64), np.empty((vias + 3, dimension))
+    times = np.empty(stages, np.int64)
+    trial = np.empty((vias + 3, dimension))
     free, tried = 0, 0
     for each in range(number):
         tried += 1
@@ -517,7 +533,8 @@ def is_free(setting: Setting, movement: Movement, obstacles: Obstacles, scene: i
 def exact_clearance(setting: Setting, movement: Movement, obstacles: Obstacles, scene: int) -> float:
     """Return the least clearance of a movement at the instants of a table, at most 1, [m]; OUTSIDE out of reach."""
     number = len(movement.table.order)
-    position, path = np.empty(len(movement.start)), np.empty((number, len(setting.joint_range)))
+    position = np.empty(len(movement.start))
+    path = np.empty((number, len(setting.joint_range)))
     for k in range(number):
         if not joints_at(setting, movement, k, position, path[k]):
             return OUTSIDE

@@ -192,7 +192,8 @@ def best_of(task: Task, problem: Problem, actions: Numbers, merit: Numbers) -> N
         least = 0.5 * CLEARANCE_MARGIN
         rows = np.flatnonzero(merit.max(axis=1) > 0.5 * INFEASIBLE)
         for _ in range(VERIFIED if rows.size else 0):
-            some, chosen = problem.take(rows), actions[rows, best[rows]][:, None]
+            some = problem.take(rows)
+            chosen = actions[rows, best[rows]][:, None]
             rows = rows[plan_clearances(task, some, chosen, least, least, exact=True)[:, 0] < least]
             if not rows.size:
                 break
@@ -242,8 +243,10 @@ def refined_actions(task: Task, problem: Problem, actions: Numbers) -> Numbers:
     found = np.array(actions)
     number, at = task.n_via, task.n_via * task.action.dimension
     for b in range(len(found)):
-        start, line = problem.start[b], problem.goal[b] - problem.start[b]
-        seeds, fixed = moves.offsets[b, :, :number].copy(), moves.offsets[b, 0, number:].copy()
+        start = problem.start[b]
+        line = problem.goal[b] - problem.start[b]
+        seeds = moves.offsets[b, :, :number].copy()
+        fixed = moves.offsets[b, 0, number:].copy()
         _, better = refine_seeds(
             setting, table, fine, start, fixed, seeds, moves.duration[b, 0], problem.obstacles, b, CLEARANCE_MARGIN,
             AIMS, unit_of_jerk(line, setting.of_hand), SMOOTH, len(seeds),

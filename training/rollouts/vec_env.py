@@ -175,7 +175,8 @@ class ViaVecEnv(VecEnv):
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state of this environment, or of one of the same kind and number of copies."""
         self.venv.unwrapped.restore(state)
-        self._returns, self._lengths = np.array(state["returns"]), np.array(state["lengths"])
+        self._returns = np.array(state["returns"])
+        self._lengths = np.array(state["lengths"])
 
     def close(self) -> None:
         """Close the environment."""

@@ -120,7 +120,8 @@ def _restore(model: BaseAlgorithm, state: dict[str, Any], arrays: dict[str, Any]
         setattr(model, name, arrays["last"][name])
     for name in DEQUES:
         setattr(model, name, deque(arrays["recent"][name], maxlen=model._stats_window_size))
-    buffer, saved = getattr(model, "replay_buffer", None), arrays["buffer"]
+    buffer = getattr(model, "replay_buffer", None)
+    saved = arrays["buffer"]
     if buffer is not None:
         _fill(_buffer_arrays(buffer), saved["arrays"])
         buffer.pos, buffer.full = saved["pos"], saved["full"]

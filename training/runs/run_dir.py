@@ -267,5 +267,6 @@ def _settings(config: TrainConfig) -> dict[str, Any]:
     values = json.loads(json.dumps(config.as_json()))  # with lists for tuples, as in the file
     for name in MAY_CHANGE:
         del values[name]
-    env_kwargs, hyperparameters = values.pop("env_kwargs"), values.pop("hyperparameters")
+    env_kwargs = values.pop("env_kwargs")
+    hyperparameters = values.pop("hyperparameters")
     return {**values, **env_kwargs, **hyperparameters}

@@ -144,7 +144,8 @@ def run_trial(trial: Trial, out: Path) -> Record:
                 methods[f"{name}/{checks}" if checks else name] = agent_method("agent", model, checks)
             for refine in trial.refine:
                 methods[f"{name}/refine{refine}"] = agent_method("agent", model, 0, refine)
-        env_kwargs, decisions = whole_task(config.env, config.env_kwargs), run.decisions
+        env_kwargs = whole_task(config.env, config.env_kwargs)
+        decisions = run.decisions
         record["curve"] = [[each["decisions"], each["success"]["rate"]] for each in run.curve]
         record["seconds"] = run.curve[-1]["seconds"] if run.curve else None
     record["rows"] = []
@@ -393,7 +394,9 @@ def _domain(tune: Any, given: Any) -> Any:
     """Return the domain of a parameter: one of a list, or a range of whole numbers or of real ones."""
     if isinstance(given, list):
         return tune.choice(given)
-    low, high, log = given["low"], given["high"], given.get("log", False)
+    low = given["low"]
+    high = given["high"]
+    log = given.get("log", False)
     if isinstance(low, int) and isinstance(high, int):
         return (tune.lograndint if log else tune.randint)(low, high + 1)
     return (tune.loguniform if log else tune.uniform)(low, high)
