@@ -200,6 +200,15 @@ def _load(
     for what, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
         if not (limit > 0.0).all():
             raise ValueError(f"{what} must be positive, got {limit}")
+    dofs = np.array([whole.jnt_dofadr[whole.joint(each).id] for each in names])
+    # Models that are moved by other means than motors have such damping.
+    stuck = whole.dof_damping[dofs].reshape(len(names), -1)[:, 0] * velocity > torque
+    if stuck.any():
+        some = ", ".join(itertools.compress(names, stuck))
+        notes.append(
+            f"{WARNING}damping of {some} is left out: it needs more than the torque limit at full speed"
+        )
+        whole.dof_damping[dofs[stuck]] = 0.0
     parsed = _parse(whole, names, chosen, notes)
     # Pairs that cannot touch are not compared: those of the file, and those that are always near and always apart.
     exclude = dict.fromkeys(_excluded(parsed, urdf.never_touch), "excluded in the file")

@@ -283,6 +283,12 @@ def test_tools_are_sites_bodies_or_points(arm, tool, where):
     np.testing.assert_allclose(other.hand(HOME), expected, atol=1e-5)
 
 
+def test_damping_that_no_motor_could_overcome_is_left_out_and_told():
+    with pytest.warns(UserWarning, match="damping"):
+        arm = load_arm(near_arm(0.02).replace('name="two"', 'name="two" damping="1e11"'), **THREE)
+    np.testing.assert_array_equal(arm.chain.damping, 0.0)
+
+
 def test_limits_that_the_file_lacks_are_chosen_and_told():
     with pytest.warns(UserWarning, match="torque limits"):
         arm = ur5e(re.sub(r' actuatorfrcrange="[^"]*"', "", TEXT))
