@@ -33,7 +33,8 @@ CUTS = (0.35, 0.5, 0.65)
 LEAST_SHARE = 0.3  # Least length along an axis across which a body is cut, as a share of the greatest
 # First and last step of the search for the ends, and last one where cuts are compared, as shares of the size
 FIRST_STEP, LAST_STEP, COARSE_STEP = 0.25, 5e-4, 0.05
-MOST_CAPSULES = 48  # Greatest number of capsules for one geom
+# Greatest number of capsules for one geom, and where their excess is at most SMALL, [m]
+MOST_CAPSULES, MOST_SMALL, SMALL = 128, 48, 0.02
 _ONE_WAY = np.concatenate((np.eye(6), np.kron([[1.0, 1.0], [1.0, -1.0]], np.eye(3))))
 # Directions in which the search moves one end of a capsule, or both, shape (24, 2, 3)
 MOVES = np.concatenate((_ONE_WAY, -_ONE_WAY)).reshape(-1, 2, 3)
@@ -138,12 +139,13 @@ def cover_points(points: Float, tolerance: float) -> list[FittedCapsule]:
     """
     body = _body(points)
     found = [_fit_capsule(np.asarray(body.shape.vertices), body)]
-    while len(found) < MOST_CAPSULES:
+    while True:
         worst = max(range(len(found)), key=lambda index: found[index].excess)
-        if found[worst].excess <= tolerance:
-            break
+        excess = found[worst].excess
+        most = MOST_SMALL if excess <= SMALL else MOST_CAPSULES
+        if excess <= tolerance or len(found) >= most:
+            return found
         found += _best_halves(found.pop(worst).corners, body, tolerance)
-    return found
 
 
 def _body(points: Float) -> Body:

@@ -52,7 +52,6 @@ WARNING = "warning: "  # Beginning of notes that are told as warnings, too
 GENERIC_NAMES = ("arm", "model", "robot", "scene")
 MIN_JOINTS = 2  # Least number of joints
 MIN_TOLERANCE, MAX_TOLERANCE = 0.005, 1.0  # Bounds of the tolerance of fitted capsules, [m]
-BASE_SHARE = 0.05  # Least tolerance of geoms of the base, as a share of their size: bases may be large
 # Distance at home that capsules leave between bodies, as a share of that of the geoms, and at most, [m]
 LEFT_SHARE, LEFT_MOST = 0.25, 0.002
 LEAST_EXCESS = 0.001  # Excess of capsules below which they are not split, [m]
@@ -599,10 +598,7 @@ def _fitted(
     for body, geoms in parsed.geoms.items():
         fits[body] = []
         for geom in geoms:
-            allowed = tolerances[body]
-            if not parsed.links[body] and allowed > FINE:
-                allowed = max(allowed, BASE_SHARE * 2.0 * float(model.geom_rbound[geom]))
-            fits[body] += cover_geom(model, geom, allowed)
+            fits[body] += cover_geom(model, geom, tolerances[body])
     while True:
         xml = _write(parsed, ranges, origin, fits)
         near = _near_capsules(parsed, xml, home, distances)

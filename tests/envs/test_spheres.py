@@ -82,5 +82,7 @@ def test_a_cube_takes_one_ball_and_many_where_little_may_stick_out(monkeypatch):
     (ball,) = cover_points(cube, 0.04)
     assert ball.radius == pytest.approx(0.05 * 3**0.5, abs=2e-3)
     assert 2 < len(cover_points(cube, 0.02)) < 20
-    monkeypatch.setattr(capsule_fit, "MOST_CAPSULES", 3)
-    assert len(cover_points(cube, 0.015)) == 3
+    monkeypatch.setattr(capsule_fit, "MOST_SMALL", 20)
+    monkeypatch.setattr(capsule_fit, "MOST_CAPSULES", 30)
+    assert len(cover_points(cube, 0.005)) == 20
+    assert len(cover_points(3.0 * cube, 0.005)) == 30
