@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 from numba import njit
+from numba.core.caching import IndexDataCacheFile
 
 TINY = 1e-12  # Length below which a vector has no direction, [m]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -36,3 +37,20 @@ def inlined(function: Function) -> Function:
     A call with packed obstacles passes 150 numbers, which takes longer than a distance.
     """
     return cast("Function", njit(inline="always", **KERNEL)(function))
+
+
+_read_index = IndexDataCacheFile._load_index
+
+
+def _index(cache: Any) -> Any:
+    """Return the index of machine code on disk, an empty one where it names records that are in other modules now.
+
+    Otherwise functions that were compiled before an update of the package would end with Numba's ImportError.
+    """
+    try:
+        return _read_index(cache)
+    except (ImportError, AttributeError):
+        return {}
+
+
+IndexDataCacheFile._load_index = _index
