@@ -39,7 +39,7 @@ def inlined(function: Function) -> Function:
     return cast("Function", njit(inline="always", **KERNEL)(function))
 
 
-_read_index = IndexDataCacheFile._load_index
+_read_index: Callable[[Any], Any] = IndexDataCacheFile._load_index
 
 
 def _index(cache: Any) -> Any:
@@ -53,4 +53,4 @@ def _index(cache: Any) -> Any:
         return {}
 
 
-IndexDataCacheFile._load_index = _index
+setattr(IndexDataCacheFile, "_load_index", _index)  # noqa: B010 - mypy knows no such assignment
