@@ -47,6 +47,9 @@ WEIGHED = 200  # Number of configurations in which the arm is weighed
 LOOKED_AT, NEAR_LOOKED_AT = 16, 1000
 # Distance within which bodies are near in at least half of the configurations, and tolerance for these, [m]
 NEAR, FINE = 0.03, 0.005
+STUCK = (
+    100.0  # Damping beyond which a joint hardly moves: its torque at full speed, relative to the torque limit
+)
 WARNING = "warning: "  # Beginning of notes that are told as warnings, too
 # Names of files that do not tell the arm; it gets the name of the model
 GENERIC_NAMES = ("arm", "model", "robot", "scene")
@@ -201,11 +204,11 @@ def _load(
             raise ValueError(f"{what} must be positive, got {limit}")
     dofs = np.array([whole.jnt_dofadr[whole.joint(each).id] for each in names])
     # Models that are moved by other means than motors have such damping.
-    stuck = whole.dof_damping[dofs].reshape(len(names), -1)[:, 0] * velocity > torque
+    stuck = whole.dof_damping[dofs].reshape(len(names), -1)[:, 0] * velocity > STUCK * torque
     if stuck.any():
         some = ", ".join(itertools.compress(names, stuck))
         notes.append(
-            f"{WARNING}damping of {some} is left out: it needs more than the torque limit at full speed"
+            f"{WARNING}damping of {some} is left out: it needs {STUCK:g} times the torque limit at full speed"
         )
         whole.dof_damping[dofs[stuck]] = 0.0
     parsed = _parse(whole, names, chosen, notes)

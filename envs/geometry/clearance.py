@@ -194,6 +194,7 @@ def nearest_spheres(
         return least, nearest, partner
     place_group(spheres, first, placed)
     place_group(spheres, second, placed)
+    # Groups that are divided leave out most pairs of parts.
     if spheres.part[first] < spheres.part[first + 1] or spheres.part[second] < spheres.part[second + 1]:
         return _nearest_by_parts(spheres, placed, first, second, least, floor)
     for one in range(spheres.first[first], spheres.first[first + 1]):
@@ -215,7 +216,11 @@ def nearest_spheres(
 def _nearest_by_parts(
     spheres: Spheres, placed: Placed, first: int, second: int, least: float, floor: float
 ) -> tuple[float, int, int]:
-    """Return the same for two placed groups, one of many spheres, of which most parts are apart."""
+    """Return the same for two placed groups, one of many spheres, of which most parts are apart.
+
+    The loop over spheres stands twice: with this one alone, checks of the Panda, whose links are mostly covered by few
+    spheres, took 10 % longer.
+    """
     nearest, partner = -1, -1
     balls = spheres.ball_radius
     for start in range(spheres.first[first], spheres.first[first + 1], PART):

@@ -287,6 +287,8 @@ def test_damping_that_no_motor_could_overcome_is_left_out_and_told():
     with pytest.warns(UserWarning, match="damping"):
         arm = load_arm(near_arm(0.02).replace('name="two"', 'name="two" damping="1e11"'), **THREE)
     np.testing.assert_array_equal(arm.chain.damping, 0.0)
+    slow = load_arm(near_arm(0.02).replace('name="two"', 'name="two" damping="2e3"'), **THREE)
+    np.testing.assert_array_equal(slow.chain.damping, (0.0, 2e3, 0.0))
 
 
 def test_limits_that_the_file_lacks_are_chosen_and_told():
