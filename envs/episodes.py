@@ -102,7 +102,8 @@ class Episodes:
         if not keep and len(rows) == len(self.begun):
             self.last_plan = None
         self.scenes = self.scenes.put(rows, scenes)
-        self._moving = bool(self.scenes.obstacles.velocity.any() or self.scenes.turn_velocity.any())
+        moving = self.scenes.obstacles.velocity, self.scenes.turn_velocity, self.scenes.reach
+        self._moving = any(part.any() for part in moving)
         self.executor.begin(rows, scenes.start, scenes.obstacles_at(np.zeros(len(rows))))
         space = self.task.space
         start = space.coordinates(scenes.start)
@@ -300,7 +301,7 @@ class Episodes:
     def _run_until(self, last: Int) -> None:
         """Run the episodes until a physics step each; obstacles keep their velocity in every piece of it."""
         state, timestep = self.executor.state, self.simulator.timestep
-        turns = self._events.steps(self.scenes.turn_time)
+        turns = self._events.steps(self.scenes.course_times())
         while True:
             rows = np.flatnonzero((state.steps < last) & ~state.collision & ~state.unstable)
             if not rows.size:

@@ -131,7 +131,7 @@ class EventPredictor:
             return found
         every = max(round(LOOK / self.timestep), 1)
         ahead = round(FORESIGHT / LOOK)
-        turns = self.steps(scenes.turn_time)
+        turns = self.steps(scenes.course_times())
         # Pieces of the episodes in which the obstacles keep their velocity
         pieces = []
         for row in range(len(now)):

@@ -34,6 +34,7 @@ from viapoint.envs.steering import Steering
 
 Trigger = Literal["horizon", "target", "course", "clearance", "sight"]
 TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)  # Events that may end a decision before the goal
+COURSES = ("turns", "reaches")  # Courses of obstacles that move
 # Values of `decide_at` with one decision for a movement, and with one in every control step
 END, STEPS = "end", "steps"
 MOST_OBSTACLES = 256  # Greatest number of obstacles in a scene that is given
@@ -76,6 +77,7 @@ class Task:
     families: tuple[str, ...]
     whole_arm: bool
     moving_obstacles: bool
+    courses: str
     n_jumps: tuple[int, int]
     decide_at: str | tuple[Trigger, ...]
     horizon: float
@@ -98,6 +100,7 @@ class Task:
         families: str | Sequence[str] | None = None,
         whole_arm: bool = False,
         moving_obstacles: bool = False,
+        courses: Literal["turns", "reaches"] = "turns",
         n_jumps: int | tuple[int, int] = 0,
         decide_at: str | Sequence[Trigger] = END,
         horizon: float = 0.3,
@@ -120,6 +123,8 @@ class Task:
         for name, value in (("moving_obstacles", moving_obstacles), ("whole_arm", whole_arm)):
             if not isinstance(value, bool | np.bool_):
                 raise TypeError(f"{name} must be True or False, got {value!r}")
+        if courses not in COURSES:
+            raise ValueError(f"courses must be one of {', '.join(COURSES)}, got {courses!r}")
         most = fewest_and_most("n_obstacles", n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
         plane = is_planar(arm)
         shapes = (PLANE_SHAPES if plane else SPACE_SHAPES) if shapes is None else shapes
@@ -145,6 +150,7 @@ class Task:
             families=check_families(names, plane, kinds, most[1]),
             whole_arm=bool(whole_arm),
             moving_obstacles=bool(moving_obstacles),
+            courses=courses,
             n_jumps=fewest_and_most("n_jumps", n_jumps, MOST_JUMPS, MOST_JUMPS),
             decide_at=_checked_decisions(decide_at),
             horizon=number_of_at_least("horizon", horizon, 1e-3),

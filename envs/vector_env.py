@@ -58,6 +58,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         families: Names of scene families that are drawn; a repeated name is drawn more often.
         whole_arm: True if obstacles in the plane are so tall that the links must clear them, too.
         moving_obstacles: True if the obstacles move.
+        courses: Courses of these: `turns`, constant velocities that change at most once, or `reaches`, each a
+            minimum-jerk reach of its own, like that of another hand.
         n_jumps: Number of jumps of the target, or the fewest and the most.
         decide_at: `end`, one decision for a movement; `steps`, a velocity in every control step; or events that end a
             decision before the goal, some of `horizon`, `target`, `course`, `clearance`, `sight`.
@@ -204,7 +206,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         if options is not None and not isinstance(options, Mapping):
             raise ValueError(f"options must be a mapping from names to values, or None, got {options!r}")
         options = dict(options or {})
-        for name in ("jumps", "turns"):
+        for name in ("jumps", "turns", "reaches"):
             if name in options and not self.task.replanning:
                 raise ValueError(
                     f"options[{name!r}] need an environment with decide_at=('target', ...), which are events of a "

@@ -29,12 +29,14 @@ DRAWN = ""  # Family of the scenes that are drawn as in training
 SEEDS = {"validation": 1_000_003, "test": 2_000_003}  # Far from training seeds
 NUMBERS = {"validation": 500, "test": 1_000}  # Number of scenes of such a set
 LARGEST = 1 << 30  # Limit of a file's arrays, [bytes]: small archives can claim any size
-OWN = ("start", "goal", "jumps", "turn_time", "turn_velocity")  # Arrays of `Scenes`
+OWN = ("start", "goal", "jumps", "turn_time", "turn_velocity", "reach")  # Arrays of `Scenes`
 MOVING = ("centre", "rotation", "size", "velocity")  # Arrays of `Obstacles` beside kind
 # Arrays of a file, with one entry for each scene
 CONTENT = ("start", "goal", "kind", *MOVING, "jumps", "turn_time", "turn_velocity", "share", "family")
+REACH = "reach"  # Array of a file where obstacles are on reaches
 # Fields of a task that say which scenes are scenes of it, besides kinds and families of obstacles
 SCENE_FIELDS = ("arm", "n_obstacles", "whole_arm", "moving_obstacles", "n_jumps")
+DEFAULT_COURSES = "turns"  # Courses of scenes of tasks that do not tell them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +86,8 @@ class FrozenScenes:
         """Return the arrays of a file by name."""
         obstacles = self.scenes.obstacles
         parts = {**self.scenes._asdict(), **obstacles._asdict(), "share": self.share, "family": self.family}
-        return {name: np.asarray(parts[name]) for name in CONTENT}
+        names = (*CONTENT, REACH) if self.scenes.reach.any() else CONTENT
+        return {name: np.asarray(parts[name]) for name in names}
 
     def save(self, path: Path) -> None:
         """Write the set with its hash; numbers that single precision represents take half the place."""
@@ -135,6 +138,7 @@ def _scene_key(task: Mapping[str, Any]) -> str:
     values = [task[name] for name in SCENE_FIELDS]
     values += [sorted(task["shapes"]), sorted(task["families"])]
     if task["moving_obstacles"] or any(task["n_jumps"]):
+        values.append(task.get("courses", DEFAULT_COURSES))
         values.append(task["duration_range"])  # things happen at parts of the longest movement
     return json.dumps(values, sort_keys=True)
 
@@ -183,7 +187,9 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
             raise ValueError(f"its arrays would take {size} bytes, more than {LARGEST}")
         with np.load(path, allow_pickle=False) as archive:
             content = {name: archive[name] for name in (*CONTENT, "task", "sha256")}
-        for name in CONTENT:
+            no_reach = np.zeros((*content["kind"].shape, 5))
+            content[REACH] = archive[REACH] if REACH in archive else no_reach
+        for name in (*CONTENT, REACH):
             if content[name].dtype.kind == "f":
                 content[name] = content[name].astype(np.float64)
         content["kind"] = content["kind"].astype(np.int64)
@@ -201,7 +207,7 @@ def _check_content(content: Mapping[str, NDArray[Any]]) -> None:
     like = resting(np.empty((number, joints)), np.empty((number, joints)), no_obstacles(number, rows))
     per_scene = {"share": np.empty(number), "family": np.empty(number, np.str_)}
     arrays: dict[str, Any] = {**like._asdict(), **like.obstacles._asdict(), **per_scene}
-    for name in CONTENT:
+    for name in (*CONTENT, REACH):
         found, wanted = content[name], arrays[name]
         kinds = "U" if name == "family" else "fi"
         if found.shape != wanted.shape or not number or found.dtype.kind not in kinds:
@@ -231,7 +237,7 @@ def scenes_for(name_or_path: str | Path, task: Task, number: int | None = None) 
     if name not in SETS:
         frozen = load(Path(name_or_path).expanduser())
         _check_fit(frozen, task)
-        scenes = _padded(frozen.scenes, task.observation.n_rows)
+        scenes = frozen.scenes.with_rows(task.observation.n_rows)
         return dataclasses.replace(frozen, scenes=scenes).spread(number)
     path = shipped_set(name, task)
     if path is not None:
@@ -243,15 +249,6 @@ def scenes_for(name_or_path: str | Path, task: Task, number: int | None = None) 
         )
     print(f"no frozen {name} scenes are those of this task: they are drawn", file=sys.stderr)
     return drawn(name, task, NUMBERS[name] if number is None else number)
-
-
-def _padded(scenes: Scenes, rows: int) -> Scenes:
-    """Return scenes with room for a number of obstacles."""
-    present = scenes.obstacles.kind.shape[1]
-    padded = resting(scenes.start, scenes.goal, scenes.obstacles.with_rows(rows))
-    padded.turn_time[:, :present] = scenes.turn_time  # obstacles that are absent never turn
-    padded.turn_velocity[:, :present] = scenes.turn_velocity
-    return padded._replace(jumps=scenes.jumps)
 
 
 def _check_fit(frozen: FrozenScenes, task: Task) -> None:

@@ -12,7 +12,7 @@ from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, row_clearance, self_clearance
 from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.obstacles import ABSENT
-from viapoint.envs.scenes.scene import NEVER, Scenes
+from viapoint.envs.scenes.scene import NEVER, Scenes, way_since_start
 
 PAIRS, TRIES = 3, 6  # Pairs of start and goal for a layout, and attempts at each end
 # Share of starts at home or near it, and of these and starts in places of goals; others are free ones
@@ -46,6 +46,7 @@ class Setting(NamedTuple):
     self_margin: float  # Least clearance of ends from the arm itself, [m]
     least_way: float  # Least length of the way from start to goal in joint space, [rad]
     n_jumps: tuple[int, int]  # Fewest and most jumps of the target
+    reaching: bool  # True if obstacles that move are on reaches of their own
     # Shortest and longest duration of movements, relative to that of the zero action
     relative_durations: tuple[float, float]
 
@@ -99,6 +100,7 @@ def _unpack_rows(draft: Draft, scene: int) -> None:
         if row < draft.n_rows[scene]:
             obstacles.kind[scene, row] = int(rows[row, 0])
         draft.scenes.turn_velocity[scene, row] = 0.0
+        draft.scenes.reach[scene, row] = 0.0
         obstacles.velocity[scene, row] = 0.0
         obstacles.centre[scene, row] = rows[row, 1:4]
         obstacles.size[scene, row] = rows[row, 13:16]
@@ -197,9 +199,10 @@ def is_row_clear(
     z = obstacles.centre[scene, row, 2]
     # After the turn, the place is that of the first course, moved by the difference of the courses.
     after = max(time - scenes.turn_time[scene, row], 0.0)
+    moved = way_since_start(scenes.reach[scene, row], time)
     for axis in range(3):
         change = scenes.turn_velocity[scene, row, axis] - obstacles.velocity[scene, row, axis]
-        obstacles.centre[scene, row, axis] += after * change
+        obstacles.centre[scene, row, axis] += after * change + moved * scenes.reach[scene, row, 2 + axis]
     least = row_clearance(draft.setting.spheres, placed, obstacles, scene, row, time, margin, margin, link)
     obstacles.centre[scene, row, 0] = x
     obstacles.centre[scene, row, 1] = y

@@ -1,4 +1,7 @@
-"""Changes of drawn scenes: jumps of the target, and obstacles that move with at most one turn."""
+"""Changes of drawn scenes: jumps of the target, and courses of obstacles.
+
+A course has a constant velocity and at most one turn, or it is a minimum-jerk reach, as that of another hand.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE
 from viapoint.envs.scenes.ends import Draft, is_end, is_row_clear
 from viapoint.envs.scenes.layout import mix
-from viapoint.envs.scenes.scene import MOST_JUMPS, NEVER
+from viapoint.envs.scenes.scene import FASTEST, MINIMUM_JERK_PEAK, MOST_JUMPS, NEVER, reached
 
 CANDIDATES = 8  # Candidates for a jump, or for the course of an obstacle
 COURSE_NUMBERS = 9  # Random numbers of a candidate for the course of an obstacle
@@ -24,6 +27,9 @@ SPEED = (0.05, 0.30)  # Speed of obstacles, [m/s]
 STEEPNESS = 0.5  # Greatest height that an obstacle in space gains, relative to its way
 # Share of obstacles that turn, and the time of the turn, relative to the centre duration
 TURNING, TURN = 0.5, (0.2, 0.7)
+# Duration of a reach of an obstacle, [s], its least and greatest length, [m], and its greatest peak speed, [m/s]
+REACH_TIME, REACH_LENGTH, REACH_SPEED = (0.6, 1.2), (0.15, 0.45), 0.9 * FASTEST
+MET_AT = (0.35, 0.65)  # Share of the duration of a reach after which an obstacle is where it was drawn
 MEETING = (0.25, 0.6)  # Time at which an obstacle is where it was drawn, relative to the centre duration
 # Least clearance of the start at first, of the goal while movements may end, and of targets that appear, [m]
 MARGIN = 0.015
@@ -73,14 +79,26 @@ def draw_courses(draft: Draft, which: Int, durations: Float, numbers: Float) -> 
 def _set_course(draft: Draft, scene: int, row: int, met: Float, duration: float, u: Float) -> None:
     """Give an obstacle a random course through a place during a movement of some duration; it rests if that is 0."""
     first, second = np.zeros(3), np.zeros(3)
-    turn, meeting = NEVER, 0.0
+    turn, meeting = NEVER, duration * _mixed(MEETING, u[8])
+    draft.scenes.reach[scene, row] = 0.0
+    height = 0.0 if draft.setting.plane else STEEPNESS
+    if duration > 0.0 and draft.setting.reaching:
+        time = _mixed(REACH_TIME, u[3])
+        begin = meeting - time * _mixed(MET_AT, u[4])
+        longest = min(REACH_LENGTH[1], REACH_SPEED * time / MINIMUM_JERK_PEAK)
+        _fill_vector(_mixed((REACH_LENGTH[0], longest), u[0]), u[1], height * (2.0 * u[2] - 1.0), first)
+        made = reached(begin, time, meeting) - reached(begin, time, 0.0)
+        draft.scenes.reach[scene, row, 0] = begin
+        draft.scenes.reach[scene, row, 1] = time
+        for axis in range(3):
+            draft.scenes.reach[scene, row, 2 + axis] = first[axis]
+            draft.scenes.obstacles.centre[scene, row, axis] = met[axis] - made * first[axis]
+        return
     if duration > 0.0:
-        height = 0.0 if draft.setting.plane else STEEPNESS
-        _fill_velocity(u[0], u[1], height * (2.0 * u[2] - 1.0), first)
-        meeting = duration * _mixed(MEETING, u[8])
+        _fill_vector(_mixed(SPEED, u[0]), u[1], height * (2.0 * u[2] - 1.0), first)
         if u[6] < TURNING:
             turn = duration * _mixed(TURN, u[7])
-            _fill_velocity(u[3], u[4], height * (2.0 * u[5] - 1.0), second)
+            _fill_vector(_mixed(SPEED, u[3]), u[4], height * (2.0 * u[5] - 1.0), second)
     for axis in range(3):
         way = first[axis] * min(meeting, turn) + second[axis] * max(meeting - turn, 0.0)
         draft.scenes.obstacles.centre[scene, row, axis] = met[axis] - way
@@ -90,13 +108,13 @@ def _set_course(draft: Draft, scene: int, row: int, met: Float, duration: float,
 
 
 @compiled
-def _fill_velocity(fast: float, heading: float, rise: float, velocity: Float) -> None:
-    """Fill in a velocity from two random numbers and the sine of its angle to the horizontal, shape (3,), [m/s]."""
-    speed, angle = _mixed(SPEED, fast), 2.0 * np.pi * heading
+def _fill_vector(length: float, heading: float, rise: float, vector: Float) -> None:
+    """Fill in a vector of some length, shape (3,), from its heading in turns and the sine of its rise."""
+    angle = 2.0 * np.pi * heading
     level = np.sqrt(1.0 - rise * rise)  # cosine of the angle to the horizontal
-    velocity[0] = speed * level * np.cos(angle)
-    velocity[1] = speed * level * np.sin(angle)
-    velocity[2] = speed * rise
+    vector[0] = length * level * np.cos(angle)
+    vector[1] = length * level * np.sin(angle)
+    vector[2] = length * rise
 
 
 @compiled

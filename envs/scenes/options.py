@@ -35,7 +35,7 @@ from viapoint.envs.scenes.scene import (
     resting,
 )
 
-OPTIONS = (*ENDS, "obstacles", "jumps", "turns")  # Options of `reset` that give a scene, or a part of one
+OPTIONS = (*ENDS, "obstacles", "jumps", "turns", "reaches")  # Options of `reset` that give a scene, or a part of one
 FORMAT = "viapoint-scene"  # Value of the key `format` of a scene file
 REACHED = 1e-6  # Greatest distance of the hand from a given place, [m]
 
@@ -66,8 +66,8 @@ def draw_given(
         options: May hold `start` and `goal`: in hand space positions of the hand, shape (2,), (3,) or N of them, [m];
             in joint space joint positions, shape (J,) or (N, J), or a :class:`Pose` or its dictionary, or N of them.
             `obstacles`: a list of shapes or dictionaries, or their JSON, for all scenes, or N such lists. `jumps`: rows
-            (time [s], target), and `turns`: rows (time [s], velocity [m/s]) for each given obstacle, of zeros for none;
-            shape (n, .) for all scenes or (N, n, .).
+            (time [s], target). `turns`: rows (time [s], velocity [m/s]), and `reaches`: rows (begin [s], duration [s],
+            way [m]), for each given obstacle, of zeros for none. Shape (n, .) for all scenes or (N, n, .).
         sampler: Sampler of the task's scenes.
         generators: N random generators.
 
@@ -93,9 +93,12 @@ def draw_given(
     scenes = resting(ends.get("start", home), ends.get("goal", home), obstacles)
     if "jumps" in options:
         scenes = scenes._replace(jumps=_jumps(options["jumps"], sampler, number))
+    for name in ("turns", "reaches"):
+        if name in options and shapes is None:
+            raise ValueError(f"options[{name!r}] are those of options['obstacles'], which must be given, too")
+    if "reaches" in options:
+        scenes = scenes._replace(reach=_rows("reaches", options["reaches"], (number, sampler.rows, 5)))
     if "turns" in options:
-        if shapes is None:
-            raise ValueError("options['turns'] are those of options['obstacles'], which must be given, too")
         turns = _rows("turns", options["turns"], (number, sampler.rows, 4))
         given = (turns != 0.0).any(axis=-1)
         scenes.turn_time[given] = turns[given][:, 0]
@@ -294,6 +297,9 @@ def scene_to_json(
     if (turn_time < NEVER).any():
         turns = np.column_stack((turn_time, scenes.turn_velocity[scene][present]))
         record["turns"] = np.where(turn_time[:, None] < NEVER, turns, 0.0).tolist()
+    reaches = scenes.reach[scene][present]
+    if reaches.any():
+        record["reaches"] = reaches.tolist()
     return json.dumps(record, indent=1) + "\n"
 
 

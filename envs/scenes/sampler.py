@@ -93,7 +93,7 @@ class SceneSampler:
     ) -> Scenes:
         """Draw one scene from each of N random generators, without the `given` parts, which are those of `scenes`.
 
-        Parts are `start`, `goal`, `obstacles`, `jumps` and `turns`.
+        Parts are `start`, `goal`, `obstacles`, `jumps`, `turns` and `reaches`.
 
         Raises:
             RuntimeError: No scene was found in many attempts.
@@ -242,6 +242,7 @@ def _setting_of(task: Task, plane: bool) -> Setting:
         self_margin=min(SELF_MARGIN, HOME_SHARE * float(own[0])),
         least_way=0.0 if plane else LEAST_WAY,
         n_jumps=task.n_jumps,
+        reaching=task.courses == "reaches",
         relative_durations=(shortest / centre, longest / centre),
     )
 

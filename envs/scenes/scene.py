@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.geometry.clearance import FAR, row_clearances
+from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import HALF_SPACE, Obstacles, no_obstacles
 from viapoint.envs.geometry.shapes import IN_TABLES
 
@@ -21,6 +23,12 @@ ROUNDING = 1e-9  # Rounding error of times, [s], and joint positions, [rad]
 LEAST_APART = 0.02  # Least difference of start and goal in the joint that moves most, [rad] or [m]
 FARTHEST = 2.0  # Greatest coordinate of an obstacle's centre, and greatest size, [m]; half-spaces have none
 FASTEST = 1.0  # Greatest speed of an obstacle, [m/s]
+# Time between two points of a reach, [s]: obstacles move straight between them, at most 1 mm from the smooth reach
+CHORD = 0.04
+LATEST = 60.0  # Latest end of a reach of an obstacle, [s]
+MINIMUM_JERK_PEAK = 1.875  # Peak speed of a minimum-jerk movement relative to its mean speed
+# Fields with a row for each obstacle
+OF_OBSTACLES = ("turn_time", "turn_velocity", "reach")
 
 
 class Scenes(NamedTuple):
@@ -49,6 +57,11 @@ class Scenes(NamedTuple):
     """Times at which obstacles change their velocity, shape (N, n), [s]; NEVER where they do not."""
     turn_velocity: Float
     """Velocities after the change, shape (N, n, 3), [m/s]."""
+    reach: Float
+    """Minimum-jerk reaches of obstacles: (begin [s], duration [s], way 3 [m]), shape (N, n, 5); of zeros for none.
+
+    A reach that has begun before time 0 goes on from the place of the obstacle at time 0.
+    """
 
     def take(self, rows: Any) -> Scenes:
         """Return the scenes at `rows`, an index array, slice or mask."""
@@ -66,8 +79,8 @@ class Scenes(NamedTuple):
         """Return the scenes with another number of rows for obstacles; those behind are left out."""
         wide = resting(self.start, self.goal, self.obstacles.with_rows(rows))
         kept = min(rows, self.turn_time.shape[1])
-        wide.turn_time[:, :kept] = self.turn_time[:, :kept]
-        wide.turn_velocity[:, :kept] = self.turn_velocity[:, :kept]
+        for name in OF_OBSTACLES:
+            getattr(wide, name)[:, :kept] = getattr(self, name)[:, :kept]
         return wide._replace(jumps=self.jumps)
 
     @classmethod
@@ -108,7 +121,51 @@ class Scenes(NamedTuple):
         centre = self.obstacles.centre + velocity * before + self.turn_velocity * after
         turned = (self.turn_time <= time + ROUNDING)[..., None]
         now = np.where(turned, self.turn_velocity, velocity)
+        if self.reach.any():
+            begin = CHORD * np.floor(time[:, 0] / CHORD + ROUNDING)
+            moved = _ways(self.reach, begin)
+            rate = (_ways(self.reach, begin + CHORD) - moved) / CHORD
+            centre = centre + moved + rate * (time[:, 0] - begin)[:, None, None]
+            now = now + rate
         return self.obstacles._replace(centre=centre, velocity=now)
+
+    def course_times(self) -> Float:
+        """Return the times at which obstacles change their velocity, shape (N, .), [s]; NEVER fills the rows."""
+        if not self.reach.any():
+            return self.turn_time
+        begin, duration = self.reach[..., 0], self.reach[..., 1]
+        chords = CHORD * np.arange(1, math.ceil((begin + duration).max() / CHORD) + 1)
+        moving = (duration > 0.0) & (begin < chords[:, None, None])
+        moving &= chords[:, None, None] < begin + duration + CHORD
+        return np.concatenate((self.turn_time, np.where(moving.any(axis=2).T, chords, NEVER)), axis=1)
+
+
+@compiled
+def reached(begin: float, duration: float, time: float) -> float:
+    """Return the share of its way that a minimum-jerk reach has made at a time, [s].
+
+    Flash & Hogan 1985: x(s) = 10 s^3 - 15 s^4 + 6 s^5, with the share s of the duration.
+    """
+    share = min(max((time - begin) / duration, 0.0), 1.0)
+    return share**3 * (10.0 + share * (6.0 * share - 15.0))
+
+
+@compiled
+def way_since_start(reach: Float, time: float) -> float:
+    """Return the share of its way that an obstacle with a reach, shape (5,), has made since time 0."""
+    if reach[1] <= 0.0:
+        return 0.0
+    return reached(reach[0], reach[1], time) - reached(reach[0], reach[1], 0.0)
+
+
+@compiled
+def _ways(reach: Float, time: Float) -> Float:
+    """Return how far reaches, shape (N, n, 5), have moved obstacles at times, shape (N,), shape (N, n, 3), [m]."""
+    found = np.zeros((*reach.shape[:2], 3))
+    for scene in range(reach.shape[0]):
+        for row in range(reach.shape[1]):
+            found[scene, row] = way_since_start(reach[scene, row], time[scene]) * reach[scene, row, 2:]
+    return found
 
 
 def resting(start: Float, goal: Float, obstacles: Obstacles) -> Scenes:
@@ -121,6 +178,7 @@ def resting(start: Float, goal: Float, obstacles: Obstacles) -> Scenes:
         np.zeros((number, MOST_JUMPS, joints + 1)),
         np.full(obstacles.kind.shape, NEVER),
         np.zeros(obstacles.centre.shape),
+        np.zeros((*obstacles.kind.shape, 5)),
     )
 
 
@@ -178,6 +236,13 @@ def _check_obstacles(scenes: Scenes, names: Sequence[Sequence[str]]) -> None:
         speed = norm(velocity)
         _refuse(present & (speed > FASTEST), f"must be at most {FASTEST:g} m/s fast", speed, names)
     _refuse(present & (turn_time <= 0.0), "must change its course after 0 s", turn_time, names)
+    begin, duration = scenes.reach[..., 0], scenes.reach[..., 1]
+    reaches = present & scenes.reach.any(axis=-1)
+    _refuse(reaches & (duration <= 0.0), "must reach in more than 0 s", duration, names)
+    late = reaches & (begin + duration > LATEST)
+    _refuse(late, f"must end its reach within {LATEST:g} s", begin + duration, names)
+    speed = MINIMUM_JERK_PEAK * norm(scenes.reach[..., 2:]) / np.where(reaches & (duration > 0.0), duration, np.inf)
+    _refuse(reaches & (speed > FASTEST), f"must reach with at most {FASTEST:g} m/s", speed, names)
 
 
 def _check_end(

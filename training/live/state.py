@@ -25,6 +25,7 @@ class Scene(NamedTuple):
     obstacles: tuple[Shape, ...]  # Obstacles at time 0, with their velocities
     jumps: Any = ()  # Jumps of the target: rows (time [s], target D)
     turns: Any = ()  # Changes of course: rows (time [s], velocity 3 [m/s]) by obstacle
+    reaches: Any = ()  # Reaches: rows (begin [s], duration [s], way 3 [m]) by obstacle
 
     def options(self) -> dict[str, Any]:
         """Return the options of `reset`; what does not change is left out."""
@@ -63,7 +64,9 @@ class Scene(NamedTuple):
         """Return the scene without an obstacle."""
         left = (*self.obstacles[:row], *self.obstacles[row + 1 :])
         return self._replace(
-            obstacles=left, turns=np.delete(self.turns, row, axis=0) if len(self.turns) else ()
+            obstacles=left,
+            turns=np.delete(self.turns, row, axis=0) if len(self.turns) else (),
+            reaches=np.delete(self.reaches, row, axis=0) if len(self.reaches) else (),
         )
 
 

@@ -19,6 +19,7 @@ from viapoint.training.planning.cautious import BELIEFS, BeliefMethod, CautiousS
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl
 from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
+from viapoint.training.planning.predictions import PREDICTIONS, PredictedSearch
 from viapoint.training.planning.search import GeometrySearch, registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
 from viapoint.training.rollouts.vec_env import env_arguments
@@ -289,12 +290,17 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
             return lambda simulation: BeliefMethod(task, belief, make(simulation))
     elif name in known:
         return known[name]
+    elif task.replanning and task.moving_obstacles and belief in PREDICTIONS:
+        search = _counted(planner, ("search", "sobol"))
+        if search is not None:
+            return lambda simulation: PredictedSearch(simulation, belief, search(simulation))
     counted = list(COUNTED) if sensed else unsensed
     found = _counted(name, counted)
     if found is not None:
         return found
     names = [*known, *(f"{each}N" for each in counted), "untrained"]  # N plans are checked
     names += [f"{each}:METHOD" for each in BELIEFS] if sensed else []
+    names += [f"{each}:searchN" for each in PREDICTIONS] if task.replanning and task.moving_obstacles else []
     raise ValueError(unknown_name("baseline", name, names))
 
 

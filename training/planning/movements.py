@@ -34,6 +34,7 @@ from viapoint.envs.geometry.clearance import (
 from viapoint.envs.geometry.compiled import compiled, inlined, kernel
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import SHORTEST_DURATION
+from viapoint.envs.scenes.scene import CHORD
 
 INSTANTS = 64  # Instants of a movement that are checked; a power of two
 # Instants of a movement that is checked once more before it is executed; a power of two
@@ -81,6 +82,7 @@ class Setting(NamedTuple):
     # Reach of the joints, see :func:`~viapoint.envs.geometry.clearance.travel`, shape (J,), [m]
     reach: Float
     hand_alone: bool  # True if the only sphere is the one around the hand of an arm in the plane
+    n_pieces: int = 1  # Scenes of obstacles for each problem, one after the other in time, each for CHORD
 
 
 class Movement(NamedTuple):
@@ -337,12 +339,15 @@ def least_clearance(
     The search stops at the first clearance below `floor`. In the plane, instants are skipped whose neighbours have so
     much clearance that they cannot have less than the least so far. (Arms in space move too far between two instants.)
 
-    Obstacles are those of the scene `scene`. Clearances above `least` are of no interest, below `floor` the exact value
+    Obstacles are those of the problem `scene`. Clearances above `least` are of no interest, below `floor` the exact value
     does not matter, [m], and after the time `until` nothing does, [s].
     """
     alone, last = setting.hand_alone, len(movement.table.order) - 1
     path, bound, placed = memory.path, memory.bound, memory.placed
-    drift = fastest(obstacles, scene) * movement.duration / last
+    first, speed = scene * setting.n_pieces, 0.0
+    for piece in range(setting.n_pieces):
+        speed = max(speed, fastest(obstacles, first + piece))
+    drift = speed * movement.duration / last
     for k in range(last + 1):
         instant = movement.table.order[k]
         here = path[instant]
@@ -365,7 +370,8 @@ def least_clearance(
             else:
                 place(setting.chain, setting.spheres, here, placed)
             window = WINDOW if setting.of_hand else 0.0
-            apart = obstacle_clearance(setting.spheres, placed, obstacles, scene, time, least + window, floor)
+            piece = first + min(int(time / CHORD), setting.n_pieces - 1)
+            apart = obstacle_clearance(setting.spheres, placed, obstacles, piece, time, least + window, floor)
             least = min(least, apart)
             if least < floor:
                 return least

@@ -118,14 +118,18 @@ class GeometrySearch:
         """
         return self.solve(Problem.of_observation(observation, self.task))
 
-    def solve(self, problem: Problem) -> Float:
-        """Return the best action of each of B problems, shape (B, m)."""
+    def solve(self, problem: Problem, n_pieces: int = 1) -> Float:
+        """Return the best action of each of B problems, shape (B, m).
+
+        While a movement is under way, courses of obstacles may have several pieces, see
+        :func:`~viapoint.training.planning.predictions.in_pieces`.
+        """
         moving = problem.remaining is not None
         at = self.task.n_via * self.task.action.dimension
         duration = None if moving or not at else at  # from rest the duration stays as it is
         actions = candidate_actions(self.task, self.n_checks, replanning=moving)
         candidates = np.broadcast_to(actions, (len(problem.start), *actions.shape))
-        setting = setting_of(self.task, problem.obstacles)
+        setting = setting_of(self.task, problem.obstacles)._replace(n_pieces=n_pieces)
         merit = merits(self.task, problem, candidates, setting)
         for each in range(self.refinements):
             top = np.argsort(-merit, axis=-1, kind="stable")[:, :N_CENTRES]

@@ -1,0 +1,166 @@
+"""Search among obstacles that move, with a prediction of their courses.
+
+A prediction is a list of places at intervals of CHORD, between which obstacles move straight. The rest is the search
+with computed geometry, which by itself takes the present velocities for constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.obstacles import Obstacles
+from viapoint.envs.scenes.motions import REACH_LENGTH, REACH_TIME
+from viapoint.envs.scenes.scene import CHORD, Scenes, reached
+from viapoint.envs.task import Task
+from viapoint.training.planning.problem import Problem
+from viapoint.training.planning.search import GeometrySearch
+from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
+
+HORIZON = 40  # Number of intervals of a prediction; obstacles keep the last velocity
+MOVING = 1e-3  # Speed above which an obstacle moves, [m/s]
+# Hypotheses on a reach: durations, and the shares of them that have passed
+DURATIONS = np.linspace(*REACH_TIME, 7)
+PASSED = np.linspace(0.01, 0.99, 50)
+# Standard deviations of what was seen from a hypothesis, [m] and [m/s], and of lengths beyond the usual ones, [m]
+PLACE_ERROR, RATE_ERROR, LENGTH_ERROR = 0.002, 0.02, 0.03
+
+
+class Seen(NamedTuple):
+    """What was seen of the n obstacles of one episode in its M decisions so far."""
+
+    time: Float  # Shape (M,), [s]
+    centre: Float  # Shape (M, n, 3), [m]
+    velocity: Float  # Shape (M, n, 3), [m/s]
+
+
+def at_rest(seen: Seen, scene: Scenes) -> Float:
+    """Return obstacles that stay where they are, shape (HORIZON + 1, n, 3), [m]."""
+    return np.repeat(seen.centre[-1:], HORIZON + 1, axis=0)
+
+
+def known_courses(seen: Seen, scene: Scenes) -> Float:
+    """Return the true courses, which no method can know."""
+    time = seen.time[-1] + CHORD * np.arange(HORIZON + 1)
+    return scene.take(np.zeros(len(time), np.int64)).obstacles_at(time).centre
+
+
+def fitted_reaches(seen: Seen, scene: Scenes) -> Float:
+    """Return minimum-jerk reaches that fit what was seen; an obstacle that rests stays where it is.
+
+    Each hypothesis on duration and begin of the reach has a way, by least squares, and a probability, by what was seen
+    and by the length of usual reaches. The prediction is the mean of all hypotheses.
+    """
+    places = at_rest(seen, scene)
+    ahead = CHORD * np.arange(HORIZON + 1)
+    for row in np.flatnonzero(norm(seen.velocity[-1]) > MOVING):
+        made, weight, way = _hypotheses(seen.time, seen.centre[:, row], seen.velocity[:, row], ahead)
+        places[:, row] += np.einsum("h,ht,hd->td", weight, made, way)
+    return places
+
+
+def _hypotheses(time: Float, centre: Float, velocity: Float, ahead: Float) -> tuple[Float, Float, Float]:
+    """Return the H hypotheses on a reach that was seen M times.
+
+    Returns:
+        Shares of the way that will be made at times from now, shape (H, T); probabilities, shape (H,); ways, shape
+        (H, 3), [m].
+    """
+    duration, passed = (part.ravel() for part in np.meshgrid(DURATIONS, PASSED, indexing="ij"))
+    begin = time[-1] - passed * duration
+    every = np.concatenate((time, time + CHORD, time[-1] + ahead))
+    share = _shares(begin, duration, every)
+    number = len(time)
+    now = share[:, number - 1, None]
+    # Places and velocities in units of their errors, as products of a coefficient and the way
+    rate = (share[:, number : 2 * number] - share[:, :number]) / CHORD
+    coefficient = np.concatenate(((share[:, :number] - now) / PLACE_ERROR, rate / RATE_ERROR), axis=1)
+    value = np.concatenate(((centre - centre[-1]) / PLACE_ERROR, velocity / RATE_ERROR))
+    square = np.maximum((coefficient**2).sum(axis=1), 1e-12)
+    way = coefficient @ value / square[:, None]
+    misfit = (value**2).sum() - square * (way**2).sum(axis=1)
+    length = norm(way)
+    beyond = np.maximum(REACH_LENGTH[0] - length, 0.0) + np.maximum(length - REACH_LENGTH[1], 0.0)
+    misfit = misfit + (beyond / LENGTH_ERROR) ** 2
+    weight = np.exp(-0.5 * (misfit - misfit.min()))
+    return share[:, 2 * number :] - now, weight / weight.sum(), way
+
+
+@compiled
+def _shares(begin: Float, duration: Float, time: Float) -> Float:
+    """Return the shares of their ways that H reaches have made at T times, shape (H, T)."""
+    found = np.empty((len(begin), len(time)))
+    for h in range(len(begin)):
+        for k in range(len(time)):
+            found[h, k] = reached(begin[h], duration[h], time[k])
+    return found
+
+
+# Predictions of the places of obstacles by name
+PREDICTIONS: dict[str, Callable[[Seen, Scenes], Float]] = {
+    "rest": at_rest,
+    "reach": fitted_reaches,
+    "known": known_courses,
+}
+
+
+class PredictedSearch:
+    """Search that revises its plans among obstacles whose courses it predicts, by one of PREDICTIONS."""
+
+    def __init__(self, simulation: SceneSimulation, prediction: str, search: GeometrySearch) -> None:
+        self.name = f"{prediction}:{search.name}"
+        self._simulation, self._predict, self._search = simulation, PREDICTIONS[prediction], search
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """Return first decisions, see :class:`~viapoint.training.planning.baselines.Method`."""
+        return self._decide(observation, scenes, {})
+
+    def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
+        """Play every episode to its end, beginning with the given decisions, and remember what is seen."""
+        memory: dict[bytes, Seen] = {}
+        self._look(self._simulation.observe(scenes), scenes, memory)
+        return self._simulation.episodes(
+            scenes, decisions, lambda seen, some: self._decide(seen, some, memory)
+        )
+
+    def _decide(self, observation: Observation, scenes: Scenes, memory: dict[bytes, Seen]) -> Float:
+        problem = Problem.of_observation(observation, self._search.task)
+        places = []
+        for i, seen in enumerate(self._look(observation, scenes, memory)):
+            places.append(self._predict(seen, scenes.take([i])))
+        obstacles = in_pieces(problem.obstacles, np.array(places))
+        return self._search.solve(problem._replace(obstacles=obstacles), n_pieces=HORIZON)
+
+    def _look(self, observation: Observation, scenes: Scenes, memory: dict[bytes, Seen]) -> list[Seen]:
+        """Add observations to what was seen in their episodes, which the scenes tell apart, and return that."""
+        task: Task = self._search.task
+        obstacles = Problem.of_observation(observation, task).obstacles
+        time = task.time_limit - np.asarray(observation["time_left"], np.float64)[:, 0]
+        found = []
+        for i in range(len(time)):
+            key = scenes.start[i].tobytes() + scenes.goal[i].tobytes()
+            new = Seen(time[i : i + 1], obstacles.centre[i : i + 1], obstacles.velocity[i : i + 1])
+            if key in memory:
+                new = Seen(*[np.concatenate(parts) for parts in zip(memory[key], new, strict=True)])
+            memory[key] = new
+            found.append(new)
+        return found
+
+
+def in_pieces(obstacles: Obstacles, places: Float) -> Obstacles:
+    """Return obstacles of B problems in pieces of CHORD, B T scenes, for places of shape (B, T + 1, n, 3), [m].
+
+    The centre of each piece is where the obstacle would be at time 0 with the velocity of the piece.
+    """
+    number, pieces = len(places), places.shape[1] - 1
+    velocity = np.diff(places, axis=1) / CHORD
+    begin = CHORD * np.arange(pieces)[:, None, None]
+    centre = places[:, :-1] - begin * velocity
+    many = obstacles.take(np.repeat(np.arange(number), pieces))
+    shape = many.centre.shape
+    return many._replace(centre=centre.reshape(shape), velocity=velocity.reshape(shape))
