@@ -4,6 +4,7 @@ python benchmarks/results.py                                  # all tasks; hours
 python benchmarks/results.py --env viapoint/PandaObstacles-v0 # others keep their numbers
 python benchmarks/results.py --only runs                      # only the trainings of benchmarks/sb3.py
 python benchmarks/results.py --only looking                   # only searches that look again on the way
+python benchmarks/results.py --only reaches                   # only obstacles on reaches of their own
 """
 
 from __future__ import annotations
@@ -47,6 +48,12 @@ LOOKING: dict[str, Any] = {
 """Decisions of PlanarSensed with rays around the hand, in which points that were seen are remembered."""
 LOOKS = "PlanarSensed, hand_rays"
 """Name of this variant in the file and on the page."""
+PREDICTIONS = ("rest:search512", "search512", "reach:search512", "known:search512")
+"""Searches with more and more that is known of the courses of obstacles."""
+INTERVALS = {"PlanarMovingObstacles": (0.3, 0.1), "PandaMovingObstacles": (0.5,)}
+"""Greatest times from one decision to the next, [s], in tasks whose obstacles may be on reaches of their own."""
+REACHES = [f"{name}, reaches" for name in INTERVALS]
+"""Names of these variants."""
 PAGE = Path("docs/results.md")
 FIELDS = ("env", "scenes", "method", "success", "low", "high", "count", "jerk_ratio", "milliseconds")
 
@@ -61,10 +68,13 @@ class Config:
     """Ids of environments with a shipped agent."""
     n_scenes: int | None = None
     """Number of scenes of each set; default: all of them."""
-    only: Literal["everything", "runs", "looking"] = "everything"
-    """Part that is measured: the trainings in `runs`, or searches that look again; other numbers stay."""
+    only: Literal["everything", "runs", "looking", "reaches"] = "everything"
+    """Part that is measured: the trainings in `runs`, searches that look again, or obstacles on reaches of their own;
+    other numbers stay."""
     runs: Path = Path("runs/sb3")
     """Folder of trainings of algorithms of Stable-Baselines3 by benchmarks/sb3.py, which get a row each."""
+    reaches: Path = Path("runs/reaches")
+    """Folder of trainings among obstacles on reaches of their own, such as `PlanarMovingObstacles-0` for seed 0."""
 
 
 def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
@@ -80,20 +90,36 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
     if config.only == "everything":
         for row in evaluate(load_agent(env_id), **common, **settings).rows:
             yield _numbers(env_id, name, row["method"], row)
-    if config.only != "runs" and task.sensor is not None and task.space.of_hand:
+    short = env_id.removeprefix("viapoint/").removesuffix("-v0")
+    if config.only in ("everything", "reaches"):
+        yield from reaches_of(config, short, common)
+    if config.only in ("everything", "looking") and task.sensor is not None and task.space.of_hand:
         for when, decide_at in LOOKING.items():
             kwargs = {"sensor": "hand_rays", "decide_at": decide_at}
             searches = ["thick:search512", "known:search512"]
             for row in evaluate(**common, env_kwargs=kwargs, baselines=searches).rows:
                 yield _numbers(LOOKS, name, f"{row['method']}, {when}", row)
-    if config.only == "looking":
+    if config.only in ("looking", "reaches"):
         return
-    short = env_id.removeprefix("viapoint/").removesuffix("-v0")
     for folder in sorted(config.runs.glob(f"{short}-*")):
         run = Run(folder)
         method = f"{run.config.algorithm.upper()}, {run.curve[-1]['decisions']:,} decisions"
         row = evaluate(load_agent(folder), **common, baselines=[]).rows[0]
         yield _numbers(env_id, name, method, row)
+
+
+def reaches_of(config: Config, short: str, common: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the numbers of each method among obstacles on reaches of their own, in scenes that are drawn."""
+    for interval in INTERVALS.get(short, ()):
+        kwargs = {"courses": "reaches", "horizon": interval}
+        rows = evaluate(**common, env_kwargs=kwargs, baselines=("straight", *PREDICTIONS)).rows
+        for folder in sorted(config.reaches.glob(f"{short}-*")):
+            seed = folder.name.rpartition("-")[2]
+            baselines = ["untrained"] if seed == "0" else []
+            for row in evaluate(load_agent(folder), **common, env_kwargs=kwargs, baselines=baselines).rows:
+                rows.append({**row, "method": row["method"].replace("agent", f"agent, seed {seed}")})
+        for row in rows:
+            yield _numbers(f"{short}, reaches", "test", f"{row['method']}, every {interval} s", row)
 
 
 def _numbers(env_id: str, name: str, method: str, row: dict[str, Any]) -> dict[str, Any]:
@@ -142,7 +168,8 @@ def write_page(rows: list[dict[str, Any]]) -> None:
         if not found:
             continue  # tasks without obstacles are not on the page
         mine = [row for row in rows if row["env"] == env_id]
-        mine = [row for row in mine if not row["method"].startswith("untrained, ")]  # in the file only
+        if env_id in SHIPPED_IDS:  # in the file only
+            mine = [row for row in mine if not row["method"].startswith("untrained, ")]
         _, _, rest = after.partition("\n\n")  # after the old table
         text = f"{before}{heading}{table(mine)}\n\n{rest}"
     PAGE.write_text(text, encoding="utf-8")
@@ -166,7 +193,7 @@ def main() -> None:
         kept = [row for row in every if (row["env"], row["method"]) not in measured]
         if config.only == "everything":
             kept = [row for row in kept if row["env"] != env_id]
-        order = [*SHIPPED_IDS, LOOKS]
+        order = [*SHIPPED_IDS, LOOKS, *REACHES]
         every = sorted(kept + found, key=lambda row: order.index(row["env"]))
         with config.out.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, FIELDS)

@@ -34,7 +34,7 @@ from viapoint.envs.steering import Steering
 
 Trigger = Literal["horizon", "target", "course", "clearance", "sight"]
 TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)  # Events that may end a decision before the goal
-COURSES = ("turns", "reaches")  # Courses of obstacles that move
+COURSES = ("turns", "reaches")  # Courses of obstacles that move; the first is the default
 # Values of `decide_at` with one decision for a movement, and with one in every control step
 END, STEPS = "end", "steps"
 MOST_OBSTACLES = 256  # Greatest number of obstacles in a scene that is given
@@ -278,6 +278,8 @@ class Task:
         sensor = values.pop("sensor")
         if sensor is not None:
             values["sensor"] = dataclasses.asdict(sensor)
+        if self.courses == COURSES[0]:  # records of frozen scenes were made without it
+            del values["courses"]
         plain: dict[str, Any] = json.loads(json.dumps(values))  # lists in place of tuples
         return plain
 

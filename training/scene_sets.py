@@ -20,7 +20,7 @@ from viapoint.envs.common.types import Float, Int
 from viapoint.envs.geometry.obstacles import KINDS, MESH, no_obstacles
 from viapoint.envs.scenes.scene import Scenes, resting
 from viapoint.envs.sensors import Sensor
-from viapoint.envs.task import Task
+from viapoint.envs.task import COURSES, Task
 
 SETS = ("validation", "test", "hard", "uniform")  # Names of the sets; a task need not have all
 BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")  # Bands of the solution share, from easy to hard
@@ -36,7 +36,6 @@ CONTENT = ("start", "goal", "kind", *MOVING, "jumps", "turn_time", "turn_velocit
 REACH = "reach"  # Array of a file where obstacles are on reaches
 # Fields of a task that say which scenes are scenes of it, besides kinds and families of obstacles
 SCENE_FIELDS = ("arm", "n_obstacles", "whole_arm", "moving_obstacles", "n_jumps")
-DEFAULT_COURSES = "turns"  # Courses of scenes of tasks that do not tell them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +137,7 @@ def _scene_key(task: Mapping[str, Any]) -> str:
     values = [task[name] for name in SCENE_FIELDS]
     values += [sorted(task["shapes"]), sorted(task["families"])]
     if task["moving_obstacles"] or any(task["n_jumps"]):
-        values.append(task.get("courses", DEFAULT_COURSES))
+        values.append(task.get("courses", COURSES[0]))
         values.append(task["duration_range"])  # things happen at parts of the longest movement
     return json.dumps(values, sort_keys=True)
 

@@ -17,6 +17,7 @@ ANY_ENVIRONMENT = [
     ({"width": 2.5}, ValueError), ({"height": True}, ValueError), ({"threads": -1}, ValueError),
     ({"arm": "ur5"}, ValueError), ({"arm": 5}, ValueError), ({"space": "hands"}, ValueError),
     ({"whole_arm": "yes"}, TypeError), ({"moving_obstacles": 1}, TypeError), ({"shapes": 3}, TypeError),
+    ({"courses": "walks"}, ValueError),
     ({"shapes": ()}, ValueError), ({"shapes": "pyramid"}, ValueError), ({"shapes": ("box", "box")}, ValueError),
     ({"families": 3}, TypeError), ({"families": ()}, ValueError), ({"families": "maze"}, ValueError),
     *(({"n_obstacles": number}, ValueError) for number in (-1, 1.5, True, (3, 2), (40, 50), (0, 257), "many")),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from episodes import ENDS, MOVING, OBSTACLES, OTHER, PANDA, PANDA_MOVING, given, post, same, same_scenes
 
+from viapoint import primitives
 from viapoint.envs import (
     Box,
     Capsule,
@@ -29,6 +30,7 @@ from viapoint.envs.geometry.clearance import memory, movement_clearance
 from viapoint.envs.geometry.shapes import REGISTERED_MESHES
 from viapoint.envs.scenes.scene import NEVER, Scenes, check_scenes
 
+REACHING = {"courses": "reaches"}
 HOME = arm_of("panda").home
 AWAY = HOME + np.array([0.9, 0.3, 0.0, 0.2, 0.0, 0.0, 0.0])
 PANDA_ENDS = {"start": HOME, "goal": AWAY}

@@ -9,12 +9,15 @@ from viapoint.training.agents.model_io import build
 from viapoint.training.config.presets import STEP_PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planning.baselines import StepAgentMethod, Straight, agent_method, make_method
+from viapoint.training.planning.predictions import Seen, fitted_reaches, known_courses
+from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, whole_task
 from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.scene_sets import scenes_for
+from viapoint.training.scene_sets import drawn, load, scenes_for
 
 MOVING, JUMPS = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarTargetJump-v0"
 STEP = "viapoint/PlanarObstaclesStep-v0"
+REACHING = {"courses": "reaches"}
 
 
 def rate(env_id, name, number=12):
@@ -28,6 +31,42 @@ def rate(env_id, name, number=12):
 def test_the_search_revises_around_moving_obstacles():
     assert rate(MOVING, "search256") > 0.9
     assert rate(MOVING, "straight") < 0.5
+
+
+def test_courses_are_predicted_the_better_the_more_is_known():
+    """Among obstacles on reaches of their own: at rest, constant velocities, fitted reaches, the truth."""
+    task = registered_task(MOVING, **REACHING)
+    frozen = drawn("validation", task, 60)
+    methods = []
+    for name in ("rest:search64", "search64", "reach:search64", "known:search64"):
+        methods.append(make_method(name, MOVING, **REACHING))
+    found = evaluate_methods(methods, frozen, MOVING, env_kwargs=REACHING, time_decisions=False)
+    rates = [result.success.mean() for result in found.results]
+    assert rates == sorted(rates)
+    assert rates[3] > rates[2] + 0.1 > rates[1] + 0.2
+
+
+def test_two_looks_at_a_reach_tell_its_end():
+    begin, duration, way = -0.2, 0.9, np.array([0.2, -0.1, 0.0])
+    scene = registered_task(MOVING).sampler()([np.random.default_rng(0)]).with_rows(1)
+    scene.reach[0, 0] = [begin, duration, *way]
+    scene.obstacles.velocity[:] = 0.0
+    scene.turn_velocity[:] = 0.0
+    time = np.array([0.0, 0.28])
+    seen = [scene.obstacles_at(time[k : k + 1]) for k in range(2)]
+    looks = Seen(time, *(np.concatenate([getattr(each, part) for each in seen]) for part in ("centre", "velocity")))
+    places = known_courses(looks, scene)
+    np.testing.assert_allclose(fitted_reaches(looks, scene), places, atol=0.02)
+    # One look leaves the end open.
+    assert np.abs(fitted_reaches(Seen(*(part[1:] for part in looks)), scene) - places).max() > 0.02
+
+
+def test_sets_of_reaching_obstacles_are_stored_with_their_reaches(tmp_path):
+    frozen = drawn("validation", registered_task(MOVING, **REACHING), 5)
+    frozen.save(tmp_path / "set.npz")
+    again = load(tmp_path / "set.npz")
+    np.testing.assert_array_equal(again.scenes.reach, frozen.scenes.reach)
+    assert again.sha256 == frozen.sha256
 
 
 def test_a_jumping_target_is_reached_by_revision_only():
