@@ -104,6 +104,8 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
     for folder in sorted(config.runs.glob(f"{short}-*")):
         run = Run(folder)
         method = f"{run.config.algorithm.upper()}, {run.curve[-1]['decisions']:,} decisions"
+        if run.config.algorithm == "viarank":  # with another belief
+            method = f"{folder.name.rpartition('-')[2]}:agent"
         row = evaluate(load_agent(folder), **common, baselines=[]).rows[0]
         yield _numbers(env_id, name, method, row)
 

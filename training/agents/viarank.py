@@ -27,13 +27,15 @@ from torch import Tensor
 from torch.nn import functional
 
 from viapoint.envs.common.types import Float
+from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.task import Task
 from viapoint.training.agents.model_io import ALGORITHMS, check_arguments
 from viapoint.training.agents.plan_agent import Observation, PlanAlgorithm, PlanPolicy, task_in
 from viapoint.training.agents.sight_network import SightInputs, SightNetwork, sight_inputs
-from viapoint.training.planning.beliefs import Sight, thick_points
+from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.candidates import candidate_actions
+from viapoint.training.planning.cautious import BELIEFS, DEFAULT_BELIEF, PRIVILEGED
 from viapoint.training.planning.problem import Numbers, Problem
 from viapoint.training.planning.search import (
     CLEARANCE_MARGIN,
@@ -61,9 +63,12 @@ class ViaRankPolicy(PlanPolicy):
         nearest: Number of places of a plan that the network sees.
         candidates: Number of Sobol points in the action space.
         refine: Number of best candidates that the planner refines around what is seen; they are ranked, too.
+        belief: Obstacles whose clearance the network sees beside the readings, one of
+            :data:`~viapoint.training.planning.cautious.BELIEFS`. With `known` and `seen` the agent decides only where
+            the true obstacles are given, as in evaluations.
     """
 
-    OWN = "width", "instants", "nearest", "candidates", "refine"
+    OWN = "width", "instants", "nearest", "candidates", "refine", "belief"
 
     def __init__(
         self,
@@ -77,6 +82,7 @@ class ViaRankPolicy(PlanPolicy):
         nearest: int = 16,
         candidates: int = 512,
         refine: int = 0,
+        belief: str = DEFAULT_BELIEF,
         **kwargs: Any,
     ) -> None:
         super().__init__(observation_space, action_space, task=task, **kwargs)
@@ -85,7 +91,10 @@ class ViaRankPolicy(PlanPolicy):
         self.nearest = nearest
         self.candidates = candidates
         self.refine = refine
+        self.belief = belief
         check_arguments(type(self), self._own())
+        if belief not in BELIEFS:
+            raise ValueError(f"belief must be one of {', '.join(BELIEFS)}, got {belief!r}")
         if self.task.sensor is None or not self.task.whole_movement:
             raise ValueError(
                 "viarank needs a task with a sensor whose actions are whole movements, such as viapoint/PlanarSensed-v0"
@@ -113,13 +122,29 @@ class ViaRankPolicy(PlanPolicy):
         """Return the best actions, shape (B, m), for parts of B observations."""
         return self.assess(observation)[0]
 
-    def assess(self, observation: Observation) -> tuple[Float, Float]:
-        """Return the best actions of B observations, shape (B, m), and their predicted success, shape (B,)."""
+    def assess(self, observation: Observation, truth: Obstacles | None = None) -> tuple[Float, Float]:
+        """Return the best actions of B observations, shape (B, m), and their predicted success, shape (B,).
+
+        Privileged beliefs need the true obstacles of B scenes.
+        """
         problem = Problem.of_observation(observation, self.task)
         sight = Sight.of(observation, self.task)
+        if self.belief != DEFAULT_BELIEF:
+            problem = problem._replace(obstacles=self.believed(sight, truth))
         actions, success = self.best(problem, sight)
         slope, offset = self.network.calibration.tolist()
         return actions, expit(slope * logit(success) + offset)
+
+    def believed(self, sight: Sight, truth: Obstacles | None) -> Obstacles:
+        """Return the obstacles that are believed to be there.
+
+        Raises:
+            ValueError: The belief needs the true obstacles, and they are not given.
+        """
+        if truth is None and self.belief in PRIVILEGED:
+            raise ValueError(f"an agent with the belief {self.belief!r} decides in evaluations only")
+        obstacles = no_obstacles(len(sight.ranges)) if truth is None else truth
+        return BELIEFS[self.belief](self.task, sight, obstacles)
 
     def best(self, problem: Problem, sight: Sight) -> tuple[Float, Float]:
         """Return the best actions of B problems, shape (B, m), and probabilities that are too high, shape (B,)."""
@@ -263,7 +288,7 @@ class ViaRank(PlanAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: Any = None, n_envs: int = 1
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the best of some random candidates."""
+        """Return the best of some random candidates; they are only measured, so the belief is the usual one."""
         observation: Any = self._last_obs
         candidates = self._candidates(n_envs)
         task = self.policy.task
@@ -302,7 +327,7 @@ class ViaRank(PlanAlgorithm):
         task = self.policy.task
         truth = Problem.of_scenes(scenes, task)
         sight = Sight.of_scenes(scenes, task)
-        return truth, truth._replace(obstacles=thick_points(task, sight)), sight
+        return truth, truth._replace(obstacles=self.policy.believed(sight, truth.obstacles)), sight
 
     @torch.no_grad()
     def _chosen(self, inputs: SightInputs, worth: NDArray[Any]) -> NDArray[np.int64]:

@@ -15,7 +15,13 @@ from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.config.checks import unknown_name
-from viapoint.training.planning.cautious import BELIEFS, BeliefMethod, CautiousSearch
+from viapoint.training.planning.cautious import (
+    BELIEFS,
+    DEFAULT_BELIEF,
+    PRIVILEGED,
+    BeliefMethod,
+    CautiousSearch,
+)
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl
 from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
@@ -168,8 +174,10 @@ class AgentMethod:
         self._settings = {name: number for name, number in given.items() if number is not None}
 
     def decide(self, observation: Observation, scenes: Any = None) -> Float:
-        """Return actions of the agent, see :class:`Method`; the scenes are unused."""
+        """Return actions of the agent, see :class:`Method`; only privileged beliefs need the scenes."""
         policy = self._model.policy
+        if getattr(policy, "belief", DEFAULT_BELIEF) in PRIVILEGED:
+            return np.asarray(policy.assess(observation, scenes.obstacles)[0])
         own = {name: getattr(policy, name) for name in self._settings if hasattr(policy, name)}
         for name in own:
             setattr(policy, name, self._settings[name])
@@ -241,7 +249,6 @@ COUNTED: dict[str, Callable[[SceneSimulation, int], Method]] = {
 }
 FEWEST_CHECKS = {"search": 4, "sobol": 1, "cautious": 1}
 SENSED = ("cautious",)  # Counted baselines that need a sensor
-DEFAULT_BELIEF = "thick"  # Belief of planners where none is named
 
 # Factories of the planners for known obstacles
 PLANNERS: dict[str, Callable[[SceneSimulation], PlannerMethod]] = {

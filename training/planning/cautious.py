@@ -59,7 +59,7 @@ def one_look(task: Task, name: str) -> Sensor:
     return sensor
 
 
-# Obstacles that are believed to be there, by name; the first two need the truth
+# Obstacles that are believed to be there, by name; PRIVILEGED ones need the truth
 BELIEFS: dict[str, Callable[[Task, Sight, Obstacles], Obstacles]] = {
     "known": lambda task, sight, truth: truth,
     "seen": seen,
@@ -67,6 +67,8 @@ BELIEFS: dict[str, Callable[[Task, Sight, Obstacles], Obstacles]] = {
     "points": lambda task, sight, truth: thick_points(task, sight, 0.0),
     "thick": lambda task, sight, truth: thick_points(task, sight),
 }
+PRIVILEGED = ("known", "seen")
+DEFAULT_BELIEF = "thick"  # Belief of planners and agents where none is named
 
 
 class BeliefMethod:
