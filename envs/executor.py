@@ -248,7 +248,7 @@ def _measure(
     episode has its own number of steps. At rest, the arm is within the tolerance of its goal, shape (n, D), and slower
     than `rest_speed`; the metrics in `state` are changed at `rows`.
     """
-    found = np.empty_like(steps)
+    found, nothing = np.empty_like(steps), np.empty(0)
     for scene in range(len(rows)):
         row = rows[scene]
         executed = joints[scene]
@@ -297,12 +297,12 @@ def _measure(
         state.steps[row] = begin + end
         # Clearance of what was done, and of what was commanded
         done = movement_clearance(
-            chain, spheres, reach, executed[:end], obstacles, scene, timestep, timestep, placed
+            chain, spheres, reach, executed[:end], obstacles, scene, timestep, timestep, placed, nothing, 0.0
         )
         state.min_clearance[row] = min(state.min_clearance[row], done[0])
         state.self_clearance[row] = min(state.self_clearance[row], done[1])
         command = movement_clearance(
-            chain, spheres, reach, path[scene, : steps[scene] + 1], obstacles, scene, 0.0, timestep, placed
+            chain, spheres, reach, path[scene, : steps[scene] + 1], obstacles, scene, 0.0, timestep, placed, nothing, 0.0
         )
         state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
         found[scene] = end

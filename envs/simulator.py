@@ -59,7 +59,7 @@ class Simulator:
             self._fields[name][np.ix_(sims, self._geoms)] = values
         position = obstacles.centre.copy()
         quaternion = quaternions_of(obstacles.rotation)
-        names = geom_meshes(obstacles)
+        names = geom_meshes(obstacles, self._meshes)
         for scene, row in np.argwhere(obstacles.kind == MESH):
             # MuJoCo gives the geom of a mesh a frame of its own, along the axes of inertia.
             mesh = self.model.geom(f"mesh_{names[scene, row]}_0").id

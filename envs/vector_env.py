@@ -217,7 +217,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         # Nothing changes before all scenes are there: impossible ones raise an error.
         tried = [copy.deepcopy(generators[i]) for i in rows]
         scenes = draw_given(options, self._samplers[0], tried)
-        geom_meshes(scenes.obstacles)
+        geom_meshes(scenes.obstacles, self.task.shapes)
         for i, generator in zip(rows, tried, strict=True):
             generators[i] = generator
         self.generators = generators

@@ -21,6 +21,8 @@ from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 FAR = 1.0  # Greatest clearance that is reported, [m]; farther obstacles do not matter
 # Way beyond the least clearance so far up to which a movement looks for more, to skip configurations, [m]
 WINDOW = 0.1
+# Errors of the clearance between two configurations of a movement: where it is close to a floor, and elsewhere, [m]
+RESOLUTION, ROUGHLY = 1e-4, 1e-3
 COARSE = 16  # Configurations from one to the next that a first, coarse look at a movement takes
 
 
@@ -314,12 +316,18 @@ def movement_clearance(
     begin: float,
     step: float,
     placed: Placed,
+    between: Float,
+    floor: float,
 ) -> tuple[float, float]:
     """Return the least clearance of T configurations from obstacles and from the arm itself, at most FAR each, [m].
 
     The values are exact, but most configurations of the path, shape (T, J), are skipped: after a clearance c of some
     spheres, none of them is nearer than the least so far before they, and the obstacles, have moved by the difference.
     The path begins at the time `begin` and takes `step` from one configuration to the next, [s].
+
+    With memory `between`, shape (J,), the lesser value also counts between the configurations, where joints and
+    obstacles move straight. It may be too great by ROUGHLY, but not so that it is `floor` or more in place of less than
+    that by RESOLUTION or more. The memory is empty, shape (0,), where this does not matter.
     """
     least, least_self = FAR, FAR
     drift = step * fastest(obstacles, scene)  # the way of obstacles in one step
@@ -336,19 +344,75 @@ def movement_clearance(
                     place(chain, spheres, path[k], placed)
                     is_placed = True
                 time, most = begin + k * step, least + WINDOW
+                bound = placed.apart[group]
                 apart = nearest_obstacle(spheres, placed, group, obstacles, scene, time, most, -FAR)
                 placed.apart[group] = apart
                 least = min(least, apart)
+                if len(between) == 0 or stride > 1 or k == 0:
+                    continue
+                way = placed.way[spheres.link[group]] + drift
+                if way > 0.0 and 0.5 * (bound + apart) < _needed(min(least, least_self), floor):
+                    share, here = 0.0, bound + way
+                    while True:
+                        # Halfway to the next look, which is not nearer than the least, nothing else can be, either.
+                        low = min(least, least_self)
+                        share += (here + low - 2.0 * _needed(low, floor)) / way
+                        if share >= 1.0:
+                            break
+                        _place_between(chain, spheres, path, k, share, between, placed)
+                        time, most = begin + (k - 1 + share) * step, least + WINDOW
+                        here = nearest_obstacle(spheres, placed, group, obstacles, scene, time, most, -FAR)
+                        least = min(least, here)
+                    is_placed = False
             for pair in range(len(spheres.pairs)):
                 if placed.pair_apart[pair] >= least_self:
                     continue
                 if not is_placed:
                     place(chain, spheres, path[k], placed)
                     is_placed = True
+                bound = placed.pair_apart[pair]
                 apart, _, _ = nearest_spheres(spheres, placed, pair, least_self + WINDOW, -FAR)
                 placed.pair_apart[pair] = apart
                 least_self = min(least_self, apart)
+                if len(between) == 0 or stride > 1 or k == 0:
+                    continue
+                way = _way_of_pair(spheres, placed, pair)
+                if way > 0.0 and 0.5 * (bound + apart) < _needed(min(least, least_self), floor):
+                    share, here = 0.0, bound + way
+                    while True:
+                        low = min(least, least_self)
+                        share += (here + low - 2.0 * _needed(low, floor)) / way
+                        if share >= 1.0:
+                            break
+                        _place_between(chain, spheres, path, k, share, between, placed)
+                        here, _, _ = nearest_spheres(spheres, placed, pair, least_self + WINDOW, -FAR)
+                        least_self = min(least_self, here)
+                    is_placed = False
     return least, least_self
+
+
+@inlined
+def _needed(low: float, floor: float) -> float:
+    """Return the clearance that must be certain between two configurations where the least so far is `low`, [m]."""
+    return max(low - ROUGHLY, floor - RESOLUTION) if low >= floor else low - ROUGHLY
+
+
+@kernel
+def _place_between(
+    chain: Chain, spheres: Spheres, path: Float, k: int, share: float, joints: Float, placed: Placed
+) -> None:
+    """Place the arm at a share of the way from the configuration before to configuration k."""
+    for joint in range(len(joints)):
+        joints[joint] = path[k - 1, joint] + share * (path[k, joint] - path[k - 1, joint])
+    place(chain, spheres, joints, placed)
+
+
+@inlined
+def _way_of_pair(spheres: Spheres, placed: Placed, pair: int) -> float:
+    """Return how much a pair of groups has moved, seen from its first link, [m]: by the joints between both alone."""
+    one = spheres.link[spheres.pairs[pair, 0]]
+    other = spheres.link[spheres.pairs[pair, 1]]
+    return float(abs(placed.way[other] - placed.way[one]))
 
 
 @inlined
@@ -362,10 +426,7 @@ def _forget(placed: Placed) -> None:
 
 @inlined
 def _move(reach: Float, first: Float, second: Float, drift: float, spheres: Spheres, placed: Placed) -> None:
-    """Lower the bounds of clearance by what spheres, and obstacles by `drift`, may move between two configurations.
-
-    Seen from its first link, a pair of groups is moved by the joints between both links alone.
-    """
+    """Lower the bounds of clearance by what spheres, and obstacles by `drift`, may move between two configurations."""
     way = placed.way
     way[0] = 0.0
     for joint in range(len(reach)):
@@ -373,9 +434,7 @@ def _move(reach: Float, first: Float, second: Float, drift: float, spheres: Sphe
     for group in range(len(placed.apart)):
         placed.apart[group] -= way[spheres.link[group]] + drift
     for pair in range(len(placed.pair_apart)):
-        one = spheres.link[spheres.pairs[pair, 0]]
-        other = spheres.link[spheres.pairs[pair, 1]]
-        placed.pair_apart[pair] -= abs(way[other] - way[one])
+        placed.pair_apart[pair] -= _way_of_pair(spheres, placed, pair)
 
 
 @compiled

@@ -28,6 +28,7 @@ from viapoint.envs.geometry.shapes import (
     PointCloud,
     Shape,
     as_obstacles,
+    registered_name,
 )
 
 __all__ = [
@@ -218,15 +219,9 @@ def quaternions_of(rotation: Float) -> Float:
     return found.reshape(*rotation.shape[:-2], 4)
 
 
-def mesh_names(meshes: Meshes) -> list[str]:
-    """Return the registered names of packed meshes, empty for others."""
-    names = [""] * (len(meshes.first) - 1)
-    for index, mesh in enumerate(split_meshes(meshes)):
-        for name, known in REGISTERED_MESHES.items():
-            if known.mesh is not None and np.array_equal(known.mesh.corners, mesh.corners):
-                names[index] = name
-                break
-    return names
+def mesh_names(meshes: Meshes, among: Iterable[str] | None = None) -> list[str]:
+    """Return the registered names of packed meshes, empty for others; `among` are the names that count."""
+    return [registered_name(mesh.corners.reshape(-1, 3), among) for mesh in split_meshes(meshes)]
 
 
 def bounding_boxes(obstacles: Obstacles) -> tuple[Float, Float]:
@@ -288,8 +283,8 @@ def observation_rows(obstacles: Obstacles, kinds: Sequence[str]) -> Float:
     """
     columns = np.array([kinds.index(kind) if kind in kinds else -1 for kind in KINDS])
     column = columns[obstacles.kind]
-    for index, name in enumerate(mesh_names(obstacles.meshes)):
-        if name in kinds:
+    for index, name in enumerate(mesh_names(obstacles.meshes, kinds)):
+        if name:
             column[(obstacles.kind == MESH) & (obstacles.size[..., 0] == index)] = kinds.index(name)
     present = obstacles.present
     unknown = present & (column < 0)
@@ -346,8 +341,10 @@ def obstacles_from_rows(rows: Float, kinds: Sequence[str]) -> Obstacles:
     return found
 
 
-def geom_meshes(obstacles: Obstacles) -> Any:
+def geom_meshes(obstacles: Obstacles, among: Iterable[str] | None = None) -> Any:
     """Return the registered names of meshes, empty for other shapes, shape (N, n), after a check of all obstacles.
+
+    `among` are the names that count; all by default.
 
     Raises:
         ValueError: An obstacle is a point cloud, which has many geoms, or a mesh without a name.
@@ -358,7 +355,7 @@ def geom_meshes(obstacles: Obstacles) -> Any:
             "a point cloud is no single geom; use a sphere for each point of PointCloud.covering"
         )
     meshes = kind == MESH
-    names = np.array([*mesh_names(obstacles.meshes), ""])
+    names = np.array([*mesh_names(obstacles.meshes, among), ""])
     found = names[np.where(meshes, obstacles.size[..., 0], -1).astype(np.int64)]
     if (meshes & (found == "")).any():
         raise ValueError("meshes must have a name; register_mesh gives them one")

@@ -546,6 +546,21 @@ def register_mesh(name: str, vertices: Any, faces: Any = None) -> None:
     REGISTERED_MESHES[name] = mesh
 
 
+def registered_name(vertices: Float, among: Iterable[str] | None = None) -> str:
+    """Return the name of the registered mesh with the same vertices in any order; empty for none.
+
+    Args:
+        vertices: Vertices, shape (V, 3), [m]; repeated ones do not matter.
+        among: Names that count; all by default.
+    """
+    wanted = np.unique(vertices, axis=0)
+    for name in REGISTERED_MESHES if among is None else among:
+        mesh = REGISTERED_MESHES.get(name)
+        if mesh is not None and np.array_equal(np.unique(mesh.vertices, axis=0), wanted):
+            return name
+    return ""
+
+
 def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
     """Return a shape from its dictionary; a shape is returned as it is.
 

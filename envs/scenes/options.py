@@ -18,11 +18,11 @@ from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.envs.geometry.distance import point_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, pack, unpack
 from viapoint.envs.geometry.shapes import (
-    REGISTERED_MESHES,
     ConvexMesh,
     Shape,
     as_obstacles,
     obstacles_from_json,
+    registered_name,
 )
 from viapoint.envs.plans import SpaceName
 from viapoint.envs.scenes.sampler import VIEW_MARGIN, SceneSampler
@@ -146,14 +146,16 @@ def _shapes(value: Any, sampler: SceneSampler, number: int) -> list[list[Shape]]
 
 def _check_shape(row: int, shape: Shape, sampler: SceneSampler) -> None:
     """Check that a task has obstacles of a kind, and that one does not contain the base of the arm."""
-    kinds = {shape.kind}
+    kind, allowed = shape.kind, sampler.task.shapes
     if isinstance(shape, ConvexMesh):
-        for name, mesh in REGISTERED_MESHES.items():
-            if np.array_equal(mesh.vertices, shape.vertices):
-                kinds.add(name)
-    if not kinds & set(sampler.task.shapes):
-        allowed = ", ".join(sampler.task.shapes)
-        raise ValueError(f"obstacle {row} must be one of the shapes of the task, {allowed}, got {shape.kind}")
+        kind = registered_name(shape.vertices, allowed)
+        if not kind:
+            raise ValueError(
+                f"obstacle {row} is a mesh: register_mesh gives it a name, which must be one of the shapes of the "
+                f"environment, {', '.join(allowed)}"
+            )
+    if kind not in allowed:
+        raise ValueError(f"obstacle {row} must be one of the shapes of the task, {', '.join(allowed)}, got {kind}")
     arm = sampler.task.arm
     base = np.repeat(arm.spheres.link, np.diff(arm.spheres.first)) == 0
     centres = sphere_centres(arm.chain, arm.spheres, arm.home)[base]

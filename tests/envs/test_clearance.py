@@ -1,5 +1,6 @@
 """Clearance is the least of all spheres, and is the same however it is computed."""
 
+import dataclasses
 import numpy as np
 import pytest
 from random_shapes import random_shape
@@ -7,6 +8,8 @@ from random_shapes import random_shape
 from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.geometry.clearance import (
+    RESOLUTION,
+    ROUGHLY,
     FAR,
     configuration_clearances,
     memory,
@@ -69,7 +72,32 @@ def test_clearance_of_a_movement_is_that_of_its_nearest_configuration(name, numb
         start, goal, bend = some_joints(rng, arm, 3)
         path = start + share * (goal - start) + 0.3 * np.sin(3.0 * np.pi * share) * (bend - start)
         path = np.clip(path, *arm.joint_range.T)
-        found = movement_clearance(arm.chain, arm.spheres, arm.reach, path, obstacles, 0, 0.0, step, placed)
+        found = movement_clearance(
+            arm.chain, arm.spheres, arm.reach, path, obstacles, 0, 0.0, step, placed, np.empty(0), 0.0
+        )
         scenes = obstacles.take(np.zeros(len(path), int))
         each = configuration_clearances(arm.chain, arm.spheres, path, scenes, step * np.arange(len(path)))
         np.testing.assert_allclose(np.maximum(found, -FAR), np.maximum(each.min(axis=0), -FAR), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["planar", "panda"])
+def test_clearance_between_configurations_is_that_of_many_more(name):
+    """Of a path with few of them, among obstacles that move."""
+    rng, arm = np.random.default_rng(1), arm_of(name)
+    placed, between = memory(arm.chain, arm.spheres), np.empty(len(arm.home))
+    few, many, duration = np.linspace(0.0, 1.0, 9), np.linspace(0.0, 1.0, 4001), 0.5
+    deeper = 0
+    for _ in range(60):
+        shapes = [dataclasses.replace(each, velocity=rng.uniform(-0.2, 0.2, 3)) for each in some_shapes(rng, 5)]
+        path = np.ascontiguousarray(some_joints(rng, arm, 9))
+        dense = np.stack([np.interp(many, few, joint) for joint in path.T], axis=-1)
+        body = arm.chain, arm.spheres, arm.reach
+        least = []
+        for joints, memory_of_it in ((path, between), (dense, np.empty(0)), (path, np.empty(0))):
+            step = duration / (len(joints) - 1)
+            found = movement_clearance(*body, joints, pack([shapes]), 0, 0.0, step, placed, memory_of_it, 0.0)
+            least.append(max(min(found), -FAR))
+        assert least[1] - 3e-3 <= least[0] <= least[1] + ROUGHLY  # many configurations may miss something, too
+        assert least[0] < 0.0 or least[1] > -RESOLUTION
+        deeper += least[0] < least[2] - 0.01
+    assert deeper > 10  # something passes between the configurations

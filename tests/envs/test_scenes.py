@@ -82,7 +82,7 @@ def test_ends_are_free_and_the_straight_movement_is_not(kwargs):
     room = memory(arm.chain, arm.spheres)
     for i in range(number):
         found = movement_clearance(
-            arm.chain, arm.spheres, arm.reach, path[i], scenes.obstacles, i, 0.0, 0.0, room
+            arm.chain, arm.spheres, arm.reach, path[i], scenes.obstacles, i, 0.0, 0.0, room, np.empty(0), 0.0
         )
         inside = space.inside(places[i]).all()
         assert min(found) < 0.01 or not inside

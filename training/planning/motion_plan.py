@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,12 +16,21 @@ from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.episodes import Episodes
-from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
+from viapoint.envs.geometry.obstacles import KINDS, MESH, Obstacles, mesh_names, no_obstacles, pack, unpack
+from viapoint.envs.geometry.shapes import (
+    IN_TABLES,
+    ConvexMesh,
+    PointCloud,
+    Shape,
+    Sphere,
+    register_mesh,
+    registered_name,
+)
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.plans import Motion, Plan, SpaceName
 from viapoint.envs.scenes.scene import resting
 from viapoint.envs.spaces import Space, space_of
-from viapoint.envs.task import Task
+from viapoint.envs.task import MOST_OBSTACLES, Task
 
 
 class Limits(NamedTuple):
@@ -187,20 +197,54 @@ def execute_plans(plans: Sequence[MotionPlan]) -> tuple[Outcome, Episodes]:
     shape (N,) each, and the simulations, which hold the records of the movements until the next ones.
     """
     first, number = plans[0], len(plans)
-    rows = max(plan.obstacles.kind.shape[1] for plan in plans)
-    episodes = _episodes(first.arm, first.space, len(first.durations) - 1, rows, number)
+    solids = [_solids(plan.obstacles) for plan in plans]
+    rows = max(each.kind.shape[1] for each in solids)
+    meshes = sorted({name for each in solids for name in mesh_names(each.meshes)})
+    episodes = _episodes(first.arm, first.space, len(first.durations) - 1, rows, number, tuple(meshes))
     space = episodes.task.space
     waypoints = np.stack([plan.waypoints for plan in plans])
     start, goal = (np.ascontiguousarray(space.joints(waypoints[:, end])) for end in (0, -1))
     obstacles = no_obstacles(number, rows)
-    for i, plan in enumerate(plans):
-        obstacles = obstacles.put([i], plan.obstacles.with_rows(rows))
+    for i, each in enumerate(solids):
+        obstacles = obstacles.put([i], each.with_rows(rows))
     episodes.start(np.arange(number), resting(start, goal, obstacles))
     decision = episodes.execute(Plan.at_rest(waypoints, np.stack([plan.durations for plan in plans])))
     return Outcome(**{name: decision.info[name] for name in Outcome._fields}), episodes
 
 
+def _solids(obstacles: Obstacles) -> Obstacles:
+    """Return the obstacles of one scene as MuJoCo takes them: clouds as spheres, meshes with a registered name.
+
+    Raises:
+        ValueError: A cloud has too many points.
+    """
+    if not np.isin(obstacles.kind, IN_TABLES).any():
+        return obstacles
+    found = list[Shape]()
+    for shape in unpack(obstacles, 0):
+        if isinstance(shape, PointCloud):
+            for point in shape.points @ shape.rotation.T + shape.position:
+                found.append(Sphere(shape.radius, position=point, velocity=shape.velocity))
+            continue
+        if isinstance(shape, ConvexMesh) and not registered_name(shape.vertices):
+            content = hashlib.sha256(np.unique(shape.vertices, axis=0).tobytes()).hexdigest()
+            register_mesh(f"mesh_{content[:12]}", shape.vertices)
+        found.append(shape)
+    if len(found) > MOST_OBSTACLES:
+        raise ValueError(
+            f"a plan is executed among at most {MOST_OBSTACLES} obstacles, where each point of a cloud is one, got "
+            f"{len(found)}; PointCloud.covering makes a cloud with fewer points"
+        )
+    return pack([found])
+
+
 @functools.lru_cache(maxsize=4)
-def _episodes(arm: Arm, space: SpaceName, n_via: int, rows: int, number: int) -> Episodes:
-    """Return simulations of an arm among up to some obstacles."""
-    return Episodes(Task.of(arm=arm, space=space, n_via=n_via, n_obstacles=(0, rows)), number)
+def _episodes(
+    arm: Arm, space: SpaceName, n_via: int, rows: int, number: int, meshes: tuple[str, ...]
+) -> Episodes:
+    """Return simulations of an arm among up to some obstacles, which may be some registered meshes."""
+    shapes = None
+    if meshes:
+        shapes = (*KINDS[:MESH], *meshes)
+    task = Task.of(arm=arm, space=space, n_via=n_via, n_obstacles=(0, rows), shapes=shapes)
+    return Episodes(task, number)

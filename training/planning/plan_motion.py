@@ -520,7 +520,8 @@ def _search(problem: _Problem, effort: _Effort, kept: float, duration: float) ->
             if clearance < kept:
                 if clearance >= widest:
                     widest = clearance
-                    tight = _Movement(found.vias[k], fine, int(found.times[k]), duration, "random", clearance)
+                    # Its clearance is computed again, with regard to the margin.
+                    tight = _Movement(found.vias[k], fine, int(found.times[k]), duration, "random")
                 continue
             free += 1
             if free == enough:  # a rough movement is worth some more seeds
@@ -621,7 +622,9 @@ def _known(problem: _Problem, movement: _Movement, fault: str, least: float | No
     movement = movement._replace(duration=duration)
     clearance = movement.clearance
     if clearance is None:
-        clearance = exact_clearance(problem.setting, movement.compiled(problem), problem.obstacles, 0)
+        clearance = exact_clearance(
+            problem.setting, movement.compiled(problem), problem.obstacles, 0, problem.margin
+        )
     offsets = problem.offsets(movement.vias, duration)
     cost = np.einsum("ij,id,jd->", movement.table.cost[movement.times], offsets, offsets)
     line = problem.goal - problem.start

@@ -479,7 +479,7 @@ def refine_seeds(
         if apart < margin:
             if apart >= 0.0:
                 movement = Movement(fine, times[0], start, offsets[0], duration)
-                exact = exact_clearance(setting, movement, obstacles, scene)
+                exact = exact_clearance(setting, movement, obstacles, scene, margin)
                 found.clearance[each] = min(exact, apart)
             continue
         stage = 0
@@ -498,7 +498,7 @@ def refine_seeds(
                 times[stage], cost = other, less
         while stage >= 0:
             movement = Movement(fine, times[stage], start, offsets[stage], duration)
-            clearance = exact_clearance(setting, movement, obstacles, scene)
+            clearance = exact_clearance(setting, movement, obstacles, scene, margin)
             if clearance >= margin:
                 break
             stage -= 1
@@ -530,8 +530,15 @@ def is_free(setting: Setting, movement: Movement, obstacles: Obstacles, scene: i
 
 
 @compiled
-def exact_clearance(setting: Setting, movement: Movement, obstacles: Obstacles, scene: int) -> float:
-    """Return the least clearance of a movement at the instants of a table, at most 1, [m]; OUTSIDE out of reach."""
+def exact_clearance(
+    setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, margin: float
+) -> float:
+    """Return the least clearance of a movement at all times, at most 1, [m]; OUTSIDE out of reach.
+
+    Between two instants of the table, the joints are taken to move straight. There the clearance may be less by
+    ROUGHLY, but not less than the margin if the result is not, see
+    :func:`~viapoint.envs.geometry.clearance.movement_clearance`.
+    """
     number = len(movement.table.order)
     position = np.empty(len(movement.start))
     path = np.empty((number, len(setting.joint_range)))
@@ -541,6 +548,7 @@ def exact_clearance(setting: Setting, movement: Movement, obstacles: Obstacles, 
     placed = memory(setting.chain, setting.spheres)
     step = movement.duration / (number - 1)
     apart, own = movement_clearance(
-        setting.chain, setting.spheres, setting.reach, path, obstacles, scene, 0.0, step, placed
-    )
+        setting.chain, setting.spheres, setting.reach, path, obstacles, scene, 0.0, step, placed,
+        np.empty(path.shape[1]), margin,
+    )  # fmt: skip
     return min(apart, own)
