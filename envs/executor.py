@@ -302,7 +302,17 @@ def _measure(
         state.min_clearance[row] = min(state.min_clearance[row], done[0])
         state.self_clearance[row] = min(state.self_clearance[row], done[1])
         command = movement_clearance(
-            chain, spheres, reach, path[scene, : steps[scene] + 1], obstacles, scene, 0.0, timestep, placed, nothing, 0.0
+            chain,
+            spheres,
+            reach,
+            path[scene, : steps[scene] + 1],
+            obstacles,
+            scene,
+            0.0,
+            timestep,
+            placed,
+            nothing,
+            0.0,
         )
         state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
         found[scene] = end

@@ -12,7 +12,7 @@ from viapoint.envs.common.types import Bool, Float
 from viapoint.envs.plans import Motion, SpaceName
 
 # Greatest distance of the hand from a reference within reach, [m], and of a joint beyond its range, [rad]
-REACH_TOLERANCE = 1e-9
+REACH_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -82,5 +82,12 @@ Space = JointSpace | HandPlane
 
 
 def space_of(arm: Arm, name: SpaceName) -> Space:
-    """Return the space of a name for an arm."""
+    """Return the space of a name for an arm.
+
+    Raises:
+        ValueError: The arm has no such space.
+    """
+    spaces = ("hand", "joints") if arm.space == "hand" else ("joints",)
+    if name not in spaces:
+        raise ValueError(f"space of this arm must be one of {', '.join(spaces)}, got {name!r}")
     return HandPlane(arm) if name == "hand" else JointSpace(arm)

@@ -116,10 +116,7 @@ class Task:
             ValueError: An argument has a value that is not allowed.
         """
         arm = arm_of(arm)
-        spaces = ("hand", "joints") if arm.space == "hand" else ("joints",)
-        space = arm.space if space is None else space
-        if space not in spaces:
-            raise ValueError(f"space of this arm must be one of {', '.join(spaces)}, got {space!r}")
+        space = space_of(arm, arm.space if space is None else space).name
         for name, value in (("moving_obstacles", moving_obstacles), ("whole_arm", whole_arm)):
             if not isinstance(value, bool | np.bool_):
                 raise TypeError(f"{name} must be True or False, got {value!r}")

@@ -129,6 +129,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         ]
         self._samplers = [self.task.sampler() for _ in self._shares]
         self._pool: ThreadPoolExecutor | None = None
+        self._process = os.getpid()
         self.generators: list[np.random.Generator] = []
         """Random generators of the environments' scenes; empty before the first reset."""
         self._running = False
@@ -394,7 +395,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """Return the results of a job for the episodes of each thread, which run side by side."""
         if len(self._shares) == 1:
             return [job(self._episodes[0], self._shares[0])]
-        if self._pool is None:
+        if self._pool is None or self._process != os.getpid():  # threads do not survive a fork
+            self._process = os.getpid()
             self._pool = ThreadPoolExecutor(len(self._shares), thread_name_prefix="viapoint")
         return list(self._pool.map(job, self._episodes, self._shares))
 

@@ -39,7 +39,7 @@ KNOWN_VELOCITIES: dict[str, tuple[float, ...]] = {
     "tiago": (0.07, 2.7, 3.66, 4.58, 4.58, 1.95, 1.76, 1.76),
     "j2s7s300": (0.628, 0.628, 0.628, 0.628, 0.838, 0.838, 0.838),
 }
-"""Velocity limits of well-known arms by a part of their name, [rad/s] or [m/s]: data sheets of Franka Robotics (Panda,
+"""Velocity limits of well-known arms by a word of their name, [rad/s] or [m/s]: data sheets of Franka Robotics (Panda,
 FR3), Universal Robots (e-Series), KUKA (LBR iiwa 14 R820), Kinova (Gen3), UFACTORY (xArm 7, Lite 6), Rethink Robotics
 (Sawyer), Flexiv (Rizon 4) and AgileX (PiPER); URDF files of Unitree (Z1), PAL Robotics (TIAGo) and Kinova (Jaco)."""
 # Torque limits of well-known arms that MuJoCo models often lack, [N m]: data sheet of KUKA (LBR iiwa 14 R820)
@@ -223,9 +223,11 @@ def _joints_below(model: mujoco.MjModel, body: int) -> int:
 
 
 def known_limits(table: dict[str, tuple[float, ...]], name: str, number: int) -> Float | None:
-    """Return the limits of a well-known arm by its name, shape (J,); None for others."""
-    plain = re.sub(r"[^a-z0-9]", "", name.lower())
+    """Return the limits of a well-known arm by whole words of its name, shape (J,); None for others."""
     for known, limits in table.items():
-        if known in plain and len(limits) == number:
+        # Between letters and digits there may be something else, as in `iiwa_14`.
+        word = r"[\W_]*".join(re.findall(r"[a-z]+|[0-9]+", known))
+        whole = re.search(rf"(?<![a-z0-9]){word}(?![a-z0-9])", name.lower())
+        if whole and len(limits) == number:
             return np.array(limits)
     return None

@@ -280,6 +280,10 @@ def _least_distance(arm: Arm, position: Float, begin: Float) -> float:
     return least
 
 
+class UnreachableError(ValueError):
+    """Error of a pose that no joint positions were found for."""
+
+
 def inverse_kinematics(
     arm: Arm,
     position: Any,
@@ -300,7 +304,8 @@ def inverse_kinematics(
         n_seeds: Number of seeds.
 
     Raises:
-        ValueError: No solution was found; the message tells the nearest distance.
+        UnreachableError: No solution was found; the message tells the nearest distance.
+        ValueError: An argument has another shape or is not finite.
 
     Example:
         >>> from viapoint.envs.arms.inverse_kinematics import inverse_kinematics
@@ -342,6 +347,6 @@ def inverse_kinematics(
         nearest = f"the nearest place found is {1e3 * away:.1f} mm away"
         if quaternion is not None and away < PLACE_TOLERANCE:
             nearest = "its position can be, but not with this orientation"
-        raise ValueError(f"the {pose} {position.tolist()} m cannot be reached: {nearest}")
+        raise UnreachableError(f"the {pose} {position.tolist()} m cannot be reached: {nearest}")
     found.sort(key=lambda each: float(np.abs(each - first).max()))
     return np.array(found)

@@ -7,6 +7,7 @@ import itertools
 import os
 import re
 import warnings
+import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +31,7 @@ from viapoint.envs.arms.choices import (
 )
 from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.arms.stored import cached_arm
-from viapoint.envs.arms.urdf import Urdf, read_urdf
+from viapoint.envs.arms.urdf import WARNING, Urdf, read_urdf
 from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least
@@ -50,7 +51,6 @@ NEAR, FINE = 0.03, 0.005
 STUCK = (
     100.0  # Damping beyond which a joint hardly moves: its torque at full speed, relative to the torque limit
 )
-WARNING = "warning: "  # Beginning of notes that are told as warnings, too
 # Names of files that do not tell the arm; it gets the name of the model
 GENERIC_NAMES = ("arm", "model", "robot", "scene")
 MIN_JOINTS = 2  # Least number of joints
@@ -525,7 +525,25 @@ def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: li
     others = {model.body(body).name or str(body) for body in model.geom_bodyid[collides] if body not in links}
     if others:
         notes.append(f"left out, not part of the arm: {', '.join(sorted(others))}")
+    _note_rest(model, joints, list(links), notes)
     return Parsed(model, rest, copy.copy(rest), joints, tool, links, names, geoms)
+
+
+def _note_rest(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[int], notes: list[str]) -> None:
+    """Note what the arm does not take from its file: planes, and forces of springs, dry friction and compensation."""
+    collides = (model.geom_contype | model.geom_conaffinity) > 0
+    if (collides & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)).any():
+        notes.append("left out: planes of the file; a floor is an obstacle, HalfSpace")
+    numbers = [model.joint(name).id for name in joints]
+    dofs = model.jnt_dofadr[numbers]
+    forces = {
+        "springs": model.jnt_stiffness[numbers],
+        "dry friction": model.dof_frictionloss[dofs],
+        "gravity compensation": model.body_gravcomp[bodies],
+    }
+    some = [what for what, values in forces.items() if values.any()]
+    if some:
+        notes.append(f"left out of torques: {', '.join(some)}")
 
 
 def _collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, list[int]]:
@@ -703,7 +721,31 @@ def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[Fi
         rgba=(0.0, 0.0, 0.0, 0.0),
     )
     spec.compile()
-    return str(spec.to_xml())
+    return _exact(spec, [parsed.names[body] for body in parsed.links])
+
+
+def _exact(spec: mujoco.MjSpec, names: list[str]) -> str:
+    """Return the text of a model with all digits of frames, ranges and inertias of some bodies; MuJoCo writes six."""
+    root = ET.fromstring(spec.to_xml())
+    for element in root.iter("body"):
+        if element.get("name") not in names:
+            continue
+        body = spec.body(element.get("name"))
+        _set_numbers(element, pos=body.pos, quat=body.quat)
+        for part, joint in zip(element.findall("joint"), body.joints, strict=True):
+            _set_numbers(part, pos=joint.pos, axis=joint.axis, range=joint.range)
+        for part, site in zip(element.findall("site"), body.sites, strict=True):
+            _set_numbers(part, pos=site.pos, quat=site.quat)
+        inertial = element.find("inertial")
+        if inertial is not None:
+            _set_numbers(inertial, pos=body.ipos, quat=body.iquat, mass=body.mass, diaginertia=body.inertia)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _set_numbers(element: ET.Element, **values: Any) -> None:
+    """Set attributes to numbers with all digits."""
+    for name, numbers in values.items():
+        element.set(name, " ".join(repr(float(number)) for number in np.atleast_1d(numbers)))
 
 
 def _add_inertia(written: Any, model: mujoco.MjModel, body: int) -> None:

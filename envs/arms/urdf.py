@@ -22,6 +22,8 @@ COMPILER = {
 }
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")  # Entries of an inertia
 BALL = 0.05  # Radius of the ball whose inertia a link gets that has none, [m]
+LIMITED = ("revolute", "prismatic")  # Types of joints that have limits
+WARNING = "warning: "  # Beginning of notes that are told as warnings, too
 LEFT_OUT = ("transmission", "gazebo", "material")  # Elements that MuJoCo does not need
 
 
@@ -65,9 +67,9 @@ def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
                 notes.append(f"a collision geom of {link.get('name')} is left out: {fault}")
     velocity = {}
     for joint in root.findall("joint"):
-        limit = joint.find("limit")
-        if limit is not None and float(limit.get("velocity", 0.0)) > 0.0:
-            velocity[joint.get("name", "")] = float(limit.get("velocity", 0.0))
+        limits = _limits(joint, notes)
+        if limits.get("velocity", 0.0) > 0.0:
+            velocity[joint.get("name", "")] = limits["velocity"]
     extension = root.find("mujoco")
     if extension is None:
         extension = ET.SubElement(root, "mujoco")
@@ -93,6 +95,32 @@ def _root(path: Path) -> ET.Element:
         if "unbound prefix" not in str(error):
             raise ValueError(f"{path} is not XML: {error}") from None
     return ET.fromstring(re.sub(rb"(</?|\s)[\w.-]+:([\w.-]+)(?=[\s=/>])", rb"\1\2", content))
+
+
+def _limits(joint: ET.Element, notes: list[str]) -> dict[str, float]:
+    """Return the limits of a joint by name, and write out those that are 0 because they are not given.
+
+    Raises:
+        ValueError: A limit is not a number, or the lower one is greater than the upper one.
+    """
+    name, limit = joint.get("name"), joint.find("limit")
+    found: dict[str, float] = {}
+    for key, text in {} if limit is None else limit.attrib.items():
+        try:
+            found[key] = float(text)
+        except ValueError:
+            raise ValueError(f"the limit {key} of joint {name!r} must be a number, got {text!r}") from None
+    if joint.get("type") in LIMITED:
+        lower, upper = found.get("lower", 0.0), found.get("upper", 0.0)
+        if lower > upper:
+            raise ValueError(
+                f"the lower limit of joint {name!r} must be less than the upper one, got {lower:g} and {upper:g}"
+            )
+        if lower == upper:
+            notes.append(f"{WARNING}joint {name} has no limits, or equal ones: it is taken as unlimited")
+        elif limit is not None:
+            limit.attrib.update(lower=f"{lower!r}", upper=f"{upper!r}")
+    return found
 
 
 def _mend_inertia(link: ET.Element, notes: list[str]) -> None:

@@ -77,7 +77,9 @@ class Room(NamedTuple):
         """
         allowed = [kind for kind in kinds if kind in self.kinds]
         if not allowed:
-            raise ValueError(f"kinds must have one of {', '.join(kinds)} in it, got {self.kinds}")
+            raise ValueError(
+                f"this family needs one of the shapes {', '.join(kinds)}, got {', '.join(self.kinds)}"
+            )
         return allowed
 
 

@@ -35,7 +35,13 @@ from viapoint.envs.scenes.scene import (
     resting,
 )
 
-OPTIONS = (*ENDS, "obstacles", "jumps", "turns", "reaches")  # Options of `reset` that give a scene, or a part of one
+OPTIONS = (
+    *ENDS,
+    "obstacles",
+    "jumps",
+    "turns",
+    "reaches",
+)  # Options of `reset` that give a scene, or a part of one
 FORMAT = "viapoint-scene"  # Value of the key `format` of a scene file
 REACHED = 1e-6  # Greatest distance of the hand from a given place, [m]
 
@@ -155,7 +161,9 @@ def _check_shape(row: int, shape: Shape, sampler: SceneSampler) -> None:
                 f"environment, {', '.join(allowed)}"
             )
     if kind not in allowed:
-        raise ValueError(f"obstacle {row} must be one of the shapes of the task, {', '.join(allowed)}, got {kind}")
+        raise ValueError(
+            f"obstacle {row} must be one of the shapes of the task, {', '.join(allowed)}, got {kind}"
+        )
     arm = sampler.task.arm
     base = np.repeat(arm.spheres.link, np.diff(arm.spheres.first)) == 0
     centres = sphere_centres(arm.chain, arm.spheres, arm.home)[base]
@@ -173,7 +181,7 @@ def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles) -> 
     if is_list and all(isinstance(each, Pose | Mapping) for each in several):
         if len(several) != number:
             raise ValueError(f"{label} must be one pose, or {number} poses, got {len(several)}")
-        poses = [_pose(label, each) for each in several]
+        poses = [as_pose(label, each) for each in several]
         if sampler.task.space_name == "joints":
             found = [
                 _solution(label, pose, sampler.task.arm, obstacles.take([i])) for i, pose in enumerate(poses)
@@ -205,8 +213,8 @@ def _planar(label: str, arm: Arm, hand: Float) -> Float:
     return joints
 
 
-def _pose(label: str, value: Any) -> Pose:
-    """Return a pose from itself or a dictionary."""
+def as_pose(label: str, value: Any) -> Pose:
+    """Return a pose from itself or a dictionary, of which an error tells the label."""
     if isinstance(value, Pose):
         return value
     if "position" not in value or not set(value) <= set(Pose._fields):

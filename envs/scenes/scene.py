@@ -15,11 +15,12 @@ from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import HALF_SPACE, Obstacles, no_obstacles
 from viapoint.envs.geometry.shapes import IN_TABLES
+from viapoint.envs.spaces import REACH_TOLERANCE
 
 MOST_JUMPS = 4  # Greatest number of jumps of the target in an episode
 ENDS = ("start", "goal")  # Names of the ends of a movement
 NEVER = 1e9  # Time of a change that does not happen, [s]
-ROUNDING = 1e-9  # Rounding error of times, [s], and joint positions, [rad]
+ROUNDING = 1e-9  # Rounding error of times, [s]
 LEAST_APART = 0.02  # Least difference of start and goal in the joint that moves most, [rad] or [m]
 FARTHEST = 2.0  # Greatest coordinate of an obstacle's centre, and greatest size, [m]; half-spaces have none
 FASTEST = 1.0  # Greatest speed of an obstacle, [m/s]
@@ -241,7 +242,11 @@ def _check_obstacles(scenes: Scenes, names: Sequence[Sequence[str]]) -> None:
     _refuse(reaches & (duration <= 0.0), "must reach in more than 0 s", duration, names)
     late = reaches & (begin + duration > LATEST)
     _refuse(late, f"must end its reach within {LATEST:g} s", begin + duration, names)
-    speed = MINIMUM_JERK_PEAK * norm(scenes.reach[..., 2:]) / np.where(reaches & (duration > 0.0), duration, np.inf)
+    speed = (
+        MINIMUM_JERK_PEAK
+        * norm(scenes.reach[..., 2:])
+        / np.where(reaches & (duration > 0.0), duration, np.inf)
+    )
     _refuse(reaches & (speed > FASTEST), f"must reach with at most {FASTEST:g} m/s", speed, names)
 
 
@@ -251,7 +256,7 @@ def _check_end(
     """Check an end of the scenes that have it: inside the joint limits, and free of the arm itself and of obstacles."""
     for joint, (low, high) in enumerate(arm.joint_range):
         position = joints[:, joint]
-        outside = (position < low - ROUNDING) | (position > high + ROUNDING)
+        outside = (position < low - REACH_TOLERANCE) | (position > high + REACH_TOLERANCE)
         allowed = f"must be from {low:.4g} to {high:.4g}"
         _refuse(there & outside, f"{name}: joint {arm.joint_names[joint]!r} {allowed}", position)
     rows, own = row_clearances(arm.chain, arm.spheres, joints, obstacles, FAR)

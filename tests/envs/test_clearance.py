@@ -1,6 +1,7 @@
 """Clearance is the least of all spheres, and is the same however it is computed."""
 
 import dataclasses
+
 import numpy as np
 import pytest
 from random_shapes import random_shape
@@ -8,9 +9,9 @@ from random_shapes import random_shape
 from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.geometry.clearance import (
+    FAR,
     RESOLUTION,
     ROUGHLY,
-    FAR,
     configuration_clearances,
     memory,
     movement_clearance,
@@ -88,7 +89,9 @@ def test_clearance_between_configurations_is_that_of_many_more(name):
     few, many, duration = np.linspace(0.0, 1.0, 9), np.linspace(0.0, 1.0, 4001), 0.5
     deeper = 0
     for _ in range(60):
-        shapes = [dataclasses.replace(each, velocity=rng.uniform(-0.2, 0.2, 3)) for each in some_shapes(rng, 5)]
+        shapes = [
+            dataclasses.replace(each, velocity=rng.uniform(-0.2, 0.2, 3)) for each in some_shapes(rng, 5)
+        ]
         path = np.ascontiguousarray(some_joints(rng, arm, 9))
         dense = np.stack([np.interp(many, few, joint) for joint in path.T], axis=-1)
         body = arm.chain, arm.spheres, arm.reach
@@ -97,7 +100,9 @@ def test_clearance_between_configurations_is_that_of_many_more(name):
             step = duration / (len(joints) - 1)
             found = movement_clearance(*body, joints, pack([shapes]), 0, 0.0, step, placed, memory_of_it, 0.0)
             least.append(max(min(found), -FAR))
-        assert least[1] - 3e-3 <= least[0] <= least[1] + ROUGHLY  # many configurations may miss something, too
+        assert (
+            least[1] - 3e-3 <= least[0] <= least[1] + ROUGHLY
+        )  # many configurations may miss something, too
         assert least[0] < 0.0 or least[1] > -RESOLUTION
         deeper += least[0] < least[2] - 0.01
     assert deeper > 10  # something passes between the configurations

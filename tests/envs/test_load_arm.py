@@ -12,6 +12,7 @@ import trimesh
 from self_contact import check_contact_implies_overlap
 
 from viapoint.envs.arms import load
+from viapoint.envs.arms.choices import KNOWN_VELOCITIES, known_limits
 from viapoint.envs.arms.kinematics import forward, sphere_centres, torques
 from viapoint.envs.arms.load import load_arm
 from viapoint.envs.geometry.clearance import row_clearances
@@ -64,8 +65,8 @@ def check_it_is_the_arm_of(text, arm):
         data.qpos[address], data.qvel[freedom], data.qacc[freedom] = joints, rates, changes
         mujoco.mj_inverse(model, data)
         position, axes = forward(arm.chain, joints)
-        np.testing.assert_allclose(position, data.site("hand").xpos, atol=1e-5)
-        np.testing.assert_allclose(axes, data.site("hand").xmat.reshape(3, 3), atol=1e-5)
+        np.testing.assert_allclose(position, data.site("hand").xpos, atol=1e-9)
+        np.testing.assert_allclose(axes, data.site("hand").xmat.reshape(3, 3), atol=1e-9)
         if len(address) == model.nv:
             needed = torques(arm.chain, joints, rates, changes)
             np.testing.assert_allclose(needed, data.qfrc_inverse + data.qfrc_constraint, rtol=1e-3, atol=1e-2)
@@ -291,6 +292,17 @@ def test_damping_that_no_motor_could_overcome_is_left_out_and_told():
     np.testing.assert_array_equal(slow.chain.damping, (0.0, 2e3, 0.0))
 
 
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [("KUKA iiwa_14", "iiwa14"), ("unitree z1", "z1"), ("xyz_1", None), ("sandpiper", None)],
+)
+def test_well_known_arms_are_known_by_whole_words(name, known):
+    for number in (6, 7):
+        found = known_limits(KNOWN_VELOCITIES, name, number)
+        wanted = KNOWN_VELOCITIES[known] if known else ()
+        assert (found is None) == (len(wanted) != number)
+
+
 def test_limits_that_the_file_lacks_are_chosen_and_told():
     with pytest.warns(UserWarning, match="torque limits"):
         arm = ur5e(re.sub(r' actuatorfrcrange="[^"]*"', "", TEXT))
@@ -377,6 +389,42 @@ def test_urdf_files_are_arms(crane):
     joints = (0.2, np.pi / 2, 0.0)
     np.testing.assert_allclose(arm.hand(joints), (0.1, 0.65, 0.52), atol=1e-5)
     np.testing.assert_allclose(arm.hand((0.0, 0.0, np.pi / 2)), (0.52, 0.0, 0.05), atol=1e-5)
+
+
+LIMIT = '<limit lower="-1" upper="2" effort'
+
+
+@pytest.mark.parametrize(
+    ("limit", "found"),
+    [
+        ('<limit upper="2" effort', (0.0, 2.0)),  # what is missing is 0
+        ('<limit lower="-1" effort', (-1.0, 0.0)),
+        (f'<limit lower="{-np.pi!r}" upper="{np.pi!r}" effort', (-np.pi, np.pi)),
+    ],
+)
+def test_limits_of_a_urdf_are_kept(crane, limit, found):
+    path = written(crane)
+    path.write_text(path.read_text().replace(LIMIT, limit))
+    assert load_arm(path).joint_range[2].tolist() == list(found)
+
+
+@pytest.mark.parametrize("limit", ['<limit lower="1" upper="1" effort', "<limit effort"])
+def test_a_joint_without_limits_is_told(crane, limit):
+    path = written(crane)
+    path.write_text(path.read_text().replace(LIMIT, limit))
+    with pytest.warns(UserWarning, match="joint tilt"):
+        arm = load_arm(path)
+    assert arm.continuous == ("turn", "tilt")
+
+
+@pytest.mark.parametrize(
+    "limit", ['<limit lower="2" upper="1" effort', '<limit lower="low" upper="2" effort']
+)
+def test_impossible_limits_name_the_joint(crane, limit):
+    path = written(crane)
+    path.write_text(path.read_text().replace(LIMIT, limit))
+    with pytest.raises(ValueError, match="'tilt'"):
+        load_arm(path)
 
 
 def test_pairs_of_an_srdf_beside_it_are_not_compared(crane):
@@ -484,6 +532,7 @@ PINCH = gripper(2, "bar").replace("</body>", '<site name="pinch"/></body>', 1)
         ([(HAND_OF_TEXT, PINCH)], "fixed: bar_0_0"),  # its tool moves with the last joint of the arm
         ([(SHOULDER, MOBILE + SHOULDER), ("</body>\n  </worldbody>", "</body></body></worldbody>")], "fixed: turn, x"),
         ([(END, WALL)], "left out, not part of the arm: wall"),
+        ([(END, f'<geom type="plane" size="1 1 1"/>{END}')], "left out: planes"),
     ],
 )  # fmt: skip
 def test_what_is_not_part_of_the_arm_is_fixed_or_left_out_and_told(changes, note):

@@ -1,5 +1,8 @@
 """Training loops that people have: Gymnasium's autoreset modes and wrappers, and loops of other libraries."""
 
+import subprocess
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -185,3 +188,22 @@ def test_tianshou():
     envs = tianshou.DummyVectorEnv([lambda: gym.make(OBSTACLES)] * 2)
     envs.reset()
     envs.step(np.zeros((2, 3), np.float32))
+
+
+FORKED = """
+import os, signal
+import gymnasium as gym
+envs = gym.make_vec("viapoint.envs:viapoint/PlanarObstacles-v0", num_envs=16, threads=2)
+envs.reset(seed=0)
+envs.step(envs.action_space.sample())
+child = os.fork()
+if not child:
+    signal.alarm(60)  # ends the child where it waits for threads that it does not have
+    envs.step(envs.action_space.sample())
+    os._exit(0)
+raise SystemExit(os.waitpid(child, 0)[1])
+"""
+
+
+def test_a_forked_process_goes_on_with_the_environments_of_its_parent():
+    subprocess.run([sys.executable, "-W", "ignore", "-c", FORKED], check=True)

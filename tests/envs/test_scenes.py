@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from episodes import ENDS, MOVING, OBSTACLES, OTHER, PANDA, PANDA_MOVING, given, post, same, same_scenes
 
-from viapoint import primitives
 from viapoint.envs import (
     Box,
     Capsule,
@@ -257,6 +256,25 @@ def test_shapes_of_a_task_that_cannot_be_simulated_are_refused(shape):
     env = gym.make(PANDA, shapes=("box", "point_cloud", "convex_mesh"), families="clutter")
     with pytest.raises(ValueError):
         env.reset(seed=1, options={**PANDA_ENDS, "obstacles": [shape]})
+
+
+def test_a_mesh_survives_json_and_one_without_a_name_changes_nothing():
+    """Whatever the order of its vertices is, and the number of its names."""
+    vertices = ConvexMesh.hull(np.random.default_rng(0).normal(0.0, 0.04, (30, 3))).vertices
+    register_mesh("pebble", vertices)
+    register_mesh("gravel", vertices[::-1])
+    env = gym.make(PANDA, shapes=("box", "gravel"), families="clutter").unwrapped
+    mesh = {"shape": "gravel", "position": (0.5, -0.5, 0.5)}
+    first, _ = env.reset(seed=1, options={**PANDA_ENDS, "obstacles": [mesh]})
+    text = scene_to_json(env.batch.scenes, env.task.arm)
+    same(env.reset(seed=1, options=scene_from_json(text))[0], first)
+    other = gym.make(PANDA, shapes=("box", "convex_mesh"), families="clutter").unwrapped
+    other.reset(seed=1)
+    scenes = other.batch.scenes
+    with pytest.raises(ValueError, match="register_mesh"):
+        other.reset(seed=2, options={**PANDA_ENDS, "obstacles": [mesh]})
+    same_scenes(other.batch.scenes, scenes)
+    other.step(np.zeros(other.action_space.shape, np.float32))
 
 
 @pytest.fixture(scope="module")

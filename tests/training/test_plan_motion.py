@@ -1,11 +1,23 @@
 """Laws of planning around known obstacles."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from viapoint.envs import Box, Capsule, Cylinder, PointCloud, Pose, Sphere, Task, arm_of, obstacles_to_json
+from viapoint.envs import (
+    Box,
+    Capsule,
+    ConvexMesh,
+    Cylinder,
+    PointCloud,
+    Pose,
+    Sphere,
+    Task,
+    arm_of,
+    obstacles_to_json,
+)
 from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.arms.load import load_arm
 from viapoint.envs.geometry.clearance import configuration_clearances
@@ -275,6 +287,9 @@ def test_gradient_of_the_objective(kwargs) -> None:
         ({"obstacles": [{"shape": "box"}]}, "obstacle 0: box: .* missing is size"),
         ({"obstacles": pack([[POST], [POST]])}, "one scene"),
         ({"arm": "robot"}, "arm must be"),
+        ({"space": "hand"}, "space of this arm"),
+        ({"goal": {"position": (0.4, 0.3, 0.4), "angle": 3.0}}, "goal must have a position"),
+        ({"rng": -1}, "rng"),
     ],
 )
 def test_bad_input(arguments, message) -> None:
@@ -287,6 +302,63 @@ def test_batches_name_the_problem() -> None:
         plan_motions(PANDA, [PANDA.home] * 2, [GOAL, GOAL[:3]], [[], []])
     with pytest.raises(ValueError, match="equally many"):
         plan_motions(PANDA, [PANDA.home] * 2, [GOAL], [[], []])
+
+
+def test_a_batch_goes_on_after_a_pose_out_of_reach() -> None:
+    plans = plan_motions(PANDA, [PANDA.home] * 2, [Pose((2.0, 0.0, 0.5)), GOAL], [[], []])
+    assert [plan.success for plan in plans] == [False, True]
+    assert "out of reach" in plans[0].reason
+
+
+def test_a_pose_is_reached_by_any_of_its_free_configurations() -> None:
+    """The nearest ten of 55 touch the boards."""
+    place = np.array([0.54, 0.33, 0.42])
+    boards = [Box((0.15, 0.15, 0.02), position=place + [0.0, 0.0, 0.155])]
+    boards.append(Box((0.02, 0.15, 0.1), position=place + [0.12, 0.0, 0.0]))
+    plan = plan_motion(PANDA, PANDA.home, Pose(place), boards)
+    assert plan.success
+    assert np.allclose(PANDA.hand(plan.waypoints[-1]), place, atol=1e-4)
+
+
+@pytest.mark.parametrize("end", [np.pi, -np.pi])
+def test_joint_limits_themselves_are_allowed(end) -> None:
+    """Also in single precision, which rounds beyond them."""
+    arm = dataclasses.replace(PANDA, joint_range=PANDA.joint_range.copy())
+    arm.joint_range[6] = -np.pi, np.pi
+    start = arm.home.copy()
+    start[6] = np.float32(end)
+    assert plan_motion(arm, start, arm.home).success
+
+
+THIN = """<mujoco><compiler angle="radian"/><worldbody><body name="upper" pos="0 0 0.3">
+  <joint name="first" axis="0 0 1" range="-3 3" actuatorfrcrange="-500 500"/>
+  <geom type="capsule" fromto="0.05 0 0 0.7 0 0" size="0.006" mass="0.3"/><body name="fore" pos="0.75 0 0">
+  <joint name="second" axis="0 0 1" range="-2.5 2.5" actuatorfrcrange="-500 500"/>
+  <geom type="capsule" fromto="0 0 0 0.7 0 0" size="0.006" mass="0.3"/><site name="tcp" pos="0.7 0 0"/>
+</body></body></worldbody></mujoco>"""
+
+
+def test_nothing_thin_is_passed_through_between_two_instants() -> None:
+    arm = load_arm(THIN, velocity_limit=6.0, name="thin")
+    for angle in np.linspace(-1.5, 1.5, 9):
+        for distance in (0.5, 1.0, 1.4):
+            place = distance * np.cos(angle), distance * np.sin(angle), 0.3
+            post = Cylinder(0.001, 0.2, position=place)
+            plan = plan_motion(arm, [-2.9, 0.0], [2.9, 0.0], [post], time_limit=0.0)
+            assert not plan.success
+            assert plan.clearance < -0.001
+
+
+def test_plans_are_executed_among_meshes_and_clouds() -> None:
+    points = np.random.default_rng(0).normal(0.0, 0.04, (30, 3))
+    place = (0.5, 0.15, 0.4)
+    for shape in (ConvexMesh.hull(points, position=place), PointCloud(points, 0.01, position=place)):
+        plan = plan_motion(PANDA, PANDA.home, GOAL, [shape])
+        assert plan.success
+        assert plan.execute().is_success
+    many = PointCloud(np.random.default_rng(0).uniform(-0.1, 0.1, (300, 3)), 0.01, position=(0.0, -0.8, 0.2))
+    with pytest.raises(ValueError, match="at most 256"):
+        plan_motion(PANDA, PANDA.home, GOAL, [many]).execute()
 
 
 def test_capsules_and_cylinders_stand_for_one_another() -> None:

@@ -54,7 +54,9 @@ def test_two_looks_at_a_reach_tell_its_end():
     scene.turn_velocity[:] = 0.0
     time = np.array([0.0, 0.28])
     seen = [scene.obstacles_at(time[k : k + 1]) for k in range(2)]
-    looks = Seen(time, *(np.concatenate([getattr(each, part) for each in seen]) for part in ("centre", "velocity")))
+    looks = Seen(
+        time, *(np.concatenate([getattr(each, part) for each in seen]) for part in ("centre", "velocity"))
+    )
     places = known_courses(looks, scene)
     np.testing.assert_allclose(fitted_reaches(looks, scene), places, atol=0.02)
     # One look leaves the end open.

@@ -109,7 +109,9 @@ def propose(arena: Arena, state: State) -> tuple[Proposal, ...]:
         return (first,)
     env = arena.env("whole")
     try:
-        env.reset(options=state.scene._replace(jumps=(), turns=(), reaches=()).options())  # later changes are not known
+        env.reset(
+            options=state.scene._replace(jumps=(), turns=(), reaches=()).options()
+        )  # later changes are not known
     except ValueError:  # the scene is impossible
         return (first,)
     scenes = env.scenes

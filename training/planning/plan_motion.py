@@ -16,7 +16,7 @@ import numpy as np
 
 from viapoint import primitives
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.inverse_kinematics import inverse_kinematics
+from viapoint.envs.arms.inverse_kinematics import UnreachableError, inverse_kinematics
 from viapoint.envs.arms.kinematics import slowdown, torques
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.types import Float
@@ -25,7 +25,7 @@ from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape
 from viapoint.envs.plans import SHORTEST_DURATION, Plan, SpaceName
-from viapoint.envs.scenes.options import Pose
+from viapoint.envs.scenes.options import Pose, as_pose
 from viapoint.envs.spaces import Space, space_of
 from viapoint.training.planning.motion_plan import Limits, MotionPlan, joint_motion
 from viapoint.training.planning.movements import (
@@ -162,8 +162,8 @@ def plan_motion(
     Args:
         arm: Arm, or name of one.
         start: Joint positions, shape (J,), [rad]; in hand space a position of the hand, shape (2,), [m].
-        goal: The same; or several of them, shape (G, D), of which the cheapest to reach is taken; or a
-            :class:`~viapoint.envs.scenes.options.Pose` of the tool.
+        goal: The same; or several of them, shape (G, D), of which the cheapest to reach is taken; or one or several
+            poses of the tool, :class:`~viapoint.envs.scenes.options.Pose`.
         obstacles: Shapes or dictionaries at time 0, with their velocities, or packed obstacles of one scene.
         n_via: Number of via-points, 1 to 3.
         seeds: Greatest number of random seeds, for all goals together; or via-points that are tried before them, shape
@@ -230,7 +230,11 @@ def plan_motion(
     else:
         given = finite_array("seeds", seeds, (None, n_via, where.dimension))
     number = -(-number // len(goals))
-    generator = np.random.default_rng(rng if rng is not None else 0)
+    if rng is None or isinstance(rng, int | np.integer):
+        rng = np.random.default_rng(whole_number("rng", 0 if rng is None else rng, 0))
+    if not isinstance(rng, np.random.Generator):
+        raise TypeError(f"rng must be a generator of numpy.random, or a seed, got {rng!r:.60}")
+    generator = rng
     until = time.perf_counter() + time_limit
     # Straight movements are cheap, and the first goal that is reached bounds what others may cost.
     little = _Effort(n_via, given[:0], 0, enough, 0.0, generator, False)
@@ -265,7 +269,7 @@ def plan_motions(
     """Plan N movements on threads; the other arguments are those of :func:`plan_motion`.
 
     Each movement is planned as :func:`plan_motion` plans it alone, whatever the number of threads is, except where the
-    time limit is reached.
+    time limit is reached. A goal pose that cannot be reached gives a plan without success, which stays at the start.
 
     Args:
         arm: Arm, or name of one.
@@ -293,6 +297,12 @@ def plan_motions(
     def plan(number: int) -> MotionPlan:
         try:
             return plan_motion(arm, starts[number], goals[number], obstacles[number], **kwargs)
+        except UnreachableError as error:  # a fault of the problem, as a goal in contact is
+            given = {name: value for name, value in kwargs.items() if name not in ("seeds", "time_limit")}
+            nothing = plan_motion(
+                arm, starts[number], starts[number], obstacles[number], time_limit=0.0, **given
+            )
+            return dataclasses.replace(nothing, success=False, reason=f"the goal is out of reach: {error}")
         except ValueError as error:
             raise ValueError(f"problem {number}: {error}") from None
 
@@ -382,10 +392,9 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
 def _goals(problem: _Problem, goal: Any) -> Float:
     """Return the goals that are tried, nearest first, shape (G, D)."""
     if isinstance(goal, Pose | Mapping):
-        pose = goal if isinstance(goal, Pose) else Pose(**goal)
-        near = problem.space.joints(problem.start)
-        found = inverse_kinematics(problem.arm, pose.position, pose.quaternion, seed=near)
-        return problem.space.coordinates(found[:GOALS])
+        goal = [goal]
+    if isinstance(goal, Sequence) and goal and all(isinstance(each, Pose | Mapping) for each in goal):
+        return np.concatenate([_solutions(problem, as_pose("goal", each)) for each in goal])
     several = np.ndim(goal) > 1
     number = np.shape(goal)[-1:] or (0,)
     if number != (len(problem.start),) and number in ((3,), (7,)):
@@ -402,6 +411,21 @@ def _goals(problem: _Problem, goal: Any) -> Float:
     away = np.abs(goals - problem.start).max(axis=-1)
     # Copies are contiguous and writable, which compiled functions depend on.
     return np.array(goals[np.argsort(away, kind="stable")])
+
+
+def _solutions(problem: _Problem, pose: Pose) -> Float:
+    """Return coordinates of configurations with the tool at a pose, nearest first; free ones where there are any."""
+    arm = problem.arm
+    near = problem.space.joints(problem.start)
+    found = inverse_kinematics(arm, pose.position, pose.quaternion, seed=near)
+    resting = ~problem.obstacles.velocity[0].any(axis=-1)
+    many = problem.obstacles.take(np.zeros(len(found), np.int64))
+    rows, own = row_clearances(arm.chain, arm.spheres, found, many, problem.margin + SPARE)
+    apart = np.minimum(own, rows[:, resting].min(axis=1, initial=np.inf))
+    free = apart >= problem.margin
+    if free.any():
+        found = found[free]
+    return np.array(problem.space.coordinates(found[:GOALS]))
 
 
 def _worth(plan: MotionPlan) -> tuple[bool, float]:
