@@ -26,8 +26,11 @@ def retarget(
     """Return a movement that continues another one from `time` on, towards a new goal.
 
     It has the least jerk from the position, velocity and acceleration of the old movement at `time` (Eqs. 25
-    to 27 of the minimum-jerk primer). With goal and arrival unchanged it is the rest of the old movement. It
-    may be retargeted again.
+    to 27 of the minimum-jerk primer). It may be retargeted again.
+
+    It is the rest of the old movement if no via-point is left to pass and goal, arrival, goal velocity and goal
+    acceleration are the old ones. A via-point of the old movement that still lies ahead is dropped unless it is
+    given again as `via`. A single one whose passage time was free is then passed as before.
 
     Near arrival an error of the state becomes a jerk of 60 dx / R^3 + 36 dv / R^2 + 9 da / R, where R is the
     remaining time. The state of the trajectory itself is exact up to rounding. A caller who plans from measured
@@ -43,7 +46,8 @@ def retarget(
         goal_velocity: (..., D) [m/s]; None = zero, FREE = the value of least cost.
         goal_acceleration: (..., D) [m/s^2]; likewise.
         freeze: remaining time to the old arrival [s] below which the old goal, arrival and final state are
-            kept, whatever the arguments say (a given via-point is dropped).
+            kept, whatever the arguments say. Via-points are dropped: those of the old movement that lie ahead,
+            and a given one.
 
     Returns:
         The movement from `time` on; its own clock starts at 0.

@@ -109,9 +109,18 @@ def curvature(trajectory: Trajectory, time: Array) -> Array:
     else:
         turn = xp.linalg.vector_norm(xp.linalg.cross(velocity, acceleration, axis=-1), axis=-1)
     length = xp.linalg.vector_norm(velocity, axis=-1)
+    bend = _ratio(xp, turn, length * length * length)
     with error_state(xp):
-        bend = turn / (length * length * length)
         return bend * slower[..., 0] * (slower[..., 0] / flatter[..., 0])
+
+
+def _ratio(xp: Namespace, numerator: Array, denominator: Array) -> Array:
+    """Return the quotient, NaN where the denominator is 0; the gradient is 0 there."""
+    # A mask of the quotient alone would not do: torch also differentiates what it hides, and 0 times infinity is NaN.
+    defined = denominator != 0
+    with error_state(xp):
+        quotient = numerator / xp.where(defined, denominator, 1.0)
+    return xp.where(defined, quotient, np.nan)[()]  # a number for a single movement, as operators return
 
 
 def dimensionless_jerk(trajectory: Trajectory) -> Array:
@@ -137,7 +146,9 @@ def dimensionless_jerk(trajectory: Trajectory) -> Array:
     xp, trajectory = trajectory.namespace, _unit_sized(trajectory)
     duration, peak = trajectory.duration, trajectory.peak(1)
     with error_state(xp):
-        return trajectory.energy(3) * duration * duration * duration / (peak * peak)
+        jerk = trajectory.energy(3) * duration * duration * duration
+        square = peak * peak
+    return _ratio(xp, jerk, square)
 
 
 def log_dimensionless_jerk(trajectory: Trajectory) -> Array:
@@ -158,8 +169,10 @@ def log_dimensionless_jerk(trajectory: Trajectory) -> Array:
         -5.322
     """
     ratio = dimensionless_jerk(trajectory)
-    with error_state(trajectory.namespace):
-        return -trajectory.namespace.log(ratio)
+    xp = trajectory.namespace
+    without_jerk = ratio == 0  # masked before the logarithm, whose slope is infinite there
+    logarithm = xp.log(xp.where(without_jerk, 1.0, ratio))
+    return xp.where(without_jerk, np.inf, -logarithm)[()]
 
 
 def spectral_arc_length(
@@ -224,8 +237,7 @@ def _arc_length(trajectory: Trajectory, cutoff: float, threshold: float, padding
     length = 2 ** (int(np.ceil(np.log2(_SPECTRUM_SAMPLES))) + int(padding))
     velocity = trajectory.sample(_SPECTRUM_SAMPLES + 1, 1)[0][..., :-1, :]
     spectrum = xp.abs(xp.fft.rfft(_length(xp, velocity), n=length, axis=-1))
-    with error_state(xp):
-        spectrum = spectrum / spectrum[..., :1]
+    spectrum = _ratio(xp, spectrum, spectrum[..., :1])
     numbers = to_numpy(spectrum)
     index = np.arange(numbers.shape[-1])
     with np.errstate(divide="ignore", invalid="ignore"):  # a movement that stands still may last no time

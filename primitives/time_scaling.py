@@ -54,7 +54,11 @@ def minimum_duration(
             allowed = f"a number, (..., 1) or (..., {trajectory.dimension})"
             raise ValueError(f"{name} must be {allowed}, got shape {tuple(limit.shape)}")
         broadcast_batch(trajectory=trajectory.batch_shape, **{name: tuple(limit.shape[:-1])})
-        factor = xp.maximum(factor, _excess(trajectory, nu, limit) ** (1.0 / nu))
+        excess = _excess(trajectory, nu, limit)
+        # The slope of a root is infinite at 0, and torch would multiply it by 0: take the root of positive ratios only.
+        moves = excess > 0
+        root = xp.where(moves, excess, 1.0) ** (1.0 / nu)
+        factor = xp.maximum(factor, xp.where(moves, root, 0.0))
     return factor * trajectory.duration
 
 

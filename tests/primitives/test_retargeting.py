@@ -43,6 +43,55 @@ def test_a_movement_through_a_via_point_goes_on_to_it():
     np.testing.assert_allclose(new(time), old(0.2 + time), atol=1e-9)
 
 
+ENDS = [
+    {},
+    {"goal_velocity": [0.7, -0.4], "goal_acceleration": [1.0, 2.0]},
+    {"goal_velocity": FREE, "goal_acceleration": FREE},
+]
+
+
+def moving_through_a_via_point(ends):
+    waypoints = np.array([[0.0, 0.0], [0.4, 0.5], [1.0, 0.0]])
+    return through(waypoints, passage_durations(waypoints, 1.0, **ends), **ends)
+
+
+@pytest.mark.parametrize("ends", ENDS)
+def test_after_the_via_point_the_old_target_and_final_state_give_the_rest_of_the_movement(ends):
+    old = moving_through_a_via_point(ends)
+    now = float(old.knots[1]) + 0.05
+    new = retarget(old, now, [1.0, 0.0], 1.0, **ends)
+    time = np.linspace(0, 1.0 - now, 30)
+    for nu in range(3):
+        np.testing.assert_allclose(new(time, nu), old(now + time, nu), atol=1e-9)
+
+
+@pytest.mark.parametrize("ends", ENDS)
+def test_a_via_point_ahead_is_passed_as_before_if_it_is_given_again_and_else_dropped(ends):
+    old = moving_through_a_via_point(ends)
+    again = retarget(old, 0.2, [1.0, 0.0], 1.0, via=[0.4, 0.5], **ends)
+    time = np.linspace(0, 0.8, 30)
+    np.testing.assert_allclose(again(time), old(0.2 + time), atol=1e-8)
+    dropped = retarget(old, 0.2, [1.0, 0.0], 1.0, **ends)
+    state = {"start_velocity": old(0.2, 1), "start_acceleration": old(0.2, 2)}
+    smoothest = point_to_point(old(0.2), [1.0, 0.0], 0.8, **state, **ends)
+    np.testing.assert_allclose(dropped(time), smoothest(time), atol=1e-12)
+    assert dropped.cost() < 0.9 * again.cost()
+
+
+@pytest.mark.parametrize("ends", ENDS[1:])
+def test_the_final_state_is_rest_unless_it_is_given_again(ends):
+    new = retarget(moving_through_a_via_point(ends), 0.8, [1.0, 0.0], 1.0)
+    np.testing.assert_allclose(new.sample([0.2], (1, 2)), 0.0, atol=1e-10)
+
+
+def test_freeze_keeps_goal_arrival_and_final_state_but_no_via_point():
+    old = moving_through_a_via_point(ENDS[1])
+    frozen = retarget(old, 0.2, [3.0, 3.0], 1.2, via=[2.0, 0.0], freeze=0.9)
+    expected = retarget(old, 0.2, [1.0, 0.0], 1.0, **ENDS[1])
+    time = np.linspace(0, 0.8, 30)
+    np.testing.assert_allclose(frozen(time), expected(time), atol=1e-12)
+
+
 def test_freeze_keeps_the_old_target_near_arrival():
     old = point_to_point(np.zeros((2, 2)), np.ones((2, 2)), 1.0)
     now = np.array([0.5, 0.95])

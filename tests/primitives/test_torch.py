@@ -89,6 +89,47 @@ def test_gradients_stay_finite_where_via_points_meet(waypoints, dtype):
     assert torch.isfinite(points.grad).all()
 
 
+@pytest.mark.parametrize(
+    "measure",
+    [
+        lambda movement: vp.curvature(movement, [0.3, 0.6]).sum(-1),
+        vp.dimensionless_jerk,
+        vp.log_dimensionless_jerk,
+        vp.spectral_arc_length,
+        lambda movement: vp.minimum_duration(movement, acceleration=1.0),
+        lambda movement: vp.minimum_duration(movement, velocity=0.5, jerk=[9.0, 9.0]),
+    ],
+)
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_still_and_steady_movements_of_a_batch_do_not_change_the_gradients_of_others(measure, speed):
+    """A steady movement has no acceleration and no jerk; where nothing moves most measures are undefined."""
+    moving = torch.tensor([[0.0, 0.0], [0.3, 0.4], [1.0, 0.0]], dtype=torch.float64)
+    other = speed * torch.tensor([[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]], dtype=torch.float64)
+    velocity = torch.tensor([[0.0, 0.0], [speed, 0.0]], dtype=torch.float64)
+    shift = torch.zeros((3, 2), dtype=torch.float64, requires_grad=True)
+
+    def values(points, rate):
+        movement = vp.through(points + shift, [0.5, 0.5], start_velocity=rate, goal_velocity=rate)
+        return measure(movement)
+
+    both = values(torch.stack([moving, other]), velocity)
+    (found,) = torch.autograd.grad(both[0], shift, retain_graph=True)
+    (expected,) = torch.autograd.grad(values(moving, velocity[0]), shift)
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    assert torch.isfinite(torch.autograd.grad(both[1], shift)[0]).all()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_gradient_of_curvature_on_a_grid_with_rest_is_that_without_it(dimension, tensor):
+    waypoints, inside = tensor(3, dimension), torch.linspace(0.1, 0.9, 9, dtype=torch.float64)
+    movement = vp.through(waypoints, [0.4, 0.6])
+    (expected,) = torch.autograd.grad(vp.curvature(movement, inside).sum(), waypoints, retain_graph=True)
+    values = vp.curvature(movement, torch.cat([torch.zeros(1), inside]))
+    assert values[0].isnan()
+    (found,) = torch.autograd.grad(values.nansum(), waypoints)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0.0)
+
+
 @pytest.mark.parametrize("number", [float, np.float64, np.float32, np.array])
 def test_a_number_beside_tensors_adds_no_dimension(number):
     reach = vp.point_to_point(torch.zeros(2), torch.ones(2), number(1.0))
