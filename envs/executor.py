@@ -296,23 +296,15 @@ def _measure(
         state.joints[row] = before
         state.steps[row] = begin + end
         # Clearance of what was done, and of what was commanded
+        body = chain, spheres, reach
         done = movement_clearance(
-            chain, spheres, reach, executed[:end], obstacles, scene, timestep, timestep, placed, nothing, 0.0
+            *body, executed[:end], obstacles, scene, timestep, timestep, placed, nothing, 0.0
         )
         state.min_clearance[row] = min(state.min_clearance[row], done[0])
         state.self_clearance[row] = min(state.self_clearance[row], done[1])
+        planned_path = path[scene, : steps[scene] + 1]
         command = movement_clearance(
-            chain,
-            spheres,
-            reach,
-            path[scene, : steps[scene] + 1],
-            obstacles,
-            scene,
-            0.0,
-            timestep,
-            placed,
-            nothing,
-            0.0,
+            *body, planned_path, obstacles, scene, 0.0, timestep, placed, nothing, 0.0
         )
         state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
         found[scene] = end

@@ -187,7 +187,7 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
         with np.load(path, allow_pickle=False) as archive:
             content = {name: archive[name] for name in (*CONTENT, "task", "sha256")}
             no_reach = np.zeros((*content["kind"].shape, 5))
-            content[REACH] = archive[REACH] if REACH in archive else no_reach
+            content[REACH] = archive.get(REACH, no_reach)
         for name in (*CONTENT, REACH):
             if content[name].dtype.kind == "f":
                 content[name] = content[name].astype(np.float64)

@@ -313,8 +313,8 @@ def test_a_batch_goes_on_after_a_pose_out_of_reach() -> None:
 def test_a_pose_is_reached_by_any_of_its_free_configurations() -> None:
     """The nearest ten of 55 touch the boards."""
     place = np.array([0.54, 0.33, 0.42])
-    boards = [Box((0.15, 0.15, 0.02), position=place + [0.0, 0.0, 0.155])]
-    boards.append(Box((0.02, 0.15, 0.1), position=place + [0.12, 0.0, 0.0]))
+    boards = [Box((0.15, 0.15, 0.02), position=place + np.array([0.0, 0.0, 0.155]))]
+    boards.append(Box((0.02, 0.15, 0.1), position=place + np.array([0.12, 0.0, 0.0])))
     plan = plan_motion(PANDA, PANDA.home, Pose(place), boards)
     assert plan.success
     assert np.allclose(PANDA.hand(plan.waypoints[-1]), place, atol=1e-4)

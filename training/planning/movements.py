@@ -339,8 +339,8 @@ def least_clearance(
     The search stops at the first clearance below `floor`. In the plane, instants are skipped whose neighbours have so
     much clearance that they cannot have less than the least so far. (Arms in space move too far between two instants.)
 
-    Obstacles are those of the problem `scene`. Clearances above `least` are of no interest, below `floor` the exact value
-    does not matter, [m], and after the time `until` nothing does, [s].
+    Obstacles are those of the problem `scene`. Clearances above `least` are of no interest, below `floor` the exact
+    value does not matter, [m], and after the time `until` nothing does, [s].
     """
     alone, last = setting.hand_alone, len(movement.table.order) - 1
     path, bound, placed = memory.path, memory.bound, memory.placed

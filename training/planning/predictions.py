@@ -32,7 +32,7 @@ PLACE_ERROR, RATE_ERROR, LENGTH_ERROR = 0.002, 0.02, 0.03
 
 
 class Seen(NamedTuple):
-    """What was seen of the n obstacles of one episode in its M decisions so far."""
+    """Places and velocities of the n obstacles of one episode, as seen in its M decisions so far."""
 
     time: Float  # Shape (M,), [s]
     centre: Float  # Shape (M, n, 3), [m]
