@@ -7,7 +7,7 @@ with computed geometry, which by itself takes the present velocities for constan
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from viapoint.envs.scenes.motions import REACH_LENGTH, REACH_TIME
 from viapoint.envs.scenes.scene import CHORD, Scenes, reached
 from viapoint.envs.task import Task
 from viapoint.training.planning.problem import Problem
-from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
 
 HORIZON = 40  # Number of intervals of a prediction; obstacles keep the last velocity
@@ -57,7 +56,7 @@ def fitted_reaches(seen: Seen, scene: Scenes) -> Float:
     and by the length of usual reaches. The prediction is the mean of all hypotheses.
     """
     places = at_rest(seen, scene)
-    ahead = CHORD * np.arange(HORIZON + 1)
+    ahead = np.linspace(0.0, CHORD * HORIZON, HORIZON + 1)
     for row in np.flatnonzero(norm(seen.velocity[-1]) > MOVING):
         made, weight, way = _hypotheses(seen.time, seen.centre[:, row], seen.velocity[:, row], ahead)
         places[:, row] += np.einsum("h,ht,hd->td", weight, made, way)
@@ -110,9 +109,12 @@ PREDICTIONS: dict[str, Callable[[Seen, Scenes], Float]] = {
 
 
 class PredictedSearch:
-    """Search that revises its plans among obstacles whose courses it predicts, by one of PREDICTIONS."""
+    """Search that revises its plans among obstacles whose courses it predicts, by one of PREDICTIONS.
 
-    def __init__(self, simulation: SceneSimulation, prediction: str, search: GeometrySearch) -> None:
+    The search is a :class:`~viapoint.training.planning.search.GeometrySearch`.
+    """
+
+    def __init__(self, simulation: SceneSimulation, prediction: str, search: Any) -> None:
         self.name = f"{prediction}:{search.name}"
         self._simulation, self._predict, self._search = simulation, PREDICTIONS[prediction], search
 
@@ -134,7 +136,7 @@ class PredictedSearch:
         for i, seen in enumerate(self._look(observation, scenes, memory)):
             places.append(self._predict(seen, scenes.take([i])))
         obstacles = in_pieces(problem.obstacles, np.array(places))
-        return self._search.solve(problem._replace(obstacles=obstacles), n_pieces=HORIZON)
+        return np.asarray(self._search.solve(problem._replace(obstacles=obstacles), n_pieces=HORIZON))
 
     def _look(self, observation: Observation, scenes: Scenes, memory: dict[bytes, Seen]) -> list[Seen]:
         """Add observations to what was seen in their episodes, which the scenes tell apart, and return that."""
