@@ -242,6 +242,15 @@ def write_config(folder: Path, config: TrainConfig) -> None:
     write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False})
 
 
+def write_timesteps(run: Run) -> None:
+    """Write the number of decisions of a run that is extended.
+
+    All else stays as it was written: an arm is named by its file, also while its copy takes its place.
+    """
+    path = run.folder / "config.json"
+    write_json(path, {**read_json(path), "n_timesteps": run.config.n_timesteps})
+
+
 def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = None) -> None:
     """Check that a run goes on with its own settings; others raise BadFileError.
 

@@ -24,7 +24,7 @@ from viapoint.training.evaluation.evaluator import MethodResult, evaluate, one_t
 from viapoint.training.io.files import BadFileError, versions
 from viapoint.training.io.progress import progress_bar
 from viapoint.training.rollouts.vec_env import LOGGED, ViaVecEnv
-from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, write_config
+from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, write_timesteps
 from viapoint.training.scene_sets import FrozenScenes, scenes_for
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
@@ -222,7 +222,7 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
                 f"got {config.n_timesteps}",
             )
         run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
-        write_config(run.folder, run.config)
+        write_timesteps(run)
     run.config = dataclasses.replace(run.config, progress=config.progress)
     began = run.versions
     others = [
