@@ -15,6 +15,7 @@ from viapoint.training import evaluate, load_agent
 from viapoint.training.agents.agent import SAC, find_model
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.viaq import ViaQ
+from viapoint.training.agents.viarank import ViaRank
 from viapoint.training.cli import entry as cli
 from viapoint.training.config.checks import ELSEWHERE
 from viapoint.training.config.configs import (
@@ -43,7 +44,7 @@ from viapoint.training.scene_sets import load, scenes_for, shipped_path
 ENV, REACH, STEP = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarReach", "PlanarObstaclesStep")
 )
-MOVING = "viapoint/PlanarMovingObstacles-v0"
+MOVING, SENSED = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarSensed-v0"
 STALLING = {"stop_when_stalled": 0.3}
 
 CONFIGURATIONS = [
@@ -223,6 +224,7 @@ CALLS = [
     lambda: Task.from_dict({**agent().get_env().get_attr("task")[0].as_dict(), "arm": "octopus"}),
     *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, "Pendulum-v1")),
     lambda: ViaQ("ViaQPolicy", VecNormalize(ViaVecEnv(ENV, 2))),
+    lambda: ViaRank("ViaRankPolicy", VecNormalize(ViaVecEnv(SENSED, 2))),
     *(lambda change=change: scene_file(**change) for change in (
         {"format": "other"}, {"start": [0.1]}, {"goal": [0.1, math.nan]}, {"jumps": [[1.0]]}, {"colour": 1},
         {"obstacles": 3}, {"obstacles": [[0.1, 0.2]]}, {"obstacles": [{"shape": "cube"}]},

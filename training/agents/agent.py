@@ -19,7 +19,7 @@ from viapoint.training.config.checks import SHIPPED, SHIPPED_IDS
 from viapoint.training.io.files import BadFileError, write_folder
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.plan_motion import checked_motion
-from viapoint.training.rollouts.vec_env import env_arguments
+from viapoint.training.rollouts.vec_env import env_arguments, predicted_actions
 
 
 class Agent(BaseAlgorithm):
@@ -79,7 +79,7 @@ class Agent(BaseAlgorithm):
         arm = task.arm
         goals = scenes.goal, arm.hand(scenes.goal)
         seen = task.observation.observe(scenes.start, arm.hand(scenes.start), goals, scenes.obstacles)
-        actions, _ = self.predict(seen, deterministic=True)
+        actions = predicted_actions(self, seen)
         ends = task.space.coordinates(scenes.start), task.space.coordinates(scenes.goal)
         plan = task.action.decode(np.asarray(actions, dtype=np.float64), *ends).take(0)
         return checked_motion(arm, task.space_name, plan, scenes.obstacles, "agent")

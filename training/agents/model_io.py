@@ -93,7 +93,17 @@ def save_model(model: BaseAlgorithm, folder: Path) -> None:
 
     Raises:
         ValueError: Its class is not in ALGORITHMS, or it has no environment of this package.
+
+    Warns:
+        UserWarning: Observations are normalised by `VecNormalize`, whose statistics are no part of the folder.
     """
+    normalize = model.get_vec_normalize_env()
+    if normalize is not None and normalize.norm_obs:
+        warnings.warn(
+            "a model folder does not hold the statistics of VecNormalize, without which the loaded model decides on "
+            "raw observations; keep them with VecNormalize.save",
+            stacklevel=3,
+        )
     path = folder / "weights.safetensors"
     write_arrays(path, weights(model))
     keep_arm(folder, model.get_env().get_attr("task", [0])[0].arm)  # type: ignore[union-attr]

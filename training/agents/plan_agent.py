@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import check_for_correct_spaces, is_vectorized_observation
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
 from viapoint.envs.task import Task
@@ -166,6 +166,11 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         """Check that the policy, which was made for one task, can decide in another; ValueError if not."""
 
     def _check_env(self, env: VecEnv) -> None:
+        normalized = unwrap_vec_normalize(env)
+        if normalized is not None and normalized.norm_obs:
+            raise ValueError(
+                f"{type(self).__name__} computes with metres: VecNormalize must be made with norm_obs=False"
+            )
         self._check_task(Task.from_dict(self.policy_kwargs["task"]), self._task_of(env))
 
     def _setup_model(self) -> None:

@@ -28,7 +28,7 @@ from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
 from viapoint.training.planning.predictions import PREDICTIONS, PredictedSearch
 from viapoint.training.planning.search import GeometrySearch, registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
-from viapoint.training.rollouts.vec_env import env_arguments
+from viapoint.training.rollouts.vec_env import env_arguments, predicted_actions
 
 
 class Method(Protocol):
@@ -182,7 +182,7 @@ class AgentMethod:
         for name in own:
             setattr(policy, name, self._settings[name])
         try:
-            actions, _ = self._model.predict(observation, deterministic=True)
+            actions = predicted_actions(self._model, observation)
         finally:
             for name, number in own.items():
                 setattr(policy, name, number)
@@ -204,7 +204,7 @@ class StepAgentMethod:
         """Return actions for the next step, shape (N, D), from observations of the step-wise task or its twin."""
         if "time_left" not in observation or "remaining" in observation:  # that of the twin
             observation = self._simulation.observe(scenes)
-        actions, _ = self._model.predict(observation, deterministic=True)
+        actions = predicted_actions(self._model, observation)
         return np.asarray(actions, dtype=np.float64)
 
     def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -51,6 +52,17 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
         for name, value in spec.kwargs.items()
         if name not in ("render_mode", "threads") and (name not in usual or usual[name] != value)
     }
+
+
+def predicted_actions(model: BaseAlgorithm, observation: Any) -> NDArray[Any]:
+    """Return the actions of a model for an observation or a batch as the environment gives it.
+
+    A model of `VecNormalize` gets it normalised with the statistics of its training, which stay as they are.
+    """
+    normalize = model.get_vec_normalize_env()
+    seen = observation if normalize is None else normalize.normalize_obs(observation)
+    actions, _ = model.predict(seen, deterministic=True)
+    return actions
 
 
 class ViaVecEnv(VecEnv):
