@@ -150,8 +150,8 @@ class Run:
         return self.folder / "final"
 
     def save(self, name: str, model: BaseAlgorithm) -> None:
-        """Write a model as `best` or `final`."""
-        write_folder(self.folder / name, lambda temporary: save_model(model, temporary))
+        """Write a model as `best` or `final`; a folder with other files is kept as `best.1`, as training must go on."""
+        write_folder(self.folder / name, lambda temporary: save_model(model, temporary), move_foreign=True)
 
     def checkpoint(self, model: BaseAlgorithm, extra: Mapping[str, Any]) -> None:
         """Write a checkpoint and remove outdated ones."""
