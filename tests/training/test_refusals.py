@@ -32,6 +32,7 @@ from viapoint.training.evaluation import statistics
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError
 from viapoint.training.planning.baselines import agent_method, make_method
+from viapoint.training.planning.benchmark import benchmark_planner
 from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.video import record_video
@@ -192,6 +193,16 @@ def film(path="film.mp4", number=1, mode="rgb_array_list"):
 CALLS = [
     *(lambda name=name: make_method(name, ENV) for name in ("magic", "search", "search3", "sobol0", "unrevised")),
     *(lambda name=name: make_method(name, MOVING) for name in ("constant", "random16", "ompl")),
+    *(lambda name=name: make_method(name, ENV) for name in ("search99999999999", "sobol65537")),
+    lambda: make_method("cautious99999999999", SENSED),
+    lambda: benchmark_planner("search99999999999"),
+    *(lambda more=more: GeometrySearch(ENV, **more) for more in (
+        {"n_checks": 10**6}, {"refinements": 10**9}, {"per_round": 10**9}, {"refinements": 64, "per_round": 2048},
+    )),
+    *(lambda name=name, value=value: setattr(agent().policy, name, value) for name, value in (
+        ("checks", -1), ("checks", 1.5), ("refine", True), ("candidates", 0), ("refinements", 10**9),
+    )),
+    lambda: setattr(load_agent(SENSED).policy, "belief", "magic"),
     lambda: agent_method("agent", SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2), 8),
     lambda: evaluate_methods([], load(shipped_path("test", ENV)), ENV),
     lambda: evaluate(ENV, env=REACH),

@@ -7,6 +7,7 @@ arm.xml                copy of the arm, if it was loaded from a file
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.metadata
 import inspect
@@ -41,6 +42,7 @@ from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES
 from viapoint.training.agents.extractors import SceneExtractor
 from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
+from viapoint.training.planning.candidates import MOST_CANDIDATES, MOST_ROUNDS
 from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments
 
 ACTIVATIONS = (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
@@ -71,6 +73,13 @@ LEAST: dict[str, float] = {
     **dict.fromkeys(("policy_delay", "target_update_interval", "next_candidates", "nearest"), 1),
     **dict.fromkeys(("width", "candidates", "per_refinement"), 1),
     **dict.fromkeys(("explore_candidates", "labels", "instants"), 2),
+}
+# Greatest values of hyperparameters that time and memory of a decision grow with
+MOST: dict[str, int] = {
+    **dict.fromkeys(("candidates", "per_refinement", "explore_candidates"), MOST_CANDIDATES),
+    **dict.fromkeys(("next_candidates", "labels", "refine"), MOST_CANDIDATES),
+    **dict.fromkeys(("instants", "nearest"), 1024),
+    "refinements": MOST_ROUNDS,
 }
 
 LARGEST_MODEL_JSON = 1 << 20  # Greatest size of `model.json`, [bytes]
@@ -200,9 +209,7 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
 
     The algorithms accept any number, and many a wrong one shows only as a training that does not learn.
     """
-    # The hints of Stable-Baselines3 name VecEnv, which its modules import for type checkers only.
-    hinted: Any = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
-    hints = typing.get_type_hints(hinted, localns={"VecEnv": object})
+    hints = _hints(function)
     for name, value in values.items():
         number = value.item() if isinstance(value, np.generic) else value
         hint = hints.get(name, Any)
@@ -226,6 +233,16 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
             raise ValueError(f"{name} must be from 0 to 1, got {value!r}")
         if number < LEAST.get(name, -math.inf):
             raise ValueError(f"{name} must be {LEAST[name]:g} or more, got {value!r}")
+        if number > MOST.get(name, math.inf):
+            raise ValueError(f"{name} must be {MOST[name]} or less, got {value!r}")
+
+
+@functools.cache
+def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the type hints of a function, or of the arguments of a class."""
+    # The hints of Stable-Baselines3 name VecEnv, which its modules import for type checkers only.
+    hinted: Any = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
+    return typing.get_type_hints(hinted, localns={"VecEnv": object})
 
 
 def untrained(model: BaseAlgorithm, seed: int = 0) -> BaseAlgorithm:

@@ -27,7 +27,7 @@ Numbers = NDArray[np.floating[Any]]
 class PlanPolicy(BasePolicy):
     """Policy without an actor: :meth:`decide` ranks candidate plans.
 
-    Subclasses set their attributes and check them. `task` holds plain values, see
+    Subclasses set their attributes, which are checked whenever they are set. `task` holds plain values, see
     :meth:`viapoint.envs.task.Task.as_dict`.
     """
 
@@ -43,6 +43,16 @@ class PlanPolicy(BasePolicy):
     ) -> None:
         super().__init__(observation_space, action_space, **kwargs)
         self.task = Task.from_dict(task)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute; settings of the policy may change after training, too, and are checked each time."""
+        if name in self.OWN:
+            self._check_setting(name, value)
+        super().__setattr__(name, value)
+
+    def _check_setting(self, name: str, value: Any) -> None:
+        """Check a setting; a wrong type, or a number out of range, raises ValueError."""
+        check_arguments(type(self), {name: value})
 
     def _own(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self.OWN}

@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.common.validation import whole_number
 from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.config.checks import unknown_name
+from viapoint.training.planning.candidates import MOST_CANDIDATES
 from viapoint.training.planning.cautious import (
     BELIEFS,
     DEFAULT_BELIEF,
@@ -283,7 +285,7 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
     """Return the factory of a baseline for a task.
 
     Raises:
-        ValueError: There is no such baseline.
+        ValueError: There is no such baseline, or it would check too many plans.
     """
     known = REPLANNING_METHODS if task.replanning else METHODS
     sensed = task.sensor is not None
@@ -316,5 +318,5 @@ def _counted(name: str, allowed: Collection[str]) -> Callable[[SceneSimulation],
     found = re.fullmatch(r"(\w+?)([0-9]+)", name)
     if found is None or found[1] not in allowed or int(found[2]) < FEWEST_CHECKS[found[1]]:
         return None
-    make, checks = COUNTED[found[1]], int(found[2])
+    make, checks = COUNTED[found[1]], whole_number(f"N of {found[1]}N", int(found[2]), 1, MOST_CANDIDATES)
     return lambda simulation: make(simulation, checks)

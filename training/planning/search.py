@@ -18,7 +18,12 @@ from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.task import Task
-from viapoint.training.planning.candidates import candidate_actions, sobol_actions
+from viapoint.training.planning.candidates import (
+    MOST_CANDIDATES,
+    MOST_ROUNDS,
+    candidate_actions,
+    sobol_actions,
+)
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.movements import (
     Memory,
@@ -95,9 +100,10 @@ class GeometrySearch:
         **kwargs: Any,
     ) -> None:
         self.task = registered_task(task, **kwargs) if isinstance(task, str) else task
-        self.n_checks = whole_number("n_checks", n_checks, 1)
-        self.refinements = whole_number("refinements", refinements, 0)
-        self.per_round = whole_number("per_round", per_round, 1)
+        self.n_checks = whole_number("n_checks", n_checks, 1, MOST_CANDIDATES)
+        self.refinements = whole_number("refinements", refinements, 0, MOST_ROUNDS)
+        self.per_round = whole_number("per_round", per_round, 1, MOST_CANDIDATES)
+        whole_number("number of all checks", self.total_checks, 1, MOST_CANDIDATES)
 
     @property
     def total_checks(self) -> int:
