@@ -272,6 +272,7 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
     (name,), (env_id, env_kwargs) = names, env_arguments(model.get_env())
     policies = {kind: each for each, kind in ALGORITHMS[name].policy_aliases.items()}
     stored = sorted(name for name in argument_names(type(model)) if hasattr(model, name))
+    limit = gym.spec(env_id).max_episode_steps  # of an id of one's own
     return {
         "format": FORMAT,
         "viapoint": importlib.metadata.version("viapoint"),
@@ -281,6 +282,7 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
             "id": env_id,
             "kwargs": _encode(env_kwargs),
             "task": model.get_env().get_attr("task", [0])[0].as_dict(),  # type: ignore[union-attr]
+            **({} if limit is None else {"max_episode_steps": limit}),
         },
         "num_timesteps": model.num_timesteps,
         "hyperparameters": {name: _encode(getattr(model, name)) for name in stored},
@@ -340,7 +342,11 @@ def own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
     if env_id not in gym.registry:  # never lets Gymnasium import a module named in a file
         if "task" not in record:
             raise ValueError(f"environment {env_id!r} is not known")
-        env_id, kwargs = ANY_TASK, record["task"]
+        limit = kwargs.get("max_episode_steps", record.get("max_episode_steps"))
+        env_id, kwargs = (
+            ANY_TASK,
+            {**record["task"], **({} if limit is None else {"max_episode_steps": limit})},
+        )
     kwargs = with_kept_arm(kwargs, folder)
     for name, most in LARGEST_ARGUMENTS.items():
         value = kwargs.get(name, 0)

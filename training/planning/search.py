@@ -11,6 +11,7 @@ import numpy as np
 
 from viapoint.envs.common.types import Bool, Float, Single
 from viapoint.envs.common.validation import whole_number
+from viapoint.envs.env import ReachEnv
 from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import Plan
@@ -350,7 +351,12 @@ def registered_task(env_id: str, **kwargs: Any) -> Task:
     check_registered(env_id)
     env: Any = gym.make_vec(env_id, num_envs=1, **kwargs)
     task = getattr(env.unwrapped, "task", None)
+    single = [each.unwrapped for each in getattr(env.unwrapped, "envs", ())]
     env.close()
+    if any(isinstance(each, ReachEnv) for each in single):
+        raise ValueError(
+            f"{env_id} must be registered with vector_entry_point='viapoint.envs.vector_env:ReachVectorEnv', too"
+        )
     if not isinstance(task, Task):
         raise ValueError(f"{env_id} is not an environment of this package")
     return task
