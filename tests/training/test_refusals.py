@@ -8,6 +8,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from viapoint.envs import Sphere, Task, scene_from_json
@@ -193,6 +194,7 @@ def film(path="film.mp4", number=1, mode="rgb_array_list"):
 CALLS = [
     *(lambda name=name: make_method(name, ENV) for name in ("magic", "search", "search3", "sobol0", "unrevised")),
     *(lambda name=name: make_method(name, MOVING) for name in ("constant", "random16", "ompl")),
+    lambda: SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2, replay_buffer_class=HerReplayBuffer),
     *(lambda name=name: make_method(name, ENV) for name in ("search99999999999", "sobol65537")),
     lambda: make_method("cautious99999999999", SENSED),
     lambda: benchmark_planner("search99999999999"),

@@ -69,8 +69,9 @@ class ViaVecEnv(VecEnv):
     """Vector environment for Stable-Baselines3 that simulates all copies of an environment in one batch.
 
     It replaces `make_vec_env` of Stable-Baselines3, which makes one Python environment per copy; `benchmarks/speed.py`
-    measures how much faster it is. Episodes may have one step or many,
-    and may end at different times.
+    measures how much faster it is. Episodes may have one step or many, and may end at different times.
+    `HerReplayBuffer` of Stable-Baselines3 does not apply: the reward of another goal depends on contact and jerk of a
+    movement that was not made, so observations have no `achieved_goal`.
 
     Args:
         env_id: Id of a registered environment.
