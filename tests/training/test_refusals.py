@@ -76,6 +76,8 @@ CONFIGURATIONS = [
     (LiveConfig, {"env": "nothing"}),
     (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}),
     (StudyConfig, {"file": "study.yaml", "workers": 0}),
+    *((kind, {"out": ""}) for kind in (TrainConfig, DemoConfig, PaperConfig)),
+    (EvaluateConfig, {"env": ENV, "json": ""}),
 ]
 
 
@@ -191,6 +193,17 @@ def film(path="film.mp4", number=1, mode="rgb_array_list"):
     record_video(path, gym.make(ENV, render_mode=mode), scenes(number), lambda *_: np.zeros((1, 3)))
 
 
+class Decides:
+    """Method that always decides the same."""
+
+    def __init__(self, name, decided):
+        self.name, self.decided = name, decided
+
+    def decide(self, observation, scenes):
+        return self.decided
+
+
+ZERO = np.zeros((2, 3))
 CALLS = [
     *(lambda name=name: make_method(name, ENV) for name in ("magic", "search", "search3", "sobol0", "unrevised")),
     *(lambda name=name: make_method(name, MOVING) for name in ("constant", "random16", "ompl")),
@@ -208,6 +221,15 @@ CALLS = [
     lambda: agent_method("agent", SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2), 8),
     lambda: evaluate_methods([], load(shipped_path("test", ENV)), ENV),
     lambda: evaluate(ENV, env=REACH),
+    lambda: evaluate(5, env=ENV),
+    *(lambda given=given: evaluate(env=ENV, baselines=given) for given in (
+        5, [3], [None], ["straight", "straight"], [Decides("a", ZERO), Decides("a", ZERO)],
+    )),
+    lambda: evaluate(ENV, checks=[4, 4]),
+    *(lambda scenes=scenes: evaluate(ENV, scenes=scenes) for scenes in (5, None, ["test"])),
+    *(lambda given=given: evaluate(env=ENV, baselines=[Decides("a", given)], n_scenes=2) for given in (
+        None, "left", ZERO[0], ZERO[:1], ZERO[:, :2], ZERO + math.nan, ZERO.astype(object),
+    )),
     lambda: evaluate(ENV, baselines=["unrevised"]),
     lambda: evaluate(baselines=["straight"]),
     lambda: evaluate(env=ENV, baselines=["untrained"]),
@@ -315,6 +337,7 @@ COMMANDS = [
     ("train --env viapoint/PlanarObstacle-v0", "Did you mean: `PlanarObstacles`"),
     ("train --n-timesteps -5", "--n-timesteps must be a whole number, from 1"),
     ("train --n-timesteps 1e5", "--n-timesteps: must be a whole number, got '1e5'"),
+    ("train --n-timesteps 16 --n-envs 16 --out=", "--out: must be a path, got ''"),
     ("train --env-kwargs n_vias=2 --out full", "did you mean 'n_via'"),
     ("train --env-kwargs n_obstacles=999", "n_obstacles"),
     ("train --env-kwargs n_via", "n_via"),

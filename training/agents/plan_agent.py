@@ -107,6 +107,8 @@ class PlanPolicy(BasePolicy):
                 raise ValueError(f"observation must be finite; {name} is {np.asarray(each)}")
         several = is_vectorized_observation(cast(Any, dict(observation)), parts)
         batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
+        if not len(batch[next(iter(batch))]):
+            return np.zeros((0, *cast(Any, self.action_space).shape), np.float32), state
         self._check_observation(batch)
         actions = np.clip(self.decide(batch), -1.0, 1.0).astype(np.float32)
         return (actions if several else actions[0]), state
