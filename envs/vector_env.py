@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -74,6 +75,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         width: Width of a rendered frame, [pixels].
         height: Height of a rendered frame, [pixels].
         threads: Threads of the simulation; 0 for one per core. Results do not depend on it.
+        max_episode_steps: Number of decisions after which an episode is truncated; None for no such limit. Gymnasium
+            passes that of a registered id.
 
     Example:
         >>> import gymnasium as gym
@@ -95,6 +98,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         width: int = 480,
         height: int = 480,
         threads: int = 0,
+        max_episode_steps: int | None = None,
         **task: Any,
     ) -> None:
         task = as_given(task)
@@ -106,6 +110,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             width=width,
             height=height,
             threads=threads,
+            max_episode_steps=max_episode_steps,
             **task,
         )
         self.task = Task.of(**task)
@@ -118,6 +123,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             raise ValueError(f"autoreset_mode must be one of {modes}, got {autoreset_mode!r}") from None
         self.metadata = {**SINGLE_METADATA, "autoreset_mode": self.autoreset_mode}
         self.render_mode = render_mode
+        self._limit = math.inf
+        if max_episode_steps is not None:
+            self._limit = whole_number("max_episode_steps", max_episode_steps, 1)
         number = whole_number("threads", threads, 0) or os.cpu_count() or 1
         number = max(min(number, self.num_envs // LEAST_SHARE), 1)
         self._shares = np.array_split(np.arange(self.num_envs), number)
@@ -134,6 +142,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """Random generators of the environments' scenes; empty before the first reset."""
         self._running = False
         self._over = np.zeros(self.num_envs, bool)
+        self._decisions = np.zeros(self.num_envs, np.int64)  # of the running episodes
         self.terminated = np.ones(self.num_envs, bool)
         """True where the last step terminated the episode, shape (num_envs,)."""
         self.truncated = np.zeros(self.num_envs, bool)
@@ -291,7 +300,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         plans = {}
         for episodes, share in zip(self._episodes, self._shares, strict=True):
             plans[episodes] = episodes.checked(whole.take(share))
-        return self._joined(self._each(lambda episodes, _: episodes.execute(plans[episodes])))
+        parts = self._each(lambda episodes, _: episodes.execute(plans[episodes]))
+        return self._joined(parts, np.ones(self.num_envs, bool))
 
     def move_goals(self, goals: Any) -> Observation:
         """Move the targets of the running episodes, which jump no more, and return the new observations.
@@ -339,6 +349,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             "generators": [generator.bit_generator.state for generator in self.generators],
             "episodes": [each.state() for each in self._episodes],
             "over": self._over.copy(),
+            "decisions": self._decisions.copy(),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -351,6 +362,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         for each, part in zip(self._episodes, state["episodes"], strict=True):
             each.restore(part)
         self._over[:] = state["over"]
+        self._decisions[:] = state.get("decisions", 0)  # states of before had no limit
         self._running = True
 
     def __getstate__(self) -> dict[str, Any]:
@@ -405,13 +417,14 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         name = f"actions of all environments ({', '.join(self.action_names)})"
         actions = finite_array(name, actions, (self.num_envs, len(self.action_names)))
         actions = np.clip(actions, -1.0, 1.0)
-        return self._joined(
-            self._each(lambda episodes, share: episodes.decide(actions[share], active[share]))
-        )
+        parts = self._each(lambda episodes, share: episodes.decide(actions[share], active[share]))
+        return self._joined(parts, active)
 
-    def _joined(self, parts: list[Decision]) -> Decision:
-        """Return the decisions of all environments together."""
+    def _joined(self, parts: list[Decision], active: Bool) -> Decision:
+        """Return the decisions of all environments together, after those of active ones have been counted."""
         decision = Decision(*map(_together, zip(*parts, strict=True)))
+        self._decisions += active
+        decision = decision._replace(truncated=decision.truncated | (self._decisions >= self._limit))
         self.terminated = decision.terminated
         self.truncated = decision.truncated
         return decision
@@ -453,6 +466,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                 episodes.start(rows, scenes, keep=True)
 
         self._each(restart)
+        self._decisions[ended] = 0
 
     def _start(self, rows: Int, scenes: Scenes) -> None:
         """Start given scenes in some environments."""
@@ -462,6 +476,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                 episodes.start(rows[inside] - share[0], scenes.take(inside))
         for flags in (self.terminated, self.truncated, self._over):
             flags[rows] = False
+        self._decisions[rows] = 0
         self._running = True
 
     def _check_running(self) -> None:

@@ -109,6 +109,24 @@ def test_a_pickled_environment_goes_on_as_the_original(env_id):
         np.testing.assert_array_equal(first[1], second[1])
 
 
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
+@pytest.mark.parametrize("limit", [1, 2])
+def test_a_limit_of_decisions_is_that_of_gymnasium(env_id, mode, limit):
+    alone = gym.make(env_id, max_episode_steps=limit)
+    batch = gym.make_vec(env_id, num_envs=2, max_episode_steps=limit, autoreset_mode=mode)
+    alone.reset(seed=3)
+    batch.reset(seed=[3, 3])
+    for action in actions_for(batch, 2 * limit):
+        *_, terminated, truncated, _ = alone.step(action)
+        batch = pickle.loads(pickle.dumps(batch))
+        *_, over, cut, _ = batch.step(np.stack((action, action)))
+        assert (over.tolist(), cut.tolist()) == ([terminated] * 2, [truncated] * 2)
+        if terminated or truncated:  # the next episode has as many decisions
+            alone.reset(seed=3)
+            batch.reset(seed=[3, 3])
+    assert limit == 1 or TASKS[env_id].get("decide_at") != "steps" or truncated
+
+
 def test_a_reset_mask_resets_only_those(env_id):
     env = gym.make_vec(env_id, num_envs=4)
     before, _ = env.reset(seed=0)

@@ -15,6 +15,7 @@ ANY_ENVIRONMENT = [
     *(({name: 1.0}, TypeError) for name in ("speed", "workers", "uniform_share", "dimension")),
     ({"render_mode": "rgb"}, ValueError), ({"width": 0}, ValueError), ({"height": -3}, ValueError),
     ({"width": 2.5}, ValueError), ({"height": True}, ValueError), ({"threads": -1}, ValueError),
+    ({"max_episode_steps": 0}, ValueError),
     ({"arm": "ur5"}, ValueError), ({"arm": 5}, ValueError), ({"space": "hands"}, ValueError),
     ({"whole_arm": "yes"}, TypeError), ({"moving_obstacles": 1}, TypeError), ({"shapes": 3}, TypeError),
     ({"courses": "walks"}, ValueError),

@@ -43,6 +43,13 @@ def policy_of(task, **kwargs):
     return ViaQPolicy(task.observation.space(), actions, lambda _: 1e-3, task=task.as_dict(), **settings)
 
 
+@pytest.mark.parametrize("env_id", [PLANE, "viapoint/PlanarSensed-v0", "viapoint/PlanarMovingObstacles-v0"])
+def test_no_scenes_have_no_actions(env_id):
+    agent = load_agent(env_id)
+    empty = {name: np.zeros((0, *box.shape), np.float32) for name, box in agent.observation_space.items()}
+    assert agent.predict(empty)[0].shape == (0, *agent.action_space.shape)
+
+
 def margins(policy, problem):
     """Return the margins of 8 actions in each scene, [m]."""
     size = policy.task.action.size

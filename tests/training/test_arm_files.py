@@ -56,6 +56,25 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     assert filmed == [kept.env_kwargs["arm"]]
 
 
+def test_a_run_goes_on_with_its_copy_of_an_arm(tmp_path, capsys) -> None:
+    file = tmp_path / "my_arm.xml"
+    shutil.copy(UR5E, file)
+    settings = ("--n-envs", "16", "--eval-every", "0", "--out", str(tmp_path / "run"))
+    main(["train", "--arm", str(file), "--n-timesteps", "16", *settings])
+    shutil.copytree(tmp_path / "run", tmp_path / "same")
+    decisions = 16
+    # The run goes on without the file, and then with the file again; the other run the other way round.
+    for name in ("elsewhere.xml", "my_arm.xml"):
+        decisions += 16
+        main(["train", "--resume", "--out", str(tmp_path / "same"), "--n-timesteps", str(decisions)])
+        file = file.rename(tmp_path / name)
+        main(["train", "--resume", "--out", str(tmp_path / "run"), "--n-timesteps", str(decisions)])
+    assert "damaged" not in capsys.readouterr().err
+    assert Run(tmp_path / "run").config == Run(tmp_path / "same").config
+    first, second = (tmp_path / name / "final" / "weights.safetensors" for name in ("run", "same"))
+    assert first.read_bytes() == second.read_bytes()
+
+
 def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     arm = ["--arm", str(UR5E), "--scenes", "validation"]
     out = tmp_path / "results.json"

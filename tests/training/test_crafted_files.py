@@ -16,6 +16,7 @@ from safetensors.numpy import load_file, save, save_file
 
 from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES
+from viapoint.training import load_agent
 from viapoint.training.agents.model_io import build, load_model, save_model
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.io.files import BadFileError
@@ -185,6 +186,26 @@ def test_what_describes_more_than_its_weights_is_refused_before_memory_is_taken(
             file.truncate(1 << 40)  # takes no room on the disk
         check_refused(model, name)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 * 1024
+
+
+SEARCHES = [
+    ("PlanarObstacles", {"candidates": 10**9}),
+    ("PlanarObstacles", {"per_refinement": 10**9}),
+    ("PlanarObstacles", {"refinements": 10**9}),
+    ("PlanarObstacles", {"refinements": 64, "per_refinement": 1024}),
+    ("PlanarObstacles", {"refine": 10**9}),
+    ("PlanarSensed", {"candidates": 10**9}),
+    ("PlanarSensed", {"instants": 10**9}),
+]
+
+
+@pytest.mark.parametrize(("task", "change"), SEARCHES)
+def test_what_could_not_decide_in_time_is_refused(task, change, tmp_path):
+    load_agent(f"viapoint/{task}-v0").save(tmp_path / "model")
+    hyperparameters = json.loads((tmp_path / "model" / RECORD).read_text())["hyperparameters"]
+    policy = {**hyperparameters["policy_kwargs"], **change}
+    edit(tmp_path / "model", hyperparameters={**hyperparameters, "policy_kwargs": policy})
+    check_refused(tmp_path / "model", RECORD)
 
 
 @pytest.mark.parametrize("name", [RECORD, WEIGHTS])

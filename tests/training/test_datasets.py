@@ -97,7 +97,10 @@ def test_episodes_are_those_of_the_method_and_have_names_by_default(folder):
         (("plan_motion", "--env", PLANE), "no actions"),
         (("straight", "--env", "viapoint/PlanarObstaclesStep-v0"), "random"),
         (("straight", "--env", PLANE, "--episodes", 0), "episodes"),
-        (("straight", "--env", PLANE, "--dataset", "../name-v0"), "group/name-v0"),
+        *(
+            (("straight", "--env", PLANE, "--dataset", name), "group/name-v0")
+            for name in ("../name-v0", "t/a-v0", "name", "group//name-v0", "a b-v0", "")
+        ),
         ((PLANE, "--env-kwargs", "n_via=2"), "env_kwargs"),
     ],
 )
@@ -113,6 +116,29 @@ def test_a_dataset_is_never_replaced():
     record_dataset("same-v0", PLANE, {}, method, 1)
     with pytest.raises(ValueError, match="exists"):
         record_dataset("same-v0", PLANE, {}, method, 1)
+
+
+@pytest.mark.parametrize("error", [OSError("No space left on device"), KeyboardInterrupt()])
+def test_a_dataset_that_cannot_be_written_leaves_nothing(error, folder, monkeypatch):
+    method = make_method("straight", PLANE)
+    record_dataset("group/kept-v0", PLANE, {}, method, 1)
+    before = sorted(folder.rglob("*"))
+
+    def full(*_):
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr("minari.dataset.minari_storage.MinariStorage.update_metadata", full)
+        for name in ("group/new-v0", "other/deep/new-v0"):
+            with pytest.raises(type(error)):
+                record_dataset(name, PLANE, {}, method, 1)
+    assert sorted(folder.rglob("*")) == before
+    record_dataset("group/new-v0", PLANE, {}, method, 1)
+
+
+def test_a_name_by_default_is_one_that_minari_allows():
+    record("thick:search4", "--env", "viapoint/PlanarSensed-v0", "--episodes", 1)
+    assert minari.load_dataset("viapoint/PlanarSensed/thick-search4-v0").total_episodes == 1
 
 
 def test_without_the_library_its_extra_is_named(monkeypatch, capsys):

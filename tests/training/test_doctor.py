@@ -47,7 +47,10 @@ def test_a_crash_and_a_hang_end_no_report(monkeypatch):
 def test_runs_need_a_folder_that_can_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     assert doctor.outcome(doctor.FOLDER, str(tmp_path / "a" / "b"))[0]
-    assert not doctor.outcome(doctor.FOLDER, str(tmp_path / "file" / "runs"))[0]
+    for nowhere in (tmp_path / "file" / "runs", "/proc", "/proc/runs"):
+        works, said = doctor.outcome(doctor.FOLDER, str(nowhere))
+        assert not works
+        assert said.endswith("cannot be written")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 

@@ -4,7 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from stable_baselines3.common.vec_env import VecNormalize
 
+from viapoint.training.agents.agent import PPO
 from viapoint.training.evaluation.evaluator import (
     SLOW_DECISION,
     MethodResult,
@@ -14,9 +16,10 @@ from viapoint.training.evaluation.evaluator import (
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.scene_sets import BANDS, drawn
 
-ENV = "viapoint/PlanarObstacles-v0"
+ENV, MOVING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
 
 
 ZEROS = np.zeros((40, 3))
@@ -72,6 +75,36 @@ def test_every_method_meets_the_same_scenes(small_scenes, solutions):
     comparison = record["compared_with_first"]["b"]
     assert (comparison["only_first"], comparison["only_second"]) == (solved, 0)
     assert len(record["outcomes"]["a"]["action"]) == 40
+
+
+@pytest.mark.parametrize("env_id", ["viapoint/PlanarReach-v0", "viapoint/PlanarReachStep-v0", MOVING])
+def test_a_model_of_normalised_observations_sees_such_ones(env_id, monkeypatch):
+    env = VecNormalize(ViaVecEnv(env_id, 8, seed=0, threads=1), norm_reward=False)
+    model = PPO("MultiInputPolicy", env, n_steps=2, batch_size=16, seed=0).learn(16)
+    raw, seen = [], []
+    normalize, predict = env.normalize_obs, model.policy.predict
+    count = float(env.obs_rms["hand"].count)
+
+    def decide(observation, *args, **kwargs):
+        seen.append(observation)
+        return predict(observation, *args, **kwargs)
+
+    def normalized(observation):
+        raw.append(observation)
+        return normalize(observation)
+
+    monkeypatch.setattr(model.policy, "predict", decide)
+    monkeypatch.setattr(env, "normalize_obs", normalized)
+    evaluate(model, scenes="validation", n_scenes=4)
+    if model.get_env().get_attr("task", [0])[0].whole_movement:
+        model.plan((-0.2, 0.35), (0.15, 0.35))
+    assert len(raw) == len(seen) > 2
+    for before, after in zip(raw, seen, strict=True):
+        assert any((before[name] != after[name]).any() for name in before)
+        for name, part in normalize(before).items():
+            np.testing.assert_array_equal(after[name], part)
+    assert env.obs_rms["hand"].count == count
+    env.close()
 
 
 def fake(success, **changes):

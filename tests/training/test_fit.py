@@ -102,6 +102,27 @@ def test_a_file_at_fault_is_told_where(change, told, file, tmp_path, capsys):
     assert not (tmp_path / "fit").exists()
 
 
+TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
+
+
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [
+        ([TABLE[0], *(f"{line},0.3" for line in TABLE[1:])], "4 values in line 2; its first line names 3"),
+        ([TABLE[0], *(f"{line}," for line in TABLE[1:])], "4 values in line 2"),
+        ([*TABLE[:3], "", "  ", "0.2,0.1"], "2 values in line 6"),
+        ([*TABLE[:2], "", "0.1,far,0.2"], "line 4, column x: far"),
+        (["", *TABLE[:3], "0.1,,0.2"], "line 5, column x: nothing"),
+        (["time,x,y,x", "0.0,0.1,0.2,0.1"], "several columns x"),
+        (["time,x,y,movement", "0.0,0.1,0.2,a", "", "0.1,0.1,0.2,"], "names no movement in line 4"),
+    ],
+)
+def test_lines_at_fault_are_told_by_their_number_in_the_file(lines, told, tmp_path, capsys):
+    path = tmp_path / "lines.csv"
+    path.write_text("\n".join(lines))
+    assert told in failed(capsys, path, "--out", tmp_path / "fit")
+
+
 def test_foreign_files_stay(file, tmp_path, capsys):
     (tmp_path / "fit.csv").write_text("mine")
     assert "not written by viapoint" in failed(capsys, file, "--out", tmp_path)

@@ -148,13 +148,23 @@ def test_a_training_leaves_foreign_files_in_its_folder_alone(tmp_path):
     assert all((folder / name).read_bytes() == NOTES for name in foreign)
 
 
-def test_a_model_of_a_run_with_foreign_files_is_not_replaced(tmp_path):
+@pytest.mark.parametrize("name", ["final/notes.txt", "final/thesis/a.tex", "final/model.json", "final"])
+def test_a_training_keeps_a_model_with_foreign_files_and_goes_on(name, tmp_path):
     folder = tmp_path / "run"
-    name = "final/notes.txt"
     train(tiny(folder, n_timesteps=32))
+    (folder / "final").rename(folder / "old")
+    if name != "final":
+        (folder / "old").rename(folder / "final")
     put(folder, name)
-    with pytest.raises(BadFileError):
-        train(TrainConfig(out=folder, resume=True, n_timesteps=64, progress=False))
-    assert (folder / name).read_bytes() == NOTES
+    changed = content_of(folder)
+    for number in (48, 64):
+        train(TrainConfig(out=folder, resume=True, n_timesteps=number, progress=False))
     assert Run(folder).decisions == 64
+    assert content_of(folder / "final").keys() == {"model.json", "weights.safetensors"}
+    after = content_of(folder)
+    assert after[name.replace("final", "final.1", 1)] == NOTES
+    for each in changed:
+        if each.startswith("final"):
+            assert after[each.replace("final", "final.1", 1)] == changed[each]
+    assert "final.2" not in after
     assert find_model(folder).name == "final"

@@ -8,6 +8,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from viapoint.envs import Sphere, Task, scene_from_json
@@ -15,6 +16,7 @@ from viapoint.training import evaluate, load_agent
 from viapoint.training.agents.agent import SAC, find_model
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.viaq import ViaQ
+from viapoint.training.agents.viarank import ViaRank
 from viapoint.training.cli import entry as cli
 from viapoint.training.config.checks import ELSEWHERE
 from viapoint.training.config.configs import (
@@ -31,6 +33,7 @@ from viapoint.training.evaluation import statistics
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError
 from viapoint.training.planning.baselines import agent_method, make_method
+from viapoint.training.planning.benchmark import benchmark_planner
 from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.video import record_video
@@ -43,7 +46,7 @@ from viapoint.training.scene_sets import load, scenes_for, shipped_path
 ENV, REACH, STEP = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarReach", "PlanarObstaclesStep")
 )
-MOVING = "viapoint/PlanarMovingObstacles-v0"
+MOVING, SENSED = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarSensed-v0"
 STALLING = {"stop_when_stalled": 0.3}
 
 CONFIGURATIONS = [
@@ -73,6 +76,8 @@ CONFIGURATIONS = [
     (LiveConfig, {"env": "nothing"}),
     (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}),
     (StudyConfig, {"file": "study.yaml", "workers": 0}),
+    *((kind, {"out": ""}) for kind in (TrainConfig, DemoConfig, PaperConfig)),
+    (EvaluateConfig, {"env": ENV, "json": ""}),
 ]
 
 
@@ -188,12 +193,43 @@ def film(path="film.mp4", number=1, mode="rgb_array_list"):
     record_video(path, gym.make(ENV, render_mode=mode), scenes(number), lambda *_: np.zeros((1, 3)))
 
 
+class Decides:
+    """Method that always decides the same."""
+
+    def __init__(self, name, decided):
+        self.name, self.decided = name, decided
+
+    def decide(self, observation, scenes):
+        return self.decided
+
+
+ZERO = np.zeros((2, 3))
 CALLS = [
     *(lambda name=name: make_method(name, ENV) for name in ("magic", "search", "search3", "sobol0", "unrevised")),
     *(lambda name=name: make_method(name, MOVING) for name in ("constant", "random16", "ompl")),
+    lambda: SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2, replay_buffer_class=HerReplayBuffer),
+    *(lambda name=name: make_method(name, ENV) for name in ("search99999999999", "sobol65537")),
+    lambda: make_method("cautious99999999999", SENSED),
+    lambda: benchmark_planner("search99999999999"),
+    *(lambda more=more: GeometrySearch(ENV, **more) for more in (
+        {"n_checks": 10**6}, {"refinements": 10**9}, {"per_round": 10**9}, {"refinements": 64, "per_round": 2048},
+    )),
+    *(lambda name=name, value=value: setattr(agent().policy, name, value) for name, value in (
+        ("checks", -1), ("checks", 1.5), ("refine", True), ("candidates", 0), ("refinements", 10**9),
+    )),
+    lambda: setattr(load_agent(SENSED).policy, "belief", "magic"),
     lambda: agent_method("agent", SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2), 8),
     lambda: evaluate_methods([], load(shipped_path("test", ENV)), ENV),
     lambda: evaluate(ENV, env=REACH),
+    lambda: evaluate(5, env=ENV),
+    *(lambda given=given: evaluate(env=ENV, baselines=given) for given in (
+        5, [3], [None], ["straight", "straight"], [Decides("a", ZERO), Decides("a", ZERO)],
+    )),
+    lambda: evaluate(ENV, checks=[4, 4]),
+    *(lambda scenes=scenes: evaluate(ENV, scenes=scenes) for scenes in (5, None, ["test"])),
+    *(lambda given=given: evaluate(env=ENV, baselines=[Decides("a", given)], n_scenes=2) for given in (
+        None, "left", ZERO[0], ZERO[:1], ZERO[:, :2], ZERO + math.nan, ZERO.astype(object),
+    )),
     lambda: evaluate(ENV, baselines=["unrevised"]),
     lambda: evaluate(baselines=["straight"]),
     lambda: evaluate(env=ENV, baselines=["untrained"]),
@@ -223,6 +259,7 @@ CALLS = [
     lambda: Task.from_dict({**agent().get_env().get_attr("task")[0].as_dict(), "arm": "octopus"}),
     *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, "Pendulum-v1")),
     lambda: ViaQ("ViaQPolicy", VecNormalize(ViaVecEnv(ENV, 2))),
+    lambda: ViaRank("ViaRankPolicy", VecNormalize(ViaVecEnv(SENSED, 2))),
     *(lambda change=change: scene_file(**change) for change in (
         {"format": "other"}, {"start": [0.1]}, {"goal": [0.1, math.nan]}, {"jumps": [[1.0]]}, {"colour": 1},
         {"obstacles": 3}, {"obstacles": [[0.1, 0.2]]}, {"obstacles": [{"shape": "cube"}]},
@@ -300,6 +337,7 @@ COMMANDS = [
     ("train --env viapoint/PlanarObstacle-v0", "Did you mean: `PlanarObstacles`"),
     ("train --n-timesteps -5", "--n-timesteps must be a whole number, from 1"),
     ("train --n-timesteps 1e5", "--n-timesteps: must be a whole number, got '1e5'"),
+    ("train --n-timesteps 16 --n-envs 16 --out=", "--out: must be a path, got ''"),
     ("train --env-kwargs n_vias=2 --out full", "did you mean 'n_via'"),
     ("train --env-kwargs n_obstacles=999", "n_obstacles"),
     ("train --env-kwargs n_via", "n_via"),

@@ -95,6 +95,9 @@ def model():
 class Forwards:
     """Steers straight ahead, faster for some goals than for others, so that episodes end at different times."""
 
+    def get_vec_normalize_env(self):
+        return None
+
     def predict(self, observation, deterministic):
         speed = 0.3 + 0.3 * (1.0 + np.sin(50.0 * observation["goal"][..., :1]))
         return np.concatenate((speed, 0.1 * speed), axis=-1), None

@@ -3,6 +3,7 @@
 import dataclasses
 import errno
 import json
+import math
 import os
 import resource
 import shlex
@@ -62,7 +63,7 @@ def same_weights(one, other, name):
 
 def same_result(one, other):
     assert curve(one) == curve(other)
-    same_weights(one, other, "best")
+    same_weights(one, other, one.best.name)
     same_weights(one, other, "final")
     same_state(*(read_state(run.checkpoints()[-1]) for run in (one, other)))
 
@@ -209,13 +210,28 @@ def test_a_training_that_stalls_ends_there_also_if_it_was_interrupted(algo, tmp_
     same_result(run, train(TrainConfig(out=killed.folder, resume=True, progress=False)))
 
 
+@pytest.mark.parametrize("algo", ["viaq", "td3", "ppo"])
+def test_a_training_that_a_callback_stops_goes_on_to_the_same_result(algo, tmp_path):
+    whole = train(config(tmp_path / "whole", algo, eval_every=0))
+    heard = Heard(steps=5)  # of PPO, the first of two steps before an update
+    stopped = train(config(tmp_path / "stopped", algo, eval_every=0), [heard])
+    assert stopped.decisions == (96 if algo == "ppo" else 80)
+    assert load_model(stopped.final).num_timesteps == stopped.decisions
+    assert heard.ended == 1
+    same_result(whole, train(TrainConfig(out=stopped.folder, resume=True, progress=False)))
+
+
 class Heard(BaseCallback):
-    """Callback that counts its ends."""
+    """Callback that counts its ends, and stops the training after some steps."""
 
     ended = 0
 
+    def __init__(self, steps=math.inf):
+        super().__init__()
+        self.steps = steps
+
     def _on_step(self):
-        return True
+        return self.n_calls < self.steps
 
     def _on_training_end(self):
         self.ended += 1

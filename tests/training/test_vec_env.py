@@ -9,6 +9,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
 from viapoint.envs.scenes.options import scene_from_json, scene_to_json
+from viapoint.training import TrainConfig, evaluate, train
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 ENV, STEP = "viapoint/PlanarObstacles-v0", "viapoint/PlanarObstaclesStep-v0"
@@ -54,6 +55,49 @@ def test_it_is_the_vector_environment(env_id, steps):
     assert env.physics_steps == native.unwrapped.physics_steps > 0
     native.close()
     env.close()
+
+
+VECTOR = {"vector_entry_point": "viapoint.envs.vector_env:ReachVectorEnv"}
+
+
+@pytest.fixture
+def register():
+    """Register an id of one's own for the test alone."""
+
+    def made(**kwargs):
+        usual = {"arm": "planar", "decide_at": "steps"}
+        gym.register("me/Own-v0", "viapoint.envs.env:ReachEnv", kwargs=usual, **kwargs)
+        return "me/Own-v0"
+
+    yield made
+    del gym.registry["me/Own-v0"]
+
+
+def test_an_own_id_has_the_limit_of_decisions_of_gymnasium(register, tmp_path, monkeypatch):
+    env_id = register(**VECTOR, max_episode_steps=3)
+    env = ViaVecEnv(env_id, 2, seed=0, threads=1)
+    env.reset()
+    cut = [[info["TimeLimit.truncated"] for info in env.step(actions(env))[-1]] for _ in range(6)]
+    assert cut == 2 * [[False] * 2, [False] * 2, [True] * 2]
+    hyperparameters = {"n_steps": 4, "batch_size": 8}
+    settings = {"n_timesteps": 16, "n_envs": 2, "eval_scenes": 4, "progress": False}
+    config = TrainConfig(
+        env=env_id, algo="ppo", out=tmp_path / "run", hyperparameters=hyperparameters, **settings
+    )
+    run = train(config)
+    result = evaluate(run.folder, scenes="validation", n_scenes=4)
+    with monkeypatch.context() as patch:
+        patch.delitem(gym.registry, env_id)  # where the model is loaded, the id need not be known
+        again = evaluate(run.best, scenes="validation", n_scenes=4)
+    for each in (result, again):
+        assert (each.results[0].outcomes["decisions"] == 3).all()
+
+
+def test_an_own_id_needs_a_vector_environment(register, tmp_path):
+    env_id = register()
+    for refused in (lambda: TrainConfig(env=env_id), lambda: evaluate(env=env_id, baselines=["straight"])):
+        with pytest.raises(ValueError, match="vector_entry_point"):
+            refused()
 
 
 def test_observations_keep_their_values(env):

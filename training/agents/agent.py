@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import sb3_contrib
 import stable_baselines3
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -19,7 +20,7 @@ from viapoint.training.config.checks import SHIPPED, SHIPPED_IDS
 from viapoint.training.io.files import BadFileError, write_folder
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.plan_motion import checked_motion
-from viapoint.training.rollouts.vec_env import env_arguments
+from viapoint.training.rollouts.vec_env import env_arguments, predicted_actions
 
 
 class Agent(BaseAlgorithm):
@@ -79,7 +80,7 @@ class Agent(BaseAlgorithm):
         arm = task.arm
         goals = scenes.goal, arm.hand(scenes.goal)
         seen = task.observation.observe(scenes.start, arm.hand(scenes.start), goals, scenes.obstacles)
-        actions, _ = self.predict(seen, deterministic=True)
+        actions = predicted_actions(self, seen)
         ends = task.space.coordinates(scenes.start), task.space.coordinates(scenes.goal)
         plan = task.action.decode(np.asarray(actions, dtype=np.float64), *ends).take(0)
         return checked_motion(arm, task.space_name, plan, scenes.obstacles, "agent")
@@ -119,6 +120,15 @@ class Agent(BaseAlgorithm):
             )
         model.trainable = env is not None
         return model
+
+    def _setup_model(self) -> None:
+        buffer = getattr(self, "replay_buffer_class", None)
+        if buffer is not None and issubclass(buffer, HerReplayBuffer):
+            raise ValueError(
+                "HerReplayBuffer does not apply: the observation has no achieved_goal, and the reward of another goal "
+                "depends on contact and jerk of a movement that was not made; leave replay_buffer_class out"
+            )
+        super()._setup_model()  # type: ignore[safe-super]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         if not self.trainable:

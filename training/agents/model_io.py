@@ -7,6 +7,7 @@ arm.xml                copy of the arm, if it was loaded from a file
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.metadata
 import inspect
@@ -41,6 +42,7 @@ from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES
 from viapoint.training.agents.extractors import SceneExtractor
 from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
+from viapoint.training.planning.candidates import MOST_CANDIDATES, MOST_ROUNDS
 from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments
 
 ACTIVATIONS = (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
@@ -72,6 +74,13 @@ LEAST: dict[str, float] = {
     **dict.fromkeys(("width", "candidates", "per_refinement"), 1),
     **dict.fromkeys(("explore_candidates", "labels", "instants"), 2),
 }
+# Greatest values of hyperparameters that time and memory of a decision grow with
+MOST: dict[str, int] = {
+    **dict.fromkeys(("candidates", "per_refinement", "explore_candidates"), MOST_CANDIDATES),
+    **dict.fromkeys(("next_candidates", "labels", "refine"), MOST_CANDIDATES),
+    **dict.fromkeys(("instants", "nearest"), 1024),
+    "refinements": MOST_ROUNDS,
+}
 
 LARGEST_MODEL_JSON = 1 << 20  # Greatest size of `model.json`, [bytes]
 LARGEST_WEIGHTS = 1 << 30  # Greatest size of `weights.safetensors`, [bytes]
@@ -93,7 +102,17 @@ def save_model(model: BaseAlgorithm, folder: Path) -> None:
 
     Raises:
         ValueError: Its class is not in ALGORITHMS, or it has no environment of this package.
+
+    Warns:
+        UserWarning: Observations are normalised by `VecNormalize`, whose statistics are no part of the folder.
     """
+    normalize = model.get_vec_normalize_env()
+    if normalize is not None and normalize.norm_obs:
+        warnings.warn(
+            "a model folder does not hold the statistics of VecNormalize, without which the loaded model decides on "
+            "raw observations; keep them with VecNormalize.save",
+            stacklevel=3,
+        )
     path = folder / "weights.safetensors"
     write_arrays(path, weights(model))
     keep_arm(folder, model.get_env().get_attr("task", [0])[0].arm)  # type: ignore[union-attr]
@@ -190,9 +209,7 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
 
     The algorithms accept any number, and many a wrong one shows only as a training that does not learn.
     """
-    # The hints of Stable-Baselines3 name VecEnv, which its modules import for type checkers only.
-    hinted: Any = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
-    hints = typing.get_type_hints(hinted, localns={"VecEnv": object})
+    hints = _hints(function)
     for name, value in values.items():
         number = value.item() if isinstance(value, np.generic) else value
         hint = hints.get(name, Any)
@@ -216,6 +233,16 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
             raise ValueError(f"{name} must be from 0 to 1, got {value!r}")
         if number < LEAST.get(name, -math.inf):
             raise ValueError(f"{name} must be {LEAST[name]:g} or more, got {value!r}")
+        if number > MOST.get(name, math.inf):
+            raise ValueError(f"{name} must be {MOST[name]} or less, got {value!r}")
+
+
+@functools.cache
+def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the type hints of a function, or of the arguments of a class."""
+    # The hints of Stable-Baselines3 name VecEnv, which its modules import for type checkers only.
+    hinted: Any = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
+    return typing.get_type_hints(hinted, localns={"VecEnv": object})
 
 
 def untrained(model: BaseAlgorithm, seed: int = 0) -> BaseAlgorithm:
@@ -245,6 +272,7 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
     (name,), (env_id, env_kwargs) = names, env_arguments(model.get_env())
     policies = {kind: each for each, kind in ALGORITHMS[name].policy_aliases.items()}
     stored = sorted(name for name in argument_names(type(model)) if hasattr(model, name))
+    limit = gym.spec(env_id).max_episode_steps  # of an id of one's own
     return {
         "format": FORMAT,
         "viapoint": importlib.metadata.version("viapoint"),
@@ -254,6 +282,7 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
             "id": env_id,
             "kwargs": _encode(env_kwargs),
             "task": model.get_env().get_attr("task", [0])[0].as_dict(),  # type: ignore[union-attr]
+            **({} if limit is None else {"max_episode_steps": limit}),
         },
         "num_timesteps": model.num_timesteps,
         "hyperparameters": {name: _encode(getattr(model, name)) for name in stored},
@@ -313,7 +342,11 @@ def own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
     if env_id not in gym.registry:  # never lets Gymnasium import a module named in a file
         if "task" not in record:
             raise ValueError(f"environment {env_id!r} is not known")
-        env_id, kwargs = ANY_TASK, record["task"]
+        limit = kwargs.get("max_episode_steps", record.get("max_episode_steps"))
+        env_id, kwargs = (
+            ANY_TASK,
+            {**record["task"], **({} if limit is None else {"max_episode_steps": limit})},
+        )
     kwargs = with_kept_arm(kwargs, folder)
     for name, most in LARGEST_ARGUMENTS.items():
         value = kwargs.get(name, 0)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import check_for_correct_spaces, is_vectorized_observation
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
 from viapoint.envs.task import Task
@@ -27,7 +27,7 @@ Numbers = NDArray[np.floating[Any]]
 class PlanPolicy(BasePolicy):
     """Policy without an actor: :meth:`decide` ranks candidate plans.
 
-    Subclasses set their attributes and check them. `task` holds plain values, see
+    Subclasses set their attributes, which are checked whenever they are set. `task` holds plain values, see
     :meth:`viapoint.envs.task.Task.as_dict`.
     """
 
@@ -43,6 +43,16 @@ class PlanPolicy(BasePolicy):
     ) -> None:
         super().__init__(observation_space, action_space, **kwargs)
         self.task = Task.from_dict(task)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute; settings of the policy may change after training, too, and are checked each time."""
+        if name in self.OWN:
+            self._check_setting(name, value)
+        super().__setattr__(name, value)
+
+    def _check_setting(self, name: str, value: Any) -> None:
+        """Check a setting; a wrong type, or a number out of range, raises ValueError."""
+        check_arguments(type(self), {name: value})
 
     def _own(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self.OWN}
@@ -97,6 +107,8 @@ class PlanPolicy(BasePolicy):
                 raise ValueError(f"observation must be finite; {name} is {np.asarray(each)}")
         several = is_vectorized_observation(cast(Any, dict(observation)), parts)
         batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
+        if not len(batch[next(iter(batch))]):
+            return np.zeros((0, *cast(Any, self.action_space).shape), np.float32), state
         self._check_observation(batch)
         actions = np.clip(self.decide(batch), -1.0, 1.0).astype(np.float32)
         return (actions if several else actions[0]), state
@@ -166,6 +178,11 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         """Check that the policy, which was made for one task, can decide in another; ValueError if not."""
 
     def _check_env(self, env: VecEnv) -> None:
+        normalized = unwrap_vec_normalize(env)
+        if normalized is not None and normalized.norm_obs:
+            raise ValueError(
+                f"{type(self).__name__} computes with metres: VecNormalize must be made with norm_obs=False"
+            )
         self._check_task(Task.from_dict(self.policy_kwargs["task"]), self._task_of(env))
 
     def _setup_model(self) -> None:

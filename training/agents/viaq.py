@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import polyak_update
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 from torch.nn import functional
 
@@ -147,12 +147,6 @@ class ViaQ(PlanAlgorithm):
                 f"the environment must have the same {', '.join(others)} as the agent: "
                 f"{ {name: before[name] for name in others} }, got { {name: after[name] for name in others} }"
             )
-
-    def _check_env(self, env: VecEnv) -> None:
-        super()._check_env(env)
-        normalized = unwrap_vec_normalize(env)
-        if normalized is not None and normalized.norm_obs:
-            raise ValueError("ViaQ computes with metres: VecNormalize must be made with norm_obs=False")
 
     def _sampled_losses(self, batch_size: int) -> dict[str, Tensor]:
         assert self.replay_buffer is not None

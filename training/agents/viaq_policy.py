@@ -13,15 +13,15 @@ from torch import Tensor
 
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import whole_number
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import turned
 from viapoint.envs.task import Task
-from viapoint.training.agents.model_io import check_arguments
 from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.agents.plan_agent import Numbers, Observation, PlanPolicy
 from viapoint.training.agents.viaq_critic import PlanInputs, ViaQCritic
-from viapoint.training.planning.candidates import candidate_actions, normal_steps
+from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
 from viapoint.training.planning.movements import FINE_INSTANTS, INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import INFEASIBLE, VERIFIED, best_of, merits, refined_actions
@@ -81,7 +81,8 @@ class ViaQPolicy(PlanPolicy):
         self.per_refinement = per_refinement
         self.checks = checks
         self.refine = refine
-        check_arguments(type(self), self._own())
+        total = candidates + refinements * per_refinement
+        whole_number("number of all candidates", total, 1, MOST_CANDIDATES)
         self.replanning = self.task.replanning
         self._check_refine()
         self.critic = ViaQCritic(self.task, width=self.width)

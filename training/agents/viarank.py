@@ -30,7 +30,7 @@ from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.task import Task
-from viapoint.training.agents.model_io import ALGORITHMS, check_arguments
+from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.plan_agent import Observation, PlanAlgorithm, PlanPolicy, task_in
 from viapoint.training.agents.sight_network import SightInputs, SightNetwork, sight_inputs
 from viapoint.training.planning.beliefs import Sight
@@ -92,15 +92,17 @@ class ViaRankPolicy(PlanPolicy):
         self.candidates = candidates
         self.refine = refine
         self.belief = belief
-        check_arguments(type(self), self._own())
-        if belief not in BELIEFS:
-            raise ValueError(f"belief must be one of {', '.join(BELIEFS)}, got {belief!r}")
         if self.task.sensor is None or not self.task.whole_movement:
             raise ValueError(
                 "viarank needs a task with a sensor whose actions are whole movements, such as viapoint/PlanarSensed-v0"
             )
         self.network = SightNetwork(self.task.sensor, width=width)
         self._make_optimizer(self.network, lr_schedule)
+
+    def _check_setting(self, name: str, value: Any) -> None:
+        super()._check_setting(name, value)
+        if name == "belief" and value not in BELIEFS:
+            raise ValueError(f"belief must be one of {', '.join(BELIEFS)}, got {value!r}")
 
     @property
     def can_refine(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any, TextIO
@@ -154,7 +155,8 @@ def record(config: RecordConfig) -> None:
                 f"baselines of {env_id}, which decides in every control step, are random, got {name!r}"
             )
         method = make_method(name, env_id, **env_kwargs)
-    dataset = config.dataset or f"{env_id.rpartition('-v')[0]}/{method.name}-v0"
+    usual = re.sub(r"[^-\w/]+", "-", f"{env_id.rpartition('-v')[0]}/{method.name}")  # a name of Minari
+    dataset = f"{usual}-v0" if config.dataset is None else config.dataset
     with scene_progress() as progress:
         found = record_dataset(dataset, env_id, env_kwargs, method, config.episodes, config.seed, progress)
     print(f"{found.total_episodes} episodes, {found.total_steps} decisions: {dataset_folder(dataset)}")

@@ -25,10 +25,15 @@ print("the shipped agent of", load_agent("viapoint/PlanarObstacles-v0").env_id, 
 BROWSER = """import shutil
 names = "chromium", "google-chrome", "chromium-browser", "microsoft-edge", "firefox"
 print(next(filter(None, map(shutil.which, names)), "") or exit("none is installed"))"""
-FOLDER = """import os, sys, pathlib
+# Permissions alone do not tell, in /proc for example.
+FOLDER = """import sys, pathlib, tempfile
 out = pathlib.Path(sys.argv[1]).absolute()
 place = next(each for each in (out, *out.parents) if each.exists())
-print(place if place.is_dir() and os.access(place, os.W_OK) else exit(f"{place} cannot be written"))"""
+try:
+    tempfile.TemporaryFile(dir=place).close()
+except OSError:
+    exit(f"{place} cannot be written")
+print(place)"""
 
 
 class Check(NamedTuple):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import itertools
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from viapoint.training.plotting.plots import fitted_movements
 
 REQUIRED = ("time", "x", "y")  # Columns that a file of movements must have
 COORDINATES = ("x", "y", "z")  # Names of the coordinates; z may be left out
+UNNAMED = ("", "NA", "NaN", "nan")  # Entries of a column `movement` that name none
 TABLE, FIGURE = "fit.csv", "fit.png"  # Files that are written
 DRAWN = 6  # Greatest number of movements in the figure
 
@@ -48,11 +51,7 @@ def run(config: FitConfig) -> None:
 
 def read_movements(path: Path) -> Movements:
     """Return the movements of a CSV file; a wrong column or entry raises BadFileError, which names it."""
-    read_bytes(path)
-    try:
-        table = pd.read_csv(path, skipinitialspace=True)
-    except (ValueError, pd.errors.ParserError) as error:
-        raise BadFileError(path, f"cannot be read as CSV ({' '.join(str(error).split())})") from None
+    table = _read_table(path)
     missing = [name for name in REQUIRED if name not in table]
     if missing:
         found = ", ".join(map(str, table.columns))
@@ -66,19 +65,52 @@ def read_movements(path: Path) -> Movements:
         row, column = wrong[0]
         raise BadFileError(
             path,
-            f"has no number in line {row + 2}, column {names[column]}: {table[names[column]].iloc[row]}; leave out "
-            "lines that were not measured",
+            f"has no number in line {table.index[row]}, column {names[column]}: "
+            f"{table[names[column]].iloc[row] or 'nothing'}; leave out lines that were not measured",
         )
-    labels = table["movement"] if "movement" in table else pd.Series(1, index=table.index)
-    if labels.isna().any():
-        raise BadFileError(path, f"names no movement in line {int(labels.isna().argmax()) + 2}")
+    labels = table["movement"] if "movement" in table else pd.Series("1", index=table.index)
+    unnamed = labels.isin(UNNAMED)
+    if unnamed.any():
+        raise BadFileError(path, f"names no movement in line {unnamed.idxmax()}")
     movements: Movements = {}
-    for label, rows in numbers.groupby(labels.astype(str), sort=False):
+    for label, rows in numbers.groupby(labels, sort=False):
         values = rows.to_numpy(dtype=float)
         movements[str(label)] = values[:, 0], values[:, 1:]
     if not movements:
         raise BadFileError(path, "holds no samples")
     return movements
+
+
+def _read_table(path: Path) -> pd.DataFrame:
+    """Return the entries of a CSV file as texts; the index holds the numbers of their lines in the file.
+
+    Pandas would take the first value of lines with too many for an index, and does not number blank lines.
+    """
+    rows, lines = [], []
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
+        reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+        for values in reader:
+            entries = [value.strip() for value in values]
+            if entries not in ([], [""]):  # a blank line
+                rows.append(entries)
+                lines.append(reader.line_num)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise BadFileError(path, f"cannot be read as CSV ({error})") from None
+    if not rows:
+        raise BadFileError(path, "cannot be read as CSV (it is empty)")
+    head, *samples = rows
+    twice = [name for name in (*REQUIRED, *COORDINATES, "movement") if head.count(name) > 1]
+    if twice:
+        raise BadFileError(path, f"has several columns {twice[0]}")
+    for line, entries in zip(lines[1:], samples, strict=True):
+        if len(entries) != len(head):
+            raise BadFileError(
+                path,
+                f"has {len(entries)} values in line {line}; its first line names {len(head)} columns: "
+                f"{', '.join(head)}",
+            )
+    return pd.DataFrame(samples, columns=head, index=lines[1:], dtype=str)
 
 
 def _printed(fits: Fits) -> str:

@@ -62,6 +62,13 @@ def check_whole(name: str, value: Any) -> int:
     return whole_number(name, value, *RANGES[name])
 
 
+def named_path(name: str, value: str | Path) -> Path:
+    """Return a path of its text, which must not be empty: Python would take that for the present folder."""
+    if not str(value):
+        raise ValueError(f"{name} must name a file or folder, got {value!r}")
+    return Path(value).expanduser()
+
+
 def check_file(name: str, path: Path | None, suffix: str = "") -> None:
     """Check that a file can be written."""
     if path is None:

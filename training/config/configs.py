@@ -31,6 +31,7 @@ from viapoint.training.config.checks import (
     check_file,
     check_folder,
     check_whole,
+    named_path,
     unknown_name,
 )
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of, usual_algorithm
@@ -58,7 +59,7 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
 
     def read(words: list[str]) -> Any:
         try:
-            return kind(words[0])
+            return named_path("it", words[0]) if kind is Path else kind(words[0])
         except ValueError:
             raise ValueError(f"must be {what}, got {words[0]!r}") from None
 
@@ -190,7 +191,7 @@ class Config:
         for each in dataclasses.fields(self):
             value = getattr(self, each.name)
             if isinstance(value, str) and "Path" in str(each.type):
-                object.__setattr__(self, each.name, Path(value).expanduser())
+                object.__setattr__(self, each.name, named_path(each.name, value))
             if str(each.type) == "NamedValues":
                 object.__setattr__(self, each.name, _plain(each.name, value))
             optional = value is None and each.default is None

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.common.validation import finite_array
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.scenes.scene import NEVER, Scenes
 from viapoint.training.agents.agent import load_agent
@@ -33,7 +34,7 @@ from viapoint.training.planning.baselines import (
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults, whole_task
 from viapoint.training.rollouts.vec_env import env_arguments
-from viapoint.training.scene_sets import BANDS, DRAWN, FrozenScenes, scenes_for
+from viapoint.training.scene_sets import BANDS, DRAWN, SETS, FrozenScenes, scenes_for
 
 Progress = Callable[[str, int, int], None]  # Method's name, scenes done, all scenes
 
@@ -210,8 +211,12 @@ def evaluate(
     """
     if n_scenes is not None:
         check_whole("n_scenes", n_scenes)
-    if isinstance(baselines, str):
-        raise ValueError(f"baselines must be a list, such as [{baselines!r}], got {baselines!r}")
+    if isinstance(baselines, str) or not isinstance(baselines, Sequence):
+        raise ValueError(f"baselines must be a list, such as ['straight'], got {baselines!r}")
+    if not isinstance(scenes, str | Path | FrozenScenes):
+        raise ValueError(
+            f"scenes must be one of {', '.join(SETS)}, the path of a file or a set, got {scenes!r}"
+        )
     settings: list[dict[str, int]] = []
     for number in [checks] if checks is None or isinstance(checks, int) else checks:
         settings.append({} if number is None else {"checks": check_whole("checks", number)})
@@ -277,6 +282,7 @@ def evaluate_methods(
     """Evaluate one or more methods in the same scenes, `batch` at a time; the rest is as for :func:`evaluate`."""
     if not methods:
         raise ValueError("there is nothing to evaluate: give an agent or baselines")
+    _check_methods(methods)
     results: list[MethodResult] = []
     opened = SceneSimulation(env_id, min(batch, len(frozen.share)), **(env_kwargs or {}))
     with one_thread(), closing(opened) as simulation:
@@ -289,6 +295,16 @@ def evaluate_methods(
     return EvaluationResult(
         env_id=env_id, scenes=frozen.name, sha256=frozen.sha256, results=tuple(results), partial=partial
     )
+
+
+def _check_methods(methods: Sequence[Any]) -> None:
+    """Check that objects are methods, with names that tell them apart in the results."""
+    for each in methods:
+        if not isinstance(getattr(each, "name", None), str) or not callable(getattr(each, "decide", None)):
+            raise ValueError(f"methods must be names, or objects with `name` and `decide`, got {each!r}")
+    names = [each.name for each in methods]
+    if len(set(names)) < len(names):
+        raise ValueError(f"methods must have different names, got {', '.join(names)}")
 
 
 def _evaluate_one(
@@ -309,6 +325,9 @@ def _evaluate_one(
             began = time.perf_counter()
             decided = method.decide(simulation.observe(scenes), scenes)
             seconds += time.perf_counter() - began
+            if not hasattr(method, "execute"):  # others have decisions of their own kind
+                shape = len(scenes.start), len(simulation.task.action_names)
+                decided = finite_array(f"decisions of {method.name}", decided, shape)
             outcome = simulation.play(method, scenes, decided)
             outcome.info["action"] = np.asarray(decided, dtype=np.float64)
             pieces.append(outcome)

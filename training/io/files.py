@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.metadata
+import itertools
 import json
 import math
 import os
 import platform
 import re
 import shutil
+import sys
 import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -88,12 +90,13 @@ def write_bytes(path: Path, content: bytes) -> None:
         raise
 
 
-def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
+def write_folder(path: Path, fill: Callable[[Path], None], *, move_foreign: bool = False) -> None:
     """Create a folder, or replace one that this package wrote, atomically; `fill` writes its content.
 
     Args:
         path: Folder to write; one with further files, or whose JSON lacks the mark of this package, is not replaced.
         fill: Function that writes the content to a temporary folder.
+        move_foreign: True to rename what would not be replaced, with a line that says so, in place of an error.
 
     Raises:
         BadFileError: There is something else, which stays as it is.
@@ -106,8 +109,13 @@ def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
         _sync_folder(temporary)
         outdated = path.with_name(f".{path.name}.{uuid.uuid4().hex}.old")
         if path.exists():
-            _check_replaceable(path, {each.name for each in temporary.iterdir()})
-            path.rename(outdated)
+            try:
+                _check_replaceable(path, {each.name for each in temporary.iterdir()})
+                path.rename(outdated)
+            except BadFileError:
+                if not move_foreign:
+                    raise
+                _move_aside(path)
         temporary.rename(path)
         shutil.rmtree(outdated, ignore_errors=True)  # there is none of a new folder
         _sync_folder(path.parent)
@@ -128,6 +136,14 @@ def _check_replaceable(path: Path, names: set[str]) -> None:
             check_ours(each)
     if there and not any(each.suffix == ".json" for each in there):
         raise BadFileError(path, f"holds {there[0].name}, not written by viapoint; name a new folder")
+
+
+def _move_aside(path: Path) -> None:
+    """Rename a file or folder, so that another one can be written in its place."""
+    numbered = (path.with_name(f"{path.name}.{number}") for number in itertools.count(1))
+    aside = next(each for each in numbered if not os.path.lexists(each))
+    path.rename(aside)
+    print(f"{path} holds what was not written by viapoint: it is kept as {aside}", file=sys.stderr)
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.common.validation import whole_number
 from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.config.checks import unknown_name
+from viapoint.training.planning.candidates import MOST_CANDIDATES
 from viapoint.training.planning.cautious import (
     BELIEFS,
     DEFAULT_BELIEF,
@@ -28,7 +30,7 @@ from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
 from viapoint.training.planning.predictions import PREDICTIONS, PredictedSearch
 from viapoint.training.planning.search import GeometrySearch, registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
-from viapoint.training.rollouts.vec_env import env_arguments
+from viapoint.training.rollouts.vec_env import env_arguments, predicted_actions
 
 
 class Method(Protocol):
@@ -182,7 +184,7 @@ class AgentMethod:
         for name in own:
             setattr(policy, name, self._settings[name])
         try:
-            actions, _ = self._model.predict(observation, deterministic=True)
+            actions = predicted_actions(self._model, observation)
         finally:
             for name, number in own.items():
                 setattr(policy, name, number)
@@ -204,7 +206,7 @@ class StepAgentMethod:
         """Return actions for the next step, shape (N, D), from observations of the step-wise task or its twin."""
         if "time_left" not in observation or "remaining" in observation:  # that of the twin
             observation = self._simulation.observe(scenes)
-        actions, _ = self._model.predict(observation, deterministic=True)
+        actions = predicted_actions(self._model, observation)
         return np.asarray(actions, dtype=np.float64)
 
     def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
@@ -283,7 +285,7 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
     """Return the factory of a baseline for a task.
 
     Raises:
-        ValueError: There is no such baseline.
+        ValueError: There is no such baseline, or it would check too many plans.
     """
     known = REPLANNING_METHODS if task.replanning else METHODS
     sensed = task.sensor is not None
@@ -316,5 +318,5 @@ def _counted(name: str, allowed: Collection[str]) -> Callable[[SceneSimulation],
     found = re.fullmatch(r"(\w+?)([0-9]+)", name)
     if found is None or found[1] not in allowed or int(found[2]) < FEWEST_CHECKS[found[1]]:
         return None
-    make, checks = COUNTED[found[1]], int(found[2])
+    make, checks = COUNTED[found[1]], whole_number(f"N of {found[1]}N", int(found[2]), 1, MOST_CANDIDATES)
     return lambda simulation: make(simulation, checks)

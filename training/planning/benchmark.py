@@ -25,12 +25,14 @@ import yaml
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
 from viapoint.envs.arms.registry import PANDA_HOME
 from viapoint.envs.common.types import Float
+from viapoint.envs.common.validation import whole_number
 from viapoint.envs.geometry.obstacles import pack
 from viapoint.envs.geometry.shapes import Box, Cylinder, Shape, as_obstacle
 from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import resting
 from viapoint.envs.task import Task
 from viapoint.training.config.checks import unknown_name
+from viapoint.training.planning.candidates import MOST_CANDIDATES
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
 from viapoint.training.planning.ompl_paths import import_ompl
 from viapoint.training.planning.plan_motion import checked_motion, ompl_motion, plan_motion
@@ -258,7 +260,8 @@ def benchmark_planner(name: str) -> Planner:
     checks = re.fullmatch(r"search([1-9]\d*)", name)
     if checks is None:
         raise ValueError(unknown_name("planner", name, [*planners, "searchN"]))
-    return lambda arm, each: _searched(arm, each, int(checks[1]))
+    number = whole_number("N of searchN", int(checks[1]), 1, MOST_CANDIDATES)
+    return lambda arm, each: _searched(arm, each, number)
 
 
 def _searched(arm: Arm, problem: BenchmarkProblem, checks: int) -> MotionPlan:

@@ -10,6 +10,9 @@ import numpy as np
 from viapoint.envs.common.types import Single
 from viapoint.envs.task import Task
 
+MOST_CANDIDATES = 1 << 16  # Greatest number of candidates of one decision; usual are up to 4096
+MOST_ROUNDS = 64  # Greatest number of rounds of refinement; usual are up to 4
+
 
 def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:
     """Return candidate actions, shape (number, m), of which the first is the zero action.

@@ -11,6 +11,7 @@ import numpy as np
 
 from viapoint.envs.common.types import Bool, Float, Single
 from viapoint.envs.common.validation import whole_number
+from viapoint.envs.env import ReachEnv
 from viapoint.envs.geometry.compiled import compiled, kernel
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import Plan
@@ -18,7 +19,12 @@ from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.task import Task
-from viapoint.training.planning.candidates import candidate_actions, sobol_actions
+from viapoint.training.planning.candidates import (
+    MOST_CANDIDATES,
+    MOST_ROUNDS,
+    candidate_actions,
+    sobol_actions,
+)
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.movements import (
     Memory,
@@ -95,9 +101,10 @@ class GeometrySearch:
         **kwargs: Any,
     ) -> None:
         self.task = registered_task(task, **kwargs) if isinstance(task, str) else task
-        self.n_checks = whole_number("n_checks", n_checks, 1)
-        self.refinements = whole_number("refinements", refinements, 0)
-        self.per_round = whole_number("per_round", per_round, 1)
+        self.n_checks = whole_number("n_checks", n_checks, 1, MOST_CANDIDATES)
+        self.refinements = whole_number("refinements", refinements, 0, MOST_ROUNDS)
+        self.per_round = whole_number("per_round", per_round, 1, MOST_CANDIDATES)
+        whole_number("number of all checks", self.total_checks, 1, MOST_CANDIDATES)
 
     @property
     def total_checks(self) -> int:
@@ -344,7 +351,12 @@ def registered_task(env_id: str, **kwargs: Any) -> Task:
     check_registered(env_id)
     env: Any = gym.make_vec(env_id, num_envs=1, **kwargs)
     task = getattr(env.unwrapped, "task", None)
+    single = [each.unwrapped for each in getattr(env.unwrapped, "envs", ())]
     env.close()
+    if any(isinstance(each, ReachEnv) for each in single):
+        raise ValueError(
+            f"{env_id} must be registered with vector_entry_point='viapoint.envs.vector_env:ReachVectorEnv', too"
+        )
     if not isinstance(task, Task):
         raise ValueError(f"{env_id} is not an environment of this package")
     return task

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +16,20 @@ import numpy as np
 
 from viapoint.training.planning.baselines import Method, OpenLoopBaseline, PlannerMethod
 
-DATASET_ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")  # As Minari allows: groups, name, version
+# Groups, name and version, as Minari allows them; and a version, which Minari does not always ask for
+DATASET_ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")
+GROUP_FILE = "namespace_metadata.json"  # File of Minari in the folder of a group
 
 
 def dataset_folder(dataset_id: str) -> Path:
     """Return the folder of a dataset, in MINARI_DATASETS_PATH or, by default, in ~/.minari/datasets."""
-    if not DATASET_ID.fullmatch(dataset_id):
-        raise ValueError(f"dataset must be named like group/name-v0, got {dataset_id!r}")
+    from minari.dataset.minari_dataset import DATASET_ID_RE
+
+    if not (DATASET_ID.fullmatch(dataset_id) and DATASET_ID_RE.fullmatch(dataset_id)):
+        raise ValueError(
+            "dataset must be named like group/name-v0, of letters, digits, - and _, two or more in a group, got "
+            f"{dataset_id!r}"
+        )
     root = os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets"
     return Path(root) / dataset_id
 
@@ -51,22 +60,37 @@ def record_dataset(
         raise ValueError(f"dataset {dataset_id} exists in {folder}; name another one, or a new version")
     if isinstance(method, PlannerMethod | OpenLoopBaseline):
         raise ValueError(f"movements of {method.name} are no actions, which a dataset holds")
-    env = gym.make(env_id, **env_kwargs)
-    buffers = []
-    for episode in range(episodes):
-        buffers.append(_episode(env, method, episode, seed + episode))
-        progress(method.name, episode + 1, episodes)
-    with warnings.catch_warnings():  # an author, a web address and an evaluation environment may be missing
-        warnings.simplefilter("ignore", UserWarning)
-        dataset = minari.create_dataset_from_buffers(
-            dataset_id,
-            buffers,
-            env=env,
-            algorithm_name=method.name,
-            description=f"{episodes} episodes of {method.name} in {env_id}, seeds {seed} to {seed + episodes - 1}",
-        )
-    env.close()
-    return dataset
+    with closing(gym.make(env_id, **env_kwargs)) as env:
+        buffers = []
+        for episode in range(episodes):
+            buffers.append(_episode(env, method, episode, seed + episode))
+            progress(method.name, episode + 1, episodes)
+        with warnings.catch_warnings(), _whole_or_nothing(folder):
+            # An author, a web address and an evaluation environment may be missing.
+            warnings.simplefilter("ignore", UserWarning)
+            return minari.create_dataset_from_buffers(
+                dataset_id,
+                buffers,
+                env=env,
+                algorithm_name=method.name,
+                description=f"{episodes} episodes of {method.name} in {env_id}, "
+                f"seeds {seed} to {seed + episodes - 1}",
+            )
+
+
+@contextmanager
+def _whole_or_nothing(folder: Path) -> Iterator[None]:
+    """Remove a new dataset that was not finished, and the groups that were made for it alone."""
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    try:
+        yield
+    except BaseException:
+        for each in made:
+            if each == folder:
+                shutil.rmtree(folder, ignore_errors=True)
+            elif each.exists() and {path.name for path in each.iterdir()} <= {GROUP_FILE}:
+                shutil.rmtree(each, ignore_errors=True)
+        raise
 
 
 def _episode(env: gym.Env[Any, Any], method: Method, number: int, seed: int) -> Any:

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -53,12 +54,24 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
     }
 
 
+def predicted_actions(model: BaseAlgorithm, observation: Any) -> NDArray[Any]:
+    """Return the actions of a model for an observation or a batch as the environment gives it.
+
+    A model of `VecNormalize` gets it normalised with the statistics of its training, which stay as they are.
+    """
+    normalize = model.get_vec_normalize_env()
+    seen = observation if normalize is None else normalize.normalize_obs(observation)
+    actions, _ = model.predict(seen, deterministic=True)
+    return actions
+
+
 class ViaVecEnv(VecEnv):
     """Vector environment for Stable-Baselines3 that simulates all copies of an environment in one batch.
 
     It replaces `make_vec_env` of Stable-Baselines3, which makes one Python environment per copy; `benchmarks/speed.py`
-    measures how much faster it is. Episodes may have one step or many,
-    and may end at different times.
+    measures how much faster it is. Episodes may have one step or many, and may end at different times.
+    `HerReplayBuffer` of Stable-Baselines3 does not apply: the reward of another goal depends on contact and jerk of a
+    movement that was not made, so observations have no `achieved_goal`.
 
     Args:
         env_id: Id of a registered environment.

@@ -20,6 +20,8 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
 
+from viapoint.envs.arms.registry import ARM_FILES
+from viapoint.envs.arms.stored import COPY
 from viapoint.training.agents.model_io import describe
 from viapoint.training.io.files import BadFileError, read_bytes, write_bytes
 from viapoint.training.rollouts.vec_env import ViaVecEnv
@@ -79,8 +81,8 @@ def read_checkpoint(model: BaseAlgorithm, path: Path) -> dict[str, Any]:
     """
     state = read_state(path)
     written_by = f"was written by viapoint {state['model'].get('viapoint')} and"
-    mine = describe(model)
-    others = [name for name in mine if name not in MAY_DIFFER and mine[name] != state["model"].get(name)]
+    mine, theirs = _with_any_file(describe(model)), _with_any_file(state["model"])
+    others = [name for name in mine if name not in MAY_DIFFER and mine[name] != theirs.get(name)]
     if others:
         raise BadFileError(path, f"{written_by} is of another model: {', '.join(others)}")
     try:
@@ -90,6 +92,20 @@ def read_checkpoint(model: BaseAlgorithm, path: Path) -> dict[str, Any]:
         reason = f"{written_by} does not fit the model ({type(error).__name__}: {error})"
         raise BadFileError(path, reason) from None
     return extra
+
+
+def _with_any_file(value: Any) -> Any:
+    """Return a description of a model, in which all arms of files have the same name.
+
+    A run goes on with the copy of its arm where the file is gone, and with the file where it is there again.
+    """
+    if not isinstance(value, Mapping):
+        return value
+    found = {name: _with_any_file(each) for name, each in value.items()}
+    arm = found.get("arm")
+    if isinstance(arm, str) and arm.endswith(ARM_FILES):
+        found["arm"] = COPY
+    return found
 
 
 def read_state(path: Path) -> dict[str, Any]:

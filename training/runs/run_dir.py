@@ -150,8 +150,8 @@ class Run:
         return self.folder / "final"
 
     def save(self, name: str, model: BaseAlgorithm) -> None:
-        """Write a model as `best` or `final`."""
-        write_folder(self.folder / name, lambda temporary: save_model(model, temporary))
+        """Write a model as `best` or `final`; a folder with other files is kept as `best.1`, as training must go on."""
+        write_folder(self.folder / name, lambda temporary: save_model(model, temporary), move_foreign=True)
 
     def checkpoint(self, model: BaseAlgorithm, extra: Mapping[str, Any]) -> None:
         """Write a checkpoint and remove outdated ones."""
@@ -240,6 +240,15 @@ def check_free(folder: Path) -> None:
 def write_config(folder: Path, config: TrainConfig) -> None:
     """Write the configuration, which makes a folder a run, without the arguments of one call."""
     write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False})
+
+
+def write_timesteps(run: Run) -> None:
+    """Write the number of decisions of a run that is extended.
+
+    All else stays as it was written: an arm is named by its file, also while its copy takes its place.
+    """
+    path = run.folder / "config.json"
+    write_json(path, {**read_json(path), "n_timesteps": run.config.n_timesteps})
 
 
 def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = None) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
 from viapoint.training.agents.model_io import build
@@ -24,7 +24,7 @@ from viapoint.training.evaluation.evaluator import MethodResult, evaluate, one_t
 from viapoint.training.io.files import BadFileError, versions
 from viapoint.training.io.progress import progress_bar
 from viapoint.training.rollouts.vec_env import LOGGED, ViaVecEnv
-from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, write_config
+from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, write_timesteps
 from viapoint.training.scene_sets import FrozenScenes, scenes_for
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
@@ -49,6 +49,10 @@ class TrainingStalledError(Exception):
     """Training ended before its limit, as the success on the validation scenes did not rise any more."""
 
 
+class CallbackStop(Exception):  # noqa: N818 - it is no error
+    """Training ends as a callback of the user asked for it."""
+
+
 class TrainingFailedError(Exception):
     """Training could not continue, as a disk is full, for example; files saved before are intact."""
 
@@ -62,7 +66,9 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
 
     Args:
         config: Environment, algorithm, seed, run folder and everything else that a training depends on.
-        callback: Callback of Stable-Baselines3, or a list of them. The checkpoints of a run do not contain their state.
+        callback: Callback of Stable-Baselines3, or a list of them. One that stops the training does so at the end of
+            the round of experience and updates, from which the run can go on. The checkpoints of a run do not contain
+            the state of callbacks.
 
     Returns:
         The run. `run.best` and `run.final` are model folders, which :func:`evaluate` and :func:`load_agent` accept.
@@ -180,11 +186,11 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
 def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> None:
     """Train from the last checkpoint of the run to its end."""
     folder = str(run.folder / "tensorboard")
-    given = [callback] if isinstance(callback, BaseCallback) else list(callback or ())
+    given = GivenCallbacks([callback] if isinstance(callback, BaseCallback) else list(callback or ()))
     try:
         with (
             closing(Logger(folder, [TensorBoardOutputFormat(folder)])) as logger,
-            RunCallback(run) as monitor,
+            RunCallback(run, given) as monitor,
         ):
             model.set_logger(logger)
             restored = run.restore(model)
@@ -193,7 +199,7 @@ def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> N
             run.write_curve(monitor.curve)  # without validations after the checkpoint
             remaining = run.config.total_timesteps - model.num_timesteps
             if remaining > 0 and not run.stalled:
-                _learn(model, remaining, [monitor, *given], fresh=restored is None)
+                _learn(model, remaining, monitor, fresh=restored is None)
             run.save("final", model)
     except OSError as error:
         raise TrainingFailedError(
@@ -202,13 +208,15 @@ def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> N
         ) from error
 
 
-def _learn(model: BaseAlgorithm, steps: int, callbacks: list[BaseCallback], *, fresh: bool) -> None:
-    """Learn; a training that stalls ends like any other."""
+def _learn(model: BaseAlgorithm, steps: int, monitor: RunCallback, *, fresh: bool) -> None:
+    """Learn; a training that stalls, or that a callback stops, ends like any other."""
+    callbacks: list[BaseCallback] = [monitor, monitor.given]
     try:
         model.learn(steps, callbacks, None, reset_num_timesteps=fresh)  # type: ignore[arg-type]
-    except TrainingStalledError:
-        for each in callbacks[1:]:  # which `learn` has not told that it ends
-            each.on_training_end()
+    except (TrainingStalledError, CallbackStop):
+        monitor.given.on_training_end()  # `learn` has not told them that it ends
+        if hasattr(model, "calibrate"):  # nor has it done this at its end
+            model.calibrate()
 
 
 def _restore_settings(run: Run, config: TrainConfig) -> None:
@@ -222,7 +230,7 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
                 f"got {config.n_timesteps}",
             )
         run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
-        write_config(run.folder, run.config)
+        write_timesteps(run)
     run.config = dataclasses.replace(run.config, progress=config.progress)
     began = run.versions
     others = [
@@ -237,6 +245,22 @@ def resume_command(run: Run) -> str:
     return shlex.join(["viapoint", "train", "--resume", "--out", str(run.folder)])
 
 
+class GivenCallbacks(CallbackList):
+    """Callbacks of the user, which stop a training between two rounds of experience only.
+
+    In the middle of a round Stable-Baselines3 drops the step that it has just made, and no run could go on from there
+    to the same result.
+    """
+
+    stopped = False
+    """True once a callback has asked for the end of the training."""
+
+    def _on_step(self) -> bool:
+        if not super()._on_step():
+            self.stopped = True
+        return True
+
+
 class RunCallback(BaseCallback):
     """Callback that validates, keeps the best model, writes checkpoints and logs, and shows progress.
 
@@ -245,9 +269,10 @@ class RunCallback(BaseCallback):
     and stops, the second stops at once.
     """
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: Run, given: GivenCallbacks) -> None:
         super().__init__()
         self.run, self.config = run, run.config
+        self.given = given
         self.curve: list[dict[str, Any]] = []  # one record for each evaluation so far
         self._seconds_before, self._began = 0.0, time.monotonic()
         self._before = 0  # Decisions when it was last decided what is due
@@ -298,7 +323,7 @@ class RunCallback(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
-        self._run_due_actions(final=False)
+        self._run_due_actions(final=self.given.stopped)
         if self._stop:
             self.run.checkpoint(self.model, {"seconds": self.seconds})
             self.run.save("final", self.model)
@@ -309,6 +334,8 @@ class RunCallback(BaseCallback):
         if self.run.stalled:
             self.run.checkpoint(self.model, {"seconds": self.seconds})
             raise TrainingStalledError
+        if self.given.stopped:
+            raise CallbackStop
 
     def _on_training_end(self) -> None:
         self._run_due_actions(final=True)

@@ -175,17 +175,18 @@ def _study(
 ) -> Study:
     """Return a study; the fields are those of the file."""
     known = {}
-    for env, fields in _entries(environments):
+    for env, fields in _entries("environments", environments):
         fields = {"scenes": scenes, "n_scenes": n_scenes, **fields}
         known[env] = _made(f"environments.{env}", _environment, fields, env, folder)
     found: list[Trial] = []
     rows: set[str] = set()
-    for make, given in ((_agent, agents), (_baseline, baselines), (_search, searches)):
-        for row, fields in _entries(given or {}):
+    kinds = (("agents", _agent, agents), ("baselines", _baseline, baselines), ("searches", _search, searches))
+    for kind, make, given in kinds:
+        for row, fields in _entries(kind, given or {}):
             if row in rows:
                 raise ValueError(f"rows must have different names, {row} is there twice")
             rows.add(row)  # rows are folders, which must not be shared
-            for env in fields.pop("environments", list(known)):
+            for env in _names(f"{row}: environments", fields.pop("environments", list(known))):
                 if env not in known:
                     raise ValueError(unknown_name(f"{row}: environments", env, known))
                 shared = {} if make is _baseline else {"seeds": seeds or [0]}
@@ -201,11 +202,11 @@ def _study(
     )
 
 
-def _entries(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+def _entries(where: str, given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield name and fields of each entry of a list or mapping, one for each point of its grid."""
     if not isinstance(given, list | Mapping):
-        raise ValueError(f"there must be a list of names, or values by name, got {given!r}")
-    entries = dict.fromkeys(given) if isinstance(given, list) else given
+        raise ValueError(f"{where} must be a list of names, or values by name, got {given!r}")
+    entries = given if isinstance(given, Mapping) else dict.fromkeys(_names(where, given))
     for name, fields in entries.items():
         if not str(name).strip("/. ") or ".." in str(name) or str(name).startswith("/"):
             raise ValueError(f"names must be words, got {name!r}")
@@ -219,6 +220,18 @@ def _entries(given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[s
             point = dict(zip(grid, values, strict=True))
             ends = [f"-{path.rpartition('.')[2]}={value}" for path, value in point.items()]
             yield f"{name}{''.join(ends)}", _with(rest, point)
+
+
+def _names(where: str, given: Any) -> list[str]:
+    """Return a list of names; something else raises ValueError."""
+    if not isinstance(given, list):
+        raise ValueError(f"{where} must be a list of names, got {given!r}")
+    for each in given:
+        if not isinstance(each, str):
+            raise ValueError(
+                f"{where} must be names, or a mapping from names to values, got {each!r} in a list"
+            )
+    return given
 
 
 def _with(fields: Values, changes: Values) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from viapoint.training.agents.model_io import load_model, untrained
 from viapoint.training.cli.doctor import explain_import_error
+from viapoint.training.config.checks import check_folder, named_path
 from viapoint.training.config.configs import StudyConfig
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.evaluation.statistics import across_seeds, wilson
@@ -101,7 +102,8 @@ def run_study(
         >>> table.success.tolist()
         [1.0]
     """
-    folder = Path(study.out if out is None else out).expanduser().absolute()
+    folder = named_path("out", study.out if out is None else out).absolute()
+    check_folder(f"out {folder}", folder)
     mark = folder / "study.json"
     if not mark.is_file() or read_json(mark).get("viapoint") != "study":
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
