@@ -141,9 +141,9 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
         if isinstance(policy, dict) and isinstance(policy.get("task"), dict):  # ViaQ's networks know the task
             task = with_kept_arm(policy["task"], folder)
             hyperparameters["policy_kwargs"] = {**policy, "task": task}
-        with warnings.catch_warnings(), parameter_budget(arrays):
+        with warnings.catch_warnings(), _parameter_budget(arrays):
             warnings.simplefilter("ignore", UserWarning)  # PPO's batches do not fill one environment
-            own = own_environment(record["env"], folder)
+            own = _own_environment(record["env"], folder)
             if env is None:
                 hyperparameters = _to_decide(hyperparameters)
             else:
@@ -158,7 +158,7 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
             raise ValueError(f"env does not fit the agent in {folder}: {error}") from None
         reason = f"does not describe a model of this version of viapoint ({type(error).__name__}: {error})"
         raise BadFileError(path, f"was written by viapoint {record.get('viapoint')} and {reason}") from None
-    put_weights(model, arrays, tensors)
+    _put_weights(model, arrays, tensors)
     if record.get("weights_sha256", "") not in ("", _digest(tensors)):
         raise BadFileError(tensors, "is damaged: its hash is not the one that model.json states")
     return model
@@ -198,7 +198,7 @@ def check_hyperparameters(algorithm: str, hyperparameters: Mapping[str, Any]) ->
         ValueError: A name is unknown, or a value has another type or is out of range.
     """
     kind = ALGORITHMS[algorithm]
-    allowed = argument_names(kind)
+    allowed = _argument_names(kind)
     for name in sorted(set(hyperparameters) - allowed):
         raise ValueError(f"{algorithm} has no hyperparameter {name!r}; it has {', '.join(sorted(allowed))}")
     check_arguments(kind, {name: _decode(value, 1) for name, value in hyperparameters.items()})
@@ -271,7 +271,7 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
         raise ValueError(f"only agents of {known} can be saved, got {type(model).__name__}")
     (name,), (env_id, env_kwargs) = names, env_arguments(model.get_env())
     policies = {kind: each for each, kind in ALGORITHMS[name].policy_aliases.items()}
-    stored = sorted(name for name in argument_names(type(model)) if hasattr(model, name))
+    stored = sorted(name for name in _argument_names(type(model)) if hasattr(model, name))
     limit = gym.spec(env_id).max_episode_steps  # of an id of one's own
     return {
         "format": FORMAT,
@@ -300,7 +300,7 @@ def _tensors(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
     return {**model.policy.state_dict(), **{name: getattr(model, name) for name in others}}
 
 
-def put_weights(model: BaseAlgorithm, arrays: Mapping[str, Any], path: Path) -> None:
+def _put_weights(model: BaseAlgorithm, arrays: Mapping[str, Any], path: Path) -> None:
     """Set the tensors of :func:`_tensors` after checking all of them.
 
     Raises:
@@ -328,7 +328,7 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
+def _own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
     """Return one copy of the environment that a file names by `id` and `kwargs`, or by its `task` alone.
 
     An arm file that is gone is replaced by its copy in the folder.
@@ -357,7 +357,7 @@ def own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
 
 
 @contextmanager
-def parameter_budget(arrays: Mapping[str, Any]) -> Iterator[None]:
+def _parameter_budget(arrays: Mapping[str, Any]) -> Iterator[None]:
     """Limit the parameters of new networks to the number in the weights, plus a few.
 
     Torch reserves memory for a layer before it touches it, and the check comes between the two.
@@ -383,7 +383,7 @@ def parameter_budget(arrays: Mapping[str, Any]) -> Iterator[None]:
         handle.remove()  # other networks may have any size
 
 
-def argument_names(kind: type[BaseAlgorithm]) -> set[str]:
+def _argument_names(kind: type[BaseAlgorithm]) -> set[str]:
     """Return the names of an algorithm's hyperparameters."""
     every = inspect.signature(kind.__init__).parameters.values()
     return {each.name for each in every if each.kind is not each.VAR_KEYWORD} - NOT_STORED

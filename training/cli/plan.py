@@ -19,7 +19,7 @@ from viapoint.training.planning.plan_motion import plan_motion
 
 def run(config: PlanConfig) -> None:
     """Plan a movement, print what is known of it, and write it."""
-    arm = arm_for(config)
+    arm = _arm_for(config)
     scene = _scene(config.scene)
     start = config.start or scene.get("start")
     if start is None:
@@ -47,7 +47,7 @@ def run(config: PlanConfig) -> None:
         print(f"{record_plan(config.video, plan)} frames: {config.video}")
 
 
-def arm_for(config: PlanConfig) -> Arm:
+def _arm_for(config: PlanConfig) -> Arm:
     """Return the arm of a name or of a file."""
     if config.arm in arm_names():
         return arm_of(config.arm)

@@ -83,7 +83,7 @@ def paths(ax: Axes, planned: Float, hand: Float) -> None:
     path(ax, hand, **ARM)
 
 
-def dot(ax: Axes, point: Any) -> None:
+def _dot(ax: Axes, point: Any) -> None:
     """Draw a via-point, shape (2,), [m]."""
     ax.plot(*(100.0 * point), marker="o", color=PALETTE.via, markersize=3.6, zorder=5)
 
@@ -105,7 +105,7 @@ def model() -> Figure:
         ax[1].plot(profile.time, profile.speed / profile.speed.max(), **MODEL)
         ax[1].set(ylabel="$T/V_M$", ylim=(0, 1.08))
     via = second(float(second.knots[1]))
-    dot(axes[1, 0], via)
+    _dot(axes[1, 0], via)
     # The construction of d1, d2 and d3, in centimetres
     start, (x, y), goal = 100.0 * second(0.0), 100.0 * via, 100.0 * second(1.0)
     thin: Any = {"color": "0.45", "linewidth": 0.6}
@@ -218,7 +218,7 @@ def pair(first: Any, second: Any, texts: Any) -> Figure:
         passage = float(movement.knots[1])
         plane(ax[0])
         paths(ax[0], motion.planned[0], motion.hand[0])
-        dot(ax[0], movement(passage))
+        _dot(ax[0], movement(passage))
         (model,), (arm,) = movements.model_profiles(movement), movements.arm_profiles(motion)
         profiles(ax[1:], model, arm, float(movement.duration))
         for each in ax[1:]:
@@ -245,7 +245,7 @@ def around_lights(avoidance: ObstacleMovements) -> Figure:
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * lights.packed_size[:2]
         outline = corners @ lights.rotation[:2, :2].T + lights.position[:2]
         ax[0].fill(*(100.0 * outline.T), color=PALETTE.obstacle)
-        dot(ax[0], via)
+        _dot(ax[0], via)
         profiles(ax[1:], model, profile, 1.0, ("model through $\\bullet$", avoidance.name))
         ax[2].set_xlabel("$t/t_f$")
     _finish(axes[1:], 1.0)
@@ -395,7 +395,7 @@ def paths_and_speeds() -> Figure:
         path(left, movement.planned(time), **MODEL)
         path(left, motion.hand[1], **ARM)
         path(left, movement.superposed(time), **SUM)
-        dot(left, movement.first(moment))
+        _dot(left, movement.first(moment))
         left.annotate(f"{1e3 * moment:.0f} ms", (-33.5, 52.5), color=THIRD, fontweight="bold")
         right.plot(time, np.hypot(*movement.planned(time, 1).T), label="plan revised", **MODEL)
         right.plot(motion.time, motion.speed()[1], label="simulated arm", **ARM)

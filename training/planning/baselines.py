@@ -138,7 +138,7 @@ class PlannerMethod:
         return SimulationResults(reward, info)
 
 
-def ompl_method(simulation: SceneSimulation) -> PlannerMethod:
+def _ompl_method(simulation: SceneSimulation) -> PlannerMethod:
     """Return the motion planner of the library OMPL.
 
     Raises:
@@ -236,7 +236,7 @@ def agent_method(name: str, model: Any, checks: int | None = None, refine: int |
     return AgentMethod(name, model, checks, refine)
 
 
-def refined_search(simulation: SceneSimulation, checks: int) -> Method:
+def _refined_search(simulation: SceneSimulation, checks: int) -> Method:
     """Return a search that spends half of its checks on refinement, which solves more scenes."""
     rounds = 2 if checks < 512 else 4
     each = checks // 2 // rounds
@@ -245,7 +245,7 @@ def refined_search(simulation: SceneSimulation, checks: int) -> Method:
 
 # Factories of baselines whose names end in the number of plans that they check, such as `search512`
 COUNTED: dict[str, Callable[[SceneSimulation, int], Method]] = {
-    "search": refined_search,
+    "search": _refined_search,
     "sobol": lambda simulation, checks: GeometrySearch(simulation.task, checks),
     "cautious": lambda simulation, checks: CautiousSearch(simulation.task, checks),
 }
@@ -255,7 +255,7 @@ SENSED = ("cautious",)  # Counted baselines that need a sensor
 # Factories of the planners for known obstacles
 PLANNERS: dict[str, Callable[[SceneSimulation], PlannerMethod]] = {
     "plan_motion": lambda simulation: PlannerMethod(simulation, "plan_motion", plan_motion),
-    "ompl": ompl_method,
+    "ompl": _ompl_method,
 }
 
 # Factories of baselines by their names on the command line

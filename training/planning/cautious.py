@@ -41,12 +41,12 @@ REFINED = {"hand": 0, "joints": 8}
 
 def seen(task: Task, sight: Sight, truth: Obstacles) -> Obstacles:
     """Return those of the true obstacles that at least one ray meets."""
-    sensor = one_look(task, "seen")
+    sensor = _one_look(task, "seen")
     hidden = sensor.hidden(sight.rotation, sight.origin, truth)
     return truth._replace(kind=np.where(hidden, ABSENT, truth.kind))
 
 
-def one_look(task: Task, name: str) -> Sensor:
+def _one_look(task: Task, name: str) -> Sensor:
     """Return the sensor of a task for a method that needs its present look alone.
 
     Raises:
@@ -97,7 +97,7 @@ class CautiousSearch:
     """
 
     def __init__(self, task: Task, n_checks: int) -> None:
-        one_look(task, f"cautious{n_checks}")
+        _one_look(task, f"cautious{n_checks}")
         self.task, self.n_checks = task, n_checks
         self.name = f"cautious{n_checks}"
 

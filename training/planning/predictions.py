@@ -38,7 +38,7 @@ class Seen(NamedTuple):
     velocity: Float  # Shape (M, n, 3), [m/s]
 
 
-def at_rest(seen: Seen, scene: Scenes) -> Float:
+def _at_rest(seen: Seen, scene: Scenes) -> Float:
     """Return obstacles that stay where they are, shape (HORIZON + 1, n, 3), [m]."""
     return np.repeat(seen.centre[-1:], HORIZON + 1, axis=0)
 
@@ -55,7 +55,7 @@ def fitted_reaches(seen: Seen, scene: Scenes) -> Float:
     Each hypothesis on duration and begin of the reach has a way, by least squares, and a probability, by what was seen
     and by the length of usual reaches. The prediction is the mean of all hypotheses.
     """
-    places = at_rest(seen, scene)
+    places = _at_rest(seen, scene)
     ahead = np.linspace(0.0, CHORD * HORIZON, HORIZON + 1)
     for row in np.flatnonzero(norm(seen.velocity[-1]) > MOVING):
         made, weight, way = _hypotheses(seen.time, seen.centre[:, row], seen.velocity[:, row], ahead)
@@ -102,7 +102,7 @@ def _shares(begin: Float, duration: Float, time: Float) -> Float:
 
 # Predictions of the places of obstacles by name
 PREDICTIONS: dict[str, Callable[[Seen, Scenes], Float]] = {
-    "rest": at_rest,
+    "rest": _at_rest,
     "reach": fitted_reaches,
     "known": known_courses,
 }
@@ -135,7 +135,7 @@ class PredictedSearch:
         places = []
         for i, seen in enumerate(self._look(observation, scenes, memory)):
             places.append(self._predict(seen, scenes.take([i])))
-        obstacles = in_pieces(problem.obstacles, np.array(places))
+        obstacles = _in_pieces(problem.obstacles, np.array(places))
         return np.asarray(self._search.solve(problem._replace(obstacles=obstacles), n_pieces=HORIZON))
 
     def _look(self, observation: Observation, scenes: Scenes, memory: dict[bytes, Seen]) -> list[Seen]:
@@ -154,7 +154,7 @@ class PredictedSearch:
         return found
 
 
-def in_pieces(obstacles: Obstacles, places: Float) -> Obstacles:
+def _in_pieces(obstacles: Obstacles, places: Float) -> Obstacles:
     """Return obstacles of B problems in pieces of CHORD, B T scenes, for places of shape (B, T + 1, n, 3), [m].
 
     The centre of each piece is where the obstacle would be at time 0 with the velocity of the piece.

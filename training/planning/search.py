@@ -128,8 +128,8 @@ class GeometrySearch:
     def solve(self, problem: Problem, n_pieces: int = 1) -> Float:
         """Return the best action of each of B problems, shape (B, m).
 
-        While a movement is under way, courses of obstacles may have several pieces, see
-        :func:`~viapoint.training.planning.predictions.in_pieces`.
+        While a movement is under way, courses of obstacles may have several pieces of CHORD: then the obstacles are
+        those of as many scenes for each problem, one after the other in time.
         """
         moving = problem.remaining is not None
         at = self.task.n_via * self.task.action.dimension

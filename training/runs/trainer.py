@@ -49,7 +49,7 @@ class TrainingStalledError(Exception):
     """Training ended before its limit, as the success on the validation scenes did not rise any more."""
 
 
-class CallbackStop(Exception):  # noqa: N818 - it is no error
+class _CallbackStop(Exception):  # noqa: N818 - it is no error
     """Training ends as a callback of the user asked for it."""
 
 
@@ -186,7 +186,7 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
 def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> None:
     """Train from the last checkpoint of the run to its end."""
     folder = str(run.folder / "tensorboard")
-    given = GivenCallbacks([callback] if isinstance(callback, BaseCallback) else list(callback or ()))
+    given = _GivenCallbacks([callback] if isinstance(callback, BaseCallback) else list(callback or ()))
     try:
         with (
             closing(Logger(folder, [TensorBoardOutputFormat(folder)])) as logger,
@@ -204,7 +204,7 @@ def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> N
     except OSError as error:
         raise TrainingFailedError(
             f"training cannot go on: {error}; all up to decision {run.decisions} is saved; go on with: "
-            f"{resume_command(run)}"
+            f"{_resume_command(run)}"
         ) from error
 
 
@@ -213,7 +213,7 @@ def _learn(model: BaseAlgorithm, steps: int, monitor: RunCallback, *, fresh: boo
     callbacks: list[BaseCallback] = [monitor, monitor.given]
     try:
         model.learn(steps, callbacks, None, reset_num_timesteps=fresh)  # type: ignore[arg-type]
-    except (TrainingStalledError, CallbackStop):
+    except (TrainingStalledError, _CallbackStop):
         monitor.given.on_training_end()  # `learn` has not told them that it ends
         if hasattr(model, "calibrate"):  # nor has it done this at its end
             model.calibrate()
@@ -240,12 +240,12 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
         print(f"the run began with {', '.join(others)}: it may end otherwise", file=sys.stderr)
 
 
-def resume_command(run: Run) -> str:
+def _resume_command(run: Run) -> str:
     """Return the command that goes on with a run."""
     return shlex.join(["viapoint", "train", "--resume", "--out", str(run.folder)])
 
 
-class GivenCallbacks(CallbackList):
+class _GivenCallbacks(CallbackList):
     """Callbacks of the user, which stop a training between two rounds of experience only.
 
     In the middle of a round Stable-Baselines3 drops the step that it has just made, and no run could go on from there
@@ -269,7 +269,7 @@ class RunCallback(BaseCallback):
     and stops, the second stops at once.
     """
 
-    def __init__(self, run: Run, given: GivenCallbacks) -> None:
+    def __init__(self, run: Run, given: _GivenCallbacks) -> None:
         super().__init__()
         self.run, self.config = run, run.config
         self.given = given
@@ -329,13 +329,13 @@ class RunCallback(BaseCallback):
             self.run.save("final", self.model)
             raise TrainingStoppedError(
                 f"stopped after {self.num_timesteps} decisions, and all is saved; go on with: "
-                f"{resume_command(self.run)}"
+                f"{_resume_command(self.run)}"
             )
         if self.run.stalled:
             self.run.checkpoint(self.model, {"seconds": self.seconds})
             raise TrainingStalledError
         if self.given.stopped:
-            raise CallbackStop
+            raise _CallbackStop
 
     def _on_training_end(self) -> None:
         self._run_due_actions(final=True)

@@ -109,7 +109,7 @@ def run_study(
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise BadFileError(folder, "holds something else than a study; name another folder")
         write_json(mark, {"viapoint": "study", "name": study.name})
-    missing = [trial for trial in study.trials if finished_record(trial, folder) is None]
+    missing = [trial for trial in study.trials if _finished_record(trial, folder) is None]
     searches = [search for search in study.searches if not search.is_finished(folder)]
     failed = []
     if missing or searches:
@@ -120,7 +120,7 @@ def run_study(
             failed += _run_trials(missing, folder, told)
             for search in searches:
                 failed += _search(search, folder, workers, told)
-    table = write_results(study, folder)
+    table = _write_results(study, folder)
     if failed:
         raise StudyFailedError(
             f"{len(failed)} trials failed; the same command tries them again: {'; '.join(failed)}"
@@ -128,7 +128,7 @@ def run_study(
     return table
 
 
-def run_trial(trial: Trial, out: Path) -> Record:
+def _run_trial(trial: Trial, out: Path) -> Record:
     """Train if needed, or go on with an interrupted training, measure, and return the record of a trial."""
     record: Record = {"viapoint": "study", "asked": _asked(trial)}
     env_kwargs, decisions = dict(trial.env_kwargs), None
@@ -162,7 +162,7 @@ def run_trial(trial: Trial, out: Path) -> Record:
     return record
 
 
-def finished_record(trial: Trial, out: Path) -> Record | None:
+def _finished_record(trial: Trial, out: Path) -> Record | None:
     """Return the record of a trial that is complete, or None; a record of other settings is obsolete."""
     path = trial.folder(out) / "result.json"
     if not path.is_file():
@@ -171,12 +171,12 @@ def finished_record(trial: Trial, out: Path) -> Record | None:
     return record if record.get("asked") == _asked(trial) else None
 
 
-def write_results(study: Study, folder: Path) -> pd.DataFrame:
+def _write_results(study: Study, folder: Path) -> pd.DataFrame:
     """Write `results.csv`, `results.md` and a figure for each environment from all records, and return the table."""
     lines = []
     curves: dict[str, dict[str, list[Any]]] = {}
     for trial in study.trials:
-        record = finished_record(trial, folder) or {"rows": []}
+        record = _finished_record(trial, folder) or {"rows": []}
         lines += [{"environment": trial.environment, **line} for line in record["rows"]]
         if "curve" in record:
             of_rows = curves.setdefault(trial.environment, {})
@@ -299,7 +299,7 @@ def _connected(address: str | None, workers: int | None) -> Iterator[None]:
 def _run_trials(trials: list[Trial], folder: Path, told: Told) -> list[str]:
     """Run trials as tasks of Ray, and return a line for each that failed."""
     ray, _ = _import_libraries()
-    task = ray.remote(num_cpus=1, max_retries=RETRIES)(run_trial)  # each trial computes on one core
+    task = ray.remote(num_cpus=1, max_retries=RETRIES)(_run_trial)  # each trial computes on one core
     running: dict[Any, Trial] = {task.remote(trial, folder): trial for trial in trials}
     failed = []
     while running:
