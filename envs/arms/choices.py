@@ -227,7 +227,9 @@ def known_limits(table: dict[str, tuple[float, ...]], name: str, number: int) ->
     for known, limits in table.items():
         # Between letters and digits there may be something else, as in `iiwa_14`.
         word = r"[\W_]*".join(re.findall(r"[a-z]+|[0-9]+", known))
-        whole = re.search(rf"(?<![a-z0-9]){word}(?![a-z0-9])", name.lower())
+        # A version may follow, as in `fr3v2`, `rizon4s` and `panda1`.
+        version = r"([a-z]\d*)?" if known[-1].isdigit() else r"\d*"
+        whole = re.search(rf"(?<![a-z0-9]){word}{version}(?![a-z0-9])", name.lower())
         if whole and len(limits) == number:
             return np.array(limits)
     return None

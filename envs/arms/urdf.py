@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ COMPILER = {
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")  # Entries of an inertia
 BALL = 0.05  # Radius of the ball whose inertia a link gets that has none, [m]
 LIMITED = ("revolute", "prismatic")  # Types of joints that have limits
+MOVING = (*LIMITED, "continuous")  # Types of joints that an arm may have
 WARNING = "warning: "  # Beginning of notes that are told as warnings, too
 LEFT_OUT = ("transmission", "gazebo", "material")  # Elements that MuJoCo does not need
 
@@ -105,11 +107,18 @@ def _limits(joint: ET.Element, notes: list[str]) -> dict[str, float]:
     """
     name, limit = joint.get("name"), joint.find("limit")
     found: dict[str, float] = {}
-    for key, text in {} if limit is None else limit.attrib.items():
+    if joint.get("type") not in MOVING:
+        return found
+    for key in ("lower", "upper", "velocity"):
+        text = None if limit is None else limit.get(key)
+        if text is None:
+            continue
         try:
             found[key] = float(text)
         except ValueError:
-            raise ValueError(f"the limit {key} of joint {name!r} must be a number, got {text!r}") from None
+            found[key] = math.nan
+        if not math.isfinite(found[key]):
+            raise ValueError(f"the limit {key} of joint {name!r} must be a finite number, got {text!r}")
     if joint.get("type") in LIMITED:
         lower, upper = found.get("lower", 0.0), found.get("upper", 0.0)
         if lower > upper:

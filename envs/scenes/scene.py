@@ -26,7 +26,7 @@ FARTHEST = 2.0  # Greatest coordinate of an obstacle's centre, and greatest size
 FASTEST = 1.0  # Greatest speed of an obstacle, [m/s]
 # Time between two points of a reach, [s]: obstacles move straight between them, at most 1 mm from the smooth reach
 CHORD = 0.04
-LATEST = 60.0  # Latest end of a reach of an obstacle, [s]
+SHORTEST_REACH, LATEST = 1e-3, 60.0  # Shortest duration of a reach of an obstacle, and its latest end, [s]
 MINIMUM_JERK_PEAK = 1.875  # Peak speed of a minimum-jerk movement relative to its mean speed
 # Fields with a row for each obstacle
 OF_OBSTACLES = ("turn_time", "turn_velocity", "reach")
@@ -239,7 +239,9 @@ def _check_obstacles(scenes: Scenes, names: Sequence[Sequence[str]]) -> None:
     _refuse(present & (turn_time <= 0.0), "must change its course after 0 s", turn_time, names)
     begin, duration = scenes.reach[..., 0], scenes.reach[..., 1]
     reaches = present & scenes.reach.any(axis=-1)
-    _refuse(reaches & (duration <= 0.0), "must reach in more than 0 s", duration, names)
+    _refuse(~present & scenes.reach.any(axis=-1), "is not there, and cannot reach", duration)
+    shortest = f"must reach in {SHORTEST_REACH:g} s or more"
+    _refuse(reaches & (duration < SHORTEST_REACH), shortest, duration, names)
     late = reaches & (begin + duration > LATEST)
     _refuse(late, f"must end its reach within {LATEST:g} s", begin + duration, names)
     speed = (

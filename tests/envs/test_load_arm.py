@@ -294,7 +294,14 @@ def test_damping_that_no_motor_could_overcome_is_left_out_and_told():
 
 @pytest.mark.parametrize(
     ("name", "known"),
-    [("KUKA iiwa_14", "iiwa14"), ("unitree z1", "z1"), ("xyz_1", None), ("sandpiper", None)],
+    [
+        ("KUKA iiwa_14", "iiwa14"),
+        ("unitree z1", "z1"),
+        ("fr3v2", "fr3"),
+        ("z12", None),
+        ("xyz_1", None),
+        ("sandpiper", None),
+    ],
 )
 def test_well_known_arms_are_known_by_whole_words(name, known):
     for number in (6, 7):

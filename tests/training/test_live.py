@@ -291,6 +291,7 @@ def test_scene_files_are_exact_and_keep_names_and_changes(arenas):
     options = ve.scene_from_json(more.to_json(MOVING))
     assert [each.name for each in options["obstacles"]] == ["ball", ""]
     np.testing.assert_array_equal(more.turns, turns[1:])
+    np.testing.assert_array_equal(again.with_obstacle(2, again.obstacles[0]).without(2).turns, turns)
     names = {}
     exec(again.to_python(MOVING, arena.arguments["any"]), names)
     assert_same(

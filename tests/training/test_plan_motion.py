@@ -308,6 +308,7 @@ def test_a_batch_goes_on_after_a_pose_out_of_reach() -> None:
     plans = plan_motions(PANDA, [PANDA.home] * 2, [Pose((2.0, 0.0, 0.5)), GOAL], [[], []])
     assert [plan.success for plan in plans] == [False, True]
     assert "out of reach" in plans[0].reason
+    assert plan_motion(PANDA, PANDA.home, [Pose((2.0, 0.0, 0.5)), Pose((0.5, 0.2, 0.4))]).success
 
 
 def test_a_pose_is_reached_by_any_of_its_free_configurations() -> None:

@@ -46,6 +46,18 @@ def test_courses_are_predicted_the_better_the_more_is_known():
     assert rates[3] > rates[2] + 0.1 > rates[1] + 0.2
 
 
+def test_episodes_with_the_same_ends_are_not_mixed_up():
+    simulation = SceneSimulation(MOVING, 8, **REACHING)
+    method = make_method("reach:search64", MOVING, **REACHING)
+    scenes = simulation.task.sampler()([np.random.default_rng((5, each)) for each in range(6)])
+    scenes.start[:], scenes.goal[:] = scenes.start[0], scenes.goal[0]
+    together = method.execute(scenes, method.decide(simulation.observe(scenes), scenes))
+    for row in range(6):
+        one = scenes.take([row])
+        alone = method.execute(one, method.decide(simulation.observe(one), one))
+        assert alone.reward[0] == together.reward[row]
+
+
 def test_two_looks_at_a_reach_tell_its_end():
     begin, duration, way = -0.2, 0.9, np.array([0.2, -0.1, 0.0])
     scene = registered_task(MOVING).sampler()([np.random.default_rng(0)]).with_rows(1)

@@ -65,9 +65,14 @@ class Scene(NamedTuple):
         left = (*self.obstacles[:row], *self.obstacles[row + 1 :])
         return self._replace(
             obstacles=left,
-            turns=np.delete(self.turns, row, axis=0) if len(self.turns) else (),
-            reaches=np.delete(self.reaches, row, axis=0) if len(self.reaches) else (),
+            turns=_without(self.turns, row),
+            reaches=_without(self.reaches, row),
         )
+
+
+def _without(rows: Any, row: int) -> Any:
+    """Return the rows of the other obstacles; obstacles that were added have none."""
+    return np.delete(rows, row, axis=0) if row < len(rows) else rows
 
 
 class Proposal(NamedTuple):

@@ -178,13 +178,14 @@ class AgentMethod:
     def decide(self, observation: Observation, scenes: Any = None) -> Float:
         """Return actions of the agent, see :class:`Method`; only privileged beliefs need the scenes."""
         policy = self._model.policy
-        if getattr(policy, "belief", DEFAULT_BELIEF) in PRIVILEGED:
-            return np.asarray(policy.assess(observation, scenes.obstacles)[0])
         own = {name: getattr(policy, name) for name in self._settings if hasattr(policy, name)}
         for name in own:
             setattr(policy, name, self._settings[name])
         try:
-            actions = predicted_actions(self._model, observation)
+            if getattr(policy, "belief", DEFAULT_BELIEF) in PRIVILEGED and scenes is not None:
+                actions, _ = policy.assess(observation, scenes.obstacles)
+            else:
+                actions = predicted_actions(self._model, observation)
         finally:
             for name, number in own.items():
                 setattr(policy, name, number)

@@ -393,8 +393,10 @@ def _goals(problem: _Problem, goal: Any) -> Float:
     """Return the goals that are tried, nearest first, shape (G, D)."""
     if isinstance(goal, Pose | Mapping):
         goal = [goal]
-    if isinstance(goal, Sequence) and goal and all(isinstance(each, Pose | Mapping) for each in goal):
-        return np.concatenate([_solutions(problem, as_pose("goal", each)) for each in goal])
+    if isinstance(goal, Sequence) and any(isinstance(each, Pose | Mapping) for each in goal):
+        if not all(isinstance(each, Pose | Mapping) for each in goal):
+            raise ValueError("goals must be poses or coordinates, not some of both")
+        return _goals_of_poses(problem, [as_pose("goal", each) for each in goal])
     several = np.ndim(goal) > 1
     number = np.shape(goal)[-1:] or (0,)
     if number != (len(problem.start),) and number in ((3,), (7,)):
@@ -411,6 +413,24 @@ def _goals(problem: _Problem, goal: Any) -> Float:
     away = np.abs(goals - problem.start).max(axis=-1)
     # Copies are contiguous and writable, which compiled functions depend on.
     return np.array(goals[np.argsort(away, kind="stable")])
+
+
+def _goals_of_poses(problem: _Problem, poses: list[Pose]) -> Float:
+    """Return the goals that are tried for several poses, shape (G, D); those out of reach are passed over.
+
+    Raises:
+        UnreachableError: All are out of reach.
+    """
+    found = []
+    fault = None
+    for pose in poses:
+        try:
+            found.append(_solutions(problem, pose))
+        except UnreachableError as error:
+            fault = error
+    if not found and fault is not None:
+        raise fault
+    return np.concatenate(found)
 
 
 def _solutions(problem: _Problem, pose: Pose) -> Float:

@@ -145,7 +145,8 @@ class PredictedSearch:
         time = task.time_limit - np.asarray(observation["time_left"], np.float64)[:, 0]
         found = []
         for i in range(len(time)):
-            key = scenes.start[i].tobytes() + scenes.goal[i].tobytes()
+            parts = scenes.start[i], scenes.goal[i], scenes.obstacles.centre[i], scenes.reach[i]
+            key = b"".join(part.tobytes() for part in parts)
             new = Seen(time[i : i + 1], obstacles.centre[i : i + 1], obstacles.velocity[i : i + 1])
             if key in memory:
                 new = Seen(*[np.concatenate(parts) for parts in zip(memory[key], new, strict=True)])
