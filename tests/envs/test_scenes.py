@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from episodes import ENDS, MOVING, OBSTACLES, OTHER, PANDA, PANDA_MOVING, given, post, same, same_scenes
 
+from viapoint import primitives
 from viapoint.envs import (
     Box,
     Capsule,
@@ -137,10 +138,13 @@ def test_a_shape_its_dictionary_and_its_json_give_the_same_movement(shape):
         same(info, results[0][1])
 
 
-@pytest.mark.parametrize("env_id", [OBSTACLES, PANDA, MOVING, "viapoint/PlanarTargetJump-v0"])
-def test_drawn_scenes_survive_json(env_id):
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"),
+    [(OBSTACLES, {}), (PANDA, {}), (MOVING, {}), (MOVING, REACHING), ("viapoint/PlanarTargetJump-v0", {})],
+)
+def test_drawn_scenes_survive_json(env_id, kwargs):
     """And their episodes."""
-    env = gym.make(env_id).unwrapped
+    env = gym.make(env_id, **kwargs).unwrapped
     for seed in range(3):
         env.reset(seed=seed)
         scenes = env.batch.scenes
@@ -151,7 +155,7 @@ def test_drawn_scenes_survive_json(env_id):
         for name, part in scenes.obstacles._asdict().items():
             if name not in ("meshes", "clouds"):
                 np.testing.assert_allclose(getattr(again.obstacles, name), part, atol=1e-12)
-        for name in ("start", "goal", "jumps", "turn_velocity"):
+        for name in ("start", "goal", "jumps", "turn_velocity", "reach"):
             np.testing.assert_allclose(getattr(again, name), getattr(scenes, name), atol=1e-9)
         after = env.step(np.zeros(env.action_space.shape, np.float32))[4]
         for name, value in before.items():
@@ -354,3 +358,53 @@ def test_changes_are_drawn_and_applied_in_time():
     wanted = scenes.obstacles.centre + before * velocity + after * scenes.turn_velocity
     np.testing.assert_allclose(later, wanted, atol=1e-12)
     assert (turns[~present] == NEVER).all()
+
+
+@pytest.mark.parametrize("env_id", [MOVING, PANDA_MOVING])
+def test_reaches_of_obstacles_are_minimum_jerk_movements(env_id):
+    """Within 1 mm at every time, also of one that began before the episode."""
+    env = gym.make(env_id, **REACHING, decide_at=()).unwrapped
+    for seed in range(3):
+        env.reset(seed=seed)
+        scenes = env.batch.scenes
+        assert scenes.reach[..., 1].any()
+        env.step(np.zeros(env.action_space.shape, np.float32))
+        time = env.last_rollout.time
+        every = scenes.take(np.zeros(len(time), np.int64)).obstacles_at(time)
+        for row in np.flatnonzero(scenes.reach[0, :, 1]):
+            begin, duration, *way = scenes.reach[0, row]
+            reach = primitives.point_to_point(np.zeros(3), np.array(way), duration)
+            moved = reach(np.clip(time - begin, 0.0, duration)) - reach(np.clip(-begin, 0.0, duration))
+            place = scenes.obstacles.centre[0, row] + moved
+            np.testing.assert_allclose(every.centre[:, row], place, atol=1e-3)
+
+
+def test_obstacles_reach_in_the_physics():
+    """An obstacle that comes from far away meets the straight movement as soon as the sum says it does."""
+    way, duration, begin = np.array([0.0, -0.4, 0.0]), 0.8, 0.02
+    options = {**ENDS, "obstacles": [post(-0.1, 0.6, 0.03)], "reaches": [[begin, duration, *way]]}
+    env = gym.make(MOVING, **REACHING, decide_at=()).unwrapped
+    env.reset(seed=0, options=options)
+    info = env.step(np.zeros(env.action_space.shape, np.float32))[4]
+    rollout = env.last_rollout
+    reach = primitives.point_to_point(np.zeros(3), way, duration)
+    post_place = np.array([-0.1, 0.6, 0.0]) + reach(np.clip(rollout.time - begin, 0.0, duration))
+    radius = env.task.arm.spheres.radius[-1]
+    apart = np.linalg.norm((rollout.hand - post_place)[:, :2], axis=-1) - 0.03 - radius
+    assert info["collision"]
+    assert info["first_contact_time"] == pytest.approx(rollout.time[int((apart < 0.0).argmax())], abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "reaches",
+    [
+        [[0.0, 0.0, 0.1, 0.0, 0.0]], [[0.0, 1e-9, 0.0, 0.0, 0.0]], [[0.0, -1.0, 0.1, 0.0, 0.0]],
+        [[0.0, 0.1, 0.4, 0.0, 0.0]], [[0.0, 1e9, 0.1, 0.0, 0.0]], [[np.nan, 1.0, 0.1, 0.0, 0.0]],
+        [[0.0] * 5, [0.0, 1.0, 0.1, 0.0, 0.0]], [[0.0, 1.0, 0.1, 0.0]],
+    ],
+)  # fmt: skip
+def test_impossible_reaches_are_refused(reaches):
+    """Too short or long, too fast, not finite, of an obstacle that is not there, of another shape."""
+    env = gym.make(MOVING, **REACHING)
+    with pytest.raises(ValueError):
+        env.reset(options={**ENDS, "obstacles": [post(0.0, 0.6)], "reaches": reaches})
