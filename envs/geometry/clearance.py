@@ -351,19 +351,17 @@ def movement_clearance(
                 if len(between) == 0 or stride > 1 or k == 0:
                     continue
                 way = placed.way[spheres.link[group]] + drift
-                if way > 0.0 and 0.5 * (bound + apart) < _needed(min(least, least_self), floor):
-                    share, here = 0.0, bound + way
-                    while True:
-                        # Halfway to the next look, which is not nearer than the least, nothing else can be, either.
-                        low = min(least, least_self)
-                        share += (here + low - 2.0 * _needed(low, floor)) / way
-                        if share >= 1.0:
-                            break
-                        _place_between(chain, spheres, path, k, share, between, placed)
-                        time, most = begin + (k - 1 + share) * step, least + WINDOW
-                        here = nearest_obstacle(spheres, placed, group, obstacles, scene, time, most, -FAR)
-                        least = min(least, here)
-                    is_placed = False
+                low = min(least, least_self)
+                if way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
+                    continue
+                share = _until_next(bound + way, way, low, floor)
+                while share < 1.0:
+                    _place_between(chain, spheres, path, k, share, between, placed)
+                    time, most = begin + (k - 1 + share) * step, least + WINDOW
+                    apart = nearest_obstacle(spheres, placed, group, obstacles, scene, time, most, -FAR)
+                    least = min(least, apart)
+                    share += _until_next(apart, way, min(least, least_self), floor)
+                is_placed = False
             for pair in range(len(spheres.pairs)):
                 if placed.pair_apart[pair] >= least_self:
                     continue
@@ -377,24 +375,33 @@ def movement_clearance(
                 if len(between) == 0 or stride > 1 or k == 0:
                     continue
                 way = _way_of_pair(spheres, placed, pair)
-                if way > 0.0 and 0.5 * (bound + apart) < _needed(min(least, least_self), floor):
-                    share, here = 0.0, bound + way
-                    while True:
-                        low = min(least, least_self)
-                        share += (here + low - 2.0 * _needed(low, floor)) / way
-                        if share >= 1.0:
-                            break
-                        _place_between(chain, spheres, path, k, share, between, placed)
-                        here, _, _ = nearest_spheres(spheres, placed, pair, least_self + WINDOW, -FAR)
-                        least_self = min(least_self, here)
-                    is_placed = False
+                low = min(least, least_self)
+                if way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
+                    continue
+                share = _until_next(bound + way, way, low, floor)
+                while share < 1.0:
+                    _place_between(chain, spheres, path, k, share, between, placed)
+                    apart, _, _ = nearest_spheres(spheres, placed, pair, least_self + WINDOW, -FAR)
+                    least_self = min(least_self, apart)
+                    share += _until_next(apart, way, min(least, least_self), floor)
+                is_placed = False
     return least, least_self
 
 
 @inlined
-def _needed(low: float, floor: float) -> float:
+def _certain(low: float, floor: float) -> float:
     """Return the clearance that must be certain between two configurations where the least so far is `low`, [m]."""
     return max(low - ROUGHLY, floor - RESOLUTION) if low >= floor else low - ROUGHLY
+
+
+@inlined
+def _until_next(apart: float, way: float, low: float, floor: float) -> float:
+    """Return the share of an interval after which to look again, where it begins with some clearance, [m].
+
+    At the next look the clearance is counted, so it is not less than the least. With both ends known, and a bound of
+    the way in the whole interval, nothing between them is nearer than what must be certain.
+    """
+    return (apart + low - 2.0 * _certain(low, floor)) / way
 
 
 @kernel
