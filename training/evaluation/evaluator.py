@@ -193,8 +193,8 @@ def evaluate(
         baselines: Names, or objects with `name` and `decide`. Names are `untrained` (the agent's network before
             training), `straight`, `random`, `random16`, `random80`, `plan_motion`, `ompl`, `searchN` and `sobolN` (N
             checked plans), in tasks with replanning `unrevised` (the first plan alone), and in tasks with a sensor
-            `cautiousN` and BELIEF:METHOD, such as `thick:search512`. Where obstacles move, also PREDICTION:searchN, such
-            as `reach:search512`.
+            `cautiousN` and BELIEF:METHOD, such as `thick:search512`. Where obstacles move, also PREDICTION:searchN,
+            such as `reach:search512`.
         time_decisions: Measure the wall time of single decisions.
         progress: Function of the method's name, the number of finished scenes and the number of all scenes.
 
