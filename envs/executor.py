@@ -260,8 +260,8 @@ def _measure(
                     state.first_contact[row] = begin + k
                 end = k + 1
                 break
-        hand = state.hand[row].copy()
-        before = state.joints[row].copy()
+        hand = state.hand[row]
+        before = state.joints[row]
         speed = 0.0
         for k in range(end):
             now = tool_position(chain, executed[k], placed.rotation, placed.origin)
@@ -292,8 +292,6 @@ def _measure(
             resting = speed < rest_speed and error < goal_tolerance
             state.rest[row] = state.rest[row] + 1 if resting else 0
         state.last_speed[row] = speed
-        state.hand[row] = hand
-        state.joints[row] = before
         state.steps[row] = begin + end
         # Clearance of what was done, and of what was commanded
         body = chain, spheres, reach

@@ -236,14 +236,17 @@ def _controls(
                     chain, position[i, following], velocity[i, following], acceleration[i, following], after
                 )
             else:
-                after[:] = before
+                after = before  # and no other part follows
             for k in range(first, min(following, steps)):
                 share = (k - first) / stride
                 for j in range(joints):
                     torque = before[j] + share * (after[j] - before[j])
                     servo = stiffness[j] * position[i, k, j] + damping[j] * velocity[i, k, j]
                     out[i, k, j] = torque + servo
-            before[:] = after
+            # Arrays change names; assigning numbers would compile Numba's messages about shapes, for two seconds.
+            spare = before
+            before = after
+            after = spare
     return out
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.compiled import compiled, inlined, kernel
+from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel
 
 Vector = tuple[float, float, float]  # Three components
 PART = 16  # Greatest number of spheres of a part of a group
@@ -89,7 +89,7 @@ class Spheres(NamedTuple):
     """
 
 
-@kernel
+@inner
 def link_frames(chain: Chain, joints: Float, rotation: Float, origin: Float) -> None:
     """Fill the world frames of links 0 to J: axes as columns, (J + 1, 3, 3), and origins, (J + 1, 3), [m]."""
     for row in range(3):
@@ -132,14 +132,14 @@ def transform(rotation: Float, origin: Float, link: int, point: Float) -> Vector
     )
 
 
-@kernel
+@inner
 def tool_position(chain: Chain, joints: Float, rotation: Float, origin: Float) -> Vector:
     """Return the world position of the tool, [m], and fill the frames of the links."""
     link_frames(chain, joints, rotation, origin)
     return transform(rotation, origin, chain.origin.shape[0], chain.tool_origin)
 
 
-@kernel
+@inner
 def point_jacobian(
     chain: Chain, rotation: Float, origin: Float, link: int, x: float, y: float, z: float, jacobian: Float
 ) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from viapoint.envs.arms.kinematics import PART, Chain, Spheres, link_frames
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.geometry.compiled import compiled, inlined, kernel
+from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel
 from viapoint.envs.geometry.distance import point_distance
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 
@@ -58,7 +58,7 @@ def memory(chain: Chain, spheres: Spheres) -> Placed:
     )
 
 
-@kernel
+@inner
 def place(chain: Chain, spheres: Spheres, joints: Float, placed: Placed) -> None:
     """Place links and bounding balls for joint positions of shape (J,)."""
     link_frames(chain, joints, placed.rotation, placed.origin)
@@ -112,18 +112,27 @@ def group_clearance(
 ) -> tuple[float, int]:
     """Return the clearance of a group of spheres from an obstacle, at most `least`, [m], and the sphere that has it.
 
-    The sphere is -1 if none is nearer than `least`. The bounding ball of the group should be looked at before. The
-    arguments are those of :func:`obstacle_clearance`.
+    The sphere is -1 if none is nearer than `least`. The arguments are those of :func:`obstacle_clearance`.
     """
     nearest = -1
-    place_group(spheres, group, placed)
-    for sphere in range(spheres.first[group], spheres.first[group + 1]):
-        radius = spheres.radius[sphere]
-        x = placed.centre[sphere, 0]
-        y = placed.centre[sphere, 1]
-        z = placed.centre[sphere, 2]
+    ball = spheres.first[group] - 1  # stands for the bounding ball of the group, which comes first
+    for sphere in range(ball, spheres.first[group + 1]):
+        if sphere == ball:
+            radius = spheres.ball_radius[group]
+            x = placed.ball[group, 0]
+            y = placed.ball[group, 1]
+            z = placed.ball[group, 2]
+        else:
+            radius = spheres.radius[sphere]
+            x = placed.centre[sphere, 0]
+            y = placed.centre[sphere, 1]
+            z = placed.centre[sphere, 2]
         distance = point_distance(obstacles, scene, row, x, y, z, time, least + radius) - radius
-        if distance < least:
+        if sphere == ball:
+            if distance >= least:
+                break
+            place_group(spheres, group, placed)
+        elif distance < least:
             least = distance
             nearest = sphere
             if least < floor:
@@ -146,14 +155,8 @@ def nearest_obstacle(
 
     The arguments are those of :func:`obstacle_clearance`.
     """
-    x = placed.ball[group, 0]
-    y = placed.ball[group, 1]
-    z = placed.ball[group, 2]
-    size = spheres.ball_radius[group]
     for row in range(obstacles.kind.shape[1]):
         if obstacles.kind[scene, row] == ABSENT:
-            continue
-        if point_distance(obstacles, scene, row, x, y, z, time, least + size) - size >= least:
             continue
         least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
         if least < floor:
@@ -161,7 +164,7 @@ def nearest_obstacle(
     return least
 
 
-@kernel
+@inner
 def obstacle_clearance(
     spheres: Spheres,
     placed: Placed,
@@ -184,7 +187,7 @@ def obstacle_clearance(
     return least
 
 
-@kernel
+@inner
 def nearest_spheres(
     spheres: Spheres, placed: Placed, pair: int, least: float, floor: float
 ) -> tuple[float, int, int]:
@@ -214,7 +217,7 @@ def nearest_spheres(
     return least, nearest, partner
 
 
-@kernel
+@inner
 def _nearest_by_parts(
     spheres: Spheres, placed: Placed, first: int, second: int, least: float, floor: float
 ) -> tuple[float, int, int]:
@@ -257,7 +260,7 @@ def _part(spheres: Spheres, group: int, sphere: int) -> int:
     return int(spheres.part[group] + (sphere - spheres.first[group]) // PART)
 
 
-@kernel
+@inner
 def self_clearance(spheres: Spheres, placed: Placed, least: float, floor: float) -> float:
     """Return the clearance of a placed arm from itself, at most `least`, [m]; see :func:`obstacle_clearance`."""
     for pair in range(len(spheres.pairs)):
@@ -294,7 +297,7 @@ def travel(reach: Float, first: Float, second: Float) -> float:
     return total
 
 
-@kernel
+@inner
 def fastest(obstacles: Obstacles, scene: int) -> float:
     """Return the greatest speed of an obstacle of a scene, [m/s]."""
     square = 0.0
@@ -404,7 +407,7 @@ def _until_next(apart: float, way: float, low: float, floor: float) -> float:
     return (apart + low - 2.0 * _certain(low, floor)) / way
 
 
-@kernel
+@inner
 def _place_between(
     chain: Chain, spheres: Spheres, path: Float, k: int, share: float, joints: Float, placed: Placed
 ) -> None:
@@ -458,7 +461,7 @@ def configuration_clearances(
     return found
 
 
-@kernel
+@inner
 def row_clearance(
     spheres: Spheres,
     placed: Placed,
@@ -479,14 +482,9 @@ def row_clearance(
     for group in range(len(spheres.link)):
         if spheres.link[group] < link:  # the base, or links that are not asked for
             continue
-        x = placed.ball[group, 0]
-        y = placed.ball[group, 1]
-        z = placed.ball[group, 2]
-        size = spheres.ball_radius[group]
-        if point_distance(obstacles, scene, row, x, y, z, time, least + size) - size < least:
-            least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
-            if least < floor:
-                return least
+        least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
+        if least < floor:
+            return least
     return least
 
 

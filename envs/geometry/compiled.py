@@ -13,9 +13,11 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 # Optimisations of arithmetic that are allowed; NaN and infinity keep their meaning
 FASTMATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
-KERNEL: dict[str, Any] = {"nogil": True, "fastmath": FASTMATH, "error_model": "numpy", "_nrt": False}
+COMPILED: dict[str, Any] = {"nogil": True, "fastmath": FASTMATH, "_nrt": True, "no_cfunc_wrapper": True}
+KERNEL: dict[str, Any] = {**COMPILED, "error_model": "numpy", "_nrt": False}
 """Options of functions that make no arrays. Without `_nrt`, Numba does not count references to arrays, which takes 5 ns
 for each array and call. Divisions by zero give infinity instead of an exception."""
+INNER: dict[str, Any] = {"no_cpython_wrapper": True}
 
 
 def compiled(function: Function) -> Function:
@@ -23,12 +25,28 @@ def compiled(function: Function) -> Function:
 
     The machine code is cached on disk, and runs without Python's global lock.
     """
-    return cast("Function", njit(cache=True, nogil=True, fastmath=FASTMATH)(function))
+    return cast("Function", njit(cache=True, **COMPILED)(function))
 
 
 def kernel(function: Function) -> Function:
     """Compile a function that makes no arrays; the machine code is cached on disk."""
     return cast("Function", njit(cache=True, **KERNEL)(function))
+
+
+def inner(function: Function) -> Function:
+    """Compile a function that makes no arrays, and that compiled functions alone call; the code is cached on disk.
+
+    It has no entrance for calls from Python, which for packed obstacles takes half a second to compile.
+    """
+    made: Any = njit(cache=True, **KERNEL, **INNER)(function)
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise TypeError(f"{function.__name__} is for compiled functions; from Python, call its `py_func`")
+
+    # Numba itself would end the interpreter.
+    made._compile_for_args = refuse
+    made._insert = lambda *_, **__: None
+    return cast("Function", made)
 
 
 def inlined(function: Function) -> Function:

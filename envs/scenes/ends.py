@@ -10,7 +10,7 @@ from viapoint.envs.arms.inverse_kinematics import descend, solve_planar
 from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position, transform
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, row_clearance, self_clearance
-from viapoint.envs.geometry.compiled import compiled, kernel
+from viapoint.envs.geometry.compiled import inlined, inner, kernel
 from viapoint.envs.geometry.obstacles import ABSENT
 from viapoint.envs.scenes.scene import NEVER, Scenes, way_since_start
 
@@ -63,6 +63,9 @@ class Draft(NamedTuple):
     n_places: Int  # Numbers of both, shape (N, 2)
     fixed: Bool  # True for starts and goals that are given, shape (N, 2)
     numbers: Float  # Uniform random numbers, shape (N, PAIRS, 2, :func:`numbers_of_end`)
+    joints: Float  # Shape (J,)
+    position: Float  # Shape (3,)
+    axes: Float  # Shape (3, 3)
     placed: Placed
     at_start: Placed
     at_goal: Placed
@@ -73,10 +76,10 @@ def numbers_of_end(joints: int) -> int:
     return 2 + TRIES * (8 + joints)
 
 
-@compiled
-def draw_ends(draft: Draft, which: Int) -> Bool:
-    """Draw starts and goals, and obstacles, of the scenes at K indices; return True for those that were found, (K,)."""
-    found = np.zeros(len(which), np.bool_)
+# Functions with one caller are compiled within it: handing over a draft costs seconds of compilation.
+@kernel
+def draw_ends(draft: Draft, which: Int, found: Bool) -> None:
+    """Draw starts, goals and obstacles of the scenes at K indices; set `found`, (K,), for those that were found."""
     for k in range(len(which)):
         scene = which[k]
         # Places in the plane are points: another attempt would be the same one.
@@ -87,10 +90,9 @@ def draw_ends(draft: Draft, which: Int) -> Bool:
             if _draw_pair(draft, scene, pair):
                 found[k] = True
                 break
-    return found
 
 
-@compiled
+@inlined
 def _unpack_rows(draft: Draft, scene: int) -> None:
     """Put the obstacles of a layout into a scene, at rest; the rows behind them become absent."""
     obstacles, rows = draft.scenes.obstacles, draft.rows[scene]  # pairs before may have left some out
@@ -102,21 +104,21 @@ def _unpack_rows(draft: Draft, scene: int) -> None:
         draft.scenes.turn_velocity[scene, row] = 0.0
         draft.scenes.reach[scene, row] = 0.0
         obstacles.velocity[scene, row] = 0.0
-        obstacles.centre[scene, row] = rows[row, 1:4]
-        obstacles.size[scene, row] = rows[row, 13:16]
         for axis in range(3):
-            obstacles.rotation[scene, row, axis] = rows[row, 4 + 3 * axis : 7 + 3 * axis]
+            obstacles.centre[scene, row, axis] = rows[row, 1 + axis]
+            obstacles.size[scene, row, axis] = rows[row, 13 + axis]
+            for column in range(3):
+                obstacles.rotation[scene, row, axis, column] = rows[row, 4 + 3 * axis + column]
 
 
-@compiled
+@inlined
 def _draw_pair(draft: Draft, scene: int, pair: int) -> bool:
     """Draw a start and a goal, and return True if they and the straight movement between them are as they must be."""
     start_given, goal_given = draft.fixed[scene]
     # The goal first: it is harder to find.
-    if not goal_given and not _draw_end(draft, scene, pair, 1):
-        return False
-    if not start_given and not _draw_end(draft, scene, pair, 0):
-        return False
+    for end in (1, 0):
+        if not draft.fixed[scene, end] and not _draw_end(draft, scene, pair, end):
+            return False
     start, goal = draft.scenes.start[scene], draft.scenes.goal[scene]
     exchange = not start_given and not goal_given and draft.n_places[scene, 0] == 0
     if exchange and draft.numbers[scene, pair, 0, 1] < EXCHANGED:
@@ -138,7 +140,7 @@ def _draw_pair(draft: Draft, scene: int, pair: int) -> bool:
     return what == BLOCKED or both_given
 
 
-@compiled
+@inlined
 def _draw_end(draft: Draft, scene: int, pair: int, end: int) -> bool:
     """Draw a start (end 0) or a goal (end 1), and return True if it is free."""
     setting = draft.setting
@@ -175,7 +177,7 @@ def _draw_end(draft: Draft, scene: int, pair: int, end: int) -> bool:
     return False
 
 
-@compiled
+@inner
 def is_end(draft: Draft, joints: Float) -> bool:
     """Return True if joints are within their inner ranges, and the arm, which is placed, is free of itself."""
     setting, placed = draft.setting, draft.placed
@@ -188,7 +190,7 @@ def is_end(draft: Draft, joints: Float) -> bool:
     return bool(self_clearance(setting.spheres, placed, margin, margin) >= margin)
 
 
-@kernel
+@inner
 def is_row_clear(
     draft: Draft, placed: Placed, scene: int, row: int, time: float, margin: float, link: int
 ) -> bool:
@@ -210,7 +212,7 @@ def is_row_clear(
     return bool(least >= margin)
 
 
-@compiled
+@inlined
 def _make_room(draft: Draft, scene: int) -> bool:
     """Leave out obstacles that touch an end, and those that are too many; return True if the others are enough.
 
@@ -236,20 +238,23 @@ def _make_room(draft: Draft, scene: int) -> bool:
         obstacles.kind[scene, row] = ABSENT
         if free:  # it moves to the first row that is left
             obstacles.kind[scene, count] = kind
-            obstacles.centre[scene, count] = obstacles.centre[scene, row]
-            obstacles.size[scene, count] = obstacles.size[scene, row]
-            obstacles.rotation[scene, count] = obstacles.rotation[scene, row]
+            for axis in range(3):
+                obstacles.centre[scene, count, axis] = obstacles.centre[scene, row, axis]
+                obstacles.size[scene, count, axis] = obstacles.size[scene, row, axis]
+                for column in range(3):
+                    turn = obstacles.rotation[scene, row, axis, column]
+                    obstacles.rotation[scene, count, axis, column] = turn
             count += 1
     return bool(keep == 0 or count == keep)
 
 
-@compiled
+@inlined
 def straight_movement(draft: Draft, scene: int) -> int:
     """Return what becomes of the straight movement: FREE, BLOCKED by an obstacle, or OUT_OF_REACH."""
     setting = draft.setting
     start = draft.scenes.start[scene]
     goal = draft.scenes.goal[scene]
-    placed, joints = draft.placed, np.empty(len(start))
+    placed, joints = draft.placed, draft.joints
     x, y, u, v = 0.0, 0.0, 0.0, 0.0
     if setting.of_hand:
         x, y, _ = tool_position(setting.chain, start, placed.rotation, placed.origin)
@@ -273,7 +278,7 @@ def straight_movement(draft: Draft, scene: int) -> int:
     return BLOCKED if blocked else FREE
 
 
-@compiled
+@kernel
 def _bit_reversed(number: int) -> float:
     """Return the k-th point of the sequence 1/2, 1/4, 3/4, 1/8, 5/8, ..., which soon finds what is in the way."""
     point, step = 0.0, 0.5
@@ -284,12 +289,12 @@ def _bit_reversed(number: int) -> float:
     return point
 
 
-@compiled
+@inlined
 def _reach(draft: Draft, scene: int, there: Float, numbers: Float, joints: Float) -> bool:
     """Solve for joint positions with the tool in a place, and return True if it gets there."""
     setting, placed = draft.setting, draft.placed
     across = there[6] * (2.0 * numbers[0] - 1.0), there[7] * (2.0 * numbers[1] - 1.0)
-    position, axes = np.empty(3), np.empty((3, 3))
+    position, axes = draft.position, draft.axes
     position[0] = there[0] + there[9] * across[0] - there[10] * across[1]
     position[1] = there[1] + there[10] * across[0] + there[9] * across[1]
     position[2] = there[2] + there[8] * (2.0 * numbers[2] - 1.0)
@@ -306,7 +311,7 @@ def _reach(draft: Draft, scene: int, there: Float, numbers: Float, joints: Float
     return bool(descend(chain, limits, position, axes, True, joints, rotation, origin) == 0.0)
 
 
-@compiled
+@inner
 def _seed(setting: Setting, position: Float, joints: Float) -> None:
     """Change joints between their limits into some near home, with the first one turned towards a position.
 
@@ -321,7 +326,7 @@ def _seed(setting: Setting, position: Float, joints: Float) -> None:
         joints[joint] = min(max(joints[joint], low), high)
 
 
-@compiled
+@inlined
 def _is_hand_clear(draft: Draft, scene: int, position: Float, axes: Float) -> bool:
     """Return True if the last link is free with the tool at a pose, which is known without inverse kinematics."""
     chain, spheres, placed = draft.setting.chain, draft.setting.spheres, draft.placed
@@ -346,7 +351,7 @@ def _is_hand_clear(draft: Draft, scene: int, position: Float, axes: Float) -> bo
     return clear
 
 
-@compiled
+@kernel
 def _tool_axes(approach: Float, cone: float, numbers: Float, axes: Float) -> None:
     """Fill in random axes of the tool, as columns, with the z axis in a cone around the approach."""
     x, y, z = approach
@@ -372,7 +377,7 @@ def _tool_axes(approach: Float, cone: float, numbers: Float, axes: Float) -> Non
         axes[row, 1] = c * second - s * first
 
 
-@compiled
+@kernel
 def _fill_frame(x: float, y: float, z: float, axes: Float) -> None:
     """Fill in axes, as columns, of which the third is a unit vector, and the first is horizontal."""
     level = np.sqrt(x * x + y * y)

@@ -114,7 +114,8 @@ class SceneSampler:
                     builds[i] = self._any_family(rng)
                 _write(draft, i, builds[i](rng, rooms[i]))
                 rng.random(out=draft.numbers[i])
-            found = draw_ends(draft, pending)
+            found = np.zeros(len(pending), np.bool_)
+            draw_ends(draft, pending, found)
             if self.viewpoint is not None:
                 obstacles = draft.scenes.obstacles.take(pending)
                 found &= point_clearances(obstacles, self.viewpoint) >= VIEW_MARGIN
@@ -149,6 +150,9 @@ class SceneSampler:
             n_places=np.zeros((number, 2), np.int64),
             fixed=fixed,
             numbers=np.zeros((number, PAIRS, 2, numbers_of_end(joints))),
+            joints=np.empty(joints),
+            position=np.empty(3),
+            axes=np.empty((3, 3)),
             placed=self._memories[0],
             at_start=self._memories[1],
             at_goal=self._memories[2],

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, place_group, self_clearance
-from viapoint.envs.geometry.compiled import compiled, kernel
+from viapoint.envs.geometry.compiled import compiled, inner, kernel
 from viapoint.envs.geometry.obstacles import ABSENT, KINDS, MESH, Obstacles, bounding_boxes
 from viapoint.envs.task import Task
 from viapoint.training.planning.movements import INSTANTS, Setting, memory_of
@@ -116,14 +116,14 @@ class Work(NamedTuple):
     local: Float  # Shape (3,), [m]
 
 
-@kernel
+@inner
 def _place(given: Given, b: int, h: int, instant: int, work: Work) -> bool:
     """Place the arm at an instant of a movement, and return True within reach and joint ranges."""
     position, joints, placed = work.position, work.joints, work.placed
     return bool(place_at(given.setting, given.moves, b, h, instant, position, joints, placed))
 
 
-@kernel
+@inner
 def _local(given: Given, b: int, row: int, point: Float, time: float, local: Float) -> None:
     """Fill in a point in the frame of an obstacle at a time, shape (3,), [m]."""
     obstacles = given.obstacles
@@ -147,7 +147,7 @@ def _gap(local: Float, half: Float, rounded: int) -> float:
     return distance
 
 
-@kernel
+@inner
 def _place_sphere(
     given: Given, b: int, h: int, row: int, group: int, sphere: int, instant: int, work: Work, local: Float
 ) -> bool:
@@ -160,7 +160,7 @@ def _place_sphere(
     return True
 
 
-@kernel
+@inner
 def _go_closest(
     given: Given,
     b: int,

@@ -31,7 +31,7 @@ from viapoint.envs.geometry.clearance import (
     self_clearance,
     travel,
 )
-from viapoint.envs.geometry.compiled import compiled, inlined, kernel
+from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import SHORTEST_DURATION
 from viapoint.envs.scenes.scene import CHORD
@@ -247,7 +247,7 @@ def _coefficients(durations: Float, coefficients: Float) -> None:
             coefficients[segment, 5, column] = 0.5 * fifth / t**5
 
 
-@kernel
+@inner
 def best_times(table: MovementTable, offsets: Float, gram: Float) -> tuple[int, float]:
     """Return the passage times of the least jerk cost, as an index of the table, and this cost in unit time.
 
@@ -280,7 +280,7 @@ def products(offsets: Float, gram: Float) -> None:
             gram[i, j] = total if i == j else 2.0 * total
 
 
-@kernel
+@inner
 def jerk_cost(table: MovementTable, times: int, gram: Float) -> float:
     """Return the jerk cost of a movement in unit time from the scalar products of its offsets."""
     cost = 0.0
@@ -290,7 +290,7 @@ def jerk_cost(table: MovementTable, times: int, gram: Float) -> float:
     return cost
 
 
-@kernel
+@inner
 def position_at(movement: Movement, instant: int, out: Float) -> None:
     """Fill in the position of a movement at an instant, shape (D,)."""
     basis, offsets = movement.table.basis, movement.offsets
@@ -301,7 +301,7 @@ def position_at(movement: Movement, instant: int, out: Float) -> None:
         out[d] = value
 
 
-@kernel
+@inner
 def joints_at(setting: Setting, movement: Movement, instant: int, position: Float, joints: Float) -> bool:
     """Fill in position, shape (D,), and joints, shape (J,), at an instant; return True within reach and ranges."""
     position_at(movement, instant, position)
@@ -323,7 +323,7 @@ def place_hand(position: Float, placed: Placed) -> None:
     placed.known[0] = True
 
 
-@kernel
+@inner
 def least_clearance(
     setting: Setting,
     movement: Movement,
@@ -383,7 +383,7 @@ def least_clearance(
     return least
 
 
-@kernel
+@inner
 def _bound_of_neighbours(
     setting: Setting, path: Float, bound: Float, instant: int, last: int, drift: float
 ) -> float:
@@ -407,7 +407,7 @@ def _bound_of_neighbours(
     return least
 
 
-@kernel
+@inner
 def shortest_duration(table: MovementTable, times: int, offsets: Float, rate_limit: Float) -> float:
     """Return the shortest duration of a movement of joints from rest that keeps velocity limits, shape (D,), [s]."""
     most = 0.0

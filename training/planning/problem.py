@@ -16,7 +16,7 @@ from viapoint.envs.arms.spheres import grouped
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, place
-from viapoint.envs.geometry.compiled import compiled, inlined, kernel
+from viapoint.envs.geometry.compiled import compiled, inlined, inner
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
 from viapoint.envs.plans import SHORTEST_DURATION
@@ -139,7 +139,7 @@ def movement_of(moves: Moves, b: int, h: int) -> Movement:
 _joints_at = inlined(joints_at.py_func)  # type: ignore[attr-defined]
 
 
-@kernel
+@inner
 def place_at(
     setting: Setting,
     moves: Moves,
@@ -280,7 +280,7 @@ def _expand(
     return every, times, duration, rough, relative, fast
 
 
-@kernel
+@inner
 def _place_vias(given: _Given, b: int, action: Float, offsets: Float) -> None:
     """Fill in the offsets of via-points and goal from the start."""
     _, vias, dimension = given.vias.shape
@@ -300,7 +300,7 @@ def _place_vias(given: _Given, b: int, action: Float, offsets: Float) -> None:
         offsets[vias, d] = given.goal[b, d] - start[d]
 
 
-@kernel
+@inner
 def _timed(
     table: MovementTable, offsets: Float, given: _Given, b: int, row: int, duration: float, gram: Float
 ) -> tuple[int, float]:

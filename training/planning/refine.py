@@ -26,7 +26,7 @@ from viapoint.envs.geometry.clearance import (
     nearest_spheres,
     place,
 )
-from viapoint.envs.geometry.compiled import compiled, kernel
+from viapoint.envs.geometry.compiled import compiled, inner, kernel
 from viapoint.envs.geometry.distance import point_distance, point_distance_and_normal
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.training.planning.movements import (
@@ -135,7 +135,7 @@ def _work(setting: Setting, columns: int, dimension: int, obstacles: Obstacles, 
     )
 
 
-@kernel
+@inner
 def _add_residual(setting: Setting, missing: float, work: _Work) -> None:
     """Add a residual, whose derivative by the joints is in `work.pull`, to those of an instant."""
     row, dimension = work.row, len(work.row)
@@ -162,7 +162,7 @@ def _add_residual(setting: Setting, missing: float, work: _Work) -> None:
                 work.square[i, j] += CONTACT_WEIGHT * row[i] * row[j]
 
 
-@kernel
+@inner
 def _pull(
     setting: Setting, work: _Work, sphere: int, link: int, x: float, y: float, z: float, sign: float
 ) -> None:
@@ -185,7 +185,7 @@ def _pull(
         work.pull[j] += sign * way
 
 
-@kernel
+@inner
 def _add_obstacles(
     setting: Setting, obstacles: Obstacles, scene: int, time: float, wanted: float, work: _Work
 ) -> tuple[float, float]:
@@ -228,7 +228,7 @@ def _add_obstacles(
     return total, nearest
 
 
-@kernel
+@inner
 def _add_own(setting: Setting, wanted: float, work: _Work) -> tuple[float, float]:
     """Add the residuals of the placed arm from itself; return their sum of squares, and the least clearance."""
     spheres, placed, total, nearest = setting.spheres, work.placed, 0.0, wanted
@@ -251,7 +251,7 @@ def _add_own(setting: Setting, wanted: float, work: _Work) -> tuple[float, float
     return total, nearest
 
 
-@kernel
+@inner
 def _add_ranges(setting: Setting, reached: bool, work: _Work) -> tuple[float, float]:
     """Add what is missing to the margin from the joint limits; return the sum of squares, and the least distance."""
     total, nearest, joints, limits = 0.0, RANGE_MARGIN, work.joints, setting.joint_range

@@ -12,7 +12,7 @@ import numpy as np
 from viapoint.envs.common.types import Bool, Float, Single
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.env import ReachEnv
-from viapoint.envs.geometry.compiled import compiled, kernel
+from viapoint.envs.geometry.compiled import compiled, inner
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import Plan
 from viapoint.envs.registration import check_registered
@@ -284,7 +284,7 @@ def plan_clearances(
     return np.asarray(_clearances(setting, moves, problem.obstacles, most, least))
 
 
-@kernel
+@inner
 def _clearance(
     setting: Setting,
     moves: Moves,
