@@ -18,7 +18,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.inverse_kinematics import in_planar_reach, planar_limits, solve_planar
+from viapoint.envs.arms.inverse_kinematics import (
+    in_planar_reach,
+    planar_limits,
+    solve_planar,
+    solve_symmetric,
+)
 from viapoint.envs.arms.kinematics import Chain, Spheres
 from viapoint.envs.common.types import Float, Int
 from viapoint.envs.geometry.clearance import (
@@ -203,15 +208,16 @@ def _coefficients(durations: Float, coefficients: Float) -> None:
     knots[segments, 0, 1] = 1.0
     knots[segments + 1, 0, 2] = 1.0
     if vias:
-        # Jerk times T^3 and snap times T^4 at the end of a segment, then at its begin, by x, vT and aT^2 at both ends.
+        # Negative snap times T^4 and jerk times T^3 at the end of a segment, then at its begin, by x, vT and aT^2 at
+        # both ends: the derivatives of the jerk cost by v and a, so that the matrix is symmetric.
         ends = np.array(
             [
-                [[-60.0, -24.0, -3.0, 60.0, -36.0, 9.0], [-360.0, -168.0, -24.0, 360.0, -192.0, 36.0]],
-                [[-60.0, -36.0, -9.0, 60.0, -24.0, 3.0], [360.0, 192.0, 36.0, -360.0, 168.0, -24.0]],
+                [[360.0, 168.0, 24.0, -360.0, 192.0, -36.0], [-60.0, -24.0, -3.0, 60.0, -36.0, 9.0]],
+                [[-360.0, -192.0, -36.0, 360.0, -168.0, 24.0], [-60.0, -36.0, -9.0, 60.0, -24.0, 3.0]],
             ]
         )
         matrix = np.zeros((2 * vias, 2 * vias))
-        right = np.zeros((2 * vias, columns))
+        right = np.zeros((columns, 2 * vias))
         for via in range(vias):
             for side in range(2):
                 segment = via + side
@@ -219,17 +225,18 @@ def _coefficients(durations: Float, coefficients: Float) -> None:
                 for row in range(2):
                     for part in range(6):
                         knot, order = segment + part // 3, part % 3
-                        weight = sign * ends[side, row, part] * length ** (order - 3 - row)
+                        weight = sign * ends[side, row, part] * length ** (order - 4 + row)
                         if order > 0 and 0 < knot < segments:
                             matrix[2 * via + row, 2 * (knot - 1) + order - 1] += weight
                         else:
                             for column in range(columns):
-                                right[2 * via + row, column] -= weight * knots[column, knot, order]
-        motion = np.linalg.solve(matrix, right)
-        for via in range(vias):
-            for column in range(columns):
-                knots[column, via + 1, 1] = motion[2 * via, column]
-                knots[column, via + 1, 2] = motion[2 * via + 1, column]
+                                right[column, 2 * via + row] -= weight * knots[column, knot, order]
+        for column in range(columns):
+            motion = right[column]
+            solve_symmetric(matrix.copy(), motion, 2 * vias)
+            for via in range(vias):
+                knots[column, via + 1, 1] = motion[2 * via]
+                knots[column, via + 1, 2] = motion[2 * via + 1]
     for segment in range(segments):
         t = durations[segment]
         for column in range(columns):

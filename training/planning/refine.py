@@ -26,7 +26,7 @@ from viapoint.envs.geometry.clearance import (
     nearest_spheres,
     place,
 )
-from viapoint.envs.geometry.compiled import compiled, inner, kernel
+from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel
 from viapoint.envs.geometry.distance import point_distance, point_distance_and_normal
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.training.planning.movements import (
@@ -355,6 +355,14 @@ def _assemble(
     return objective + CONTACT_WEIGHT * contact, nearest
 
 
+@kernel
+def _copy(source: Float, target: Float) -> None:
+    """Copy rows; for assignments of arrays Numba would compile messages about shapes, which takes seconds."""
+    for row in range(len(source)):
+        for column in range(source.shape[1]):
+            target[row, column] = source[row, column]
+
+
 @compiled
 def _refine(
     setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, aim: Aim, unit: float, work: _Work
@@ -400,7 +408,7 @@ def _refine(
         )
         if value < objective:
             done = objective - value < aim.gain * objective and nearest >= FREE
-            offsets[:vias] = trial[:vias]
+            _copy(trial[:vias], offsets)
             hessian, other_hessian = other_hessian, hessian
             gradient, other_gradient = other_gradient, gradient
             times, objective = other, value
@@ -460,13 +468,14 @@ def refine_seeds(
     # The refined movement, and the polished ones, each of which is smoother than the one before.
     stages = len(aims)
     offsets = np.empty((stages, vias + 3, dimension))
-    offsets[:, vias:] = fixed
+    for stage in range(stages):
+        _copy(fixed, offsets[stage, vias:])
     times = np.empty(stages, np.int64)
     trial = np.empty((vias + 3, dimension))
     free, tried = 0, 0
     for each in range(number):
         tried += 1
-        offsets[0, :vias] = seeds[each]
+        _copy(seeds[each], offsets[0])
         for aim in (aims[0], NARROW):
             movement = Movement(table, 0, start, offsets[0], duration)
             times[0] = _refine(setting, movement, obstacles, scene, aim, unit, work)
@@ -474,7 +483,7 @@ def refine_seeds(
             apart = _clearance(setting, movement, obstacles, scene, margin, NEARLY)
             if not NEARLY < apart < margin:
                 break
-        found.vias[each] = offsets[0, :vias]
+        _copy(offsets[0, :vias], found.vias[each])
         found.times[each] = times[0]
         if apart < margin:
             if apart >= 0.0:
@@ -487,14 +496,14 @@ def refine_seeds(
         for later in range(1, stages):
             if later > 1 and cost < smooth * unit:
                 break
-            trial[:] = offsets[stage]
+            _copy(offsets[stage], trial)
             movement = Movement(table, 0, start, trial, duration)
             other = _refine(setting, movement, obstacles, scene, aims[later], unit, work)
             _, less = best_times(table, trial, work.gram)
             movement = Movement(table, other, start, trial, duration)
             if less < cost and is_free(setting, movement, obstacles, scene, margin):
                 stage += 1
-                offsets[stage] = trial
+                _copy(trial, offsets[stage])
                 times[stage], cost = other, less
         while stage >= 0:
             movement = Movement(fine, times[stage], start, offsets[stage], duration)
@@ -504,7 +513,7 @@ def refine_seeds(
             stage -= 1
         if stage < 0:
             continue
-        found.vias[each] = offsets[stage, :vias]
+        _copy(offsets[stage, :vias], found.vias[each])
         found.times[each] = times[stage]
         found.clearance[each] = clearance
         _, found.cost[each] = best_times(table, offsets[stage], work.gram)
@@ -514,7 +523,7 @@ def refine_seeds(
     return tried, found
 
 
-@compiled
+@inlined
 def _clearance(
     setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, margin: float, floor: float
 ) -> float:
