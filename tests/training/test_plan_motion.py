@@ -221,6 +221,18 @@ def test_a_start_that_is_the_goal_is_a_plan() -> None:
         assert np.isfinite(plan.joints(100).torque).all()
 
 
+def test_short_movements_succeed_in_physics() -> None:
+    rng = np.random.default_rng(5)
+    low, high = PANDA.joint_range.T
+    starts = rng.uniform(low + 0.2, high - 0.2, (150, 7))
+    goals = starts + rng.uniform(0.003, 0.03, (150, 1)) * rng.normal(size=(150, 7))
+    plans = plan_motions(PANDA, starts, goals, [[]] * 150, time_limit=0.0)
+    good = [plan for plan in plans if plan.success]
+    outcome, _ = execute_plans(good)
+    assert len(good) > 100
+    assert outcome.is_success.all()
+
+
 def test_given_seeds_come_first() -> None:
     found = plan_motion(PANDA, PANDA.home, GOAL, [POST])
     again = plan_motion(PANDA, PANDA.home, GOAL, [POST], seeds=found.waypoints[None, 1:-1])

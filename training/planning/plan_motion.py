@@ -24,7 +24,7 @@ from viapoint.envs.common.validation import finite_array, number_of_at_least, wh
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape
-from viapoint.envs.plans import SHORTEST_DURATION, Plan, SpaceName
+from viapoint.envs.plans import Plan, SpaceName
 from viapoint.envs.scenes.options import Pose, as_pose
 from viapoint.envs.spaces import Space, space_of
 from viapoint.training.planning.motion_plan import Limits, MotionPlan, joint_motion
@@ -60,7 +60,8 @@ SEEDS = 256  # Greatest number of random seeds
 CHUNKS = 1, 1, 2, 4  # Numbers of seeds between two looks at the clock; the last one repeats
 LONGEST_SEARCH = 1.0  # Default of the time limit, [s]
 RANGE_TOLERANCE = 1e-6  # Way beyond a joint limit that counts as rounding, [rad]
-UNLIMITED = 0.85  # Shortest duration that is chosen for an arm without velocity limits, [s]
+# Shortest durations that are chosen: servos come to rest in time after them; for arms without velocity limits, [s]
+SHORTEST, UNLIMITED = 0.25, 0.85
 LIMIT_STRIDE = 4  # Step between the instants at which limits are looked at
 ROUNDS = 6  # Greatest number of times that a movement is planned again because it must take longer
 # Duration relative to that of the straight movement with which planning among moving obstacles begins
@@ -157,7 +158,8 @@ def plan_motion(
     The straight movement is taken if it is free. Otherwise via-points are refined by the gradient of clearance and jerk
     (see `training.planning.refine`), from the straight line first, and then from random seeds, until
     `enough` free movements are found. Each is checked at 256 instants and polished; the one with the least jerk is
-    taken. The duration is the shortest that keeps 97 % of the velocity and torque limits, if none is given.
+    taken. The duration is the shortest that keeps 97 % of the velocity and torque limits, 0.25 s or more, if none is
+    given.
 
     Args:
         arm: Arm, or name of one.
@@ -638,8 +640,8 @@ def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple
     motion = joint_motion(problem.space, position, velocity, acceleration)
     needed = slowdown(arm.chain, arm.velocity_limit, arm.torque_limit, *motion)
     factor = 1.0 if least is None else max(needed, least)
-    if least == 0.0:  # a start that is the goal needs a duration, too
-        shortest = SHORTEST_DURATION if np.isfinite(arm.velocity_limit).all() else UNLIMITED
+    if least == 0.0:
+        shortest = SHORTEST if np.isfinite(arm.velocity_limit).all() else UNLIMITED
         factor = max(factor, shortest / duration)
     rate = motion.velocity / factor
     change = motion.acceleration / factor**2
