@@ -269,9 +269,8 @@ def _load(
             "hold; give torque_limit"
         )
         torque = np.where(weak, WEIGHTS * weight, torque)
-    endless = []
-    if given["joint_range"] is None:
-        endless = [each for each in names if not whole.jnt_limited[whole.joint(each).id]]
+    limited = whole.jnt_limited[[whole.joint(each).id for each in names]].astype(bool)
+    endless = itertools.compress(names, ~limited & ~arm.chain.sliding)
     return replace(
         arm,
         excess=arm.excess + excess,

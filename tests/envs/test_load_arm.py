@@ -15,6 +15,7 @@ from viapoint.envs.arms import load
 from viapoint.envs.arms.choices import KNOWN_VELOCITIES, known_limits
 from viapoint.envs.arms.kinematics import forward, sphere_centres, torques
 from viapoint.envs.arms.load import load_arm
+from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import pack
 
@@ -264,6 +265,7 @@ def test_nothing_but_the_file_is_needed(arm):
     np.testing.assert_array_equal(alone.velocity_limit, 3.14)  # a well-known arm
     assert any(note.startswith("tool: 'hand'") for note in alone.notes)
     assert "shoulder_pan: -6.283 to 6.283 rad, at most 3.14 rad/s and 150 N m" in alone.report()
+    assert arm_of(UR5E) is arm_of(str(UR5E))
     searched = load_arm(UR5E)
     own = row_clearances(arm.chain, arm.spheres, searched.home[None], pack([[]]), 1.0)[1]
     assert own[0] > 0.0

@@ -211,6 +211,12 @@ def test_goals_of_continuous_joints_are_taken_modulo_a_turn() -> None:
     goal = arm.home + 0.5
     plan = plan_motion(arm, arm.home, goal + 2.0 * np.pi * np.array([1, -1, 0, 2, 0, 0]))
     assert np.allclose(plan.waypoints[-1], goal)
+    wide = load_arm(text, velocity_limit=3.0, home=arm.home, joint_range=[(-6.0, 6.0)] * 6)
+    assert wide.continuous == arm.joint_names
+    start = arm.home + 3.0 * np.eye(6)[0]
+    for each, way in ((wide, 2.0 * np.pi - 6.0), (arm, -6.0)):
+        end = plan_motion(each, start, start - 6.0 * np.eye(6)[0], time_limit=0.0).waypoints[-1]
+        assert np.allclose(end - start, way * np.eye(6)[0])
 
 
 def test_a_start_that_is_the_goal_is_a_plan() -> None:
@@ -314,6 +320,8 @@ def test_batches_name_the_problem() -> None:
         plan_motions(PANDA, [PANDA.home] * 2, [GOAL, GOAL[:3]], [[], []])
     with pytest.raises(ValueError, match="equally many"):
         plan_motions(PANDA, [PANDA.home] * 2, [GOAL], [[], []])
+    with pytest.raises(ValueError):
+        plan_motions(PANDA, [PANDA.home], [GOAL], [[]], threads=2.5)
 
 
 def test_a_batch_goes_on_after_a_pose_out_of_reach() -> None:

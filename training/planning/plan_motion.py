@@ -71,6 +71,7 @@ ROUNDING = 1e-6  # Rounding error of clearances, [m]
 # Required clearances of a path of OMPL in each attempt, until one can be made smooth, [m]
 OMPL_MARGINS = (0.010, 0.004, 0.001, 0.001)
 OMPL_PATIENCE = 1.0  # Time limit for each path of OMPL as a baseline, [s]
+TURN = 2.0 * np.pi  # [rad]
 GOALS = 8  # Greatest number of configurations that are tried for a pose
 
 
@@ -291,6 +292,8 @@ def plan_motions(
         [True, True]
     """
     arm = arm_of(arm)
+    if threads is not None:
+        whole_number("threads", threads, 1)
     if not len(starts) == len(goals) == len(obstacles):
         raise ValueError(
             f"starts, goals and obstacles must be equally many, got {len(starts)}, {len(goals)}, {len(obstacles)}"
@@ -408,10 +411,12 @@ def _goals(problem: _Problem, goal: Any) -> Float:
         )
     goals = finite_array("goal", goal if several else [goal], (None, len(problem.start)))
     if problem.arm.continuous and not problem.space.of_hand:
-        # The equivalent position that is nearest to the middle of the range.
+        # The equivalent position within the range that is nearest to the start.
         endless = np.isin(problem.arm.joint_names, problem.arm.continuous)
-        turns = np.round((goals - problem.arm.joint_range.mean(axis=1)) / (2.0 * np.pi))
-        goals = goals - 2.0 * np.pi * np.where(endless, turns, 0.0)
+        low, high = _setting(problem.arm, False).joint_range.T
+        turns = np.round((goals - problem.start) / TURN)
+        turns = np.clip(turns, np.ceil((goals - high) / TURN), np.floor((goals - low) / TURN))
+        goals = goals - TURN * np.where(endless, turns, 0.0)
     away = np.abs(goals - problem.start).max(axis=-1)
     # Copies are contiguous and writable, which compiled functions depend on.
     return np.array(goals[np.argsort(away, kind="stable")])
