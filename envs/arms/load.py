@@ -58,6 +58,7 @@ MIN_TOLERANCE, MAX_TOLERANCE = 0.005, 1.0  # Bounds of the tolerance of fitted c
 # Distance at home that capsules leave between bodies, as a share of that of the geoms, and at most, [m]
 LEFT_SHARE, LEFT_MOST = 0.25, 0.002
 LEAST_EXCESS = 0.001  # Excess of capsules below which they are not split, [m]
+SHORT = 1e-5  # Length of a capsule that is written as a sphere around it, [m]
 MIN_INERTIA = 1e-12  # Least principal moment of inertia of a body, [kg m^2]
 # Relative margin of the triangle inequality of principal moments; the text of a model keeps six digits
 INERTIA_MARGIN = 2e-5
@@ -165,6 +166,8 @@ def load_arm(
         "tolerance": number_of_at_least("tolerance", tolerance, MIN_TOLERANCE, MAX_TOLERANCE),
     }
     notes = list(urdf.notes)
+    for number, joint in enumerate(spec.joints):
+        joint.name = joint.name or f"unnamed_{number}"
     whole = _compiled(spec, notes)
     arguments = {**given, "name": name, "notes": notes, "urdf": urdf[2:]}
     known_as = f"{name} {spec.modelname}"
@@ -543,6 +546,12 @@ def _note_rest(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[int]
     some = [what for what, values in forces.items() if values.any()]
     if some:
         notes.append(f"left out of torques: {', '.join(some)}")
+    coupled = model.eq_obj1id[(model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (model.eq_active0 > 0)]
+    followers = ", ".join(itertools.compress(joints, np.isin(numbers, coupled)))
+    if followers:
+        notes.append(
+            f"{WARNING}{followers} follows another joint in the file, but not in plans; joints= without it fixes it"
+        )
 
 
 def _collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, list[int]]:
@@ -788,8 +797,10 @@ def _add_capsule(written: Any, model: mujoco.MjModel, capsule: FittedCapsule) ->
     """Add a capsule that covers a geom, or a part of it, to the body."""
     turn = frame_matrices(model.geom_quat[capsule.geom])
     first, second = model.geom_pos[capsule.geom] + capsule.ends @ turn.T
-    size = (capsule.radius, 0.0, 0.0)
-    if np.array_equal(capsule.ends[0], capsule.ends[1]):
-        written.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=first, size=size)
+    length = float(np.linalg.norm(second - first))
+    if length < SHORT:
+        size = (capsule.radius + 0.5 * length, 0.0, 0.0)
+        written.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=0.5 * (first + second), size=size)
     else:
+        size = (capsule.radius, 0.0, 0.0)
         written.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(*first, *second), size=size)

@@ -66,9 +66,12 @@ def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
             fault = "no geometry" if geometry is None else _prepared(geometry, path, packages, assets)
             if fault:
                 link.remove(collision)
-                notes.append(f"a collision geom of {link.get('name')} is left out: {fault}")
+                notes.append(f"{WARNING}a collision geom of {link.get('name')} is left out: {fault}")
     velocity = {}
     for joint in root.findall("joint"):
+        if joint.get("type") == "floating":  # MuJoCo has such joints of the first body only
+            joint.set("type", "fixed")
+            notes.append(f"fixed: {joint.get('name')}, which floats")
         limits = _limits(joint, notes)
         if limits.get("velocity", 0.0) > 0.0:
             velocity[joint.get("name", "")] = limits["velocity"]
@@ -169,7 +172,7 @@ def _prepared(
         element.set("filename", str(found.resolve()))
         if found.suffix.lower() == ".stl":
             content = found.read_bytes()
-            if content[:6] == b"solid ":
+            if content[:5].lower() == b"solid":
                 _add_text_stl(element, content, assets)
             elif not any(content[80:84]):  # the number of triangles
                 return f"there is no triangle in {found.name}"
@@ -178,7 +181,7 @@ def _prepared(
 
 def _add_text_stl(mesh: ET.Element, content: bytes, assets: dict[str, bytes]) -> None:
     """Add a mesh to assets as binary STL, which MuJoCo reads, if its file is text."""
-    corners = np.array(re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", content), "<f4").reshape(-1, 9)
+    corners = np.array(re.findall(rb"(?i)vertex\s+(\S+)\s+(\S+)\s+(\S+)", content), "<f4").reshape(-1, 9)
     if len(corners):  # many binary files begin like text
         facets = np.zeros(len(corners), [("normal", "<f4", 3), ("corners", "<f4", 9), ("spare", "<u2")])
         facets["corners"] = corners

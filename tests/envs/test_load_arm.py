@@ -286,6 +286,14 @@ def test_tools_are_sites_bodies_or_points(arm, tool, where):
     np.testing.assert_allclose(other.hand(HOME), expected, atol=1e-5)
 
 
+def test_joints_without_names_get_some_and_those_that_follow_others_are_told():
+    nameless = load_arm(re.sub(r'joint name="\w+"', "joint", near_arm(0.02)), **{**THREE, "joints": None})
+    assert nameless.joint_names == ("unnamed_0", "unnamed_1", "unnamed_2")
+    equality = '<equality><joint joint1="three" joint2="two" polycoef="0 -1 0 0 0"/></equality></mujoco>'
+    with pytest.warns(UserWarning, match="three follows"):
+        load_arm(near_arm(0.02).replace("</mujoco>", equality), **THREE)
+
+
 def test_damping_that_no_motor_could_overcome_is_left_out_and_told():
     with pytest.warns(UserWarning, match="damping"):
         arm = load_arm(near_arm(0.02).replace('name="two"', 'name="two" damping="1e11"'), **THREE)
@@ -508,6 +516,11 @@ def test_the_second_time_an_arm_comes_from_the_cache(cache, monkeypatch):
         ur5e(text.replace("0.1625", "0.1626"), **changes)
 
 
+def test_a_capsule_of_hardly_any_length_is_covered():
+    arm = load_arm(near_arm(0.02).replace('size="0.05"', 'type="capsule" size="0.05 1e-9"'), **THREE)
+    assert arm.spheres.radius.max() == pytest.approx(0.05)
+
+
 @pytest.mark.parametrize("fault", ["broken", "file", "shape"])
 def test_a_cache_that_cannot_be_used_is_ignored(fault, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -563,6 +576,9 @@ def test_a_visual_mesh_that_is_missing_is_left_out_and_one_that_collides_is_name
         load_arm(path)
 
 
+FLOATING = '<joint name="base_joint" type="floating"><parent link="odom"/><child link="base"/></joint>'
+
+
 def test_urdf_files_with_odd_parts_load(crane):
     trimesh.creation.box((0.1, 0.1, 0.1)).export(crane / "meshes" / "wrist.stl", file_type="stl_ascii")
     path = written(crane, "package://renamed_description/meshes/wrist.stl")
@@ -579,11 +595,16 @@ def test_urdf_files_with_odd_parts_load(crane):
         '</collision><collision><geometry><box size="0 0 0"/></geometry></collision></link>',
         1,
     )
+    text = text.replace('<link name="base">', '<link name="odom"/>' + FLOATING + '<link name="base">')
     path.write_text(text)
-    arm = load_arm(path)
+    stl = crane / "meshes" / "wrist.stl"
+    stl.write_bytes(stl.read_bytes().upper().replace(b"SOLID ", b"solid"))
+    with pytest.warns(UserWarning, match=r"boom\.dae"):
+        arm = load_arm(path)
+    assert arm.joint_names == ("lift", "turn", "tilt")
     assert "wrist" in arm.group_names
     assert "boom" not in arm.group_names
-    for told in ("inertia of boom", "its box has no size", "boom.dae"):
+    for told in ("fixed: base_joint", "inertia of boom", "its box has no size", "boom.dae"):
         assert any(told in note for note in arm.notes), told
 
 
