@@ -370,13 +370,16 @@ def test_nothing_thin_is_passed_through_between_two_instants() -> None:
             assert plan.clearance < -0.001
 
 
-def test_plans_are_executed_among_meshes_and_clouds() -> None:
+def test_plans_are_executed_among_all_shapes() -> None:
     points = np.random.default_rng(0).normal(0.0, 0.04, (30, 3))
     place = (0.5, 0.15, 0.4)
     for shape in (ConvexMesh.hull(points, position=place), PointCloud(points, 0.01, position=place)):
         plan = plan_motion(PANDA, PANDA.home, GOAL, [shape])
         assert plan.success
         assert plan.execute().is_success
+    low = (-0.05, 0.37, 0.0)
+    for shape in (Sphere(0.02, position=low), Capsule(0.02, 0.05, position=low), PointCloud([low], 0.02)):
+        assert plan_motion("planar", (-0.2, 0.3), (0.1, 0.4), [shape]).execute().is_success
     many = PointCloud(np.random.default_rng(0).uniform(-0.1, 0.1, (300, 3)), 0.01, position=(0.0, -0.8, 0.2))
     with pytest.raises(ValueError, match="at most 256"):
         plan_motion(PANDA, PANDA.home, GOAL, [many]).execute()
