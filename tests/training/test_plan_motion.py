@@ -324,6 +324,14 @@ def test_batches_name_the_problem() -> None:
         plan_motions(PANDA, [PANDA.home], [GOAL], [[]], threads=2.5)
 
 
+def test_problems_of_a_batch_share_no_generator(monkeypatch) -> None:
+    drawn_first = []
+    monkeypatch.setattr(module, "plan_motion", lambda *_, rng: drawn_first.append(rng.uniform()))
+    plan_motions(PANDA, [PANDA.home] * 2, [GOAL] * 2, [[]] * 2, threads=1, rng=np.random.default_rng(1))
+    children = np.random.default_rng(1).spawn(2)
+    assert drawn_first == [child.uniform() for child in children]
+
+
 def test_a_batch_goes_on_after_a_pose_out_of_reach() -> None:
     plans = plan_motions(PANDA, [PANDA.home] * 2, [Pose((2.0, 0.0, 0.5)), GOAL], [[], []])
     assert [plan.success for plan in plans] == [False, True]

@@ -280,7 +280,7 @@ def plan_motions(
         goals: N goals.
         obstacles: Obstacles of the N problems, each as :func:`plan_motion` takes them.
         threads: Number of threads; as many as the machine has processors by default.
-        **kwargs: Arguments of :func:`plan_motion`.
+        **kwargs: Arguments of :func:`plan_motion`; a random generator `rng` gives each problem one of its own.
 
     Raises:
         ValueError: The problems are not equally many, or an argument of one is not allowed; the message names it.
@@ -299,9 +299,15 @@ def plan_motions(
             f"starts, goals and obstacles must be equally many, got {len(starts)}, {len(goals)}, {len(obstacles)}"
         )
 
+    # Problems that shared a generator would depend on one another, and on the threads.
+    rng = kwargs.pop("rng", None)
+    rngs = rng.spawn(len(starts)) if isinstance(rng, np.random.Generator) else [rng] * len(starts)
+
     def plan(number: int) -> MotionPlan:
         try:
-            return plan_motion(arm, starts[number], goals[number], obstacles[number], **kwargs)
+            return plan_motion(
+                arm, starts[number], goals[number], obstacles[number], rng=rngs[number], **kwargs
+            )
         except UnreachableError as error:  # a fault of the problem, as a goal in contact is
             given = {name: value for name, value in kwargs.items() if name not in ("seeds", "time_limit")}
             nothing = plan_motion(
