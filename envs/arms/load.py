@@ -64,6 +64,8 @@ MIN_INERTIA = 1e-12  # Least principal moment of inertia of a body, [kg m^2]
 INERTIA_MARGIN = 2e-5
 # Transmissions of actuators that drive a joint directly
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+# Types of geoms that are left out
+GROUNDS = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 RESERVED = ("", "world", "meshes")  # Names that bodies of the arm cannot have, beside those of obstacles
 
 Pair = tuple[int, int]  # Numbers of two bodies, the first one first in the file
@@ -534,8 +536,8 @@ def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: li
 def _note_rest(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[int], notes: list[str]) -> None:
     """Note what the arm does not take from its file: planes, and forces of springs, dry friction and compensation."""
     collides = (model.geom_contype | model.geom_conaffinity) > 0
-    if (collides & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)).any():
-        notes.append("left out: planes of the file; a floor is an obstacle, HalfSpace")
+    if (collides & np.isin(model.geom_type, GROUNDS)).any():
+        notes.append("left out: planes and height fields of the file; a floor is an obstacle, HalfSpace")
     numbers = [model.joint(name).id for name in joints]
     dofs = model.jnt_dofadr[numbers]
     forces = {
@@ -555,9 +557,9 @@ def _note_rest(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[int]
 
 
 def _collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, list[int]]:
-    """Return the geoms of each body: those that collide, or all of a link of which none does; planes are left out."""
+    """Return the geoms of each body: those that collide, or all of a link of which none does; grounds are left out."""
     collides = (model.geom_contype | model.geom_conaffinity) > 0
-    solid = model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
+    solid = ~np.isin(model.geom_type, GROUNDS)
     found = {}
     for link in sorted(set(links.values())):
         bodies = [body for body in links if links[body] == link]

@@ -541,6 +541,7 @@ MOBILE = (
     '<geom size=".05" mass="2"/>'
 )
 WALL = '<body name="wall" pos="2 0 0"><geom type="box" size=".1 1 1"/></body></worldbody>'
+HILLS = '<asset><hfield name="hills" nrow="2" ncol="2" size="2 2 .1 .1"/></asset>'
 PINCH = gripper(2, "bar").replace("</body>", '<site name="pinch"/></body>', 1)
 
 
@@ -555,6 +556,7 @@ PINCH = gripper(2, "bar").replace("</body>", '<site name="pinch"/></body>', 1)
         ([(SHOULDER, MOBILE + SHOULDER), ("</body>\n  </worldbody>", "</body></body></worldbody>")], "fixed: turn, x"),
         ([(END, WALL)], "left out, not part of the arm: wall"),
         ([(END, f'<geom type="plane" size="1 1 1"/>{END}')], "left out: planes"),
+        ([("<worldbody>", f'{HILLS}<worldbody><geom type="hfield" hfield="hills"/>')], "left out: planes"),
     ],
 )  # fmt: skip
 def test_what_is_not_part_of_the_arm_is_fixed_or_left_out_and_told(changes, note):
