@@ -117,6 +117,8 @@ def test_given_duration_stays_or_fails() -> None:
     fast = plan_motion(PANDA, PANDA.home, GOAL, [POST], duration=0.3)
     assert not fast.success
     assert "limit" in fast.reason
+    weak = dataclasses.replace(PANDA, torque_limit=0.1 * PANDA.torque_limit)
+    assert "weight of the arm" in plan_motion(weak, PANDA.home, GOAL, time_limit=0.0).reason
 
 
 def test_ends_that_do_not_keep_the_margin_are_told() -> None:

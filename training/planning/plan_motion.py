@@ -665,6 +665,13 @@ def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple
         f"joint {worst!r} needs {max(limits):.2f} times its {kind} limit in {factor * duration:.2f} s; "
         f"the shortest duration is {needed * duration:.2f} s"
     )
+    if limits.torque > 1.0:
+        at_rest = np.abs(torques(arm.chain, motion.position, np.zeros(1), np.zeros(1))) / arm.torque_limit
+        if at_rest.max() > 1.0:
+            worst = arm.joint_names[int(at_rest.max(axis=0).argmax())]
+            beyond = (
+                f"joint {worst!r} needs {at_rest.max():.2f} times its torque limit for the weight of the arm"
+            )
     return factor * duration, limits, beyond
 
 
