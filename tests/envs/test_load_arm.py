@@ -435,12 +435,18 @@ def test_a_joint_without_limits_is_told(crane, limit):
 
 
 @pytest.mark.parametrize(
-    "limit", ['<limit lower="2" upper="1" effort', '<limit lower="low" upper="2" effort']
+    ("old", "new", "name"),
+    [
+        (LIMIT, '<limit lower="2" upper="1" effort', "tilt"),
+        (LIMIT, '<limit lower="low" upper="2" effort', "tilt"),
+        ('radius="0.04"', 'radius="thin"', "post"),
+        ('mass value="3"', 'mass value="heavy"', "post"),
+    ],
 )
-def test_impossible_limits_name_the_joint(crane, limit):
+def test_impossible_numbers_name_the_joint_or_link(crane, old, new, name):
     path = written(crane)
-    path.write_text(path.read_text().replace(LIMIT, limit))
-    with pytest.raises(ValueError, match="'tilt'"):
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(ValueError, match=f"'{name}'"):
         load_arm(path)
 
 
@@ -598,6 +604,7 @@ def test_urdf_files_with_odd_parts_load(crane):
         1,
     )
     text = text.replace('<link name="base">', '<link name="odom"/>' + FLOATING + '<link name="base">')
+    text = text.replace('<mass value="1"/>\n    <inertia ixx="0.1"', '<mass value="1"/><inertia ixx="nan"')
     path.write_text(text)
     stl = crane / "meshes" / "wrist.stl"
     stl.write_bytes(stl.read_bytes().upper().replace(b"SOLID ", b"solid"))
@@ -606,7 +613,14 @@ def test_urdf_files_with_odd_parts_load(crane):
     assert arm.joint_names == ("lift", "turn", "tilt")
     assert "wrist" in arm.group_names
     assert "boom" not in arm.group_names
-    for told in ("fixed: base_joint", "inertia of boom", "its box has no size", "boom.dae"):
+    for told in (
+        "fixed: base_joint",
+        "mass of base",
+        "inertia of boom",
+        "inertia of wrist",
+        "its box has no size",
+        "boom.dae",
+    ):
         assert any(told in note for note in arm.notes), told
 
 
