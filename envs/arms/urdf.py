@@ -153,8 +153,10 @@ def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
     """Replace an inertia that no body has by that of a ball of the same mass."""
     inertia = link.find("inertial/inertia")
     mass = link.find("inertial/mass")
-    if link.find("collision") is not None and (mass is None or float(mass.get("value", 0.0)) <= 0.0):
-        notes.append(f"mass of {link.get('name')}, which the file lacks: {COMPILER['boundmass']} kg")
+    if mass is None and link.find("collision") is not None:
+        notes.append(f"mass of {link.get('name')}, which the file lacks: that of its geoms, as if of water")
+    elif mass is not None and float(mass.get("value", 0.0)) <= 0.0:
+        notes.append(f"mass of {link.get('name')}, which is not positive: {COMPILER['boundmass']} kg")
     if inertia is None or mass is None:
         return
     entries = [float(inertia.get(name, 0.0)) for name in INERTIA]
