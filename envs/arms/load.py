@@ -106,7 +106,7 @@ def load_arm(
     tool: Any = None,
     joints: Sequence[str] | None = None,
     base: str | None = None,
-    packages: Sequence[str | Path] = (),
+    packages: str | Path | Sequence[str | Path] = (),
     name: str | None = None,
     home: Any = None,
     origin: Any = None,
@@ -128,7 +128,7 @@ def load_arm(
             name, or else the tip of the chain.
         joints: Names of the hinges and slides from the base to the tool, two or more; by default all of the chain.
         base: Body that the chain begins at; needed where a file has two arms.
-        packages: Folders for `package://` in a URDF; the folders above the file are always looked in.
+        packages: Folder or folders for `package://` in a URDF; the folders above the file are always looked in.
         name: Name of the arm; by default that of the file or the model.
         home: Home configuration, shape (J,); by default the file's first keyframe if it is free, or else one that is
             looked for.
@@ -152,7 +152,8 @@ def load_arm(
         >>> arm.joint_names[:3], arm.notes[0]
         (('shoulder_pan', 'shoulder_lift', 'elbow'), "tool: 'hand'")
     """
-    spec, own_name, urdf = _read(file, tuple(packages))
+    folders = (packages,) if isinstance(packages, str | Path) else tuple(packages)
+    spec, own_name, urdf = _read(file, folders)
     name = own_name if name is None else name
     if not isinstance(name, str) or not name:
         raise ValueError(f"name must be a string of one or more characters, got {name!r}")

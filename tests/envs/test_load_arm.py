@@ -473,7 +473,8 @@ def test_packages_are_looked_for_in_given_folders(crane, tmp_path):
     path.write_text(URDF.replace("MESH", "package://parts/meshes/wrist.obj"))
     (tmp_path / "store").mkdir()
     crane.rename(tmp_path / "store" / "parts")
-    assert load_arm(path, packages=[tmp_path / "store"]).joint_names == ("lift", "turn", "tilt")
+    for packages in ([tmp_path / "store"], tmp_path / "store", str(tmp_path / "store")):
+        assert load_arm(path, packages=packages).joint_names == ("lift", "turn", "tilt")
 
 
 def test_files_that_are_no_robot_are_refused(tmp_path):
