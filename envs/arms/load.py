@@ -58,11 +58,14 @@ MIN_TOLERANCE, MAX_TOLERANCE = 0.005, 1.0  # Bounds of the tolerance of fitted c
 # Distance at home that capsules leave between bodies, as a share of that of the geoms, and at most, [m]
 LEFT_SHARE, LEFT_MOST = 0.25, 0.002
 LEAST_EXCESS = 0.001  # Excess of capsules below which they are not split, [m]
+SHORT = 1e-5  # Length of a capsule that is written as a sphere around it, [m]
 MIN_INERTIA = 1e-12  # Least principal moment of inertia of a body, [kg m^2]
 # Relative margin of the triangle inequality of principal moments; the text of a model keeps six digits
 INERTIA_MARGIN = 2e-5
 # Transmissions of actuators that drive a joint directly
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+# Types of geoms that are left out
+GROUNDS = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 RESERVED = ("", "world", "meshes")  # Names that bodies of the arm cannot have, beside those of obstacles
 
 Pair = tuple[int, int]  # Numbers of two bodies, the first one first in the file
@@ -103,7 +106,7 @@ def load_arm(
     tool: Any = None,
     joints: Sequence[str] | None = None,
     base: str | None = None,
-    packages: Sequence[str | Path] = (),
+    packages: str | Path | Sequence[str | Path] = (),
     name: str | None = None,
     home: Any = None,
     origin: Any = None,
@@ -125,7 +128,7 @@ def load_arm(
             name, or else the tip of the chain.
         joints: Names of the hinges and slides from the base to the tool, two or more; by default all of the chain.
         base: Body that the chain begins at; needed where a file has two arms.
-        packages: Folders for `package://` in a URDF; the folders above the file are always looked in.
+        packages: Folder or folders for `package://` in a URDF; the folders above the file are always looked in.
         name: Name of the arm; by default that of the file or the model.
         home: Home configuration, shape (J,); by default the file's first keyframe if it is free, or else one that is
             looked for.
@@ -149,7 +152,8 @@ def load_arm(
         >>> arm.joint_names[:3], arm.notes[0]
         (('shoulder_pan', 'shoulder_lift', 'elbow'), "tool: 'hand'")
     """
-    spec, own_name, urdf = _read(file, tuple(packages))
+    folders = (packages,) if isinstance(packages, str | Path) else tuple(packages)
+    spec, own_name, urdf = _read(file, folders)
     name = own_name if name is None else name
     if not isinstance(name, str) or not name:
         raise ValueError(f"name must be a string of one or more characters, got {name!r}")
@@ -165,6 +169,8 @@ def load_arm(
         "tolerance": number_of_at_least("tolerance", tolerance, MIN_TOLERANCE, MAX_TOLERANCE),
     }
     notes = list(urdf.notes)
+    for number, joint in enumerate(spec.joints):
+        joint.name = joint.name or f"unnamed_{number}"
     whole = _compiled(spec, notes)
     arguments = {**given, "name": name, "notes": notes, "urdf": urdf[2:]}
     known_as = f"{name} {spec.modelname}"
@@ -269,9 +275,8 @@ def _load(
             "hold; give torque_limit"
         )
         torque = np.where(weak, WEIGHTS * weight, torque)
-    endless = []
-    if given["joint_range"] is None:
-        endless = [each for each in names if not whole.jnt_limited[whole.joint(each).id]]
+    limited = whole.jnt_limited[[whole.joint(each).id for each in names]].astype(bool)
+    endless = itertools.compress(names, ~limited & ~arm.chain.sliding)
     return replace(
         arm,
         excess=arm.excess + excess,
@@ -532,8 +537,8 @@ def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: li
 def _note_rest(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[int], notes: list[str]) -> None:
     """Note what the arm does not take from its file: planes, and forces of springs, dry friction and compensation."""
     collides = (model.geom_contype | model.geom_conaffinity) > 0
-    if (collides & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)).any():
-        notes.append("left out: planes of the file; a floor is an obstacle, HalfSpace")
+    if (collides & np.isin(model.geom_type, GROUNDS)).any():
+        notes.append("left out: planes and height fields of the file; a floor is an obstacle, HalfSpace")
     numbers = [model.joint(name).id for name in joints]
     dofs = model.jnt_dofadr[numbers]
     forces = {
@@ -544,12 +549,18 @@ def _note_rest(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[int]
     some = [what for what, values in forces.items() if values.any()]
     if some:
         notes.append(f"left out of torques: {', '.join(some)}")
+    coupled = model.eq_obj1id[(model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (model.eq_active0 > 0)]
+    followers = ", ".join(itertools.compress(joints, np.isin(numbers, coupled)))
+    if followers:
+        notes.append(
+            f"{WARNING}{followers} follows another joint in the file, but not in plans; joints= without it fixes it"
+        )
 
 
 def _collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, list[int]]:
-    """Return the geoms of each body: those that collide, or all of a link of which none does; planes are left out."""
+    """Return the geoms of each body: those that collide, or all of a link of which none does; grounds are left out."""
     collides = (model.geom_contype | model.geom_conaffinity) > 0
-    solid = model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
+    solid = ~np.isin(model.geom_type, GROUNDS)
     found = {}
     for link in sorted(set(links.values())):
         bodies = [body for body in links if links[body] == link]
@@ -789,8 +800,10 @@ def _add_capsule(written: Any, model: mujoco.MjModel, capsule: FittedCapsule) ->
     """Add a capsule that covers a geom, or a part of it, to the body."""
     turn = frame_matrices(model.geom_quat[capsule.geom])
     first, second = model.geom_pos[capsule.geom] + capsule.ends @ turn.T
-    size = (capsule.radius, 0.0, 0.0)
-    if np.array_equal(capsule.ends[0], capsule.ends[1]):
-        written.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=first, size=size)
+    length = float(np.linalg.norm(second - first))
+    if length < SHORT:
+        size = (capsule.radius + 0.5 * length, 0.0, 0.0)
+        written.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=0.5 * (first + second), size=size)
     else:
+        size = (capsule.radius, 0.0, 0.0)
         written.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(*first, *second), size=size)

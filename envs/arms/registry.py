@@ -95,6 +95,7 @@ def arm_of(arm: Any) -> Arm:
     """
     if isinstance(arm, Arm):
         return arm
+    arm = str(arm) if isinstance(arm, Path) else arm
     if isinstance(arm, str) and arm in _BUILT_IN:
         return _BUILT_IN[arm]()
     if isinstance(arm, str) and arm in _OWN:

@@ -58,17 +58,15 @@ def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
         for element in root.findall(name):
             root.remove(element)
     for link in root.findall("link"):
-        _mend_inertia(link, notes)
-        for visual in link.findall("visual"):
-            link.remove(visual)
-        for collision in link.findall("collision"):
-            geometry = collision.find("geometry")
-            fault = "no geometry" if geometry is None else _prepared(geometry, path, packages, assets)
-            if fault:
-                link.remove(collision)
-                notes.append(f"a collision geom of {link.get('name')} is left out: {fault}")
+        try:
+            _prepare_link(link, path, packages, assets, notes)
+        except ValueError as error:
+            raise ValueError(f"{path.name}, link {link.get('name')!r}: {error}") from None
     velocity = {}
     for joint in root.findall("joint"):
+        if joint.get("type") == "floating":  # MuJoCo has such joints of the first body only
+            joint.set("type", "fixed")
+            notes.append(f"fixed: {joint.get('name')}, which floats")
         limits = _limits(joint, notes)
         if limits.get("velocity", 0.0) > 0.0:
             velocity[joint.get("name", "")] = limits["velocity"]
@@ -132,14 +130,39 @@ def _limits(joint: ET.Element, notes: list[str]) -> dict[str, float]:
     return found
 
 
+def _prepare_link(
+    link: ET.Element,
+    path: Path,
+    packages: tuple[str | Path, ...],
+    assets: dict[str, bytes],
+    notes: list[str],
+) -> None:
+    """Mend the inertia of a link, and leave out its visual geoms and those for collisions that cannot be used."""
+    _mend_inertia(link, notes)
+    for visual in link.findall("visual"):
+        link.remove(visual)
+    for collision in link.findall("collision"):
+        geometry = collision.find("geometry")
+        fault = "no geometry" if geometry is None else _prepared(geometry, path, packages, assets)
+        if fault:
+            link.remove(collision)
+            notes.append(f"{WARNING}a collision geom of {link.get('name')} is left out: {fault}")
+
+
 def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
     """Replace an inertia that no body has by that of a ball of the same mass."""
     inertia = link.find("inertial/inertia")
     mass = link.find("inertial/mass")
+    if mass is None and link.find("collision") is not None:
+        notes.append(f"mass of {link.get('name')}, which the file lacks: that of its geoms, as if of water")
+    elif mass is not None and float(mass.get("value", 0.0)) <= 0.0:
+        notes.append(f"mass of {link.get('name')}, which is not positive: {COMPILER['boundmass']} kg")
     if inertia is None or mass is None:
         return
-    xx, xy, xz, yy, yz, zz = (float(inertia.get(name, 0.0)) for name in INERTIA)
-    if np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[0] < 0.0:
+    entries = [float(inertia.get(name, 0.0)) for name in INERTIA]
+    xx, xy, xz, yy, yz, zz = entries
+    matrix = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+    if not np.isfinite(entries).all() or np.linalg.eigvalsh(matrix)[0] < 0.0:
         moment = 0.4 * float(mass.get("value", 0.0)) * BALL**2
         inertia.attrib.update(
             dict.fromkeys(INERTIA, "0") | dict.fromkeys(("ixx", "iyy", "izz"), f"{moment:g}")
@@ -165,11 +188,11 @@ def _prepared(
             )
         found = next((place for place in _places(file, path, packages) if place.is_file()), None)
         if found is None:
-            raise ValueError(f"{path.name}: there is no file {file!r}; packages= names folders to look in")
+            raise ValueError(f"there is no file {file!r}; packages= names folders to look in")
         element.set("filename", str(found.resolve()))
         if found.suffix.lower() == ".stl":
             content = found.read_bytes()
-            if content[:6] == b"solid ":
+            if content[:5].lower() == b"solid":
                 _add_text_stl(element, content, assets)
             elif not any(content[80:84]):  # the number of triangles
                 return f"there is no triangle in {found.name}"
@@ -178,7 +201,7 @@ def _prepared(
 
 def _add_text_stl(mesh: ET.Element, content: bytes, assets: dict[str, bytes]) -> None:
     """Add a mesh to assets as binary STL, which MuJoCo reads, if its file is text."""
-    corners = np.array(re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", content), "<f4").reshape(-1, 9)
+    corners = np.array(re.findall(rb"(?i)vertex\s+(\S+)\s+(\S+)\s+(\S+)", content), "<f4").reshape(-1, 9)
     if len(corners):  # many binary files begin like text
         facets = np.zeros(len(corners), [("normal", "<f4", 3), ("corners", "<f4", 9), ("spare", "<u2")])
         facets["corners"] = corners

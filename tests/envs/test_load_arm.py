@@ -15,6 +15,7 @@ from viapoint.envs.arms import load
 from viapoint.envs.arms.choices import KNOWN_VELOCITIES, known_limits
 from viapoint.envs.arms.kinematics import forward, sphere_centres, torques
 from viapoint.envs.arms.load import load_arm
+from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import pack
 
@@ -264,6 +265,7 @@ def test_nothing_but_the_file_is_needed(arm):
     np.testing.assert_array_equal(alone.velocity_limit, 3.14)  # a well-known arm
     assert any(note.startswith("tool: 'hand'") for note in alone.notes)
     assert "shoulder_pan: -6.283 to 6.283 rad, at most 3.14 rad/s and 150 N m" in alone.report()
+    assert arm_of(UR5E) is arm_of(str(UR5E))
     searched = load_arm(UR5E)
     own = row_clearances(arm.chain, arm.spheres, searched.home[None], pack([[]]), 1.0)[1]
     assert own[0] > 0.0
@@ -282,6 +284,14 @@ def test_tools_are_sites_bodies_or_points(arm, tool, where):
     body = data.body("wrist_3")
     expected = arm.hand(HOME) if where is None else body.xpos + body.xmat.reshape(3, 3) @ where
     np.testing.assert_allclose(other.hand(HOME), expected, atol=1e-5)
+
+
+def test_joints_without_names_get_some_and_those_that_follow_others_are_told():
+    nameless = load_arm(re.sub(r'joint name="\w+"', "joint", near_arm(0.02)), **{**THREE, "joints": None})
+    assert nameless.joint_names == ("unnamed_0", "unnamed_1", "unnamed_2")
+    equality = '<equality><joint joint1="three" joint2="two" polycoef="0 -1 0 0 0"/></equality></mujoco>'
+    with pytest.warns(UserWarning, match="three follows"):
+        load_arm(near_arm(0.02).replace("</mujoco>", equality), **THREE)
 
 
 def test_damping_that_no_motor_could_overcome_is_left_out_and_told():
@@ -425,12 +435,18 @@ def test_a_joint_without_limits_is_told(crane, limit):
 
 
 @pytest.mark.parametrize(
-    "limit", ['<limit lower="2" upper="1" effort', '<limit lower="low" upper="2" effort']
+    ("old", "new", "name"),
+    [
+        (LIMIT, '<limit lower="2" upper="1" effort', "tilt"),
+        (LIMIT, '<limit lower="low" upper="2" effort', "tilt"),
+        ('radius="0.04"', 'radius="thin"', "post"),
+        ('mass value="3"', 'mass value="heavy"', "post"),
+    ],
 )
-def test_impossible_limits_name_the_joint(crane, limit):
+def test_impossible_numbers_name_the_joint_or_link(crane, old, new, name):
     path = written(crane)
-    path.write_text(path.read_text().replace(LIMIT, limit))
-    with pytest.raises(ValueError, match="'tilt'"):
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(ValueError, match=f"'{name}'"):
         load_arm(path)
 
 
@@ -457,7 +473,8 @@ def test_packages_are_looked_for_in_given_folders(crane, tmp_path):
     path.write_text(URDF.replace("MESH", "package://parts/meshes/wrist.obj"))
     (tmp_path / "store").mkdir()
     crane.rename(tmp_path / "store" / "parts")
-    assert load_arm(path, packages=[tmp_path / "store"]).joint_names == ("lift", "turn", "tilt")
+    for packages in ([tmp_path / "store"], tmp_path / "store", str(tmp_path / "store")):
+        assert load_arm(path, packages=packages).joint_names == ("lift", "turn", "tilt")
 
 
 def test_files_that_are_no_robot_are_refused(tmp_path):
@@ -506,6 +523,11 @@ def test_the_second_time_an_arm_comes_from_the_cache(cache, monkeypatch):
         ur5e(text.replace("0.1625", "0.1626"), **changes)
 
 
+def test_a_capsule_of_hardly_any_length_is_covered():
+    arm = load_arm(near_arm(0.02).replace('size="0.05"', 'type="capsule" size="0.05 1e-9"'), **THREE)
+    assert arm.spheres.radius.max() == pytest.approx(0.05)
+
+
 @pytest.mark.parametrize("fault", ["broken", "file", "shape"])
 def test_a_cache_that_cannot_be_used_is_ignored(fault, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -526,6 +548,7 @@ MOBILE = (
     '<geom size=".05" mass="2"/>'
 )
 WALL = '<body name="wall" pos="2 0 0"><geom type="box" size=".1 1 1"/></body></worldbody>'
+HILLS = '<asset><hfield name="hills" nrow="2" ncol="2" size="2 2 .1 .1"/></asset>'
 PINCH = gripper(2, "bar").replace("</body>", '<site name="pinch"/></body>', 1)
 
 
@@ -540,6 +563,7 @@ PINCH = gripper(2, "bar").replace("</body>", '<site name="pinch"/></body>', 1)
         ([(SHOULDER, MOBILE + SHOULDER), ("</body>\n  </worldbody>", "</body></body></worldbody>")], "fixed: turn, x"),
         ([(END, WALL)], "left out, not part of the arm: wall"),
         ([(END, f'<geom type="plane" size="1 1 1"/>{END}')], "left out: planes"),
+        ([("<worldbody>", f'{HILLS}<worldbody><geom type="hfield" hfield="hills"/>')], "left out: planes"),
     ],
 )  # fmt: skip
 def test_what_is_not_part_of_the_arm_is_fixed_or_left_out_and_told(changes, note):
@@ -561,6 +585,9 @@ def test_a_visual_mesh_that_is_missing_is_left_out_and_one_that_collides_is_name
         load_arm(path)
 
 
+FLOATING = '<joint name="base_joint" type="floating"><parent link="odom"/><child link="base"/></joint>'
+
+
 def test_urdf_files_with_odd_parts_load(crane):
     trimesh.creation.box((0.1, 0.1, 0.1)).export(crane / "meshes" / "wrist.stl", file_type="stl_ascii")
     path = written(crane, "package://renamed_description/meshes/wrist.stl")
@@ -577,11 +604,24 @@ def test_urdf_files_with_odd_parts_load(crane):
         '</collision><collision><geometry><box size="0 0 0"/></geometry></collision></link>',
         1,
     )
+    text = text.replace('<link name="base">', '<link name="odom"/>' + FLOATING + '<link name="base">')
+    text = text.replace('<mass value="1"/>\n    <inertia ixx="0.1"', '<mass value="1"/><inertia ixx="nan"')
     path.write_text(text)
-    arm = load_arm(path)
+    stl = crane / "meshes" / "wrist.stl"
+    stl.write_bytes(stl.read_bytes().upper().replace(b"SOLID ", b"solid"))
+    with pytest.warns(UserWarning, match=r"boom\.dae"):
+        arm = load_arm(path)
+    assert arm.joint_names == ("lift", "turn", "tilt")
     assert "wrist" in arm.group_names
     assert "boom" not in arm.group_names
-    for told in ("inertia of boom", "its box has no size", "boom.dae"):
+    for told in (
+        "fixed: base_joint",
+        "mass of base",
+        "inertia of boom",
+        "inertia of wrist",
+        "its box has no size",
+        "boom.dae",
+    ):
         assert any(told in note for note in arm.notes), told
 
 

@@ -117,6 +117,8 @@ def test_given_duration_stays_or_fails() -> None:
     fast = plan_motion(PANDA, PANDA.home, GOAL, [POST], duration=0.3)
     assert not fast.success
     assert "limit" in fast.reason
+    weak = dataclasses.replace(PANDA, torque_limit=0.1 * PANDA.torque_limit)
+    assert "weight of the arm" in plan_motion(weak, PANDA.home, GOAL, time_limit=0.0).reason
 
 
 def test_ends_that_do_not_keep_the_margin_are_told() -> None:
@@ -211,6 +213,12 @@ def test_goals_of_continuous_joints_are_taken_modulo_a_turn() -> None:
     goal = arm.home + 0.5
     plan = plan_motion(arm, arm.home, goal + 2.0 * np.pi * np.array([1, -1, 0, 2, 0, 0]))
     assert np.allclose(plan.waypoints[-1], goal)
+    wide = load_arm(text, velocity_limit=3.0, home=arm.home, joint_range=[(-6.0, 6.0)] * 6)
+    assert wide.continuous == arm.joint_names
+    start = arm.home + 3.0 * np.eye(6)[0]
+    for each, way in ((wide, 2.0 * np.pi - 6.0), (arm, -6.0)):
+        end = plan_motion(each, start, start - 6.0 * np.eye(6)[0], time_limit=0.0).waypoints[-1]
+        assert np.allclose(end - start, way * np.eye(6)[0])
 
 
 def test_a_start_that_is_the_goal_is_a_plan() -> None:
@@ -219,6 +227,18 @@ def test_a_start_that_is_the_goal_is_a_plan() -> None:
         assert plan.success
         assert plan.duration > 0.0
         assert np.isfinite(plan.joints(100).torque).all()
+
+
+def test_short_movements_succeed_in_physics() -> None:
+    rng = np.random.default_rng(5)
+    low, high = PANDA.joint_range.T
+    starts = rng.uniform(low + 0.2, high - 0.2, (150, 7))
+    goals = starts + rng.uniform(0.003, 0.03, (150, 1)) * rng.normal(size=(150, 7))
+    plans = plan_motions(PANDA, starts, goals, [[]] * 150, time_limit=0.0)
+    good = [plan for plan in plans if plan.success]
+    outcome, _ = execute_plans(good)
+    assert len(good) > 100
+    assert outcome.is_success.all()
 
 
 def test_given_seeds_come_first() -> None:
@@ -302,6 +322,16 @@ def test_batches_name_the_problem() -> None:
         plan_motions(PANDA, [PANDA.home] * 2, [GOAL, GOAL[:3]], [[], []])
     with pytest.raises(ValueError, match="equally many"):
         plan_motions(PANDA, [PANDA.home] * 2, [GOAL], [[], []])
+    with pytest.raises(ValueError):
+        plan_motions(PANDA, [PANDA.home], [GOAL], [[]], threads=2.5)
+
+
+def test_problems_of_a_batch_share_no_generator(monkeypatch) -> None:
+    drawn_first = []
+    monkeypatch.setattr(module, "plan_motion", lambda *_, rng: drawn_first.append(rng.uniform()))
+    plan_motions(PANDA, [PANDA.home] * 2, [GOAL] * 2, [[]] * 2, threads=1, rng=np.random.default_rng(1))
+    children = np.random.default_rng(1).spawn(2)
+    assert drawn_first == [child.uniform() for child in children]
 
 
 def test_a_batch_goes_on_after_a_pose_out_of_reach() -> None:
@@ -350,13 +380,16 @@ def test_nothing_thin_is_passed_through_between_two_instants() -> None:
             assert plan.clearance < -0.001
 
 
-def test_plans_are_executed_among_meshes_and_clouds() -> None:
+def test_plans_are_executed_among_all_shapes() -> None:
     points = np.random.default_rng(0).normal(0.0, 0.04, (30, 3))
     place = (0.5, 0.15, 0.4)
     for shape in (ConvexMesh.hull(points, position=place), PointCloud(points, 0.01, position=place)):
         plan = plan_motion(PANDA, PANDA.home, GOAL, [shape])
         assert plan.success
         assert plan.execute().is_success
+    low = (-0.05, 0.37, 0.0)
+    for shape in (Sphere(0.02, position=low), Capsule(0.02, 0.05, position=low), PointCloud([low], 0.02)):
+        assert plan_motion("planar", (-0.2, 0.3), (0.1, 0.4), [shape]).execute().is_success
     many = PointCloud(np.random.default_rng(0).uniform(-0.1, 0.1, (300, 3)), 0.01, position=(0.0, -0.8, 0.2))
     with pytest.raises(ValueError, match="at most 256"):
         plan_motion(PANDA, PANDA.home, GOAL, [many]).execute()

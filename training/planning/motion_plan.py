@@ -243,8 +243,6 @@ def _episodes(
     arm: Arm, space: SpaceName, n_via: int, rows: int, number: int, meshes: tuple[str, ...]
 ) -> Episodes:
     """Return simulations of an arm among up to some obstacles, which may be some registered meshes."""
-    shapes = None
-    if meshes:
-        shapes = (*KINDS[:MESH], *meshes)
+    shapes = (*KINDS[:MESH], *meshes)
     task = Task.of(arm=arm, space=space, n_via=n_via, n_obstacles=(0, rows), shapes=shapes)
     return Episodes(task, number)

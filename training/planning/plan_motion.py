@@ -24,7 +24,7 @@ from viapoint.envs.common.validation import finite_array, number_of_at_least, wh
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape
-from viapoint.envs.plans import SHORTEST_DURATION, Plan, SpaceName
+from viapoint.envs.plans import Plan, SpaceName
 from viapoint.envs.scenes.options import Pose, as_pose
 from viapoint.envs.spaces import Space, space_of
 from viapoint.training.planning.motion_plan import Limits, MotionPlan, joint_motion
@@ -60,7 +60,8 @@ SEEDS = 256  # Greatest number of random seeds
 CHUNKS = 1, 1, 2, 4  # Numbers of seeds between two looks at the clock; the last one repeats
 LONGEST_SEARCH = 1.0  # Default of the time limit, [s]
 RANGE_TOLERANCE = 1e-6  # Way beyond a joint limit that counts as rounding, [rad]
-UNLIMITED = 0.85  # Shortest duration that is chosen for an arm without velocity limits, [s]
+# Shortest durations that are chosen: servos come to rest in time after them; for arms without velocity limits, [s]
+SHORTEST, UNLIMITED = 0.25, 0.85
 LIMIT_STRIDE = 4  # Step between the instants at which limits are looked at
 ROUNDS = 6  # Greatest number of times that a movement is planned again because it must take longer
 # Duration relative to that of the straight movement with which planning among moving obstacles begins
@@ -70,6 +71,7 @@ ROUNDING = 1e-6  # Rounding error of clearances, [m]
 # Required clearances of a path of OMPL in each attempt, until one can be made smooth, [m]
 OMPL_MARGINS = (0.010, 0.004, 0.001, 0.001)
 OMPL_PATIENCE = 1.0  # Time limit for each path of OMPL as a baseline, [s]
+TURN = 2.0 * np.pi  # [rad]
 GOALS = 8  # Greatest number of configurations that are tried for a pose
 
 
@@ -157,7 +159,8 @@ def plan_motion(
     The straight movement is taken if it is free. Otherwise via-points are refined by the gradient of clearance and jerk
     (see `training.planning.refine`), from the straight line first, and then from random seeds, until
     `enough` free movements are found. Each is checked at 256 instants and polished; the one with the least jerk is
-    taken. The duration is the shortest that keeps 97 % of the velocity and torque limits, if none is given.
+    taken. The duration is the shortest that keeps 97 % of the velocity and torque limits, 0.25 s or more, if none is
+    given.
 
     Args:
         arm: Arm, or name of one.
@@ -277,7 +280,7 @@ def plan_motions(
         goals: N goals.
         obstacles: Obstacles of the N problems, each as :func:`plan_motion` takes them.
         threads: Number of threads; as many as the machine has processors by default.
-        **kwargs: Arguments of :func:`plan_motion`.
+        **kwargs: Arguments of :func:`plan_motion`; a random generator `rng` gives each problem one of its own.
 
     Raises:
         ValueError: The problems are not equally many, or an argument of one is not allowed; the message names it.
@@ -289,14 +292,22 @@ def plan_motions(
         [True, True]
     """
     arm = arm_of(arm)
+    if threads is not None:
+        whole_number("threads", threads, 1)
     if not len(starts) == len(goals) == len(obstacles):
         raise ValueError(
             f"starts, goals and obstacles must be equally many, got {len(starts)}, {len(goals)}, {len(obstacles)}"
         )
 
+    # Problems that shared a generator would depend on one another, and on the threads.
+    rng = kwargs.pop("rng", None)
+    rngs = rng.spawn(len(starts)) if isinstance(rng, np.random.Generator) else [rng] * len(starts)
+
     def plan(number: int) -> MotionPlan:
         try:
-            return plan_motion(arm, starts[number], goals[number], obstacles[number], **kwargs)
+            return plan_motion(
+                arm, starts[number], goals[number], obstacles[number], rng=rngs[number], **kwargs
+            )
         except UnreachableError as error:  # a fault of the problem, as a goal in contact is
             given = {name: value for name, value in kwargs.items() if name not in ("seeds", "time_limit")}
             nothing = plan_motion(
@@ -406,10 +417,12 @@ def _goals(problem: _Problem, goal: Any) -> Float:
         )
     goals = finite_array("goal", goal if several else [goal], (None, len(problem.start)))
     if problem.arm.continuous and not problem.space.of_hand:
-        # The equivalent position that is nearest to the middle of the range.
+        # The equivalent position within the range that is nearest to the start.
         endless = np.isin(problem.arm.joint_names, problem.arm.continuous)
-        turns = np.round((goals - problem.arm.joint_range.mean(axis=1)) / (2.0 * np.pi))
-        goals = goals - 2.0 * np.pi * np.where(endless, turns, 0.0)
+        low, high = _setting(problem.arm, False).joint_range.T
+        turns = np.round((goals - problem.start) / TURN)
+        turns = np.clip(turns, np.ceil((goals - high) / TURN), np.floor((goals - low) / TURN))
+        goals = goals - TURN * np.where(endless, turns, 0.0)
     away = np.abs(goals - problem.start).max(axis=-1)
     # Copies are contiguous and writable, which compiled functions depend on.
     return np.array(goals[np.argsort(away, kind="stable")])
@@ -638,8 +651,8 @@ def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple
     motion = joint_motion(problem.space, position, velocity, acceleration)
     needed = slowdown(arm.chain, arm.velocity_limit, arm.torque_limit, *motion)
     factor = 1.0 if least is None else max(needed, least)
-    if least == 0.0:  # a start that is the goal needs a duration, too
-        shortest = SHORTEST_DURATION if np.isfinite(arm.velocity_limit).all() else UNLIMITED
+    if least == 0.0:
+        shortest = SHORTEST if np.isfinite(arm.velocity_limit).all() else UNLIMITED
         factor = max(factor, shortest / duration)
     rate = motion.velocity / factor
     change = motion.acceleration / factor**2
@@ -652,6 +665,13 @@ def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple
         f"joint {worst!r} needs {max(limits):.2f} times its {kind} limit in {factor * duration:.2f} s; "
         f"the shortest duration is {needed * duration:.2f} s"
     )
+    if limits.torque > 1.0:
+        at_rest = np.abs(torques(arm.chain, motion.position, np.zeros(1), np.zeros(1))) / arm.torque_limit
+        if at_rest.max() > 1.0:
+            worst = arm.joint_names[int(at_rest.max(axis=0).argmax())]
+            beyond = (
+                f"joint {worst!r} needs {at_rest.max():.2f} times its torque limit for the weight of the arm"
+            )
     return factor * duration, limits, beyond
 
 
