@@ -8,7 +8,9 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import FlattenObservation, NormalizeObservation, RescaleAction
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from viapoint.envs import Sphere, Task, scene_from_json
@@ -234,6 +236,9 @@ CALLS = [
     lambda: evaluate(baselines=["straight"]),
     lambda: evaluate(env=ENV, baselines=["untrained"]),
     lambda: evaluate("nowhere"),
+    *(lambda wrap=wrap: evaluate(SAC("MlpPolicy", NormalizeObservation(wrap(FlattenObservation(gym.make(ENV))))))
+      for wrap in (lambda env: env, Monitor)),
+    lambda: evaluate(SAC("MultiInputPolicy", RescaleAction(gym.make(ENV), np.float32(0), np.float32(1)))),
     lambda: evaluate(ENV, baselines="straight"),
     lambda: evaluate(ENV, checks=[0, 1.5]),
     lambda: evaluate(ENV, n_scenes=0),

@@ -46,6 +46,11 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
         raise ValueError(
             f"the environment must be one of this package, made by its id, got {inner if spec is None else spec.id}"
         )
+    for wrapper in (gym.ObservationWrapper, gym.ActionWrapper):
+        if any(inner.env_is_wrapped(wrapper, [0])):
+            raise ValueError(
+                f"the environment must have no {wrapper.__name__}: models know it by its id alone"
+            )
     usual = gym.spec(spec.id).kwargs
     return spec.id, {
         name: value
