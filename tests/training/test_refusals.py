@@ -49,6 +49,7 @@ ENV, REACH, STEP = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarReach", "PlanarObstaclesStep")
 )
 MOVING, SENSED = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarSensed-v0"
+CHANGING = MOVING, "viapoint/PlanarTargetJump-v0"
 STALLING = {"stop_when_stalled": 0.3}
 
 CONFIGURATIONS = [
@@ -275,6 +276,9 @@ CALLS = [
     *(lambda text=text: scene_from_json(text) for text in ("{", b"\xff\xfe", "[" * 100_000, "1" * (2 << 20))),
     lambda: load(Path("tests")),
     lambda: scenes_for("tests", Task.of()),
+    *(lambda env_id=env_id: scenes_for(shipped_path("validation", env_id), Task.of()) for env_id in CHANGING),
+    *(lambda name=name: evaluate(env=ENV, baselines=["straight"], scenes=load(shipped_path("test", name)))
+      for name in ("viapoint/PandaObstacles-v0", *CHANGING)),
     lambda: scenes_for("hard", Task.of(n_obstacles=3)),
     lambda: scenes_for(shipped_path("test", ENV), Task.of(n_obstacles=1)),
     lambda: scenes_for(shipped_path("test", ENV), Task.of(arm="panda")),
