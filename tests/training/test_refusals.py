@@ -11,7 +11,7 @@ import pytest
 from gymnasium.wrappers import FlattenObservation, NormalizeObservation, RescaleAction
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecExtractDictObs, VecNormalize
 
 from viapoint.envs import Sphere, Task, scene_from_json
 from viapoint.training import evaluate, load_agent
@@ -239,6 +239,7 @@ CALLS = [
     lambda: evaluate("nowhere"),
     *(lambda wrap=wrap: evaluate(SAC("MlpPolicy", NormalizeObservation(wrap(FlattenObservation(gym.make(ENV))))))
       for wrap in (lambda env: env, Monitor)),
+    lambda: evaluate(SAC("MlpPolicy", VecExtractDictObs(ViaVecEnv(ENV, 2), "goal"))),
     lambda: evaluate(SAC("MultiInputPolicy", RescaleAction(gym.make(ENV), np.float32(0), np.float32(1)))),
     lambda: evaluate(ENV, baselines="straight"),
     lambda: evaluate(ENV, checks=[0, 1.5]),

@@ -37,6 +37,10 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
         ValueError: The environment is another one.
     """
     inner = env.unwrapped if env is not None else None
+    if env is not None and env.observation_space != env.unwrapped.observation_space:
+        raise ValueError(
+            f"{type(env).__name__} changes observations: models know an environment by its id alone"
+        )
     if isinstance(inner, ViaVecEnv):
         return inner.env_id, dict(inner.env_kwargs)
     if inner is None:
