@@ -12,7 +12,7 @@ from gymnasium.utils import EzPickle
 from gymnasium.wrappers import RecordVideo
 
 from viapoint.envs.common.types import Observation
-from viapoint.envs.common.validation import as_given
+from viapoint.envs.common.validation import as_given, finite_array
 from viapoint.envs.episodes import History
 from viapoint.envs.outcome import Rollout
 from viapoint.envs.plans import Plan
@@ -89,6 +89,8 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         """
         if self._over:
             raise gym.error.ResetNeeded("the episode is over or has not begun: call reset() before step()")
+        names = self.batch.action_names
+        action = finite_array(f"action ({', '.join(names)})", action, (len(names),))
         decision = self.batch.execute_actions([action])
         terminated = bool(decision.terminated[0])
         truncated = bool(decision.truncated[0])

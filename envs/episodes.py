@@ -227,8 +227,10 @@ class Episodes:
         begin = state.steps.copy()
         self._adopt(plan, np.flatnonzero(revised))
         step, event, final = self._events(self.plan, self._began, begin, scenes, self.goals, self.looks)
-        last = np.where(state.reachable & active, step, begin)
-        self._run_until(last)
+        self._run_until(np.where(state.reachable & active, step, begin), self._references)
+        rows = np.flatnonzero(state.steps > begin)
+        times = self.simulator.timestep * (np.stack((begin, state.steps)) - self._began)[:, rows]
+        state.jerk_cost[rows] += jerk_cost_between(take(self._movements, rows), times[0], times[1])
         return self._decision(before, begin, first, final, event)
 
     def _adopt(self, plan: Plan, rows: Int) -> None:
@@ -298,21 +300,16 @@ class Episodes:
         needed = slowdowns(arm.chain, arm.velocity_limit, arm.torque_limit, *space.joint_motion(some))
         return needed, inside
 
-    def _run_until(self, last: Int) -> None:
+    def _run_until(self, last: Int, references: References) -> None:
         """Run the episodes until a physics step each; obstacles keep their velocity in every piece of it."""
-        state, timestep = self.executor.state, self.simulator.timestep
+        state = self.executor.state
         turns = self._events.steps(self.scenes.course_times())
         while True:
             rows = np.flatnonzero((state.steps < last) & ~state.collision & ~state.unstable)
             if not rows.size:
                 return
             now = state.steps[rows]
-            self._run(rows, np.minimum(last[rows], next_step(turns[rows], now)) - now, self._references)
-            movements, began = take(self._movements, rows), self._began[rows]
-            done = state.steps[rows] - began
-            begin = np.asarray((now - began) * timestep)
-            end = np.asarray(done * timestep)
-            state.jerk_cost[rows] += jerk_cost_between(movements, begin, end)
+            self._run(rows, np.minimum(last[rows], next_step(turns[rows], now)) - now, references)
 
     def _run(self, rows: Int, steps: Int, references: References) -> None:
         """Execute references in some episodes for a number of physics steps each, shape (n,)."""
@@ -341,15 +338,18 @@ class Episodes:
         number = steering.physics_steps
         ahead = steering.follow(self._motion, velocity, number)
         state.reachable[:] = task.space.inside(ahead.position).all(axis=-1)
-        rows = np.flatnonzero(state.reachable & active)
+
+        def references(some: Int, count: int) -> Motion:
+            since = state.steps[some] - begin[some]
+            motion = steering.follow(take(self._motion, some), velocity[some], int(since.max()) + count)
+            steps = since[:, None] + np.arange(count + 1)
+            return Motion(*(part[np.arange(len(some))[:, None], steps] for part in motion))
+
+        moves = state.reachable & active
+        rows = np.flatnonzero(moves)
+        self._run_until(np.where(moves, begin + number, begin), references)
         if rows.size:
-            motion = take(self._motion, rows)
-
-            def references(some: Int, count: int) -> Motion:
-                return steering.follow(take(self._motion, some), velocity[some], count)
-
-            self._run(rows, np.full(len(rows), number), references)
-            state.jerk_cost[rows] += steering.jerk_cost(motion, velocity[rows])
+            state.jerk_cost[rows] += steering.jerk_cost(take(self._motion, rows), velocity[rows])
             put(self._motion, rows, Motion(*(part[rows, -1] for part in ahead)))
         self.begun[:] = True
         jumps = self._events.steps(self.scenes.jump_times)

@@ -217,10 +217,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             raise ValueError(f"options must be a mapping from names to values, or None, got {options!r}")
         options = dict(options or {})
         for name in ("jumps", "turns", "reaches"):
-            if name in options and not self.task.replanning:
+            if name in options and self.task.whole_movement:
                 raise ValueError(
-                    f"options[{name!r}] need an environment with decide_at=('target', ...), which are events of a "
-                    f"movement; here it is {self.task.decide_at!r}"
+                    f"options[{name!r}] need several decisions, such as decide_at=('target',), got "
+                    f"{self.task.decide_at!r}"
                 )
         rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self._running)
         generators, first_seed = self._seeded(seed, rows)

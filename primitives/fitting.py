@@ -174,6 +174,8 @@ def fit_via_points(
         ([[0.15, 0.2]], [0.5], 0.001)
     """
     counts = _counts(n_via)
+    if not isinstance(free_ends, bool | np.bool_):
+        raise ValueError(f"free_ends must be True or False, got {free_ends!r}")
     movements, batch, kind = _recordings(time, position, 2 * counts[-1] + 5)
     fits = []
     for times, positions in movements:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Int
 from viapoint.envs.geometry.obstacles import KINDS, MESH, no_obstacles
-from viapoint.envs.scenes.scene import Scenes, resting
+from viapoint.envs.scenes.scene import NEVER, Scenes, check_scenes, resting
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import COURSES, Task
 
@@ -226,18 +226,18 @@ def drawn(name: str, task: Task, number: int) -> FrozenScenes:
     return FrozenScenes(name="drawn", task=task.as_dict(), scenes=scenes, share=np.full(number, np.nan))
 
 
-def scenes_for(name_or_path: str | Path, task: Task, number: int | None = None) -> FrozenScenes:
-    """Return scenes of a set in SETS or of a file, evenly spread over it, up to a number.
+def scenes_for(given: str | Path | FrozenScenes, task: Task, number: int | None = None) -> FrozenScenes:
+    """Return scenes of a set in SETS, of a file or of a record, evenly spread over it, up to a number.
 
     Where no frozen scenes are those of the task, they are drawn, and a line says so. A set that there is not, or scenes
     that cannot be those of the task, raise ValueError.
     """
-    name = str(name_or_path)
-    if name not in SETS:
-        frozen = load(Path(name_or_path).expanduser())
+    if isinstance(given, FrozenScenes) or str(given) not in SETS:
+        frozen = given if isinstance(given, FrozenScenes) else load(Path(given).expanduser())
         _check_fit(frozen, task)
         scenes = frozen.scenes.with_rows(task.observation.n_rows)
         return dataclasses.replace(frozen, scenes=scenes).spread(number)
+    name = str(given)
     path = shipped_set(name, task)
     if path is not None:
         return load(path, name).spread(number)
@@ -261,3 +261,7 @@ def _check_fit(frozen: FrozenScenes, task: Task) -> None:
             f"({', '.join(sorted(kinds)) or 'none'}); the task has {len(task.arm.joint_names)} joints and up to {rows} "
             f"obstacles ({', '.join(task.shapes)})"
         )
+    changes = frozen.scenes.jumps, frozen.scenes.reach, frozen.scenes.turn_time < NEVER
+    if task.whole_movement and any(part.any() for part in changes):
+        raise ValueError(f"{frozen.name} holds scenes that change on the way, and the task has one decision")
+    check_scenes(frozen.scenes, task.arm)

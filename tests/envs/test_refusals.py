@@ -81,6 +81,9 @@ def test_actions(env_id):
         for action in bad:
             with pytest.raises(ValueError):
                 env.step(action)
+        with pytest.raises(ValueError) as raised:
+            env.step(zero[..., :-1])
+        assert f"shape {zero.shape}, got" in str(raised.value)
         env.step(zero.astype(np.int8))  # nothing was done by those
 
 

@@ -140,8 +140,11 @@ def test_a_shape_its_dictionary_and_its_json_give_the_same_movement(shape):
 
 @pytest.mark.parametrize(
     ("env_id", "kwargs"),
-    [(OBSTACLES, {}), (PANDA, {}), (MOVING, {}), (MOVING, REACHING), ("viapoint/PlanarTargetJump-v0", {})],
-)
+    [
+        (OBSTACLES, {}), (PANDA, {}), (MOVING, {}), (MOVING, REACHING), ("viapoint/PlanarTargetJump-v0", {}),
+        ("viapoint/PlanarTargetJumpStep-v0", {}), ("viapoint/PlanarMovingObstaclesStep-v0", REACHING),
+    ],
+)  # fmt: skip
 def test_drawn_scenes_survive_json(env_id, kwargs):
     """And their episodes."""
     env = gym.make(env_id, **kwargs).unwrapped

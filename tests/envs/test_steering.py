@@ -5,7 +5,7 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from episodes import GOAL, START, STEP, WALL, given
+from episodes import GOAL, START, STEP, WALL, given, post
 
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import Motion
@@ -158,3 +158,11 @@ def test_a_reference_out_of_reach_ends_the_episode():
     assert not any(info[name] for name in ("reachable", "is_success", "collision"))
     assert env.physics_steps == before
     assert env.observation_space.contains(observation)
+
+
+def test_obstacles_turn_within_a_control_step():
+    """They do not go on to its end and jump from there."""
+    coming = post(-0.1, 0.5, velocity=(0.0, -0.9, 0.0))
+    env, _ = given(STEP, [coming], turns=[[0.05, 0.0, 0.9, 0.0]], control_step=0.1)
+    *_, info = env.step(np.zeros(2, np.float32))
+    assert info["min_clearance"] == pytest.approx(env.last_rollout.clearance.min(), abs=1e-9)

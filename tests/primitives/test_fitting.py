@@ -216,3 +216,5 @@ NOT_ASCENDING = np.where(np.arange(20) == 3, TIME[2], TIME)
 def test_bad_input_is_refused_with_advice(arguments, words):
     with pytest.raises(ValueError, match=words):
         fit_via_points(*arguments)
+    with pytest.raises(ValueError):
+        fit_via_points(TIME, REACH, free_ends="no")

@@ -92,6 +92,8 @@ def changed(name, value):
         (lambda table: table.drop(columns=["time", "x"]), "no column time, x"),
         (changed("z", "far"), "line 5, column z: far"),
         (changed("movement", np.nan), "names no movement in line 5"),
+        (changed("movement", "None"), "names no movement in line 5"),
+        (changed("movement", "null"), "names no movement in line 5"),
         (lambda table: table[::-1], "movement straight: time must ascend"),
         (lambda table: table[:0], "holds no samples"),
     ],

@@ -460,6 +460,12 @@ def test_command_line_plans_and_measures(tmp_path, capsys) -> None:
     with pytest.raises(SystemExit):
         main([*words, "--time-limit", "0"])
     assert "no plan is safe" in capsys.readouterr().err
+    scene.write_text(
+        f'{{"format": "viapoint-scene", "obstacles": {obstacles_to_json([POST])}, "reaches": [[0, 1, 0.1, 0, 0]]}}'
+    )
+    with pytest.raises(SystemExit):
+        main(words)
+    assert "has reaches" in capsys.readouterr().err
     main(
         [
             "evaluate",

@@ -8,8 +8,10 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import FlattenObservation, NormalizeObservation, RescaleAction
 from stable_baselines3 import HerReplayBuffer
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecExtractDictObs, VecNormalize
 
 from viapoint.envs import Sphere, Task, scene_from_json
 from viapoint.training import evaluate, load_agent
@@ -47,6 +49,7 @@ ENV, REACH, STEP = (
     f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarReach", "PlanarObstaclesStep")
 )
 MOVING, SENSED = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarSensed-v0"
+CHANGING = MOVING, "viapoint/PlanarTargetJump-v0"
 STALLING = {"stop_when_stalled": 0.3}
 
 CONFIGURATIONS = [
@@ -234,6 +237,10 @@ CALLS = [
     lambda: evaluate(baselines=["straight"]),
     lambda: evaluate(env=ENV, baselines=["untrained"]),
     lambda: evaluate("nowhere"),
+    *(lambda wrap=wrap: evaluate(SAC("MlpPolicy", NormalizeObservation(wrap(FlattenObservation(gym.make(ENV))))))
+      for wrap in (lambda env: env, Monitor)),
+    lambda: evaluate(SAC("MlpPolicy", VecExtractDictObs(ViaVecEnv(ENV, 2), "goal"))),
+    lambda: evaluate(SAC("MultiInputPolicy", RescaleAction(gym.make(ENV), np.float32(0), np.float32(1)))),
     lambda: evaluate(ENV, baselines="straight"),
     lambda: evaluate(ENV, checks=[0, 1.5]),
     lambda: evaluate(ENV, n_scenes=0),
@@ -270,6 +277,9 @@ CALLS = [
     *(lambda text=text: scene_from_json(text) for text in ("{", b"\xff\xfe", "[" * 100_000, "1" * (2 << 20))),
     lambda: load(Path("tests")),
     lambda: scenes_for("tests", Task.of()),
+    *(lambda env_id=env_id: scenes_for(shipped_path("validation", env_id), Task.of()) for env_id in CHANGING),
+    *(lambda name=name: evaluate(env=ENV, baselines=["straight"], scenes=load(shipped_path("test", name)))
+      for name in ("viapoint/PandaObstacles-v0", *CHANGING)),
     lambda: scenes_for("hard", Task.of(n_obstacles=3)),
     lambda: scenes_for(shipped_path("test", ENV), Task.of(n_obstacles=1)),
     lambda: scenes_for(shipped_path("test", ENV), Task.of(arm="panda")),

@@ -19,7 +19,15 @@ from viapoint.training.plotting.plots import fitted_movements
 
 REQUIRED = ("time", "x", "y")  # Columns that a file of movements must have
 COORDINATES = ("x", "y", "z")  # Names of the coordinates; z may be left out
-UNNAMED = ("", "NA", "NaN", "nan")  # Entries of a column `movement` that name none
+UNNAMED = (
+    "",
+    "na",
+    "<na>",
+    "nan",
+    "n/a",
+    "none",
+    "null",
+)  # Entries of a column `movement` that name none, in any case
 TABLE, FIGURE = "fit.csv", "fit.png"  # Files that are written
 DRAWN = 6  # Greatest number of movements in the figure
 
@@ -69,7 +77,7 @@ def read_movements(path: Path) -> Movements:
             f"{table[names[column]].iloc[row] or 'nothing'}; leave out lines that were not measured",
         )
     labels = table["movement"] if "movement" in table else pd.Series("1", index=table.index)
-    unnamed = labels.isin(UNNAMED)
+    unnamed = labels.str.lower().isin(UNNAMED)
     if unnamed.any():
         raise BadFileError(path, f"names no movement in line {unnamed.idxmax()}")
     movements: Movements = {}

@@ -70,7 +70,11 @@ def _scene(path: Path | None) -> dict[str, Any]:
     text = path.expanduser().read_text(encoding="utf-8")
     if text.lstrip().startswith("["):
         return {"obstacles": obstacles_from_json(text)}
-    return scene_from_json(text)
+    scene = scene_from_json(text)
+    changes = [name for name in ("jumps", "turns", "reaches") if scene.get(name)]
+    if changes:
+        raise ValueError(f"{path} has {', '.join(changes)}: a plan is for one goal and constant velocities")
+    return scene
 
 
 def _goal(config: PlanConfig, scene: dict[str, Any]) -> Any:

@@ -238,8 +238,7 @@ def evaluate(
             methods.append(OpenLoopBaseline(first, SceneSimulation(env_id, 250, **kwargs)))
         else:
             methods.append(make_method(each, env_id, **kwargs))
-    frozen = scenes if isinstance(scenes, FrozenScenes) else scenes_for(scenes, task, n_scenes)
-    chosen = frozen.spread(n_scenes)
+    chosen = scenes_for(scenes, task, n_scenes)
     if n_scenes is not None and n_scenes > len(chosen.share):
         print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
     return evaluate_methods(

@@ -317,7 +317,8 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
 def _counted(name: str, allowed: Collection[str]) -> Callable[[SceneSimulation], Method] | None:
     """Return the factory of a baseline whose name ends in the number of plans that it checks; None for others."""
     found = re.fullmatch(r"(\w+?)([0-9]+)", name)
-    if found is None or found[1] not in allowed or int(found[2]) < FEWEST_CHECKS[found[1]]:
+    if found is None or found[1] not in allowed:
         return None
-    make, checks = COUNTED[found[1]], whole_number(f"N of {found[1]}N", int(found[2]), 1, MOST_CANDIDATES)
+    kind, number = found[1], int(found[2])
+    make, checks = COUNTED[kind], whole_number(f"N of {kind}N", number, FEWEST_CHECKS[kind], MOST_CANDIDATES)
     return lambda simulation: make(simulation, checks)

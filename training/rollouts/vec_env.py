@@ -37,6 +37,10 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
         ValueError: The environment is another one.
     """
     inner = env.unwrapped if env is not None else None
+    if env is not None and env.observation_space != env.unwrapped.observation_space:
+        raise ValueError(
+            f"{type(env).__name__} changes observations: models know an environment by its id alone"
+        )
     if isinstance(inner, ViaVecEnv):
         return inner.env_id, dict(inner.env_kwargs)
     if inner is None:
@@ -46,6 +50,11 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
         raise ValueError(
             f"the environment must be one of this package, made by its id, got {inner if spec is None else spec.id}"
         )
+    for wrapper in (gym.ObservationWrapper, gym.ActionWrapper):
+        if any(inner.env_is_wrapped(wrapper, [0])):
+            raise ValueError(
+                f"the environment must have no {wrapper.__name__}: models know it by its id alone"
+            )
     usual = gym.spec(spec.id).kwargs
     return spec.id, {
         name: value
