@@ -609,7 +609,7 @@ def test_urdf_files_with_odd_parts_load(crane):
     path.write_text(text)
     stl = crane / "meshes" / "wrist.stl"
     stl.write_bytes(stl.read_bytes().upper().replace(b"SOLID ", b"solid"))
-    with pytest.warns(UserWarning, match=r"boom\.dae"):
+    with pytest.warns(UserWarning, match=r"boom\.dae|no size"):
         arm = load_arm(path)
     assert arm.joint_names == ("lift", "turn", "tilt")
     assert "wrist" in arm.group_names
