@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.kinematics import Spheres
 from viapoint.envs.arms.spheres import grouped
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Bool, Float, Int
@@ -350,20 +349,15 @@ def setting_of(task: Task, obstacles: Obstacles, *, exact: bool = False) -> Sett
     With `exact`, movements of the hand keep ELBOW_ROOM from the joint ranges, which the executed movement needs.
     """
     arm = task.arm
-    ranges = arm.joint_range
-    if exact and task.space.of_hand:
-        ranges = ranges + ELBOW_ROOM * np.array([1.0, -1.0])
     if not task.space.of_hand:
-        return Setting(arm.chain, arm.spheres, ranges, False, arm.reach, False)
+        return Setting(arm.chain, arm.spheres, arm.joint_range, False, arm.reach, False)
     centre, half = bounding_boxes(obstacles)
     tall = (np.abs(obstacles.rotation[..., 2, :]) * half).sum(axis=-1)
     present = obstacles.present
     low = (centre[..., 2] - tall).min(where=present, initial=1e9) - NEAR
     high = (centre[..., 2] + tall).max(where=present, initial=-1e9) + NEAR
     bottom, top = _heights(arm)
-    spheres = _some_groups(arm, tuple((top > low) & (bottom < high)))
-    alone = len(spheres.radius) == 1 and bool(np.allclose(spheres.centre[0], arm.chain.tool_origin))
-    return Setting(arm.chain, spheres, ranges, True, arm.reach, alone)
+    return _hand_setting(arm, tuple((top > low) & (bottom < high)), exact)
 
 
 @functools.lru_cache(maxsize=64)
@@ -380,10 +374,15 @@ def _heights(arm: Arm) -> Float:
 
 
 @functools.lru_cache(maxsize=256)
-def _some_groups(arm: Arm, wanted: tuple[bool, ...]) -> Spheres:
-    """Return some groups of spheres of an arm, the last one if none is wanted, so that no table is empty."""
+def _hand_setting(arm: Arm, wanted: tuple[bool, ...], exact: bool) -> Setting:
+    """Return an arm in the plane with some groups of spheres, the last one if none is wanted: no table is empty."""
     spheres = arm.spheres
     kept = np.flatnonzero(wanted) if any(wanted) else np.array([len(wanted) - 1])
     some = [slice(spheres.first[group], spheres.first[group + 1]) for group in kept]
     centres = [spheres.centre[rows] for rows in some]
-    return grouped(centres, [spheres.radius[rows] for rows in some], spheres.link[kept].tolist(), ())
+    spheres = grouped(centres, [spheres.radius[rows] for rows in some], spheres.link[kept].tolist(), ())
+    alone = len(spheres.radius) == 1 and bool(np.allclose(spheres.centre[0], arm.chain.tool_origin))
+    ranges = arm.joint_range
+    if exact:
+        ranges = ranges + ELBOW_ROOM * np.array([1.0, -1.0])
+    return Setting(arm.chain, spheres, ranges, True, arm.reach, alone)
