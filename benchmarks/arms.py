@@ -35,10 +35,10 @@ STRAIGHT, PROBLEMS = 50, 100
 PROJECTS = {
     "menagerie": "MuJoCo Menagerie 75df466 (each folder has its licence)",
     "erd": "example-robot-data 6.0.0 (BSD-3-Clause)",
-    "bullet": "bulletphysics/bullet3 1b03cbdd (zlib; folders have their own licences)",
+    "bullet": "bulletphysics/bullet3 6c888f4 (zlib; folders have their own licences)",
     "urdfs": "Daniella1/urdf_files_dataset 81f4cda (MIT; folders have their own licences)",
     "airo": "airo-ugent/airo-models 6c187ea (MIT)",
-    "unitree": "unitreerobotics/unitree_ros bae25b3 (BSD-3-Clause)",
+    "unitree": "unitreerobotics/unitree_ros d6f13aa (BSD-3-Clause)",
     "robosuite": "robosuite 1.5.2 (MIT)",
     "robotics": "gymnasium-robotics 1.4.2 (MIT)",
     "gymxarm": "gym-xarm 0.1.1 (Apache-2.0)",
@@ -189,7 +189,7 @@ def measure(path: Path, arguments: dict[str, Any]) -> dict[str, Any]:
     }
     try:
         return {**known, **measure_movements(arm)._asdict()}
-    except RuntimeError as error:  # no scene was found
+    except RuntimeError as error:  # too few scenes were found
         return {**known, "fault": str(error)}
 
 
@@ -210,19 +210,27 @@ def measure_movements(arm: Arm) -> Movements:
     )
 
 
-def drawn(arm: Arm, n_obstacles: Any, number: int) -> Scenes:
-    """Return scenes that are drawn for an arm, one for each of the first seeds."""
+def drawn(arm: Arm, n_obstacles: Any, number: int) -> list[Scenes]:
+    """Return scenes that are drawn for an arm, one for each of the first seeds with which one is found."""
     sampler = Task.of(arm=arm, n_obstacles=n_obstacles).sampler()
-    return sampler([np.random.default_rng(seed) for seed in range(number)])
-
-
-def planned(arm: Arm, scenes: Scenes, time_limit: float) -> list[MotionPlan]:
-    """Return plans for scenes."""
-    found = []
-    for row in range(len(scenes.start)):
-        obstacles = scenes.obstacles.take([row])
-        found.append(plan_motion(arm, scenes.start[row], scenes.goal[row], obstacles, time_limit=time_limit))
+    found: list[Scenes] = []
+    for seed in range(2 * number):
+        try:
+            found.append(sampler([np.random.default_rng(seed)]))
+        except RuntimeError:  # no scene was found
+            if seed + 1 - len(found) > number:  # too few are left
+                raise
+        if len(found) == number:
+            break
     return found
+
+
+def planned(arm: Arm, scenes: list[Scenes], time_limit: float) -> list[MotionPlan]:
+    """Return plans for scenes."""
+    return [
+        plan_motion(arm, each.start[0], each.goal[0], each.obstacles, time_limit=time_limit)
+        for each in scenes
+    ]
 
 
 def page_table(found: pd.DataFrame) -> str:

@@ -184,6 +184,8 @@ def arm_from_xml(
             left_out.append(LeftOut(names[first], names[second], reason))
     spheres = spheres._replace(pairs=spheres.pairs[kept])
     inertia = _greatest_inertia(model, data, tuple(joints))
+    # Much damping makes a joint as slow to return as much inertia does.
+    inertia = np.maximum(inertia, 0.5 * chain.damping / bandwidth)
     stiffness = inertia * bandwidth**2
     return Arm(
         name=name,

@@ -172,7 +172,7 @@ def ancestors(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def _tip(model: mujoco.MjModel, base: str | None) -> int:
-    """Return the last body of the longest chain of joints, before it branches into fingers.
+    """Return the last body of the longest chain of joints, or its flange, before it branches into fingers.
 
     Raises:
         ValueError: There are several arms, or no chain.
@@ -194,6 +194,11 @@ def _tip(model: mujoco.MjModel, base: str | None) -> int:
             body = moving[0]
         else:  # nothing more that moves, or fingers
             break
+    while not moving:  # the only frame without geoms on the last link is its flange
+        frames = [each for each in _children(model, body) if not model.body_geomnum[each]]
+        if len(frames) != 1:
+            break
+        body = frames[0]
     if len(chain_joints(model, body, base)) < 2:
         raise ValueError("no chain of two or more hinges and slides leads to a tool; name one with tool=")
     return body

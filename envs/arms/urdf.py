@@ -150,15 +150,18 @@ def _prepare_link(
 
 
 def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
-    """Replace an inertia that no body has by that of a ball of the same mass."""
-    inertia = link.find("inertial/inertia")
+    """Replace an inertia that no body has, or that is missing, by that of a ball of the same mass."""
+    inertial = link.find("inertial")
     mass = link.find("inertial/mass")
     if mass is None and link.find("collision") is not None:
         notes.append(f"mass of {link.get('name')}, which the file lacks: that of its geoms, as if of water")
     elif mass is not None and float(mass.get("value", 0.0)) <= 0.0:
         notes.append(f"mass of {link.get('name')}, which is not positive: {COMPILER['boundmass']} kg")
-    if inertia is None or mass is None:
+    if inertial is None or mass is None:
         return
+    inertia = inertial.find("inertia")
+    if inertia is None:
+        inertia = ET.SubElement(inertial, "inertia", ixx="nan")
     entries = [float(inertia.get(name, 0.0)) for name in INERTIA]
     xx, xy, xz, yy, yz, zz = entries
     matrix = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
@@ -167,7 +170,9 @@ def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
         inertia.attrib.update(
             dict.fromkeys(INERTIA, "0") | dict.fromkeys(("ixx", "iyy", "izz"), f"{moment:g}")
         )
-        notes.append(f"inertia of {link.get('name')}, which is not positive: that of a ball of {BALL:g} m")
+        notes.append(
+            f"inertia of {link.get('name')}, which is missing or not positive: that of a ball of {BALL:g} m"
+        )
 
 
 def _prepared(
