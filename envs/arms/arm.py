@@ -236,17 +236,16 @@ def _controls(
                     chain, position[i, following], velocity[i, following], acceleration[i, following], after
                 )
             else:
-                after = before  # and no other part follows
+                for j in range(joints):  # assigned as arrays, Numba would compile messages about shapes
+                    after[j] = before[j]
             for k in range(first, min(following, steps)):
                 share = (k - first) / stride
                 for j in range(joints):
                     torque = before[j] + share * (after[j] - before[j])
                     servo = stiffness[j] * position[i, k, j] + damping[j] * velocity[i, k, j]
                     out[i, k, j] = torque + servo
-            # Arrays change names; assigning numbers would compile Numba's messages about shapes, for two seconds.
-            spare = before
-            before = after
-            after = spare
+            for j in range(joints):
+                before[j] = after[j]
     return out
 
 
