@@ -298,5 +298,5 @@ def _checked_decisions(decide_at: Any) -> str | tuple[Trigger, ...]:
     elif isinstance(decide_at, Sequence) and all(each in TRIGGERS for each in decide_at):
         return tuple(decide_at)
     raise ValueError(
-        f"decide_at must be {END!r}, {STEPS!r} or some of {', '.join(TRIGGERS)}, got {decide_at!r}"
+        f"decide_at must be {END!r}, {STEPS!r} or a list with some of {', '.join(TRIGGERS)}, got {decide_at!r}"
     )

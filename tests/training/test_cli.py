@@ -1,5 +1,6 @@
 """The command, from the words to the files."""
 
+import io
 import json
 import re
 import subprocess
@@ -52,8 +53,19 @@ def test_output_that_nobody_reads_ends_the_command_without_a_word():
         assert process.stderr.read() == b""
 
 
+def test_names_are_printed_where_the_output_knows_only_ascii(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), "ascii"))
+    monkeypatch.setattr(cli, "run_command", lambda config: print("runs/größe"))
+    run("doctor")
+
+
+INTERRUPTED = RuntimeError()
+INTERRUPTED.__context__ = KeyboardInterrupt()  # as Numba's, when Ctrl-C comes while it loads code
+
+
 @pytest.mark.parametrize(
-    ("error", "code"), [(ZeroDivisionError("over nothing"), 2), (KeyboardInterrupt(), 130)]
+    ("error", "code"),
+    [(ZeroDivisionError("over nothing"), 2), (KeyboardInterrupt(), 130), (INTERRUPTED, 130)],
 )
 def test_an_end_in_the_middle_is_one_line_and_a_code(error, code, capsys, monkeypatch):
     def broken(config):

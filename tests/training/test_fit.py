@@ -1,5 +1,7 @@
 """The command `fit`: from the lines of a file to the table and the figure."""
 
+import errno
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -132,6 +134,15 @@ def test_foreign_files_stay(file, tmp_path, capsys):
     assert "is missing" in failed(capsys, tmp_path / "nothing.csv")
     (tmp_path / "empty.csv").touch()
     assert "cannot be read as CSV" in failed(capsys, tmp_path / "empty.csv", "--out", tmp_path / "fit")
+
+
+def test_a_full_disk_leaves_no_half_of_a_figure(file, tmp_path, capsys, monkeypatch):
+    def full(handle):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    assert "fit.png" in failed(capsys, file, "--out", tmp_path / "fit")
+    assert not list((tmp_path / "fit").iterdir())
 
 
 @pytest.mark.parametrize("numbers", [(2, 1), (0, 1, 2), (9,), (-1,)])

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import gymnasium as gym
 import imageio_ffmpeg
 import numpy as np
@@ -63,6 +65,19 @@ def test_a_film_that_fails_half_way_leaves_nothing(env, tmp_path):
 
     with pytest.raises(KeyError):
         record_video(tmp_path / "film.mp4", env, scenes_of(env, 2), broken)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("env", TASKS[:1], indirect=True)
+def test_a_film_that_the_encoder_could_not_finish_is_refused(env, tmp_path, monkeypatch):
+    def on_a_full_disk(path, *_, **__):
+        Path(path).write_bytes(b"half a film")
+        while True:
+            yield
+
+    monkeypatch.setattr(imageio_ffmpeg, "write_frames", on_a_full_disk)
+    with pytest.raises(OSError):
+        record_video(tmp_path / "film.mp4", env, scenes_of(env, 1), search(env))
     assert not list(tmp_path.iterdir())
 
 

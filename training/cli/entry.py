@@ -54,6 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names that a terminal without UTF-8 cannot show
     try:
         config = parse(words)
         if words[0] == "train" and config.resume:
@@ -65,6 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes the rest at its exit
         raise SystemExit(141) from None
     except Exception as error:
+        if _was_interrupted(error):
+            _leave("stopped", 130)
         if isinstance(error, ImportError) and words[:1] == ["doctor"]:
             # It says what is missing, without the package that reads options.
             doctor.run(SimpleNamespace(out=Path("runs")))
@@ -149,6 +153,13 @@ def _one_line(error: Exception) -> str:
     )
     text = " ".join(str(error).split()) or type(error).__name__
     return text if known else f"{type(error).__name__}: {text} (--debug shows where)"
+
+
+def _was_interrupted(error: BaseException | None) -> bool:
+    """Return True if an error came up while a library handled Ctrl-C, as Numba's do while they load code."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None
 
 
 def _leave(message: str, code: int) -> None:

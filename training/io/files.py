@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import io
 import itertools
 import json
 import math
@@ -144,6 +145,17 @@ def _move_aside(path: Path) -> None:
     aside = next(each for each in numbered if not os.path.lexists(each))
     path.rename(aside)
     print(f"{path} holds what was not written by viapoint: it is kept as {aside}", file=sys.stderr)
+
+
+def write_figure(path: Path, figure: Any, **options: Any) -> Path:
+    """Write a figure of Matplotlib in the format of the suffix; options are those of `savefig`."""
+    content = io.BytesIO()
+    metadata = (
+        {"Creator": MARK.decode(), "Date": None} if path.suffix == ".svg" else {"Software": MARK.decode()}
+    )
+    figure.savefig(content, format=path.suffix[1:], metadata=metadata, **options)
+    write_bytes(path, content.getvalue())
+    return path
 
 
 def write_json(path: Path, value: Any) -> None:

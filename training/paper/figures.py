@@ -16,7 +16,7 @@ from viapoint import primitives
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import unpack
-from viapoint.training.io.files import MARK
+from viapoint.training.io.files import write_figure
 from viapoint.training.paper import double_step, movements, one_via, point_to_point
 from viapoint.training.paper.movements import TARGETS, Profile, curved, passage_share, simulate, straight
 from viapoint.training.paper.obstacles import ObstacleMovements, features
@@ -49,12 +49,9 @@ def sheet(
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write a figure as PNG and SVG."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.png", folder / f"{name}.svg"]
-    figure.savefig(paths[0], metadata={"Software": MARK.decode()})
+    picture = write_figure(folder / f"{name}.png", figure)
     figure.set_layout_engine("none")  # the same layout for both files, computed once
-    figure.savefig(paths[1], metadata={"Date": None, "Creator": MARK.decode()})
-    return paths
+    return [picture, write_figure(folder / f"{name}.svg", figure)]
 
 
 def plane(ax: Axes, *, names: tuple[str, ...] = tuple(TARGETS)) -> None:

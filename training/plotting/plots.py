@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
 from viapoint.primitives import ViaPointFit
-from viapoint.training.io.files import MARK
+from viapoint.training.io.files import write_figure
 from viapoint.training.scene_sets import BANDS
 
 BLUE = "#1f5fa8"
@@ -45,7 +45,7 @@ def learning_curve(path: Path, curve: Sequence[Mapping[str, Any]]) -> Path:
     ax.set_xlim(left=0.0)
     ax.set_ylim(0.0, 102.0)
     style_axes(ax)
-    return _save(figure, path)
+    return write_figure(path, figure, dpi=DOTS_PER_INCH)
 
 
 def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
@@ -67,7 +67,7 @@ def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
     ax.set_ylim(0.0, 102.0)
     ax.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     style_axes(ax)
-    return _save(figure, path)
+    return write_figure(path, figure, dpi=DOTS_PER_INCH)
 
 
 def success_of_rows(
@@ -101,7 +101,7 @@ def success_of_rows(
     for ax in (axes, *others):
         ax.legend(frameon=False)
         style_axes(ax)
-    return _save(figure, path)
+    return write_figure(path, figure, dpi=DOTS_PER_INCH)
 
 
 def fitted_movements(
@@ -139,7 +139,7 @@ def fitted_movements(
             right.set_title(title, fontweight="normal")
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), markerscale=1.2)
-        return _save(figure, path, matplotlib.rcParams["savefig.dpi"])
+        return write_figure(path, figure)
 
 
 def style_axes(ax: Any) -> None:
@@ -153,9 +153,3 @@ def _percent(rates: Sequence[Mapping[str, float]]) -> tuple[Float, Float, Float]
     """Return rates and the ends of their intervals, [%]."""
     rate, low, high = (100.0 * np.array([each[part] for each in rates]) for part in ("rate", "low", "high"))
     return rate, low, high
-
-
-def _save(figure: Figure, path: Path, dots_per_inch: float = DOTS_PER_INCH) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=dots_per_inch, metadata={"Software": MARK.decode()})
-    return path

@@ -23,7 +23,7 @@ from viapoint.envs.common.types import Frame
 from viapoint.envs.rendering.renderer import EpisodeRenderer
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.config.checks import check_file
-from viapoint.training.io.files import MARK
+from viapoint.training.io.files import MARK, write_figure
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
 from viapoint.training.rollouts.rollout import Decide
 
@@ -100,6 +100,7 @@ def _scenes(env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, name: str, f
 def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
     """Encode frames of equal size, at least one, as a slow MP4 file (H.264), and return their number."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    full = OSError(f"the encoder could not write {path}: is there room on the disk?")
     part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part.mp4")
     count, writer = 0, None
     try:
@@ -112,10 +113,15 @@ def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
                     macro_block_size=1, ffmpeg_log_level="error",
                 )  # fmt: skip
                 writer.send(None)  # the generator opens the file
-            writer.send(np.ascontiguousarray(frame))
+            try:
+                writer.send(np.ascontiguousarray(frame))
+            except OSError:
+                raise full from None
             count += 1
         if writer is not None:
-            writer.close()  # the file is complete now
+            writer.close()  # the file is complete now, if the encoder has not failed, which it does not tell
+        if MARK not in part.read_bytes():
+            raise full
         os.replace(part, path)
     finally:
         if writer is not None:
@@ -186,7 +192,7 @@ def gallery(
     *,
     heading: str = "",
 ) -> None:
-    """Play an episode in each scene, and save a page of their last pictures as a PNG file in an existing folder.
+    """Play an episode in each scene, and save a page of their last pictures as a PNG file.
 
     Args:
         path: PNG file.
@@ -225,4 +231,4 @@ def gallery(
     figure.legend(handles, list(marks), **places, fontsize=8, frameon=False)
     if lines:
         figure.suptitle("\n".join(lines), fontsize=11, color=PALETTE.executed)
-    figure.savefig(path, metadata={"Software": MARK.decode()})
+    write_figure(path, figure)
