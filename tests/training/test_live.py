@@ -23,7 +23,7 @@ from viapoint.training.live import drawing
 from viapoint.training.live.arena import AGENT, HAND, MOTION, SEARCH, STRAIGHT, Arena
 from viapoint.training.live.decide import APART, decide, describe_plan, execute, profile, propose
 from viapoint.training.live.page import LivePage
-from viapoint.training.live.state import State
+from viapoint.training.live.state import Scene, State
 from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 PLANAR, PANDA = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
@@ -145,6 +145,16 @@ def test_a_plan_of_the_motion_planner_is_free_or_says_why_not(env_id, arenas):
         for method in (SEARCH, STRAIGHT) if number >= 6 else ():  # impossible scenes
             assert not decided(arena, case, method).plan.success
     assert executed >= 3
+
+
+@pytest.mark.parametrize("method", [SEARCH, STRAIGHT])
+def test_a_scene_that_a_later_change_makes_impossible_has_no_plan_of_another_method(method, arenas):
+    arena = arenas("viapoint/PlanarTargetJump-v0")
+    scene = Scene(np.array([-0.2, 0.3]), np.array([0.1, 0.4]), (), np.array([[0.3, 0.2, 0.3]]))
+    assert decided(arena, scene, method).plan.success
+    post = ve.Cylinder(0.02, 0.04, position=(0.2, 0.3, 0.0))  # at the goal after the jump
+    with pytest.raises(ValueError):
+        decided(arena, scene._replace(obstacles=(post,)), method)
 
 
 @pytest.mark.parametrize("env_id", [PLANAR, PANDA])

@@ -46,7 +46,10 @@ def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Propos
     try:
         observation, _ = arena.env(name).reset(options=scene.options())
     except ValueError:
-        return _planned(arena, state, time_limit)
+        best = _planned(arena, state, time_limit)
+        if best.motion.success:
+            raise  # what changes later is at fault, which the motion planner does not know
+        return best
     begin = time.perf_counter()
     action = decide_(observation)
     seconds = time.perf_counter() - begin

@@ -165,6 +165,7 @@ class Tab:
             state.origin = changes.get("origin", "")
             self._later.pop("comparison", None)
         state.movement, state.playing, state.before = None, False, state.plan
+        self._later.pop("proposals", None)  # those of the scene before
         proposal = decide(self.arena, state)
         state.proposals, state.picked, state.profile = (proposal,), 0, None
         self._say(describe_plan(proposal), proposal.motion.success)
