@@ -13,11 +13,12 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 # Optimisations of arithmetic that are allowed; NaN and infinity keep their meaning
 FASTMATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
+# `_nrt` allows arrays to be made; left out, Numba takes it from the function that is compiled around this one.
 COMPILED: dict[str, Any] = {"nogil": True, "fastmath": FASTMATH, "_nrt": True, "no_cfunc_wrapper": True}
 KERNEL: dict[str, Any] = {**COMPILED, "error_model": "numpy", "_nrt": False}
 """Options of functions that make no arrays. Without `_nrt`, Numba does not count references to arrays, which takes 5 ns
 for each array and call. Divisions by zero give infinity instead of an exception."""
-INNER: dict[str, Any] = {"no_cpython_wrapper": True}
+INNER: dict[str, Any] = {"no_cpython_wrapper": True}  # Further options of functions that Python never calls
 
 
 def compiled(function: Function) -> Function:
