@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -16,9 +16,15 @@ from stable_baselines3.common.utils import check_for_correct_spaces, is_vectoriz
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
+from viapoint.envs.common.validation import whole_number
 from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
 from viapoint.training.agents.model_io import check_arguments
+from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
+
+N_ELITES = 8  # Number of candidates around which each round of refinement samples
+# Standard deviation of the first round of refinement, in the action space; each round halves it
+SPREAD = 0.15
 
 Observation = Mapping[str, NDArray[Any]]
 Numbers = NDArray[np.floating[Any]]
@@ -32,6 +38,9 @@ class PlanPolicy(BasePolicy):
     """
 
     OWN: tuple[str, ...]  # Names of further arguments of the subclass, which become attributes
+    candidates: int  # Number of Sobol points in the action space
+    refinements: int  # Rounds of candidates around the best ones
+    per_refinement: int  # Candidates of each round
 
     def __init__(
         self,
@@ -43,6 +52,7 @@ class PlanPolicy(BasePolicy):
     ) -> None:
         super().__init__(observation_space, action_space, **kwargs)
         self.task = Task.from_dict(task)
+        self.replanning = self.task.replanning
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute; settings of the policy may change after training, too, and are checked each time."""
@@ -53,6 +63,10 @@ class PlanPolicy(BasePolicy):
     def _check_setting(self, name: str, value: Any) -> None:
         """Check a setting; a wrong type, or a number out of range, raises ValueError."""
         check_arguments(type(self), {name: value})
+
+    def _check_candidates(self) -> None:
+        total = self.candidates + self.refinements * self.per_refinement
+        whole_number("number of all candidates", total, 1, MOST_CANDIDATES)
 
     def _own(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self.OWN}
@@ -68,6 +82,33 @@ class PlanPolicy(BasePolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         always = {"task": self.task.as_dict(), "lr_schedule": self._dummy_schedule}
         return {**super()._get_constructor_parameters(), **self._own(), **always}
+
+    def proposals(self, number: int, values: Callable[[Numbers], Numbers]) -> tuple[Numbers, Numbers]:
+        """Return candidates of some problems, shape (B, N, m), and their values, shape (B, N); the first is zero.
+
+        Each round of refinement adds candidates around the best ones so far.
+
+        Args:
+            number: Number of problems B.
+            values: Function that returns the values of actions of shape (B, H, m), shape (B, H).
+        """
+        spread = candidate_actions(self.task, self.candidates, replanning=self.replanning)
+        actions: Numbers = np.broadcast_to(spread, (number, *spread.shape))
+        value = values(actions)
+        for each in range(self.refinements):
+            best = min(N_ELITES, actions.shape[1])
+            top = np.argpartition(-value, best - 1, axis=1)[:, :best]
+            some = self.around(np.take_along_axis(actions, top[..., None], axis=1), each)
+            actions = np.concatenate((actions, some), axis=1)
+            value = np.concatenate((value, values(some)), axis=1)
+        return actions, value
+
+    def around(self, centres: Numbers, each: int) -> Numbers:
+        """Return candidates of a round around some of shape (B, ., m), shape (B, per_refinement, m)."""
+        number = self.per_refinement
+        steps = normal_steps(number, self.task.action.size, each) * (SPREAD * 0.5**each)
+        around = centres[:, np.arange(number) % centres.shape[1]]
+        return np.clip(around + steps, -1.0, 1.0).astype(np.float32)
 
     @abstractmethod
     def decide(self, observation: Observation) -> Numbers:

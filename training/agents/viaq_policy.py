@@ -13,7 +13,6 @@ from torch import Tensor
 
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import whole_number
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import turned
@@ -21,15 +20,11 @@ from viapoint.envs.task import Task
 from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.agents.plan_agent import Numbers, Observation, PlanPolicy
 from viapoint.training.agents.viaq_critic import PlanInputs, ViaQCritic
-from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
 from viapoint.training.planning.movements import FINE_INSTANTS, INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import INFEASIBLE, VERIFIED, best_of, merits, refined_actions
 
 KEEP = 0.1  # Minimum gain of Q for which a running plan is revised
-N_ELITES = 8  # Number of candidates around which each round of refinement samples
-# Standard deviation of the first round of refinement, in the action space; each round halves it
-SPREAD = 0.15
 # Greatest number of proposals that are checked; all further checks are of plans around the best of them
 PROPOSALS = 32
 LOCAL_ROUNDS = 4  # Rounds of checks around the best checked plans
@@ -81,9 +76,7 @@ class ViaQPolicy(PlanPolicy):
         self.per_refinement = per_refinement
         self.checks = checks
         self.refine = refine
-        total = candidates + refinements * per_refinement
-        whole_number("number of all candidates", total, 1, MOST_CANDIDATES)
-        self.replanning = self.task.replanning
+        self._check_candidates()
         self._check_refine()
         self.critic = ViaQCritic(self.task, width=self.width)
         self.critic_target: ViaQCritic | None = None
@@ -144,23 +137,7 @@ class ViaQPolicy(PlanPolicy):
 
     def propose(self, problem: Problem) -> tuple[Numbers, Numbers]:
         """Return candidates, shape (B, N, m), and their ranking criterion, shape (B, N); the first is zero."""
-        spread = candidate_actions(self.task, self.candidates, replanning=self.replanning)
-        actions = np.broadcast_to(spread, (len(problem.start), *spread.shape))
-        values = self.values(problem, actions)
-        for each in range(self.refinements):
-            best = min(N_ELITES, actions.shape[1])
-            top = np.argpartition(-values, best - 1, axis=1)[:, :best]
-            some = self._around(np.take_along_axis(actions, top[..., None], axis=1), each)
-            actions = np.concatenate((actions, some), axis=1)
-            values = np.concatenate((values, self.values(problem, some)), axis=1)
-        return actions, values
-
-    def _around(self, centres: Numbers, each: int) -> Numbers:
-        """Return candidates of a round around some of shape (B, ., m), shape (B, per_refinement, m)."""
-        number = self.per_refinement
-        steps = normal_steps(number, self.task.action.size, each) * (SPREAD * 0.5**each)
-        around = centres[:, np.arange(number) % centres.shape[1]]
-        return np.clip(around + steps, -1.0, 1.0).astype(np.float32)
+        return self.proposals(len(problem.start), lambda actions: self.values(problem, actions))
 
     def decide(self, observation: Observation) -> Numbers:
         """Return the chosen actions, shape (B, m), for parts of B observations."""
@@ -218,7 +195,7 @@ class ViaQPolicy(PlanPolicy):
             share = (count + each) // LOCAL_ROUNDS
             if share:
                 top = np.argsort(-worth, axis=1, kind="stable")[:, :4]
-                near = self._around(np.take_along_axis(checked, top[..., None], axis=1), each)[:, :share]
+                near = self.around(np.take_along_axis(checked, top[..., None], axis=1), each)[:, :share]
                 checked = np.concatenate((checked, near), axis=1)
                 worth = np.concatenate((worth, merits(self.task, problem, near)), axis=1)
         return best_of(self.task, problem, checked, worth)

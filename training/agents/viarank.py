@@ -36,7 +36,7 @@ from viapoint.training.agents.sight_network import SightInputs, SightNetwork, si
 from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.cautious import BELIEFS, DEFAULT_BELIEF, PRIVILEGED
-from viapoint.training.planning.problem import Numbers, Problem
+from viapoint.training.planning.problem import Numbers, Problem, moves_of, worth_of
 from viapoint.training.planning.search import (
     CLEARANCE_MARGIN,
     plan_clearances,
@@ -46,6 +46,7 @@ from viapoint.training.planning.search import (
 EFFORT_WEIGHT = 0.05  # Weight of the reward of a successful plan beside its probability of success
 # First part of the seeds of scenes for the calibration, far from those of training, and their number
 CALIBRATION, CALIBRATION_SCENES = 3_000_017, 320
+EXPLORED = 512  # Number of Sobol points of which plans are learned from
 SAME_RAY = 0.02  # Greatest distance of a point from the ray of the sensor, [m]
 BLOCK = 16  # Scenes that are decided together
 
@@ -62,13 +63,15 @@ class ViaRankPolicy(PlanPolicy):
         instants: Instants of a plan at which the arm is looked at.
         nearest: Number of places of a plan that the network sees.
         candidates: Number of Sobol points in the action space.
+        refinements: Rounds of candidates around the best ones.
+        per_refinement: Candidates of each round.
         refine: Number of best candidates that the planner refines around what is seen; they are ranked, too.
         belief: Obstacles whose clearance the network sees beside the readings, one of
             :data:`~viapoint.training.planning.cautious.BELIEFS`. With `known` and `seen` the agent decides only where
             the true obstacles are given, as in evaluations.
     """
 
-    OWN = "width", "instants", "nearest", "candidates", "refine", "belief"
+    OWN = "width", "instants", "nearest", "candidates", "refinements", "per_refinement", "refine", "belief"
 
     def __init__(
         self,
@@ -80,7 +83,9 @@ class ViaRankPolicy(PlanPolicy):
         width: int = 32,
         instants: int = 32,
         nearest: int = 16,
-        candidates: int = 512,
+        candidates: int = 256,
+        refinements: int = 4,
+        per_refinement: int = 64,
         refine: int = 0,
         belief: str = DEFAULT_BELIEF,
         **kwargs: Any,
@@ -90,8 +95,11 @@ class ViaRankPolicy(PlanPolicy):
         self.instants = instants
         self.nearest = nearest
         self.candidates = candidates
+        self.refinements = refinements
+        self.per_refinement = per_refinement
         self.refine = refine
         self.belief = belief
+        self._check_candidates()
         if self.task.sensor is None or not self.task.whole_movement:
             raise ValueError(
                 "viarank needs a task with a sensor whose actions are whole movements, such as viapoint/PlanarSensed-v0"
@@ -110,15 +118,16 @@ class ViaRankPolicy(PlanPolicy):
         return self.task.n_via > 0
 
     @torch.no_grad()
-    def rank(self, problem: Problem, sight: Sight, actions: Numbers) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return ranking criterion and probability of success of actions of shape (B, H, m), shape (B, H) each.
+    def rank(self, problem: Problem, sight: Sight, actions: Numbers) -> Numbers:
+        """Return the ranking criterion of actions of shape (B, H, m), shape (B, H).
 
-        The problems have the obstacles that are believed to be there.
+        It is the probability of success, and EFFORT_WEIGHT times the reward of those that succeed. The problems have
+        the obstacles that are believed to be there.
         """
         inputs, worth = sight_inputs(self.task, problem, sight, actions, self.instants, self.nearest)
         # Geometry is computed on the processor, the network may be on another device.
         success = torch.sigmoid(self.network(inputs.to(self.device))).cpu().numpy()
-        return success + EFFORT_WEIGHT * worth, success
+        return np.asarray(success + EFFORT_WEIGHT * worth)
 
     def decide(self, observation: Observation) -> Numbers:
         """Return the best actions, shape (B, m), for parts of B observations."""
@@ -150,25 +159,24 @@ class ViaRankPolicy(PlanPolicy):
 
     def best(self, problem: Problem, sight: Sight) -> tuple[Float, Float]:
         """Return the best actions of B problems, shape (B, m), and probabilities that are too high, shape (B,)."""
-        every = candidate_actions(self.task, self.candidates, replanning=False)
         chosen, success = [], []
         for first in range(0, len(problem.start), BLOCK):
             rows = slice(first, first + BLOCK)
             some = sight.take(rows)
             there = problem.take(np.arange(len(problem.start))[rows])
-            actions: Numbers = np.broadcast_to(every, (len(there.start), *every.shape))
-            value, likely = self.rank(there, some, actions)
+            rank = functools.partial(self.rank, there, some)
+            actions, value = self.proposals(len(there.start), rank)
             if self.refine:
                 top = np.argsort(-value, axis=1, kind="stable")[:, : self.refine]
                 seeds = np.take_along_axis(actions, top[..., None], axis=1)
                 refined = refined_actions(self.task, there, seeds)
-                more, sure = self.rank(there, some, refined)
                 actions = np.concatenate((actions, refined), axis=1)
-                value = np.concatenate((value, more), axis=1)
-                likely = np.concatenate((likely, sure), axis=1)
+                value = np.concatenate((value, rank(refined)), axis=1)
             best = np.arange(len(value)), value.argmax(axis=1)
-            chosen.append(actions[best])
-            success.append(likely[best])
+            taken = actions[best]
+            worth = worth_of(self.task, there, moves_of(self.task, there, taken[:, None]))[:, 0]
+            chosen.append(taken)
+            success.append(value[best] - EFFORT_WEIGHT * worth)
         return np.concatenate(chosen).astype(np.float64), np.concatenate(success).astype(np.float64)
 
     def _check_observation(self, batch: Observation) -> None:
@@ -283,7 +291,7 @@ class ViaRank(PlanAlgorithm):
 
     def _candidates(self, number: int) -> NDArray[np.float32]:
         """Return random candidates of some scenes, shape (number, H, m)."""
-        every = candidate_actions(self.policy.task, self.policy.candidates, replanning=False)
+        every = candidate_actions(self.policy.task, EXPLORED, replanning=False)
         drawn = np.random.uniform(size=(number, len(every))).argsort(axis=1)  # noqa: NPY002 - seeded by SB3
         return np.asarray(every[drawn[:, : self.explore_candidates]], np.float32)
 
@@ -296,7 +304,7 @@ class ViaRank(PlanAlgorithm):
         task = self.policy.task
         problem = Problem.of_observation(observation, task)
         sight = Sight.of(observation, task)
-        value, _ = self.policy.rank(problem, sight, candidates)
+        value = self.policy.rank(problem, sight, candidates)
         actions = candidates[np.arange(n_envs), value.argmax(axis=1)]
         return actions, actions
 
