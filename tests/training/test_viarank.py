@@ -1,5 +1,7 @@
 """Laws of agents that see obstacles with a sensor."""
 
+import functools
+
 import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
@@ -41,6 +43,19 @@ def test_models_are_saved_and_loaded(agent, tmp_path) -> None:
     loaded = load_agent(tmp_path / "model")
     observation = ViaVecEnv(ENV, 8, seed=3).reset()
     assert np.array_equal(agent.predict(observation)[0], loaded.predict(observation)[0])
+
+
+def test_rounds_of_candidates_never_lower_the_best_value(agent) -> None:
+    policy = agent.policy
+    scenes = policy.task.sampler()([np.random.default_rng((5, i)) for i in range(16)])
+    rank = functools.partial(
+        policy.rank, Problem.of_scenes(scenes, policy.task), Sight.of_scenes(scenes, policy.task)
+    )
+    actions, value = policy.proposals(16, rank)
+    first = value[:, : policy.candidates].max(axis=1)
+    assert actions.shape[1] == policy.candidates + policy.refinements * policy.per_refinement
+    assert (value.max(axis=1) >= first).all()
+    assert (value.max(axis=1) > first).mean() > 0.5
 
 
 def test_places_are_those_of_the_movement() -> None:
