@@ -79,6 +79,10 @@ class Arm:
     notes: tuple[str, ...] = ()
     """Choices that were made for the arm when it was loaded, and parts that were left out."""
 
+    def __deepcopy__(self, memo: object) -> Arm:
+        """Return the arm itself, which never changes, so that copies of a task are equal to it."""
+        return self
+
     def report(self) -> str:
         """Return what the arm is, and what was chosen for it, as a text of several lines."""
         lines = [repr(self)]

@@ -1,5 +1,7 @@
 """Bad input raises one error where it enters: the input, and the type of the error."""
 
+import copy
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -208,6 +210,11 @@ def test_arguments_of_classes_and_functions(call, arguments):
     for each in arguments:
         with pytest.raises(ValueError):
             call(*each)
+
+
+def test_a_copy_of_a_task_is_equal():
+    task = Task.of(arm="panda")
+    assert copy.deepcopy(task) == task
 
 
 def test_records_of_tasks():

@@ -456,6 +456,15 @@ def test_command_line_plans_and_measures(tmp_path, capsys) -> None:
     main(words)
     assert "success" in capsys.readouterr().out
     assert np.allclose(read_motion(tmp_path / "plan.csv")[1].position[-1], GOAL)
+    scene.write_text("\ufeff" + obstacles_to_json([POST]))  # as editors of Windows do
+    main(words)
+    foreign = tmp_path / "foreign.csv"
+    foreign.write_text("time,x\n0,1\n")
+    for refused in (foreign, tmp_path, foreign / "plan.csv"):
+        with pytest.raises(SystemExit):
+            main([*words[:-1], str(refused)])
+    assert foreign.read_text() == "time,x\n0,1\n"
+    capsys.readouterr()
     scene.write_text(obstacles_to_json(WALL))
     with pytest.raises(SystemExit):
         main([*words, "--time-limit", "0"])

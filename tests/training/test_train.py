@@ -143,6 +143,21 @@ def test_what_a_run_leaves(tmp_path, capsys):
         assert [event.value for event in logged] == pytest.approx(values, rel=1e-6)
 
 
+def test_ctrl_c_is_heard_after_the_last_decision_too(tmp_path, monkeypatch):
+    """A demo that trains first would go on with its evaluation."""
+    save = Run.save
+
+    def interrupted(self, name, model):
+        if name == "final":
+            os.kill(os.getpid(), signal.SIGINT)
+        return save(self, name, model)
+
+    monkeypatch.setattr(Run, "save", interrupted)
+    with pytest.raises(TrainingStoppedError):
+        train(config(tmp_path / "run"))
+    assert Run(tmp_path / "run").ended
+
+
 def test_ctrl_c_saves_and_leaves_and_the_rest_follows(tmp_path, monkeypatch):
     whole = train(config(tmp_path / "whole", checkpoint_every=10_000))
     step_wait = ViaVecEnv.step_wait

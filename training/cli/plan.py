@@ -13,12 +13,15 @@ from viapoint.envs.arms.registry import arm_names, arm_of
 from viapoint.envs.geometry.shapes import obstacles_from_json
 from viapoint.envs.scenes.options import Pose, scene_from_json
 from viapoint.training.config.configs import PlanConfig
-from viapoint.training.planning.export import write_motion
+from viapoint.training.io.files import LARGEST_JSON, BadFileError, read_bytes
+from viapoint.training.planning.export import read_motion, write_motion
 from viapoint.training.planning.plan_motion import plan_motion
 
 
 def run(config: PlanConfig) -> None:
     """Plan a movement, print what is known of it, and write it."""
+    if config.out is not None:
+        _check_replaceable(config.out)
     arm = _arm_for(config)
     scene = _scene(config.scene)
     start = config.start or scene.get("start")
@@ -47,6 +50,18 @@ def run(config: PlanConfig) -> None:
         print(f"{record_plan(config.video, plan)} frames: {config.video}")
 
 
+def _check_replaceable(path: Path) -> None:
+    """Check that there is no file yet, or a movement, which was written by an earlier call."""
+    if not path.exists():
+        return
+    try:
+        read_motion(path)
+    except (OSError, ValueError):
+        raise BadFileError(
+            path, "exists and was not written by viapoint; name another file, or move it away"
+        ) from None
+
+
 def _arm_for(config: PlanConfig) -> Arm:
     """Return the arm of a name or of a file."""
     if config.arm in arm_names():
@@ -67,7 +82,7 @@ def _scene(path: Path | None) -> dict[str, Any]:
     """Return start, goal and obstacles of a scene file, or of a list of obstacles."""
     if path is None:
         return {}
-    text = path.expanduser().read_text(encoding="utf-8")
+    text = read_bytes(path, LARGEST_JSON).decode("utf-8-sig")
     if text.lstrip().startswith("["):
         return {"obstacles": obstacles_from_json(text)}
     scene = scene_from_json(text)

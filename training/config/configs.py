@@ -499,8 +499,10 @@ class PlanConfig(Config):
 
     def _check(self) -> None:
         check_file("video", self.video, ".mp4")
-        if self.out is not None and self.out.suffix not in MOTION_FILES:
-            raise ValueError(f"out must end in {' or '.join(MOTION_FILES)}, got {self.out}")
+        if self.out is not None:
+            if self.out.suffix.lower() not in MOTION_FILES:
+                raise ValueError(f"out must end in {' or '.join(MOTION_FILES)}, got {self.out}")
+            check_folder(f"out {self.out}", self.out.parent)
         if self.goal and self.position:
             raise ValueError("a goal is either --goal, joint positions, or --position; both are given")
         for name, length in (("position", 3), ("quaternion", 4)):

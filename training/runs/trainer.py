@@ -201,6 +201,7 @@ def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> N
             if remaining > 0 and not run.stalled:
                 _learn(model, remaining, monitor, fresh=restored is None)
             run.save("final", model)
+            monitor.check_stopped()
     except OSError as error:
         raise TrainingFailedError(
             f"training cannot go on: {error}; all up to decision {run.decisions} is saved; go on with: "
@@ -314,6 +315,14 @@ class RunCallback(BaseCallback):
         self._stop = True
         self._bar.write("saving and leaving; Ctrl-C again leaves at once", file=sys.stderr)
 
+    def check_stopped(self) -> None:
+        """Check that nobody pressed Ctrl-C; everything is saved already, also after the last decision."""
+        if self._stop:
+            raise TrainingStoppedError(
+                f"stopped after {self.run.decisions} decisions, and all is saved; go on with: "
+                f"{_resume_command(self.run)}"
+            )
+
     def _on_training_start(self) -> None:
         self._began = time.monotonic()
         self._show_progress()
@@ -327,10 +336,7 @@ class RunCallback(BaseCallback):
         if self._stop:
             self.run.checkpoint(self.model, {"seconds": self.seconds})
             self.run.save("final", self.model)
-            raise TrainingStoppedError(
-                f"stopped after {self.num_timesteps} decisions, and all is saved; go on with: "
-                f"{_resume_command(self.run)}"
-            )
+            self.check_stopped()
         if self.run.stalled:
             self.run.checkpoint(self.model, {"seconds": self.seconds})
             raise TrainingStalledError
