@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from viapoint.envs import arm_of
-from viapoint.envs.arms.stored import write_arm
 from viapoint.training import Run, evaluate, load_agent
 from viapoint.training.cli.entry import main
 
@@ -85,15 +83,3 @@ def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch) -> None
     assert filmed == [str(UR5E)]
     with pytest.raises(SystemExit):
         main(["evaluate", "--arm", "nowhere.xml"])
-
-
-def test_a_copy_of_an_arm_is_the_same_arm(tmp_path) -> None:
-    arm = arm_of(str(UR5E))
-    write_arm(tmp_path / "copy.xml", arm)
-    copy = arm_of(str(tmp_path / "copy.xml"))
-    assert (copy.name, copy.group_names, copy.left_out) == (arm.name, arm.group_names, arm.left_out)
-    for mine, theirs in ((copy.spheres, arm.spheres), (copy.chain, arm.chain)):
-        for first, second in zip(mine, theirs, strict=True):
-            np.testing.assert_array_equal(first, second)
-    for name in ("joint_range", "velocity_limit", "torque_limit", "home", "stiffness", "damping"):
-        np.testing.assert_array_equal(getattr(copy, name), getattr(arm, name))
