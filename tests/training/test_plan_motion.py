@@ -395,14 +395,6 @@ def test_plans_are_executed_among_all_shapes() -> None:
         plan_motion(PANDA, PANDA.home, GOAL, [many]).execute()
 
 
-def test_capsules_and_cylinders_stand_for_one_another() -> None:
-    for shape in (
-        Capsule(0.05, 0.4, position=(0.5, 0.15, 0.4)),
-        Cylinder(0.05, 0.4, position=(0.5, 0.15, 0.4)),
-    ):
-        assert plan_motion(PANDA, PANDA.home, GOAL, [shape]).success
-
-
 def test_the_benchmark_is_that_of_the_literature() -> None:
     arm, problems = benchmark_panda(), benchmark_problems()
     assert len(problems) == 700
