@@ -3,6 +3,7 @@
 import doctest
 import enum
 import inspect
+import itertools
 from pathlib import Path
 
 import gymnasium as gym
@@ -68,16 +69,18 @@ def test_agents_are_loaded_by_id_run_and_model_folder(run):
 
 
 def test_a_planned_movement_is_the_one_that_an_environment_executes():
-    env, agent = gym.make(ENV), load_agent(ENV)
-    for seed in range(3):
+    shapes = ("capsule", "box", "cylinder")
+    env = gym.make(ENV, shapes=shapes).unwrapped
+    agent = ViaQ("ViaQPolicy", ViaVecEnv(ENV, 4, seed=0, threads=1, shapes=shapes), seed=0)
+    search = GeometrySearch(ENV, 256, shapes=shapes)
+    for method, seed in itertools.product((agent, search), range(3)):
         observation, _ = env.reset(seed=seed)
-        scene = env.unwrapped.batch.scenes.take([0])
-        start, goal = env.unwrapped.task.space.coordinates(np.concatenate((scene.start, scene.goal)))
-        plan = agent.plan(start=start, goal=goal, obstacles=unpack(scene.obstacles, 0))
-        env.step(agent.predict(observation, deterministic=True)[0])
-        executed = env.unwrapped.last_plan
-        np.testing.assert_allclose(plan.waypoints, executed.waypoints, atol=1e-6)
-        np.testing.assert_allclose(plan.durations, executed.durations, atol=1e-6)
+        scene = env.batch.scenes
+        start, goal = env.task.space.coordinates(np.concatenate((scene.start, scene.goal)))
+        plan = method.plan(start=start, goal=goal, obstacles=unpack(scene.obstacles, 0))
+        env.step(method.predict(observation, deterministic=True)[0])
+        np.testing.assert_allclose(plan.waypoints, env.last_plan.waypoints, atol=1e-6)
+        np.testing.assert_allclose(plan.durations, env.last_plan.durations, atol=1e-6)
         ends = plan.trajectory()(np.array([0.0, plan.durations.sum()]))
         np.testing.assert_allclose(ends, [start, goal], atol=1e-9)
 
