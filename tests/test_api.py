@@ -13,13 +13,12 @@ from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from viapoint import envs, primitives, training
-from viapoint.envs import Cylinder
 from viapoint.envs.geometry.obstacles import unpack
 from viapoint.envs.scenes import families_registry
 from viapoint.training import GeometrySearch, TrainConfig, ViaQ, ViaVecEnv, evaluate, load_agent, train
 
 ROOT = Path(__file__).parents[1]
-ENV, REPLANNING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
+ENV = "viapoint/PlanarObstacles-v0"
 EXPORTS = [(package, name) for package in (primitives, envs, training) for name in package.__all__]
 SMALL = {"learning_starts": 16, "gradient_steps": 1, "policy_kwargs": {"candidates": 8, "refinements": 0}}
 
@@ -94,41 +93,6 @@ def test_an_evaluation_has_one_row_for_each_method_and_number_of_checks():
     assert low <= result.success_rate <= high
     assert result.to_dict()["methods"]["agent"]["success"]["rate"] == result.success_rate
     assert evaluate(search, env=ENV, n_scenes=10).success_rate == result.rows[-1]["success"]["rate"]
-
-
-POST = Cylinder(0.03, 0.1, position=(0.0, 0.35, 0.0))
-
-
-def planned(env_id, **arguments):
-    return load_agent(env_id).plan(**{"start": (-0.2, 0.3), "goal": (0.1, 0.4), **arguments})
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: load_agent("viapoint/Reach-v0"),
-        lambda: load_agent("viapoint/Nothing-v0"),
-        lambda: load_agent(Path("nowhere")),
-        lambda: load_agent(ROOT),
-        lambda: load_agent(Path(__file__)),
-        lambda: planned(ENV, obstacles=[POST] * 9),
-        lambda: planned(ENV, obstacles=[(0.0, 0.35, 0.03)]),
-        lambda: planned(ENV, start=(0.0, 9.0)),
-        lambda: planned(ENV, goal=(np.nan, 0.3)),
-        lambda: planned("viapoint/PlanarReach-v0", obstacles=[POST]),
-        lambda: planned(REPLANNING),
-        lambda: evaluate(),
-        lambda: evaluate(env=ENV),
-        lambda: evaluate(env=ENV, baselines=["magic"]),
-        lambda: evaluate(env=ENV, baselines=["untrained"]),
-        lambda: evaluate(ENV, env=REPLANNING),
-        lambda: evaluate(ENV, scenes="nowhere.npz"),
-        lambda: evaluate(env="viapoint/Nothing-v0", baselines=["straight"]),
-    ],
-)
-def test_bad_input_is_refused(call):
-    with pytest.raises(ValueError):
-        call()
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Bad input raises one error where it enters: the input, and the type of the error."""
 
 import functools
-import json
 import math
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecExtractDictObs, VecNormalize
 
-from viapoint.envs import Sphere, Task, scene_from_json
+from viapoint.envs import Sphere, Task
 from viapoint.training import evaluate, load_agent
 from viapoint.training.agents.agent import SAC, find_model
 from viapoint.training.agents.model_io import ALGORITHMS
@@ -176,18 +175,6 @@ def predicted(**changes):
     return agent().predict({**observation, **changes})
 
 
-def scene_file(**changes):
-    """Return the scene of a file, as an environment starts it."""
-    record = {"format": "viapoint-scene", "start": [-0.2, 0.3], "goal": [0.1, 0.4], "obstacles": []}
-    options = scene_from_json(json.dumps({**record, **changes}))
-    return gym.make(ENV).reset(seed=0, options=options)
-
-
-def capsule_file(**changes):
-    capsule = {"shape": "capsule", "radius": 0.02, "half_length": 0.03, "position": [0.4, 0.4, 0.0]}
-    return scene_file(obstacles=[{**capsule, **changes}])
-
-
 def scenes(number):
     return SceneSimulation(ENV, 1).task.sampler()([np.random.default_rng(0)] * number)
 
@@ -237,6 +224,8 @@ CALLS = [
     lambda: evaluate(baselines=["straight"]),
     lambda: evaluate(env=ENV, baselines=["untrained"]),
     lambda: evaluate("nowhere"),
+    lambda: load_agent(Path(__file__)),
+    lambda: load_agent(Path(__file__).parent),
     *(lambda wrap=wrap: evaluate(SAC("MlpPolicy", NormalizeObservation(wrap(FlattenObservation(gym.make(ENV))))))
       for wrap in (lambda env: env, Monitor)),
     lambda: evaluate(SAC("MlpPolicy", VecExtractDictObs(ViaVecEnv(ENV, 2), "goal"))),
@@ -267,14 +256,6 @@ CALLS = [
     *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, "Pendulum-v1")),
     lambda: ViaQ("ViaQPolicy", VecNormalize(ViaVecEnv(ENV, 2))),
     lambda: ViaRank("ViaRankPolicy", VecNormalize(ViaVecEnv(SENSED, 2))),
-    *(lambda change=change: scene_file(**change) for change in (
-        {"format": "other"}, {"start": [0.1]}, {"goal": [0.1, math.nan]}, {"jumps": [[1.0]]}, {"colour": 1},
-        {"obstacles": 3}, {"obstacles": [[0.1, 0.2]]}, {"obstacles": [{"shape": "cube"}]},
-    )),
-    *(lambda change=change: capsule_file(**change) for change in (
-        {"radius": "x"}, {"radius": -1.0}, {"position": [0, 0]}, {"colour": 1},
-    )),
-    *(lambda text=text: scene_from_json(text) for text in ("{", b"\xff\xfe", "[" * 100_000, "1" * (2 << 20))),
     lambda: load(Path("tests")),
     lambda: scenes_for("tests", Task.of()),
     *(lambda env_id=env_id: scenes_for(shipped_path("validation", env_id), Task.of()) for env_id in CHANGING),
