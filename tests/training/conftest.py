@@ -11,6 +11,7 @@ import torch
 from viapoint.training import scene_sets
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets import FrozenScenes
+from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 sys.path.append(str(Path(__file__).parent))
 sys.path += [str(Path(__file__).parents[2] / folder) for folder in ("docs/figures", "benchmarks")]
@@ -24,6 +25,14 @@ def one_thread():
 
 
 @pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
+def env():
+    """Six environments, which SB3 takes."""
+    env = ViaVecEnv(ENV, 6, seed=3, threads=1)
+    yield env
+    env.close()
+
+
 def small_scenes():
     """Forty scenes, with the share of 32 random actions that solve each."""
     simulation = SceneSimulation(ENV, 64, threads=1)

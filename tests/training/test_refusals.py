@@ -154,13 +154,6 @@ def test_what_cannot_be_trained_leaves_no_folder(changes, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture(scope="module")
-def env():
-    env = ViaVecEnv(ENV, 6, seed=3)
-    yield env
-    env.close()
-
-
 @functools.cache
 def agent():
     return load_agent(ENV)
