@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from viapoint.training import scene_sets
+from viapoint.training.cli import entry
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets import FrozenScenes
 from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.scene_sets import FrozenScenes
 
 sys.path.append(str(Path(__file__).parent))
 sys.path += [str(Path(__file__).parents[2] / folder) for folder in ("docs/figures", "benchmarks")]
@@ -24,7 +25,6 @@ def one_thread():
     torch.set_num_threads(1)
 
 
-@pytest.fixture(scope="session")
 @pytest.fixture(scope="module")
 def env():
     """Six environments, which SB3 takes."""
@@ -33,6 +33,7 @@ def env():
     env.close()
 
 
+@pytest.fixture(scope="session")
 def small_scenes():
     """Forty scenes, with the share of 32 random actions that solve each."""
     simulation = SceneSimulation(ENV, 64, threads=1)
@@ -53,6 +54,22 @@ def shipped(small_scenes, tmp_path, monkeypatch):
     small_scenes.save(path)
     monkeypatch.setattr(scene_sets, "shipped_set", lambda name, task: path)
     return small_scenes
+
+
+@pytest.fixture
+def failed(capsys):
+    """Function of the words of a command that fails; it returns the one line on the standard error output."""
+
+    def told(*words, code=2):
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            entry.main([str(word) for word in words])
+        assert end.value.code == code
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert line.startswith("viapoint: ")
+        return line
+
+    return told
 
 
 @pytest.fixture(autouse=True, scope="session")
