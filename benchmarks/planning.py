@@ -2,6 +2,7 @@
 
 python benchmarks/planning.py table   # problems 21 to 100 of each set, about five minutes
 python benchmarks/planning.py curves  # problems 1 to 20, about twelve minutes
+python benchmarks/planning.py data FOLDER  # the problems of the package again, from a folder of the original files
 """
 
 from __future__ import annotations
@@ -45,13 +46,36 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("table", "curves"))
-    asked = parser.parse_args().what
+    parser.add_argument("what", choices=("table", "curves", "data"))
+    parser.add_argument("folder", nargs="?", type=Path)
+    asked = parser.parse_args()
+    if asked.what == "data":
+        if asked.folder is None:
+            parser.error("data needs a folder")
+        write_problems(asked.folder)
+        return
     problems = benchmark_problems()
-    if asked == "table":
+    if asked.what == "table":
         write_table([each for each in problems if each.number > DEVELOPED_ON])
     else:
         draw_curves([each for each in problems if each.number <= DEVELOPED_ON])
+
+
+def write_problems(folder: Path) -> None:
+    """Write the numeric file of the package from a folder of the original files."""
+    problems = benchmark.read_problems(folder)
+    shapes = [shape for problem in problems for shape in problem.obstacles]
+    np.savez_compressed(
+        Path(benchmark.__file__).parent / "data" / "motionbenchmaker.npz",
+        set=np.array([benchmark.SETS.index(problem.set) for problem in problems], np.int8),
+        number=np.array([problem.number for problem in problems], np.int16),
+        start=np.array([problem.start for problem in problems]),
+        goal=np.array([problem.goal for problem in problems]),
+        count=np.array([len(problem.obstacles) for problem in problems], np.int16),
+        kind=np.array([benchmark.KINDS[type(shape)] for shape in shapes], np.int8),
+        pose=np.array([[*shape.position, *shape.quaternion] for shape in shapes], np.float32),
+        size=np.array([shape.packed_size for shape in shapes], np.float32),
+    )
 
 
 def write_table(problems: list[BenchmarkProblem]) -> None:

@@ -96,51 +96,23 @@ def timed(waypoints: Float, duration: Float, state: Motion) -> Plan:
     return Plan(waypoints, durations, state.velocity, state.acceleration)
 
 
-def revised_waypoints(
-    layout: ActionLayout,
-    line: Float,
-    position: Float,
-    vias: Float,
-    goal: Float,
-    remaining: Float,
-    actions: Float,
-) -> tuple[Float, Float]:
-    """Return waypoints (..., K + 2, D) and durations (...,), [s], of revised plans; batch dimensions broadcast.
-
-    Args:
-        layout: Layout of the actions.
-        line: Vector along which offsets are measured in hand space, shape (..., D).
-        position: Commanded position, shape (..., D).
-        vias: Default via-points, shape (..., K, D).
-        goal: Present goal, shape (..., D).
-        remaining: Default remaining time, shape (...,), [s].
-        actions: Shape (..., m), in [-1, 1].
-    """
-    d, number = layout.dimension, layout.n_via
-    batch = actions.shape[:-1]
-    offsets = actions[..., : number * d].reshape(*batch, number, d) * np.array(layout.via_scale)
-    if layout.space == "hand":
-        offsets = turned(offsets, line[..., None, :])
-    least = least_remaining(layout)
-    remaining = np.maximum(remaining, least)
-    duration = np.maximum(remaining * np.exp(layout.log_half_range * actions[..., number * d]), least)
-    if layout.space == "hand":
-        duration = np.minimum(duration, np.maximum(remaining, layout.duration_range[1]))
-    ends = [np.broadcast_to(end[..., None, :], (*batch, 1, d)) for end in (position, goal)]
-    return np.concatenate((ends[0], vias + offsets, ends[1]), axis=-2), duration
-
-
 def _revised(layout: ActionLayout, nominal: NominalPlan, actions: Float) -> Plan:
     """Return plans in motion for actions that change them."""
-    state = nominal.state
-    points, duration = revised_waypoints(
-        layout, _line(nominal), state.position, nominal.vias, nominal.goal, nominal.remaining, actions
-    )
+    state, number, d = nominal.state, layout.n_via, layout.dimension
+    offsets = actions[:, : number * d].reshape(len(actions), number, d) * np.array(layout.via_scale)
+    if layout.space == "hand":
+        offsets = turned(offsets, _line(nominal)[:, None])
+    points = np.concatenate((state.position[:, None], nominal.vias + offsets, nominal.goal[:, None]), axis=1)
+    least = least_remaining(layout)
+    remaining = np.maximum(nominal.remaining, least)
+    duration = np.maximum(remaining * np.exp(layout.log_half_range * actions[:, number * d]), least)
+    if layout.space == "hand":
+        duration = np.minimum(duration, np.maximum(remaining, layout.duration_range[1]))
     zero = (actions == 0.0).all(axis=-1)
     slightly = nominal.changed & ~nominal.jumped
     plan = timed(points, np.where(zero & slightly, nominal.remaining, duration), state)
     # The smoothest movement itself: its via-points are evenly spaced in time.
-    even = np.broadcast_to(duration[:, None] / (layout.n_via + 1), plan.durations.shape)
+    even = np.broadcast_to(duration[:, None] / (number + 1), plan.durations.shape)
     return plan._replace(durations=np.where((zero & ~slightly)[:, None], even, plan.durations))
 
 

@@ -31,11 +31,6 @@ FAR = 1e3
 CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
 
-@pytest.fixture
-def rng():
-    return np.random.default_rng(8)
-
-
 def places(rng, number):
     """Points around the origin, half of them close to it."""
     return rng.uniform(-0.5, 0.5, (number, 3)) * np.where(np.arange(number) % 2, 1.0, 0.3)[:, None]

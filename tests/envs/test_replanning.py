@@ -152,21 +152,6 @@ def test_reward_terms_sum_to_those_of_the_whole_episode(env_id):
         assert total["reward_success"] == weights.success * last["is_success"]
 
 
-@pytest.mark.parametrize("env_id", [*IDS, "viapoint/PlanarObstaclesStep-v0"])
-def test_episodes_go_on_from_a_stored_state(env_id):
-    first, second = (gym.make_vec(env_id, num_envs=3, threads=1).unwrapped for _ in range(2))
-    first.reset(seed=0)
-    actions = np.random.default_rng(0).uniform(-0.4, 0.4, (9, *first.action_space.shape))
-    for action in actions[:4]:
-        first.step(action)
-    second.restore(first.state())
-    for action in actions[4:]:
-        one, two = first.step(action), second.step(action)
-        same(one[0], two[0])
-        np.testing.assert_array_equal(one[1], two[1])
-        np.testing.assert_array_equal(one[4]["jerk_cost"], two[4]["jerk_cost"])
-
-
 def test_a_plan_in_metres_and_seconds_can_be_executed_on_the_way():
     env, _ = given(JUMP, horizon=0.2, decide_at=("horizon",))
     env.step(np.zeros(3))

@@ -328,7 +328,7 @@ def test_impossible_changes_and_places_are_refused(options):
 
 @pytest.mark.parametrize(
     "text",
-    [None, b"\xff", "[]", "{}", '{"format": "viapoint-scene", "obstacle": []}',
+    [None, b"\xff", "[]", "{}", "{", "[" * 100_000, "1" * (2 << 20), '{"format": "viapoint-scene", "obstacle": []}',
      '{"format": "viapoint-scene", "obstacles": [{"shape": "cube"}]}', '{"format": "viapoint-scene", "obstacles": 3}'],
 )  # fmt: skip
 def test_invalid_scene_files_are_refused(text):

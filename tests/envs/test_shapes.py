@@ -50,11 +50,6 @@ TWISTED = [(0, 1, 2), (5, 4, 3), (0, 3, 1), (3, 4, 1), (1, 4, 2), (4, 5, 2), (2,
 
 
 @pytest.fixture
-def rng():
-    return np.random.default_rng(3)
-
-
-@pytest.fixture
 def wedge():
     """A registered mesh, which is gone afterwards."""
     register_mesh("wedge", WEDGE)

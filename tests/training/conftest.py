@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from viapoint.training import scene_sets
+from viapoint.training.cli import entry
 from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.scene_sets import FrozenScenes
 
 sys.path.append(str(Path(__file__).parent))
@@ -21,6 +23,14 @@ ENV = "viapoint/PlanarObstacles-v0"
 @pytest.fixture(autouse=True)
 def one_thread():
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def env():
+    """Six environments, which SB3 takes."""
+    env = ViaVecEnv(ENV, 6, seed=3, threads=1)
+    yield env
+    env.close()
 
 
 @pytest.fixture(scope="session")
@@ -44,6 +54,22 @@ def shipped(small_scenes, tmp_path, monkeypatch):
     small_scenes.save(path)
     monkeypatch.setattr(scene_sets, "shipped_set", lambda name, task: path)
     return small_scenes
+
+
+@pytest.fixture
+def failed(capsys):
+    """Function of the words of a command that fails; it returns the one line on the standard error output."""
+
+    def told(*words, code=2):
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            entry.main([str(word) for word in words])
+        assert end.value.code == code
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert line.startswith("viapoint: ")
+        return line
+
+    return told
 
 
 @pytest.fixture(autouse=True, scope="session")

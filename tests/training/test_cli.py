@@ -17,16 +17,6 @@ def run(*words):
     cli.main([str(word) for word in words])
 
 
-def failed(capsys, *words, code=2):
-    """The one line that a command left on the standard error output."""
-    with pytest.raises(SystemExit) as end:
-        run(*words)
-    assert end.value.code == code
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("viapoint: ")
-    return line
-
-
 @pytest.mark.parametrize("command", cli.COMMANDS)
 def test_every_command_has_help(command, capsys):
     with pytest.raises(SystemExit) as end:
@@ -67,12 +57,12 @@ INTERRUPTED.__context__ = KeyboardInterrupt()  # as Numba's, when Ctrl-C comes w
     ("error", "code"),
     [(ZeroDivisionError("over nothing"), 2), (KeyboardInterrupt(), 130), (INTERRUPTED, 130)],
 )
-def test_an_end_in_the_middle_is_one_line_and_a_code(error, code, capsys, monkeypatch):
+def test_an_end_in_the_middle_is_one_line_and_a_code(error, code, failed, monkeypatch):
     def broken(config):
         raise error
 
     monkeypatch.setattr(cli, "run_command", broken)
-    assert str(error) in failed(capsys, "doctor", code=code)
+    assert str(error) in failed("doctor", code=code)
     if code == 2:
         with pytest.raises(ZeroDivisionError):
             run("doctor", "--debug")
@@ -106,12 +96,12 @@ def test_train_then_evaluate_then_play(trained, shipped, tmp_path, capsys):
     assert video.stat().st_size > 1000
 
 
-def test_arguments_of_the_environment_are_taken(capsys):
+def test_arguments_of_the_environment_are_taken(capsys, failed):
     words = "evaluate --env viapoint/PlanarSensed-v0 --scenes validation --n-scenes 4 --baselines search16 --env-kwargs"
     run(*words.split(), "sensor=hand_rays", "decide_at=[sight]")
     assert "search16" in capsys.readouterr().out
     for argument, named in (("sensr=rays", "sensor"), ("sensor=nose", "hand_rays"), ("n_via=a", "n_via")):
-        assert named in failed(capsys, *words.split(), argument)
+        assert named in failed(*words.split(), argument)
 
 
 def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, tmp_path):
@@ -128,7 +118,7 @@ def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, 
     assert sorted(each["methods"]["straight"]["scenes"] for each in kept) == [3, 4, 40]
 
 
-def test_an_agent_of_another_task_meets_scenes_of_that_task(tmp_path, capsys):
+def test_an_agent_of_another_task_meets_scenes_of_that_task(tmp_path, failed):
     folder = tmp_path / "run"
     run(
         "train", "--out", folder, "--n-timesteps", 32, "--n-envs", 32, "--eval-every", 0, "--no-progress",
@@ -140,11 +130,10 @@ def test_an_agent_of_another_task_meets_scenes_of_that_task(tmp_path, capsys):
     assert [each["scenes"] for each in record["methods"].values()] == [3, 3]
     run("play", folder, "--n-scenes", 1, "--video", tmp_path / "film.mp4")
     assert (tmp_path / "film.mp4").stat().st_size > 1000
-    capsys.readouterr()
-    assert "validation, test" in failed(capsys, "evaluate", folder, "--scenes", "hard")
+    assert "validation, test" in failed("evaluate", folder, "--scenes", "hard")
 
 
-def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys):
+def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys, failed):
     folder = tmp_path / "run"
     begun = [
         "train", "--out", folder, "--seed", 3, "--env", REACH, "--n-timesteps", 64, "--n-envs", 32, "--eval-every", 0,
@@ -160,10 +149,10 @@ def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys):
         ("--hyperparameters tau=0.1", ("tau as usual",)),
         ("--n-timesteps 32", ("64 decisions", "got 32")),
     ):
-        told = failed(capsys, "train", "--out", folder, "--resume", *words.split())
+        told = failed("train", "--out", folder, "--resume", *words.split())
         assert all(name in told for name in named), told
         assert (folder / "config.json").read_bytes() == before
-    assert "--resume" in failed(capsys, *begun)
+    assert "--resume" in failed(*begun)
     run(*begun, "--resume")
     run("train", "--out", folder, "--resume", "--n-timesteps", 96, "--no-progress")
     assert "96 of 96 decisions" in capsys.readouterr().out

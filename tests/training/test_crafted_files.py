@@ -20,19 +20,11 @@ from viapoint.training import load_agent
 from viapoint.training.agents.model_io import build, load_model, save_model
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.io.files import BadFileError
-from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs.checkpoints import read_checkpoint, read_state, write_checkpoint
 
 ENV = "viapoint/PlanarObstacles-v0"
 RECORD, WEIGHTS = "model.json", "weights.safetensors"
 SMALL = {"learning_starts": 8, "batch_size": 8, "buffer_size": 64, "policy_kwargs": {"net_arch": [8]}}
-
-
-@pytest.fixture(scope="module")
-def env():
-    env = ViaVecEnv(ENV, 2, seed=0, threads=1)
-    yield env
-    env.close()
 
 
 def new(env):

@@ -39,15 +39,6 @@ def run(*words):
     cli.main(["fit", *map(str, words)])
 
 
-def failed(capsys, *words):
-    """The one line that the command left on the standard error output."""
-    with pytest.raises(SystemExit) as end:
-        run(*words)
-    assert end.value.code == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    return line
-
-
 def test_a_file_gives_a_table_and_a_figure(file, tmp_path, capsys):
     folder = tmp_path / "new" / "fit"
     run(file, "--out", folder)
@@ -100,9 +91,9 @@ def changed(name, value):
         (lambda table: table[:0], "holds no samples"),
     ],
 )
-def test_a_file_at_fault_is_told_where(change, told, file, tmp_path, capsys):
+def test_a_file_at_fault_is_told_where(change, told, file, tmp_path, failed):
     change(pd.read_csv(file)).to_csv(file, index=False)
-    assert told in failed(capsys, file, "--out", tmp_path / "fit")
+    assert told in failed("fit", file, "--out", tmp_path / "fit")
     assert not (tmp_path / "fit").exists()
 
 
@@ -121,30 +112,30 @@ TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
         (["time,x,y,movement", "0.0,0.1,0.2,a", "", "0.1,0.1,0.2,"], "names no movement in line 4"),
     ],
 )
-def test_lines_at_fault_are_told_by_their_number_in_the_file(lines, told, tmp_path, capsys):
+def test_lines_at_fault_are_told_by_their_number_in_the_file(lines, told, tmp_path, failed):
     path = tmp_path / "lines.csv"
     path.write_text("\n".join(lines))
-    assert told in failed(capsys, path, "--out", tmp_path / "fit")
+    assert told in failed("fit", path, "--out", tmp_path / "fit")
 
 
-def test_foreign_files_stay(file, tmp_path, capsys):
+def test_foreign_files_stay(file, tmp_path, failed):
     (tmp_path / "fit.csv").write_text("mine")
-    assert "not written by viapoint" in failed(capsys, file, "--out", tmp_path)
+    assert "not written by viapoint" in failed("fit", file, "--out", tmp_path)
     assert (tmp_path / "fit.csv").read_text() == "mine"
-    assert "is missing" in failed(capsys, tmp_path / "nothing.csv")
+    assert "is missing" in failed("fit", tmp_path / "nothing.csv")
     (tmp_path / "empty.csv").touch()
-    assert "cannot be read as CSV" in failed(capsys, tmp_path / "empty.csv", "--out", tmp_path / "fit")
+    assert "cannot be read as CSV" in failed("fit", tmp_path / "empty.csv", "--out", tmp_path / "fit")
 
 
-def test_a_full_disk_leaves_no_half_of_a_figure(file, tmp_path, capsys, monkeypatch):
+def test_a_full_disk_leaves_no_half_of_a_figure(file, tmp_path, failed, monkeypatch):
     def full(handle):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    assert "fit.png" in failed(capsys, file, "--out", tmp_path / "fit")
+    assert "fit.png" in failed("fit", file, "--out", tmp_path / "fit")
     assert not list((tmp_path / "fit").iterdir())
 
 
 @pytest.mark.parametrize("numbers", [(2, 1), (0, 1, 2), (9,), (-1,)])
-def test_a_wrong_number_of_via_points_is_told_before_the_file_is_read(numbers, capsys):
-    assert "--n-via must be" in failed(capsys, "nothing.csv", "--n-via", *numbers)
+def test_a_wrong_number_of_via_points_is_told_before_the_file_is_read(numbers, failed):
+    assert "--n-via must be" in failed("fit", "nothing.csv", "--n-via", *numbers)

@@ -18,7 +18,6 @@ import viapoint.envs as ve
 from viapoint.envs.registration import ENV_IDS
 from viapoint.training.agents.agent import SAC
 from viapoint.training.agents.viaq import ViaQ
-from viapoint.training.cli import entry as cli
 from viapoint.training.live import drawing
 from viapoint.training.live.arena import AGENT, HAND, MOTION, SEARCH, STRAIGHT, Arena
 from viapoint.training.live.decide import APART, decide, describe_plan, execute, profile, propose
@@ -336,7 +335,7 @@ def test_impossible_files_are_refused(change, arenas):
         arena.read(json.dumps(GOOD_FILE | change).encode())
 
 
-def test_what_cannot_be_served_is_refused(capsys, tmp_path):
+def test_what_cannot_be_served_is_refused(failed, tmp_path):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -346,11 +345,7 @@ def test_what_cannot_be_served_is_refused(capsys, tmp_path):
             ([str(tmp_path / "none")], "none"),
             (["--arm", "nowhere.xml", "--port", "0"], "nowhere.xml"),
         ):
-            with pytest.raises(SystemExit) as end:
-                cli.main(["live", *words])
-            assert end.value.code == 2
-            (line,) = capsys.readouterr().err.splitlines()
-            assert named in line
+            assert named in failed("live", *words)
     with pytest.raises(ValueError):
         LivePage(PLANAR, env=PANDA, port=0)
 

@@ -87,17 +87,6 @@ def test_a_jumping_target_is_reached_by_revision_only():
     assert (rate(JUMPS, "straight"), rate(JUMPS, "unrevised")) == (1.0, 0.0)
 
 
-def test_an_episode_is_the_same_alone_and_among_others():
-    simulation = SceneSimulation(MOVING, 8)
-    scenes = simulation.task.sampler()([np.random.default_rng((4, each)) for each in range(11)])
-    actions = np.random.default_rng(0).uniform(-0.5, 0.5, (11, simulation.task.action.size))
-    together = simulation(scenes, actions)
-    for row in (0, 7, 10):
-        alone = simulation(scenes.take([row]), actions[[row]])
-        for name, value in alone.info.items():
-            np.testing.assert_array_equal(value[0], together.info[name][row])
-
-
 @pytest.fixture(scope="module")
 def model():
     preset = STEP_PRESETS["sac"]

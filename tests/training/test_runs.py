@@ -25,13 +25,6 @@ from viapoint.training.runs.run_dir import Run
 ENV = "viapoint/PlanarObstacles-v0"
 
 
-@pytest.fixture(scope="module")
-def env():
-    env = ViaVecEnv(ENV, 4, seed=0, threads=1)
-    yield env
-    env.close()
-
-
 def new(algo, env, **hyperparameters):
     preset = PRESETS[algo]
     return build(algo, preset.policy, env, {**preset.arguments(), **hyperparameters}, seed=1)

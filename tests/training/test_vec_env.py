@@ -15,13 +15,6 @@ from viapoint.training.rollouts.vec_env import ViaVecEnv
 ENV, STEP = "viapoint/PlanarObstacles-v0", "viapoint/PlanarObstaclesStep-v0"
 
 
-@pytest.fixture
-def env():
-    env = ViaVecEnv(ENV, 6, seed=3, threads=1)
-    yield env
-    env.close()
-
-
 def actions(env, seed=0):
     generator = np.random.default_rng(seed)
     return generator.uniform(-0.5, 0.5, (env.num_envs, *env.action_space.shape)).astype(np.float32)

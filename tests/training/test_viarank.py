@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
-from viapoint.envs import Task
-from viapoint.training import ViaQ, ViaRank, ViaVecEnv, evaluate, load_agent
+from viapoint.training import ViaQ, ViaRank, ViaVecEnv, evaluate
 from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.places import places_of
 from viapoint.training.planning.problem import Problem, moves_of
@@ -36,13 +35,6 @@ def test_predicted_success_is_calibrated(agent) -> None:
     scenes = simulation.task.sampler()([np.random.default_rng((9, i)) for i in range(300)])
     actions, predicted = agent.policy.assess(simulation.observe(scenes))
     assert abs(predicted.mean() - simulation(scenes, actions).success.mean()) < 0.08
-
-
-def test_models_are_saved_and_loaded(agent, tmp_path) -> None:
-    agent.save(tmp_path / "model")
-    loaded = load_agent(tmp_path / "model")
-    observation = ViaVecEnv(ENV, 8, seed=3).reset()
-    assert np.array_equal(agent.predict(observation)[0], loaded.predict(observation)[0])
 
 
 def test_rounds_of_candidates_never_lower_the_best_value(agent) -> None:
@@ -96,7 +88,9 @@ def test_sets_of_scenes_are_solvable_and_partly_hidden() -> None:
     frozen = scenes_for("validation", task)
     known = registered_task("viapoint/PlanarObstacles-v0")
     assert not np.isin(frozen.scenes.start[:, 0], scenes_for("validation", known).scenes.start[:, 0]).any()
-    assert 0.1 < frozen.hidden.mean() < 0.5
+    obstacles = frozen.scenes.obstacles
+    hidden = task.sensor.hidden(*task.sensor.pose(task.arm, frozen.scenes.start), obstacles)
+    assert 0.1 < (hidden.sum(axis=1) / obstacles.present.sum(axis=1)).mean() < 0.5
     problem = Problem.of_scenes(frozen.scenes, task)
     straight = np.zeros((len(frozen.share), 1, task.action.size))
     assert (plan_clearances(task, problem, straight, 0.01, 0.0)[:, 0] < 0.01).all()
@@ -152,8 +146,3 @@ def test_other_observations_are_refused(agent, change) -> None:
 def test_baselines_that_mean_nothing_are_refused(env_id, name) -> None:
     with pytest.raises(ValueError):
         evaluate(env=env_id, baselines=[name], n_scenes=2)
-
-
-def test_tasks_with_sensors_are_written_and_read() -> None:
-    task = Task.of(arm="panda", n_obstacles=(1, 4), sensor="camera")
-    assert Task.from_dict(task.as_dict()) == task

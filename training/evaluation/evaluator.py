@@ -146,7 +146,7 @@ class EvaluationResult:
         for each in others:
             number = min(len(first.success), len(each.success))  # of an evaluation that was interrupted
             pairs = each.success[:number], first.success[:number]
-            compared[each.name] = mcnemar(*pairs)._asdict() if number else None
+            compared[each.name] = mcnemar(*pairs) if number else None
         outcomes = {}
         for result in self.results:
             arrays = {"action": result.actions, **result.outcomes}

@@ -20,15 +20,6 @@ class Interval(NamedTuple):
     high: float
 
 
-class Comparison(NamedTuple):
-    """Comparison of two methods on the same scenes."""
-
-    difference: float  # Success rate of the first minus that of the second
-    only_first: int  # Scenes in which the second alone failed
-    only_second: int  # Scenes in which the first alone failed
-    p_value: float  # Two-sided p-value of the exact McNemar test
-
-
 def wilson(successes: int, trials: int) -> Interval:
     """Return Wilson's score interval of a success rate; without trials it is (nan, 0, 1).
 
@@ -45,8 +36,11 @@ def wilson(successes: int, trials: int) -> Interval:
     return Interval(test.statistic, float(low), float(high))
 
 
-def mcnemar(first: ArrayLike, second: ArrayLike) -> Comparison:
+def mcnemar(first: ArrayLike, second: ArrayLike) -> dict[str, float]:
     """Compare the successes of two methods on the same N > 0 scenes, shape (N,), by the exact McNemar test.
+
+    The result holds `difference`, the success rate of the first minus that of the second; `only_first` and
+    `only_second`, numbers of scenes in which one alone succeeded; and the two-sided `p_value`.
 
     Only the b scenes where the first alone succeeded and the c where the second alone did distinguish them. If
     both are equally likely, b is binomial(b + c, 1/2). Source: McNemar 1947, Psychometrika 12, 153-157.
@@ -55,12 +49,12 @@ def mcnemar(first: ArrayLike, second: ArrayLike) -> Comparison:
     only_first = int((a > b).sum())
     only_second = int((b > a).sum())
     differing = only_first + only_second
-    return Comparison(
-        difference=float(a.mean() - b.mean()),
-        only_first=only_first,
-        only_second=only_second,
-        p_value=float(stats.binomtest(only_first, differing).pvalue) if differing else 1.0,
-    )
+    return {
+        "difference": float(a.mean() - b.mean()),
+        "only_first": only_first,
+        "only_second": only_second,
+        "p_value": float(stats.binomtest(only_first, differing).pvalue) if differing else 1.0,
+    }
 
 
 def across_seeds(

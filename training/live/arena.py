@@ -10,14 +10,13 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 
 import viapoint.envs as ve
 from viapoint.envs.arms.kinematics import forward
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.clearance import configuration_clearances
-from viapoint.envs.geometry.obstacles import KINDS, pack
+from viapoint.envs.geometry.obstacles import KINDS, pack, quaternions_of
 from viapoint.training.agents.agent import Agent
 from viapoint.training.live.state import Scene, State
 from viapoint.training.paper.movements import TARGETS, rows_of_lights
@@ -188,9 +187,7 @@ class Arena:
 
     def orientation(self, coordinates: Float) -> Float:
         """Return the orientation of the tool for joint positions, a quaternion."""
-        quaternion = np.empty(4)
-        mujoco.mju_mat2Quat(quaternion, forward(self.task.arm.chain, coordinates)[1].ravel())
-        return quaternion
+        return quaternions_of(forward(self.task.arm.chain, coordinates)[1])
 
     def clearances(self, coordinates: Float, obstacles: ve.Obstacles, times: Float | None = None) -> Float:
         """Return clearances from obstacles at T times [s] and of the arm from itself, shape (T, 2), [m]."""

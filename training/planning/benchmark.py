@@ -24,9 +24,10 @@ import yaml
 
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
 from viapoint.envs.arms.registry import PANDA_HOME
+from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import whole_number
-from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.geometry.obstacles import pack, quaternions_of
 from viapoint.envs.geometry.shapes import Box, Cylinder, Shape, as_obstacle
 from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import resting
@@ -191,8 +192,7 @@ def _shapes_of(objects: list[Mapping[str, Any]]) -> Iterator[Shape]:
         outer = _matrix(each.get("pose"))
         for primitive, pose in zip(each["primitives"], each["primitive_poses"], strict=True):
             place = outer @ _matrix(pose)
-            quaternion = np.empty(4)
-            mujoco.mju_mat2Quat(quaternion, place[:3, :3].flatten())
+            turn = quaternions_of(place[:3, :3])
             kind = primitive["type"]
             sizes = np.array(primitive["dimensions"], dtype=np.float64)
             if kind == "box":
@@ -203,7 +203,7 @@ def _shapes_of(objects: list[Mapping[str, Any]]) -> Iterator[Shape]:
                 values = {"radius": sizes[0]}
             else:
                 raise ValueError(f"primitives must be box, cylinder or sphere, got {kind!r}")
-            yield as_obstacle({"shape": kind, **values, "position": place[:3, 3], "quaternion": quaternion})
+            yield as_obstacle({"shape": kind, **values, "position": place[:3, 3], "quaternion": turn})
 
 
 def _matrix(pose: Mapping[str, Any] | None) -> Float:
@@ -211,27 +211,10 @@ def _matrix(pose: Mapping[str, Any] | None) -> Float:
     matrix = np.eye(4)
     if pose:
         x, y, z, w = pose["orientation"]
-        turn = np.empty(9)
-        mujoco.mju_quat2Mat(turn, np.array((w, x, y, z)) / np.linalg.norm((w, x, y, z)))
-        matrix[:3, :3], matrix[:3, 3] = turn.reshape(3, 3), pose["position"]
+        quaternion = np.array((w, x, y, z))
+        matrix[:3, :3] = frame_matrices(quaternion / np.linalg.norm(quaternion))
+        matrix[:3, 3] = pose["position"]
     return matrix
-
-
-def write_problems(folder: str | Path, path: str | Path) -> None:
-    """Write the numeric file of the package from a folder of the original files."""
-    problems = read_problems(folder)
-    shapes = [shape for problem in problems for shape in problem.obstacles]
-    np.savez_compressed(
-        path,
-        set=np.array([SETS.index(problem.set) for problem in problems], np.int8),
-        number=np.array([problem.number for problem in problems], np.int16),
-        start=np.array([problem.start for problem in problems]),
-        goal=np.array([problem.goal for problem in problems]),
-        count=np.array([len(problem.obstacles) for problem in problems], np.int16),
-        kind=np.array([KINDS[type(shape)] for shape in shapes], np.int8),
-        pose=np.array([[*shape.position, *shape.quaternion] for shape in shapes], np.float32),
-        size=np.array([shape.packed_size for shape in shapes], np.float32),
-    )
 
 
 Planner = Callable[[Arm, BenchmarkProblem], MotionPlan]

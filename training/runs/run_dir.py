@@ -106,7 +106,8 @@ class Run:
             check_free(folder)  # another process may have been faster
             write_json(folder / "versions.json", versions())
             keep_arm(folder, config.task.arm)
-            write_config(folder, config)
+            # The file that makes a folder a run comes last; it does not hold the arguments of one call.
+            write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False})
         return cls(folder)
 
     @property
@@ -235,11 +236,6 @@ def check_free(folder: Path) -> None:
     if names - begun - {"versions.json", COPY, "lock"}:
         raise BadFileError(folder, "is not empty and is no run folder")
     check_ours(folder / "versions.json")
-
-
-def write_config(folder: Path, config: TrainConfig) -> None:
-    """Write the configuration, which makes a folder a run, without the arguments of one call."""
-    write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False})
 
 
 def write_timesteps(run: Run) -> None:

@@ -45,12 +45,8 @@ class TrainingStoppedError(Exception):
     exit_code = 130  # Exit code of shells for Ctrl-C
 
 
-class TrainingStalledError(Exception):
-    """Training ended before its limit, as the success on the validation scenes did not rise any more."""
-
-
-class _CallbackStop(Exception):  # noqa: N818 - it is no error
-    """Training ends as a callback of the user asked for it."""
+class _TrainingEnds(Exception):  # noqa: N818 - it is no error
+    """Training ends before its limit: success does not rise any more, or a callback of the user asked for it."""
 
 
 class TrainingFailedError(Exception):
@@ -214,7 +210,7 @@ def _learn(model: BaseAlgorithm, steps: int, monitor: RunCallback, *, fresh: boo
     callbacks: list[BaseCallback] = [monitor, monitor.given]
     try:
         model.learn(steps, callbacks, None, reset_num_timesteps=fresh)  # type: ignore[arg-type]
-    except (TrainingStalledError, _CallbackStop):
+    except _TrainingEnds:
         monitor.given.on_training_end()  # `learn` has not told them that it ends
         if hasattr(model, "calibrate"):  # nor has it done this at its end
             model.calibrate()
@@ -337,11 +333,11 @@ class RunCallback(BaseCallback):
             self.run.checkpoint(self.model, {"seconds": self.seconds})
             self.run.save("final", self.model)
             self.check_stopped()
-        if self.run.stalled:
+        stalled = self.run.stalled
+        if stalled:
             self.run.checkpoint(self.model, {"seconds": self.seconds})
-            raise TrainingStalledError
-        if self.given.stopped:
-            raise _CallbackStop
+        if stalled or self.given.stopped:
+            raise _TrainingEnds
 
     def _on_training_end(self) -> None:
         self._run_due_actions(final=True)
