@@ -193,8 +193,6 @@ def main() -> None:
                 found += list(rows_of(config, env_id, name))
         measured = {(row["env"], row["method"]) for row in found}
         kept = [row for row in every if (row["env"], row["method"]) not in measured]
-        if config.only == "everything":
-            kept = [row for row in kept if row["env"] != env_id]
         order = [*SHIPPED_IDS, LOOKS, *REACHES]
         every = sorted(kept + found, key=lambda row: order.index(row["env"]))
         with config.out.open("w", newline="", encoding="utf-8") as file:

@@ -45,7 +45,7 @@ from viapoint.training.planning.search import (
 
 EFFORT_WEIGHT = 0.05  # Weight of the reward of a successful plan beside its probability of success
 # First part of the seeds of scenes for the calibration, far from those of training, and their number
-CALIBRATION, CALIBRATION_SCENES = 3_000_017, 320
+CALIBRATION, CALIBRATION_SCENES = 3_000_017, 640
 EXPLORED = 512  # Number of Sobol points of which plans are learned from
 SAME_RAY = 0.02  # Greatest distance of a point from the ray of the sensor, [m]
 BLOCK = 16  # Scenes that are decided together
@@ -84,8 +84,8 @@ class ViaRankPolicy(PlanPolicy):
         instants: int = 32,
         nearest: int = 16,
         candidates: int = 256,
-        refinements: int = 4,
-        per_refinement: int = 64,
+        refinements: int = 2,
+        per_refinement: int = 128,
         refine: int = 0,
         belief: str = DEFAULT_BELIEF,
         **kwargs: Any,
