@@ -288,6 +288,8 @@ def _connected(address: str | None, workers: int | None) -> Iterator[None]:
             socket.create_connection((host, int(port)), timeout=10.0).close()
         ray.init(address=address or "local", **settings)
     except (OSError, RuntimeError, ValueError) as error:
+        if address is None:
+            raise ValueError(f"Ray cannot be started: {_one_line(error)}") from None
         advice = "`ray start --head` starts one, and one that has a token needs RAY_AUTH_MODE=token"
         raise ValueError(f"no Ray cluster at {address} ({_one_line(error)}); {advice}") from None
     try:
