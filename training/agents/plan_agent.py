@@ -64,9 +64,14 @@ class PlanPolicy(BasePolicy):
         """Check a setting; a wrong type, or a number out of range, raises ValueError."""
         check_arguments(type(self), {name: value})
 
+    @property
+    def all_candidates(self) -> int:
+        """Number of candidates of a decision, those of all rounds among them."""
+        return self.candidates + self.refinements * self.per_refinement
+
     def _check_candidates(self) -> None:
-        total = self.candidates + self.refinements * self.per_refinement
-        whole_number("number of all candidates", total, 1, MOST_CANDIDATES)
+        """Check the number of candidates of a decision; ValueError if there are too many."""
+        whole_number("number of all candidates", self.all_candidates, 1, MOST_CANDIDATES)
 
     def _own(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self.OWN}

@@ -46,7 +46,6 @@ from viapoint.training.planning.search import (
 EFFORT_WEIGHT = 0.05  # Weight of the reward of a successful plan beside its probability of success
 # First part of the seeds of scenes for the calibration, far from those of training, and their number
 CALIBRATION, CALIBRATION_SCENES = 3_000_017, 640
-EXPLORED = 512  # Number of Sobol points of which plans are learned from
 SAME_RAY = 0.02  # Greatest distance of a point from the ray of the sensor, [m]
 BLOCK = 16  # Scenes that are decided together
 
@@ -290,8 +289,8 @@ class ViaRank(PlanAlgorithm):
             )
 
     def _candidates(self, number: int) -> NDArray[np.float32]:
-        """Return random candidates of some scenes, shape (number, H, m)."""
-        every = candidate_actions(self.policy.task, EXPLORED, replanning=False)
+        """Return random candidates of some scenes, shape (number, H, m), of as many as a decision compares."""
+        every = candidate_actions(self.policy.task, self.policy.all_candidates, replanning=False)
         drawn = np.random.uniform(size=(number, len(every))).argsort(axis=1)  # noqa: NPY002 - seeded by SB3
         return np.asarray(every[drawn[:, : self.explore_candidates]], np.float32)
 
