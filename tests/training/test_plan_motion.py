@@ -177,7 +177,7 @@ def test_objective_does_not_depend_on_the_direction_of_time(kwargs) -> None:
                 refine._assemble(
                     setting._replace(spheres=spheres),
                     Movement(table, 0, np.ascontiguousarray(one), offsets, 1.0),
-                    *(scene, 0, aim, 360.0, np.empty((0, 0)), np.empty(0), work),
+                    *(scene, 0, aim, 360.0, np.inf, np.empty((0, 0)), np.empty(0), work),
                 )[0]
             )
     assert np.ptp(found) > 1.0
@@ -274,7 +274,7 @@ def test_gradient_of_the_objective(kwargs) -> None:
     def objective(problem, offsets) -> float:
         start, scene = problem
         movement = Movement(table, 80, start, offsets, 1.0)
-        return refine._assemble(setting, movement, scene, 0, aim, 360.0, hessian, gradient, work)[0]
+        return refine._assemble(setting, movement, scene, 0, aim, 360.0, np.inf, hessian, gradient, work)[0]
 
     for start, goal, scene in zip(starts, goals, obstacles, strict=True):
         line = goal - start

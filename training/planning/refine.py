@@ -296,11 +296,15 @@ def _assemble(
     scene: int,
     aim: Aim,
     unit: float,
+    limit: float,
     hessian: Float,
     gradient: Float,
     work: _Work,
 ) -> tuple[float, float]:
-    """Fill in matrix and gradient of the objective; return the objective, and the least clearance, [m] or [rad]."""
+    """Fill in matrix and gradient of the objective; return the objective, and the least clearance, [m] or [rad].
+
+    It ends as soon as the objective is `limit` or more, which is then returned.
+    """
     table, times, offsets = movement.table, movement.times, movement.offsets
     columns, dimension = offsets.shape
     vias = columns - 3
@@ -331,13 +335,15 @@ def _assemble(
         time = movement.duration * k / last
         from_obstacles, first = _add_obstacles(setting, obstacles, scene, time, aim.clearance, work)
         from_itself, second = 0.0, OWN_CLEARANCE
-        if (k - begin) % (2 * aim.stride) == 0:  # bodies of the arm are less often near one another
+        if (k - begin) % (4 * aim.stride) == 0:  # bodies of the arm are less often near one another
             from_itself, second = _add_own(setting, OWN_CLEARANCE, work)
         from_ranges, third = _add_ranges(setting, reached or not setting.of_hand, work)
         missing = from_obstacles + from_itself + from_ranges
         if missing == 0.0:
             continue
         contact += missing
+        if objective + CONTACT_WEIGHT * contact >= limit:
+            return limit, nearest
         # Some bodies are always near one another: only their contact counts.
         nearest = min(nearest, first, third)
         if second < 0.0:
@@ -353,6 +359,18 @@ def _assemble(
                         value = work.square[i, j] if i >= j else work.square[j, i]
                         hessian[a * dimension + i, b * dimension + j] += factor * value
     return objective + CONTACT_WEIGHT * contact, nearest
+
+
+@inlined
+def _expected_gain(hessian: Float, gradient: Float, step: Float, factor: float) -> float:
+    """Return by how much a step lowers the objective if its model is right; matrix and gradient are half of its own."""
+    gain = 0.0
+    for i in range(len(step)):
+        curvature = hessian[i, i] * step[i]
+        for j in range(i):
+            curvature += 2.0 * hessian[i, j] * step[j]
+        gain -= factor * step[i] * (2.0 * gradient[i] + factor * curvature)
+    return gain
 
 
 @kernel
@@ -381,7 +399,9 @@ def _refine(
     longest = LONGEST_STEP[1] if setting.of_hand else LONGEST_STEP[0]
     times, _ = best_times(table, offsets, work.gram)
     movement = Movement(table, times, start, offsets, duration)
-    objective, _ = _assemble(setting, movement, obstacles, scene, aim, unit, hessian, gradient, work)
+    objective, nearest = _assemble(
+        setting, movement, obstacles, scene, aim, unit, np.inf, hessian, gradient, work
+    )
     damping = DAMPING
     for _ in range(aim.iterations):
         largest = 0.0
@@ -394,6 +414,8 @@ def _refine(
         for i in range(size):
             largest = max(largest, abs(step[i]))
         factor = min(1.0, longest / max(largest, 1e-12))
+        if nearest >= FREE and _expected_gain(hessian, gradient, step, factor) < aim.gain * objective:
+            break
         for a in range(vias):
             for d in range(dimension):
                 trial[a, d] = offsets[a, d] + factor * step[a * dimension + d]
@@ -403,10 +425,11 @@ def _refine(
                     trial[a, d] = min(max(trial[a, d], low), high)
         other, _ = best_times(table, trial, work.gram)
         movement = Movement(table, other, start, trial, duration)
-        value, nearest = _assemble(
-            setting, movement, obstacles, scene, aim, unit, other_hessian, other_gradient, work
+        value, apart = _assemble(
+            setting, movement, obstacles, scene, aim, unit, objective, other_hessian, other_gradient, work
         )
         if value < objective:
+            nearest = apart
             done = objective - value < aim.gain * objective and nearest >= FREE
             _copy(trial[:vias], offsets)
             hessian, other_hessian = other_hessian, hessian
