@@ -62,7 +62,7 @@ class ViaQPolicy(PlanPolicy):
         width: int = 32,
         instants: int = 32,
         candidates: int = 256,
-        refinements: int = 4,
+        refinements: int = 2,
         per_refinement: int = 64,
         checks: int = 0,
         refine: int = 0,
