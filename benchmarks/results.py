@@ -1,4 +1,4 @@
-"""Measure the shipped agents and the methods without learning in the frozen sets, and write the tables of results.md.
+"""Measure the shipped agents and the methods without learning in the frozen sets, and write the tables of two pages and a figure.
 
 python benchmarks/results.py                                  # all tasks; hours
 python benchmarks/results.py --env viapoint/PandaObstacles-v0 # others keep their numbers
@@ -17,15 +17,17 @@ from typing import Any, Literal
 
 import torch
 import tyro
+from matplotlib.figure import Figure
 
 from viapoint.training import Run, evaluate, load_agent
 from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.planning.search import registered_task
+from viapoint.training.plotting.plots import style_axes
 from viapoint.training.scene_sets import SETS, shipped_set
 
-BASELINES = ("untrained", "straight", "sobol64", "search512", "plan_motion")
-REPLANNING_BASELINES = BASELINES[:-1]
-"""Baselines of tasks in which plans are revised: :func:`plan_motion` is for obstacles that rest."""
+BASELINES = ("untrained", "straight", "sobol64", "search512", "plan_motion", "ompl")
+REPLANNING_BASELINES = BASELINES[:-2]
+"""Baselines of tasks in which plans are revised: planners are for obstacles that rest."""
 SENSED_BASELINES = (
     "untrained",
     "straight",
@@ -54,7 +56,31 @@ INTERVALS = {"PlanarMovingObstacles": (0.3, 0.1), "PandaMovingObstacles": (0.5,)
 """Greatest times from one decision to the next, [s], in tasks whose obstacles may be on reaches of their own."""
 REACHES = [f"{name}, reaches" for name in INTERVALS]
 """Names of these variants."""
-PAGE = Path("docs/results.md")
+PAGES = Path("docs/results.md"), Path("docs/results-details.md")
+PICTURE = Path("docs/images/results.png")
+DETAILS = ("points:", "fitted:", "agent, seed")
+"""Beginnings of methods that are on the second page, as are agents with other beliefs."""
+STYLES = {
+    "plan_motion": ("#c0504d", "D"),
+    "ompl": ("#c0504d", "P"),
+    "search512": ("#7f7f7f", "s"),
+    "sobol64": ("#7f7f7f", "v"),
+    "known:plan_motion": ("#c0504d", "d"),
+    "known:search512": ("#7f7f7f", "h"),
+    "seen:search512": ("#7f7f7f", "^"),
+    "cautious512": ("#7f7f7f", "X"),
+    "thick:search512": ("#7f7f7f", "s"),
+    "thick:plan_motion": ("#c0504d", "D"),
+    "agent": ("#1f5fa8", "o"),
+    "agent, 16 checks": ("#1f5fa8", "p"),
+    "agent, 4 refined": ("#1f5fa8", "*"),
+    "agent, 16 refined": ("#1f5fa8", "*"),
+    "untrained": ("#9dc3e6", "o"),
+    "SAC": ("#2a9d8f", "o"),
+    "TQC": ("#2a9d8f", "s"),
+    "PPO": ("#2a9d8f", "^"),
+}
+"""Colours and marks of methods in the figure: planners, searches, agents, and those of Stable-Baselines3."""
 FIELDS = ("env", "scenes", "method", "success", "low", "high", "count", "jerk_ratio", "milliseconds")
 
 
@@ -104,8 +130,11 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
     for folder in sorted(config.runs.glob(f"{short}-*")):
         run = Run(folder)
         method = f"{run.config.algorithm.upper()}, {run.curve[-1]['decisions']:,} decisions"
+        last = folder.name.rpartition("-")[2]
         if run.config.algorithm == "viarank":  # with another belief
-            method = f"{folder.name.rpartition('-')[2]}:agent"
+            method = f"{last}:agent"
+        elif run.config.algorithm == "viaq":
+            method = f"agent, seed {last}"
         row = evaluate(load_agent(folder), **common, baselines=[]).rows[0]
         yield _numbers(env_id, name, method, row)
 
@@ -161,24 +190,75 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def write_page(rows: list[dict[str, Any]]) -> None:
-    """Put the tables into the page: each follows the heading of its task, up to the next empty line after it."""
-    text = PAGE.read_text(encoding="utf-8")
+def is_detail(method: str) -> bool:
+    """Return True for methods that are on the second page."""
+    return method.startswith(DETAILS) or method.endswith(":agent")
+
+
+def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
+    """Return the tables of both pages by the headings that they follow."""
+    found = {}
     for env_id in dict.fromkeys(row["env"] for row in rows):
-        heading = f"### {env_id.removeprefix('viapoint/').removesuffix('-v0')}\n\n"
-        before, found, after = text.partition(heading)
-        if not found:
-            continue  # tasks without obstacles are not on the page
         mine = [row for row in rows if row["env"] == env_id]
-        if env_id in SHIPPED_IDS:  # in the file only
-            mine = [row for row in mine if not row["method"].startswith("untrained, ")]
-        _, _, rest = after.partition("\n\n")  # after the old table
-        text = f"{before}{heading}{table(mine)}\n\n{rest}"
-    PAGE.write_text(text, encoding="utf-8")
+        heading = env_id.removeprefix("viapoint/").removesuffix("-v0")
+        if env_id not in SHIPPED_IDS:  # tables of the second page
+            found[heading] = table(mine)
+            continue
+        found[heading] = table([row for row in mine if not is_detail(row["method"])])
+        for kind, part in {"beliefs": ":", "seeds": "seed"}.items():
+            some = [row for row in mine if part in row["method"]]
+            if some:
+                found[f"{heading}, {kind}"] = table(some)
+    return found
+
+
+def write_pages(rows: list[dict[str, Any]]) -> None:
+    """Put the tables into the pages: each follows its heading, up to the next empty line after it."""
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for heading, lines in tables(rows).items():
+            before, found, after = text.partition(f"### {heading}\n\n")
+            if found:  # tasks without obstacles are not on the pages
+                _, _, rest = after.partition("\n\n")  # after the old table
+                text = f"{before}{found}{lines}\n\n{rest}"
+        page.write_text(text, encoding="utf-8")
+
+
+def draw(rows: list[dict[str, Any]]) -> None:
+    """Draw success in `test` against the time of a decision, a panel for each task with obstacles."""
+    shown = [name for name in SHIPPED_IDS if registered_task(name).n_obstacles[1]]
+    figure = Figure(figsize=(9.0, 11.0), layout="constrained")
+    panels = figure.subplots(4, 2, sharex=True, sharey=True).flat
+    marks: dict[str, Any] = {}
+    for env_id, axes in zip(shown, panels, strict=False):
+        for row in rows:
+            name = row["method"] if row["method"] in STYLES else row["method"].partition(",")[0]
+            known = row["env"] == env_id and row["scenes"] == "test" and not is_detail(row["method"])
+            if not known or name not in STYLES:
+                continue
+            color, mark = STYLES[name]
+            success = float(row["success"])
+            bars = [[success - float(row["low"])], [float(row["high"]) - success]]
+            marks[name] = axes.errorbar(
+                float(row["milliseconds"]), success, bars, color=color, marker=mark, markersize=7.0,
+                markeredgecolor="white", linewidth=1.0,
+            )  # fmt: skip
+        axes.set_title(env_id.removeprefix("viapoint/").removesuffix("-v0"), fontsize=11)
+        axes.set_xscale("log")
+        axes.set_ylim(0.0, 103.0)
+        axes.grid(alpha=0.25)
+        style_axes(axes)
+    for axes in panels:  # what is left holds the legend
+        axes.axis("off")
+        order = [name for name in STYLES if name in marks]
+        axes.legend([marks[name] for name in order], order, loc="center", frameon=False, ncols=2, fontsize=10)
+    figure.supxlabel("time of a decision [ms]")
+    figure.supylabel("success in test [%]")
+    figure.savefig(PICTURE, dpi=110)
 
 
 def main() -> None:
-    """Measure, and write the file and the tables of the page after each task."""
+    """Measure, and write the file, the tables of the pages and the figure after each task."""
     config = tyro.cli(Config)
     torch.set_num_threads(1)
     every: list[dict[str, Any]] = []
@@ -199,7 +279,8 @@ def main() -> None:
             writer = csv.DictWriter(file, FIELDS)
             writer.writeheader()
             writer.writerows(every)
-        write_page(every)
+        write_pages(every)
+        draw(every)
         print(f"{env_id} is measured", flush=True)
 
 
