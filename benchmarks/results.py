@@ -1,4 +1,4 @@
-"""Measure the shipped agents and the methods without learning in the frozen sets, and write the tables of two pages and a figure.
+"""Measure shipped agents and methods without learning in the frozen sets; write tables of two pages and a figure.
 
 python benchmarks/results.py                                  # all tasks; hours
 python benchmarks/results.py --env viapoint/PandaObstacles-v0 # others keep their numbers

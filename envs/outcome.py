@@ -50,7 +50,7 @@ class Outcome(NamedTuple):
     """Metrics of N executed movements, shape (N,) each."""
 
     is_success: Bool
-    """True for no contact, joint limits kept, and rest at the goal after the settling time."""
+    """True for no contact, joint limits kept, a plan within reach, stable physics, and rest at the goal in the end."""
     collision: Bool
     """True for contact with an obstacle or of the arm with itself."""
     first_contact_time: Float

@@ -122,19 +122,19 @@ class Task:
                 raise TypeError(f"{name} must be True or False, got {value!r}")
         if courses not in COURSES:
             raise ValueError(f"courses must be one of {', '.join(COURSES)}, got {courses!r}")
-        most = fewest_and_most("n_obstacles", n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
+        numbers = fewest_and_most("n_obstacles", n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
         plane = is_planar(arm)
         shapes = (PLANE_SHAPES if plane else SPACE_SHAPES) if shapes is None else shapes
         kinds = check_kinds(names_of("shapes", shapes))
-        families = default_families(plane, kinds, most[1]) if families is None else families
+        families = default_families(plane, kinds, numbers[1]) if families is None else families
         names = names_of("families", families)
         if isinstance(sensor, str):
-            room = room_of(arm, kinds, most, tall=False)
+            room = room_of(arm, kinds, numbers, tall=False)
             sensor = named_sensor(sensor, arm, room.foot, room.scale)
-            if decide_at == END:  # one look is all
+            if decide_at == END:  # only one look at the beginning
                 sensor = dataclasses.replace(sensor, looks=1)
         sensor = Sensor.of(sensor)
-        if sensor is not None and not most[1]:
+        if sensor is not None and not numbers[1]:
             raise ValueError("sensor needs n_obstacles of 1 or more: there is nothing to see")
         task = cls(
             arm=arm,
@@ -142,9 +142,9 @@ class Task:
             n_via=whole_number("n_via", n_via, 0),
             timing=timing,
             duration_range=DURATIONS[space] if duration_range is None else duration_range,
-            n_obstacles=most,
+            n_obstacles=numbers,
             shapes=kinds,
-            families=check_families(names, plane, kinds, most[1]),
+            families=check_families(names, plane, kinds, numbers[1]),
             whole_arm=bool(whole_arm),
             moving_obstacles=bool(moving_obstacles),
             courses=courses,

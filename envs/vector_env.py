@@ -55,8 +55,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         duration_range: Shortest and longest movement: in hand space [s], in joint space multiples of the shortest
             movement that the velocity limits allow.
         n_obstacles: Number of obstacles, or the fewest and the most.
-        shapes: Shapes that obstacles may have; by default those of the families.
-        families: Names of scene families that are drawn; a repeated name is drawn more often.
+        shapes: Shapes that obstacles may have; by default cylinders and boxes in the plane, all but meshes and point
+            clouds in space.
+        families: Names of scene families that are drawn; by default those of training. A repeated name is drawn more
+            often.
         whole_arm: True if obstacles in the plane are so tall that the links must clear them, too.
         moving_obstacles: True if the obstacles move.
         courses: Courses of these: `turns`, constant velocities that change at most once, or `reaches`, each a
@@ -211,7 +213,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                 environments to reset, all others keep their episodes.
 
         Raises:
-            ValueError: A given scene is impossible; the environments are unchanged.
+            ValueError: A given scene is impossible, such as a goal in contact, see
+                `viapoint.envs.scenes.scene.check_scenes`; the environments are unchanged.
         """
         if options is not None and not isinstance(options, Mapping):
             raise ValueError(f"options must be a mapping from names to values, or None, got {options!r}")

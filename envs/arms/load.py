@@ -350,7 +350,7 @@ def _per_joint(name: str, values: Any, joints: tuple[str, ...]) -> Float:
 
 
 def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: list[str]) -> Float:
-    """Return the range of each joint, shape (J, 2)."""
+    """Return the range of each joint, as MuJoCo read it from the file or as given, shape (J, 2)."""
     found, endless = [], []
     for name in joints:
         joint = model.joint(name).id

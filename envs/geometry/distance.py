@@ -1,4 +1,4 @@
-"""Signed distance of a point from packed obstacles, and its gradient."""
+"""Signed distance of a point from packed obstacles, and its gradient; `shapes` has the formula of each shape."""
 
 from __future__ import annotations
 

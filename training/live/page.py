@@ -67,7 +67,7 @@ class Tab:
             return not (self._busy or self._jobs or self._later or self.state.playing)
 
     def act(self, name: str, *values: Any, **changes: Any) -> None:
-        """Call a method in the thread of the tab.
+        """Call a method by its name, such as `drag`, in the thread of the tab; view and panels call it.
 
         A waiting call of the same kind is replaced, so that a fast drag skips positions instead of lagging behind.
         """

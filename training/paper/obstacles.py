@@ -1,4 +1,4 @@
-"""Row 12: comparison of a method that avoids the paper's rows of lights with the paper's subjects."""
+"""Row 12 (Fig. 8): comparison of a method that avoids the paper's rows of lights with the paper's subjects."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def features(profiles: list[Profile], plan: Plan) -> pd.DataFrame:
 
 
 def obstacle_claims(avoidance: ObstacleMovements) -> list[Claim]:
-    """Return the claims of row 12."""
+    """Return the claims of row 12, the numbers of Fig. 8."""
     arm = features(avoidance.profiles, avoidance.plan)
     model = features(movements.model_profiles(avoidance.plan.trajectory()), avoidance.plan)
     worst, number = avoidance.motion.worst, len(arm)
