@@ -1,12 +1,11 @@
-"""Arms track movements of their joints, and say clearly what they are and are not."""
+"""Arms track movements of their joints."""
 
 import mujoco
 import numpy as np
 import pytest
 
 from viapoint import primitives
-from viapoint.envs.arms.arm import arm_from_xml
-from viapoint.envs.arms.registry import arm_of, register_arm
+from viapoint.envs.arms.registry import arm_of
 
 
 @pytest.mark.parametrize("name", ["planar", "panda"])
@@ -34,41 +33,3 @@ def test_movements_at_half_of_the_speed_limits_are_tracked_within_a_milliradian(
             mujoco.mj_step(model, data)
             error = max(error, np.abs(data.qpos - motion[0][0, k + 1]).max())
         assert error < 1e-3
-
-
-LINKS = """
-<mujoco>
-  <worldbody>
-    <body name="a"><joint name="one" axis="0 0 1" range="-2 2"/><geom type="{}" size="0.1 0.1 0.1" mass="1"/>
-      <body name="b" pos="1 0 0"><joint name="two" axis="0 0 1" range="-2 2"/><geom size="0.1" mass="1"/>
-        <site name="tip"/>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-
-
-def small(geom="sphere"):
-    limits = {"velocity_limit": (2.0, 2.0), "torque_limit": (50.0, 50.0)}
-    return arm_from_xml(
-        "small", LINKS.format(geom), joints=("one", "two"), tool="tip", home=(0.0, 0.0), **limits
-    )
-
-
-def test_collision_geoms_of_other_shapes_are_refused():
-    with pytest.raises(ValueError, match="capsules or spheres"):
-        small("box")
-
-
-def test_arms_are_found_by_their_names():
-    arm = small()
-    register_arm(arm)
-    assert arm_of("small") is arm
-    assert arm_of(arm) is arm
-    with pytest.raises(ValueError, match="small"):
-        arm_of("large")
-    with pytest.raises(TypeError):
-        register_arm("small")
-    with pytest.raises(ValueError, match="built-in"):
-        register_arm(arm_of("panda"))

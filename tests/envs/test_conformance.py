@@ -127,16 +127,6 @@ def test_a_limit_of_decisions_is_that_of_gymnasium(env_id, mode, limit):
     assert limit == 1 or TASKS[env_id].get("decide_at") != "steps" or truncated
 
 
-def test_a_reset_mask_resets_only_those(env_id):
-    env = gym.make_vec(env_id, num_envs=4)
-    before, _ = env.reset(seed=0)
-    mask = np.array([True, False, True, False])
-    after, _ = env.reset(options={"reset_mask": mask})
-    for name, part in before.items():
-        np.testing.assert_array_equal(part[~mask], after[name][~mask])
-    assert not np.array_equal(before["goal"][mask], after["goal"][mask])
-
-
 @pytest.mark.parametrize("begun", [False, True])
 def test_a_failed_reset_changes_nothing(env_id, begun):
     usual, refused = gym.make(env_id), gym.make(env_id)

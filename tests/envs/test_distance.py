@@ -128,23 +128,6 @@ def test_distances_agree_with_coal_and_mujoco(kind, rng):
     assert touching > 50
 
 
-@CONVEX
-def test_inside_a_shape_the_surface_is_as_near_as_the_distance_says(kind, rng):
-    """No point within the distance is outside, and the foot of the normal is on the surface."""
-    shape = random_shape(kind, rng)
-    points = np.array(shape.position) + places(rng, 4000)
-    distance, normals = (part[0, 0] for part in measured(pack([[shape]]), points))
-    inside = distance < 0.0
-    assert inside.sum() > 20
-    points, distance, normals = points[inside], distance[inside], normals[inside]
-    foot = points - distance[:, None] * normals
-    np.testing.assert_allclose(shape.distance(foot), 0.0, atol=1e-9)
-    for _ in range(50):
-        ways = rng.normal(size=points.shape)
-        ways *= 0.999 * -distance[:, None] / np.linalg.norm(ways, axis=1)[:, None]
-        assert (shape.distance(points + ways) < 0.0).all()
-
-
 @ALL
 def test_normals_are_gradients(kind, rng):
     step = 1e-6
