@@ -16,10 +16,8 @@ from viapoint.envs.geometry.clearance import (
     memory,
     movement_clearance,
 )
-from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.geometry.obstacles import KINDS, pack
 from viapoint.envs.geometry.shapes import as_obstacle
-
-KINDS = ("sphere", "capsule", "cylinder", "box", "half_space")
 
 
 def some_shapes(rng, number):

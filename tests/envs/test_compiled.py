@@ -3,10 +3,6 @@
 import subprocess
 import sys
 
-import pytest
-
-from viapoint.envs.geometry.compiled import inner, kernel
-
 RECORD = """
 from typing import NamedTuple
 
@@ -24,25 +20,6 @@ def doubled(length):
 USE = (
     "from caller import Length, doubled; print(doubled(Length(1.5)), sum(doubled.stats.cache_hits.values()))"
 )
-
-
-@inner
-def twice(number):
-    return 2.0 * number
-
-
-@kernel
-def fourfold(number):
-    return twice(twice(number))
-
-
-def test_functions_for_compiled_ones_alone_refuse_calls_from_python():
-    with pytest.raises(TypeError):
-        twice(1.5)
-    assert fourfold(1.5) == 6.0
-    with pytest.raises(TypeError):
-        twice(1.5)  # though it is compiled now
-    assert twice.py_func(1.5) == 3.0
 
 
 def test_records_may_move_to_another_module(tmp_path):

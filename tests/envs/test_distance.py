@@ -5,7 +5,6 @@ import mujoco
 import numpy as np
 import pytest
 from random_shapes import random_shape
-from scipy.spatial.transform import Rotation
 
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.distance import (
@@ -22,7 +21,6 @@ from viapoint.envs.geometry.shapes import (
     HalfSpace,
     PointCloud,
     Sphere,
-    as_obstacle,
 )
 
 ALL = pytest.mark.parametrize("kind", KINDS)
@@ -162,24 +160,6 @@ def test_numbers_beyond_the_limit_are_between_it_and_the_distance(kind, rng):
         np.testing.assert_allclose(near_normals[near], normals[near], atol=1e-12)
         assert (found[~near] >= np.minimum(exact[~near], limit) - 1e-9).all()
         assert (found[~near] <= exact[~near] + 1e-9).all()
-
-
-@ALL
-def test_distances_move_and_turn_with_the_shape(kind, rng):
-    shape, points, velocity = random_shape(kind, rng), places(rng, 200), rng.normal(size=3)
-    turn, shift = Rotation.from_rotvec((0.5, -1.0, 2.0)), np.array([0.3, -0.1, 0.2])
-    quaternion = (turn * Rotation.from_matrix(shape.rotation)).as_quat(scalar_first=True)
-    place = turn.apply(np.array(shape.position)) + shift
-    moved = as_obstacle({**shape.to_dict(), "position": place, "quaternion": quaternion})
-    there = turn.apply(points) + shift
-    np.testing.assert_allclose(moved.distance(there), shape.distance(points), atol=1e-9)
-    before, before_normals = measured(pack([[shape]]), points)
-    _, normals = measured(pack([[moved]]), there)
-    np.testing.assert_allclose(normals[0, 0], turn.apply(before_normals[0, 0]), atol=1e-6)
-    flying = as_obstacle({**shape.to_dict(), "velocity": velocity})
-    after, after_normals = measured(pack([[flying]]), points + 0.7 * velocity, 0.7)
-    np.testing.assert_allclose(after, before, atol=1e-12)
-    np.testing.assert_allclose(after_normals, before_normals, atol=1e-6)
 
 
 @ALL

@@ -29,28 +29,11 @@ def test_a_straight_movement_with_nothing_in_the_way_succeeds():
     env, _ = given()
     _, reward, *_, info = env.step(np.zeros(3, np.float32))
     assert info["is_success"]
-    assert info["jerk_ratio"] == pytest.approx(1.0, abs=1e-9)
     assert info["path_length"] == pytest.approx(0.4, abs=1e-3)
     assert info["peak_speed"] == pytest.approx(1.875 * 0.4 / info["duration"], rel=2e-3)
     assert info["jerk_cost"] == pytest.approx(360.0 * 0.4**2 / info["duration"] ** 5, rel=1e-9)
     assert (info["first_contact_time"], info["min_clearance"]) == (-1.0, 1.0)
     assert reward > 0.5
-
-
-def test_rewards_are_ordered_as_a_person_would_order_them():
-    """Smooth way round, wide way round, crash; only a plan out of reach does not start."""
-    outcomes = []
-    for via in ((-0.1, 0.54), (-0.1, 0.58), None):
-        env, _ = given(obstacles=[WALL])
-        action = np.zeros(3, np.float32) if via is None else through(env, np.array(via))
-        _, reward, *_, info = env.step(action)
-        outcomes.append((reward, info["is_success"], info["collision"]))
-        if via is not None:
-            np.testing.assert_allclose(env.last_plan.waypoints[1], via, atol=1e-6)
-    rewards = [each[0] for each in outcomes]
-    assert rewards == sorted(rewards, reverse=True)
-    assert [each[1:] for each in outcomes] == [(True, False), (True, False), (False, True)]
-    assert 0.2 < info["first_contact_time"] < info["duration"]
 
 
 def test_a_plan_out_of_reach_is_a_failed_movement_that_does_not_start():

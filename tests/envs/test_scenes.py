@@ -39,7 +39,6 @@ from viapoint.envs import (
 )
 from viapoint.envs.arms.kinematics import forward
 from viapoint.envs.geometry.clearance import memory, movement_clearance
-from viapoint.envs.geometry.shapes import REGISTERED_MESHES
 from viapoint.envs.scenes.scene import NEVER, Scenes, check_scenes
 
 REACHING = {"courses": "reaches"}
@@ -202,22 +201,6 @@ def test_each_scene_of_a_batch_has_its_own_obstacles_and_names(several):
     ):
         with pytest.raises(ValueError, match=words):
             several.reset(seed=0, options={**PANDA_ENDS, "obstacles": obstacles})
-
-
-def test_meshes_of_a_task_can_be_given():
-    register_mesh("tetrahedron", 0.1 * np.eye(4, 3))
-    try:
-        env = gym.make(PANDA, shapes=("box", "tetrahedron"), families="clutter").unwrapped
-        values = {"shape": "tetrahedron", "position": (0.3, 0.6, 0.4)}
-        hull = ConvexMesh.hull(0.1 * np.eye(4, 3), position=(0.3, 0.6, 0.4))
-        results = []
-        for form in (values, hull):
-            first, _ = env.reset(seed=0, options={**PANDA_ENDS, "obstacles": [form]})
-            results.append((first, env.step(np.zeros(8, np.float32))[4]))
-        same(results[0][0], results[1][0])
-        same(results[0][1], results[1][1])
-    finally:
-        del REGISTERED_MESHES["tetrahedron"]
 
 
 def test_obstacles_that_are_given_a_velocity_move_in_any_task():

@@ -19,7 +19,6 @@ from viapoint.envs import (
 )
 from viapoint.envs.events import NEW_DISTANCE, NEW_POINTS, Event
 from viapoint.envs.geometry.obstacles import add_to_model, pack, unpack
-from viapoint.training import evaluate
 from viapoint.training.planning.beliefs import Sight, fitted_boxes, thick_points
 from viapoint.training.planning.search import registered_task
 
@@ -180,21 +179,3 @@ def test_looks_do_not_depend_on_the_batch_and_are_restored() -> None:
     many.unwrapped.restore(state)
     again = many.step(-action)[0]
     assert all(np.array_equal(once[name], again[name]) for name in once)
-
-
-def test_looking_again_helps_a_search() -> None:
-    solved = {}
-    for when, kwargs in {
-        "once": {"sensor": "hand_rays"},
-        "again": {"sensor": "hand_rays", "decide_at": ("sight", "clearance")},
-    }.items():
-        result = evaluate(
-            env="viapoint/PlanarSensed-v0",
-            env_kwargs=kwargs,
-            scenes="validation",
-            n_scenes=60,
-            baselines=["thick:search128"],
-            time_decisions=False,
-        )
-        solved[when] = result.success_rate
-    assert solved["again"] > solved["once"] + 0.08
