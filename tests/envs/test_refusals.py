@@ -45,7 +45,7 @@ from viapoint.envs import (
 from viapoint.envs.env import RecordMovements
 from viapoint.envs.geometry.obstacles import add_to_model, geom_meshes, pack
 from viapoint.envs.geometry.shapes import check_kinds
-from viapoint.envs.plans import ActionLayout, Plan
+from viapoint.envs.plans import Plan
 from viapoint.envs.rewards import RewardWeights
 from viapoint.envs.scenes.families_registry import scene_families
 from viapoint.envs.scenes.layout import Layout
@@ -197,13 +197,6 @@ def test_goals_that_are_moved(goals):
     np.testing.assert_array_equal(env.observe()["goal"], before["goal"])
 
 
-HAND = {
-    "space": "hand",
-    "names_of_axes": ("along", "across"),
-    "via_scale": (0.1, 0.2),
-    "duration_range": (0.5, 1.0),
-}
-LAYOUT = ActionLayout(**HAND)
 CUBE = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]) / 10
 POINT, BALL = np.ones(3), Sphere(0.1)
 
@@ -216,14 +209,6 @@ def recorder(mode):
     env = gym.Wrapper(gym.Env())
     env.env.render_mode = mode
     return RecordMovements(env, "nowhere")
-
-
-def decoded(*shapes):
-    return LAYOUT.decode(*map(np.ones, shapes))
-
-
-def encoded(*shapes):
-    return LAYOUT.encode(Plan(*map(np.ones, shapes)))
 
 
 def nothing(rng, room):
@@ -248,16 +233,6 @@ def from_rows(shape):
 
 CALLS = [
     (ReachVectorEnv, [(0,), (-1,), (1.5,), (True,), ("two",)]),
-    (lambda change: ActionLayout(**{**HAND, **change}), [
-        *(({"n_via": number},) for number in (-1, 1.5, 17)),
-        *(({"via_scale": scale},) for scale in ((np.inf, 0.1), (0.1,), ("far", 0.1), 0.1, (0.0, 0.1))),
-        ({"timing": "free"},), ({"space": "joints", "rate_limit": (1.0, 1.0)},),
-    ]),
-    (decoded, [
-        ((2,), (2,), (2,)), ((5,), (2,), (2,)), ((4, 2), (4, 2), (4, 2)), ((), (2,), (2,)), ((3,), (3,), (3,)),
-        ((3,), (2,), (3,)),
-    ]),
-    (encoded, [((4, 2), (3,)), ((3, 3), (2,)), ((2,), (1,)), ((3, 2), (3,))]),
     (lambda change: record(**change), [({"arm": "none"},), ({"n_via": 99},)]),
     (lambda weights: RewardWeights(**weights), [
         ({"success": np.nan},), ({"success": "much"},), ({"duration": -0.1},), ({"progress": True},),

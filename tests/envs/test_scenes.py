@@ -24,14 +24,9 @@ from episodes import (
 from viapoint import primitives
 from viapoint.envs import (
     Box,
-    Capsule,
     ConvexMesh,
-    Cylinder,
-    HalfSpace,
     Pose,
-    Sphere,
     Task,
-    obstacles_from_rows,
     obstacles_to_json,
     register_mesh,
     scene_from_json,
@@ -117,28 +112,13 @@ def test_targets_jump_in_time():
 # Given scenes
 
 
-@pytest.mark.parametrize(
-    "shape",
-    [
-        Sphere(0.05, position=(0.3, 0.6, 0.4)),
-        Capsule(0.1 / 3.0, 0.2 / 3.0, position=(1.0 / 3.0, 0.6, 0.1), name="post"),
-        Cylinder(0.04, 0.1, position=(0.3, 0.6, 0.4), quaternion=(0.6, 0.0, 0.8, 0.0)),
-        CRATE,
-        HalfSpace.facing((-0.6, 0.0, 0.8), position=(1.0 / 3.0, 0.0, -0.4)),
-        Box((0.2, 0.2, 0.05), position=(0.0, 0.0, -0.03)),  # touches the base, which it may
-    ],
-    ids=lambda shape: shape.kind,
-)
-def test_a_shape_its_dictionary_and_its_json_give_the_same_movement(shape):
+def test_shapes_their_dictionaries_and_their_json_give_the_same_movement():
     env = gym.make(PANDA).unwrapped
+    shapes = [CRATE, Box((0.2, 0.2, 0.05), position=(0.0, 0.0, -0.03))]  # touches the base, which it may
+    read = json.loads(json.dumps([shape.to_dict() for shape in shapes]))
     results = []
-    read = json.loads(json.dumps([shape.to_dict()]))
-    for form in ([shape], (shape.to_dict(),), obstacles_to_json([shape]), read):
+    for form in (shapes, tuple(shape.to_dict() for shape in shapes), obstacles_to_json(shapes), read):
         first, _ = env.reset(seed=0, options={**PANDA_ENDS, "obstacles": form})
-        row = env.task.observation.rows(first["obstacles"])[:1]
-        seen = obstacles_from_rows(row[None], env.task.shapes)
-        if shape.kind != "half_space":
-            np.testing.assert_allclose(seen.centre[0, 0], shape.position, atol=1e-6)
         results.append((first, env.step(np.zeros(8, np.float32))[4]))
     for first, info in results[1:]:
         same(first, results[0][0])
