@@ -103,29 +103,26 @@ def test_outside_the_movement_the_end_points_are_held_at_rest(rng):
     np.testing.assert_allclose(trajectory([end], 1)[0], ends["goal_velocity"], atol=1e-12)
 
 
+def answers(movement, times, number):
+    """Properties of a movement, and samples at given and at equally spaced times."""
+    properties = movement.coefficients, movement.cost(), movement.peak(1), movement.extrema(2).maximum
+    return [*properties, *movement.sample(times), *movement.sample(number)]
+
+
 @pytest.mark.parametrize("dimension", [1, 2, 3])
 @pytest.mark.parametrize("vias", [0, 1, 3])
 def test_a_batch_gives_bit_for_bit_what_each_item_gives_alone(vias, dimension, rng):
     waypoints, durations, ends = random_movement(rng, vias, batch=(70,), dimension=dimension)
     batch = through(waypoints, durations, **ends)
-    answers = (batch.coefficients, batch.cost(), batch.peak(1), batch.extrema(2).maximum)
     for count in (0, 1, 2, 3, 4, 7, 8, 12, 50, 200):  # few times have layouts of their own
         times, number = rng.uniform(-0.1, 4, (70, count)), max(2, count)
-        together = [*batch.sample(times), *batch.sample(times[0], nu=(0, 4)), *batch.sample(number)]
-        for i in (0, 1, 33, 69):
-            for items in (i, slice(i, i + 1)):
-                own = {name: value[items] for name, value in ends.items()}
-                alone = through(waypoints[items], durations[items], **own)
-                single = (alone.coefficients, alone.cost(), alone.peak(1), alone.extrema(2).maximum)
-                for whole, part in zip(answers, single, strict=True):
-                    np.testing.assert_array_equal(whole[items], part)
-                parts = [
-                    *alone.sample(times[items]),
-                    *alone.sample(times[0], nu=(0, 4)),
-                    *alone.sample(number),
-                ]
-                for whole, part in zip(together, parts, strict=True):
-                    np.testing.assert_array_equal(whole[items], part)
+        together, shared = answers(batch, times, number), batch.sample(times[0], nu=(0, 4))
+        for items in (0, 1, 33, 69, slice(1, 2)):
+            own = {name: value[items] for name, value in ends.items()}
+            alone = through(waypoints[items], durations[items], **own)
+            parts = [*answers(alone, times[items], number), *alone.sample(times[0], nu=(0, 4))]
+            for whole, part in zip([*together, *shared], parts, strict=True):
+                np.testing.assert_array_equal(whole[items], part)
 
 
 def test_sample_fills_given_buffers(rng):
