@@ -121,13 +121,6 @@ def gripper(number, joint="finger", depth=1):
     return "".join(text.format(side, 0.04 * side) for side in range(number))
 
 
-def test_fingers_with_several_joints_stay_where_the_keyframe_has_them():
-    pose = " ".join(map(str, (*HOME, 0.5, -0.9, -0.3, 0.7)))
-    key = f'{END}<keyframe><key qpos="{pose}"/></keyframe>'
-    text = changed((HAND_OF_TEXT, gripper(2, depth=2) + HAND_OF_TEXT), (END, key))
-    check_it_is_the_arm_of(text, ur5e(text))
-
-
 SHOULDER = '<body name="shoulder" pos="0 0 0.1625">'
 CARRIAGE = (
     '<body name="carriage"><joint name="lift" type="slide" axis="0 0.6 0.8" range="0 0.5" damping="3" armature="2" '
@@ -146,13 +139,6 @@ def test_a_slide_is_fixed_as_in_the_keyframe_or_is_a_joint(moves):
     assert arm.chain.sliding.tolist() == ([True] if moves else []) + [False] * 6
     assert "carriage" in arm.group_names
     check_it_is_the_arm_of(text, arm)
-
-
-def test_an_arm_of_two_joints_and_a_home_in_the_middle_of_the_ranges(arm):
-    text = changed(('name="shoulder_lift"', 'name="shoulder_lift" range="0.5 1.5"'))
-    two = ur5e(text, joints=JOINTS[:2], tool="hand", home=None, torque_limit=500.0)
-    np.testing.assert_allclose(two.home, [0.0, 1.0], atol=1e-5)
-    assert {"shoulder", "upper_arm", "wrist_3"} <= set(two.group_names)
 
 
 def test_pairs_that_the_file_does_not_let_collide_are_left_out():
@@ -175,9 +161,7 @@ def test_joints_and_bodies_may_have_any_names(arm):
 THREE = {"tool": "tool", "joints": ("one", "two", "three"), "velocity_limit": 1.0, "torque_limit": 1e3}
 
 
-@pytest.mark.parametrize(
-    ("gap", "reason"), [(0.004, "always near"), (0.02, "always near"), (-0.001, "in contact at home")]
-)
+@pytest.mark.parametrize(("gap", "reason"), [(0.004, "always near"), (-0.001, "in contact at home")])
 def test_bodies_that_never_touch_or_touch_at_home_are_left_out(gap, reason):
     arm = load_arm(near_arm(gap), **THREE)
     assert [pair[:2] for pair in arm.left_out if reason in pair.reason] == [("a", "c")]

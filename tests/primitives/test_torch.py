@@ -118,17 +118,6 @@ def test_still_and_steady_movements_of_a_batch_do_not_change_the_gradients_of_ot
     assert torch.isfinite(torch.autograd.grad(both[1], shift)[0]).all()
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_the_gradient_of_curvature_on_a_grid_with_rest_is_that_without_it(dimension, tensor):
-    waypoints, inside = tensor(3, dimension), torch.linspace(0.1, 0.9, 9, dtype=torch.float64)
-    movement = vp.through(waypoints, [0.4, 0.6])
-    (expected,) = torch.autograd.grad(vp.curvature(movement, inside).sum(), waypoints, retain_graph=True)
-    values = vp.curvature(movement, torch.cat([torch.zeros(1), inside]))
-    assert values[0].isnan()
-    (found,) = torch.autograd.grad(values.nansum(), waypoints)
-    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0.0)
-
-
 @pytest.mark.parametrize("number", [float, np.float64, np.float32, np.array])
 def test_a_number_beside_tensors_adds_no_dimension(number):
     reach = vp.point_to_point(torch.zeros(2), torch.ones(2), number(1.0))
