@@ -65,15 +65,6 @@ def test_examples_run(name):
     assert done.returncode == 0, done.stderr
 
 
-def test_the_readme_shows_what_its_first_example_prints():
-    first, printed = re.search(
-        r"```python\n(.*?)```\n+```text\n(.*?)```", text("README.md"), re.DOTALL
-    ).groups()
-    done = subprocess.run([sys.executable, "-c", first], cwd=ROOT, capture_output=True, text=True)
-    times = r"milliseconds=[\d.]+"
-    assert re.sub(times, "", done.stdout) == re.sub(times, "", printed), done.stderr
-
-
 def commands(name):
     """Command lines of `viapoint` and `make` on a page, as a reader would type them."""
     blocks = re.findall(r"```\w*\n(.*?)```", text(name), re.DOTALL)

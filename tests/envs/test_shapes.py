@@ -61,6 +61,14 @@ def some_shapes(rng, kinds=KINDS, number=3):
     return [random_shape(kind, rng, moving=True) for kind in kinds for _ in range(number)]
 
 
+def assert_same_distances(obstacles, scenes, rng, atol=1e-9):
+    """Check that the obstacles of each scene have the distances of its shapes from random points."""
+    points = rng.uniform(-0.5, 0.5, (100, 3))
+    for i, shapes in enumerate(scenes):
+        found = signed_distances(unpack(obstacles, i), points)
+        np.testing.assert_allclose(found, signed_distances(shapes, points), atol=atol)
+
+
 def prism(twist):
     """Vertices of a prism over a triangle whose upper end is turned."""
     turn = np.arange(3) * 2.0 * np.pi / 3.0
@@ -90,13 +98,10 @@ def test_packed_obstacles_are_unpacked_as_the_same_shapes(rng):
     scenes = [some_shapes(rng), [], some_shapes(rng, KINDS[:3], 1)]
     obstacles = pack(scenes)
     assert obstacles.present.sum(axis=1).tolist() == [len(scene) for scene in scenes]
-    points = rng.uniform(-0.5, 0.5, (300, 3))
+    assert_same_distances(obstacles, scenes, rng)
     for i, scene in enumerate(scenes):
         again = unpack(obstacles, i)
         assert [shape.kind for shape in again] == [shape.kind for shape in scene]
-        np.testing.assert_allclose(
-            signed_distances(again, points), signed_distances(scene, points), atol=1e-9
-        )
         for one, other in zip(again, scene, strict=True):
             np.testing.assert_array_equal(one.velocity, other.velocity)
     assert pack([scenes[0]], rows=30).kind.shape == (1, 30)
@@ -112,11 +117,7 @@ def test_scenes_are_taken_and_put(rng):
     before = obstacles.take([0, 1])
     changed = obstacles.put([1], other.take(slice(1, 2)))
     changed = changed.put([2], changed.take([0]))
-    points = rng.uniform(-0.5, 0.5, (100, 3))
-    for scene, shapes in enumerate((first, second, first)):
-        np.testing.assert_allclose(
-            signed_distances(unpack(changed, scene), points), signed_distances(shapes, points), atol=1e-9
-        )
+    assert_same_distances(changed, (first, second, first), rng)
     assert len(changed.meshes.first) - 1 == 6
     np.testing.assert_array_equal(changed.kind, obstacles.kind)  # in place
     assert len(changed.put([1], before.take([0])).clouds.radius) == 3
@@ -135,10 +136,7 @@ def test_rows_of_observations_are_read_back(dtype, rng, wedge):
     assert (rows[~pack(scenes, rows=20).present] == 0.0).all()
     again = obstacles_from_rows(rows.astype(dtype), kinds)
     atol = 1e-5 if dtype is np.float32 else 1e-9
-    points = rng.uniform(-0.5, 0.5, (100, 3))
-    for i, scene in enumerate(scenes):
-        found = signed_distances(unpack(again, i), points)
-        np.testing.assert_allclose(found, signed_distances(scene, points), atol=atol)
+    assert_same_distances(again, scenes, rng, atol)
     np.testing.assert_allclose(observation_rows(again, kinds), rows, atol=atol)
 
 
