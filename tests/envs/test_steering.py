@@ -5,7 +5,7 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from episodes import GOAL, START, STEP, WALL, given, post
+from episodes import GOAL, STEP, WALL, given, post
 
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import Motion
@@ -29,18 +29,18 @@ def some_motion(number=5, seed=0):
     return Motion(*values[:3]), values[3]
 
 
-def towards(env, observation, points):
-    """Steer the hand past points to the last of them, and return all steps of the episode."""
-    points = [np.asarray(point, dtype=float) for point in points]
-    along = (GOAL - START) / np.linalg.norm(GOAL - START)
-    frame = np.stack((along, (-along[1], along[0])))
-    steps = []
+def towards(env, observation, *points):
+    """Steer the hand past points to its goal, and return all steps of the episode."""
+    start, steps = observation["hand"][:2], []
     while True:
-        hand = observation["hand"][:2]
-        if len(points) > 1 and np.linalg.norm(hand - points[0]) < 0.03:
+        hand, goal = observation["hand"][:2], observation["goal"][:2]
+        if points and np.linalg.norm(hand - points[0]) < 0.03:
             points = points[1:]
-        velocity = 8.0 * (points[0] - hand) - 0.3 * observation["velocity"]
-        action = frame @ velocity / np.array(env.task.steering.top_speed)
+        velocity = 8.0 * ((points[0] if points else goal) - hand) - 0.3 * observation["velocity"]
+        # Components of actions are along and across the line from the start to the present goal.
+        along = (goal - start) / np.linalg.norm(goal - start)
+        frame = np.stack((along, (-along[1], along[0])))
+        action = np.clip(frame @ velocity / env.task.steering.top_speed, -1.0, 1.0)
         observation, *rest = env.step(action.astype(np.float32))
         steps.append((observation, *rest))
         if rest[1] or rest[2]:
@@ -81,12 +81,12 @@ def test_the_zero_action_brings_to_rest_and_no_action_exceeds_the_bounds(space):
 
 
 def test_the_way_round_succeeds_where_the_straight_line_crashes():
-    crash = towards(*given(STEP, [WALL]), [GOAL])[-1]
+    crash = towards(*given(STEP, [WALL]))[-1]
     assert crash[2]
     assert crash[-1]["collision"]
     assert not crash[-1]["is_success"]
     env, observation = given(STEP, [WALL])
-    around = towards(env, observation, [(-0.2, 0.56), (-0.05, 0.56), GOAL])
+    around = towards(env, observation, (-0.2, 0.56), (-0.05, 0.56))
     info, rollout = around[-1][-1], env.last_rollout
     assert info["is_success"]
     assert len(around) * 0.04 == pytest.approx(info["duration"] + SETTLING, abs=0.041)
@@ -102,15 +102,8 @@ def test_the_way_round_succeeds_where_the_straight_line_crashes():
 def test_a_hand_that_follows_a_jumping_target_arrives_at_the_last_place(seed):
     env = gym.make("viapoint/PlanarTargetJumpStep-v0").unwrapped
     seen, _ = env.reset(seed=seed)
-    start, times, over = seen["hand"][:2], env.batch.scenes.jump_times, False
-    while not over:
-        velocity = 8.0 * (seen["goal"] - seen["hand"])[:2] - 0.3 * seen["velocity"]
-        # Components of actions are along and across the line from the start to the present goal.
-        along = (seen["goal"][:2] - start) / np.linalg.norm(seen["goal"][:2] - start)
-        action = np.array([along @ velocity, along[0] * velocity[1] - along[1] * velocity[0]])
-        action = np.clip(action / np.array(env.task.steering.top_speed), -1.0, 1.0)
-        seen, _, terminated, truncated, info = env.step(action.astype(np.float32))
-        over = terminated or truncated
+    times = env.batch.scenes.jump_times
+    info = towards(env, seen)[-1][-1]
     assert info["is_success"]
     assert info["time"] > times[times < NEVER].max()
 
