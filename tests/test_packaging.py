@@ -28,16 +28,11 @@ import viapoint.training.cli.entry
 from viapoint.training import evaluate, load_agent, plan_motion, train
 assert load_agent("viapoint/PlanarObstacles-v0").env_id == "viapoint/PlanarObstacles-v0"
 """
-ALL = """
-import viapoint.training.live.page, minari, ray.tune, ompl
-from viapoint.training.study.run import run_study
-"""
 OF_TRAINING = ("torch", "stable_baselines3", "matplotlib", "pandas", "tyro")
 OF_OTHERS = ("ray", "optuna", "viser", "mjviser", "ompl", "minari", "gymnasium_robotics", "furo")
 INSTALLED = {
     "base": ((*OF_TRAINING, *OF_OTHERS), BASE),
     "training": (OF_OTHERS, BASE + TRAINING),
-    "all": ((), BASE + TRAINING + ALL),
 }
 """Packages that are absent from an environment, and a script that works there, by the extras that are installed."""
 WHERE = """
