@@ -11,20 +11,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-MAY_IMPORT = {
-    "primitives": {"numpy", "array_api_compat", "viapoint.primitives"},
-    "envs": {
-        "numpy",
-        "array_api_compat",
-        "gymnasium",
-        "mujoco",
-        "numba",
-        "scipy",
-        "glfw",
-        "viapoint.primitives",
-        "viapoint.envs",
-    },
-}
+BASE = {"numpy", "array_api_compat", "viapoint.primitives"}
+SIMULATION = {"gymnasium", "mujoco", "numba", "scipy", "glfw", "viapoint.envs"}
+MAY_IMPORT = {"primitives": BASE, "envs": BASE | SIMULATION}
 """Modules outside the standard library; MuJoCo comes with `glfw`."""
 IMPORT = re.compile(r"^\s*(?:from (\w[\w.]*) import |import (\w[\w.]*)(?: as \w+)?$)", re.MULTILINE)
 

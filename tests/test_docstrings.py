@@ -35,8 +35,3 @@ def fragments(source):
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_docstrings_begin_with_a_whole_sentence(path):
     assert fragments(path.read_text()) == []
-
-
-def test_fragments_are_recognised():
-    for text in ("Of the scene.", "What came of it.", "The same for others.", "As SB3."):
-        assert len(fragments(f'def function():\n    """{text}"""\n\nNUMBER = 1\n"""{text}"""\n')) == 2

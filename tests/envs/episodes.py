@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 
 import viapoint.envs as package
-from viapoint.envs import Box, Cylinder
+from viapoint.envs import Box, Cylinder, arm_of
 from viapoint.envs.events import Event
 
 OBSTACLES, STEP, JUMP, MOVING = (
@@ -17,6 +17,11 @@ START, GOAL, OTHER = np.array([-0.3, 0.4]), np.array([0.1, 0.4]), np.array([0.0,
 ENDS = {"start": START, "goal": GOAL}
 WALL = Box((0.008, 0.1, 0.04), position=(-0.1, 0.4, 0.0))
 """Wall across the middle of the straight line from START to GOAL."""
+
+HOME = arm_of("panda").home
+PANDA_ENDS = {"start": HOME, "goal": HOME + np.array([0.9, 0.3, 0.0, 0.2, 0.0, 0.0, 0.0])}
+CRATE = Box((0.03, 0.04, 0.05), position=(0.2, 0.7, 0.4), quaternion=(0.96, 0.0, 0.28, 0.0))
+"""Box within reach of the Panda."""
 
 
 def post(x, y, radius=0.02, **others):

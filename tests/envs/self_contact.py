@@ -16,7 +16,7 @@ def least_pair_distance(arm, joints):
     for a, b in spheres.pairs:
         apart = np.linalg.norm(centres[..., some[a], None, :] - centres[..., None, some[b], :], axis=-1)
         found.append((apart - spheres.radius[some[a], None] - spheres.radius[some[b]]).min(axis=(-2, -1)))
-    return np.stack(found, axis=-1)
+    return np.stack(found, axis=-1) if found else np.empty((*joints.shape[:-1], 0))
 
 
 def check_contact_implies_overlap(arm, number=3000):

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from random_shapes import random_shape
+from self_contact import least_pair_distance
 
 from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.arms.registry import arm_of
@@ -16,10 +17,8 @@ from viapoint.envs.geometry.clearance import (
     memory,
     movement_clearance,
 )
-from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.geometry.obstacles import KINDS, pack
 from viapoint.envs.geometry.shapes import as_obstacle
-
-KINDS = ("sphere", "capsule", "cylinder", "box", "half_space")
 
 
 def some_shapes(rng, number):
@@ -45,7 +44,6 @@ def test_clearance_is_that_of_the_nearest_sphere(name):
     times = rng.uniform(0.0, 1.0, number)
     found = configuration_clearances(arm.chain, arm.spheres, joints, pack(scenes), times)
     link = np.repeat(arm.spheres.link, np.diff(arm.spheres.first))
-    group = np.repeat(np.arange(len(arm.spheres.link)), np.diff(arm.spheres.first))
     for i in range(number):
         centres = sphere_centres(arm.chain, arm.spheres, joints[i])
         moves = link > 0
@@ -54,11 +52,8 @@ def test_clearance_is_that_of_the_nearest_sphere(name):
             for shape in scenes[i]
         ]
         assert max(found[i, 0], -FAR) == pytest.approx(np.clip(np.min(distances), -FAR, FAR), abs=1e-9)
-        apart = np.linalg.norm(centres[:, None] - centres, axis=-1)
-        apart -= arm.spheres.radius[:, None] + arm.spheres.radius
-        pairs = {tuple(pair) for pair in arm.spheres.pairs}
-        compared = np.array([[(a, b) in pairs for b in group] for a in group])
-        assert found[i, 1] == pytest.approx(min(apart[compared].min(initial=FAR), FAR), abs=1e-9)
+    own = least_pair_distance(arm, joints).min(axis=-1, initial=FAR)
+    np.testing.assert_allclose(found[:, 1], own, atol=1e-9)
 
 
 @pytest.mark.parametrize("number", [0, 5])
@@ -100,9 +95,8 @@ def test_clearance_between_configurations_is_that_of_many_more(name):
             step = duration / (len(joints) - 1)
             found = movement_clearance(*body, joints, pack([shapes]), 0, 0.0, step, placed, memory_of_it, 0.0)
             least.append(max(min(found), -FAR))
-        assert (
-            least[1] - 3e-3 <= least[0] <= least[1] + ROUGHLY
-        )  # many configurations may miss something, too
+        # Many configurations may miss something, too.
+        assert least[1] - 3e-3 <= least[0] <= least[1] + ROUGHLY
         assert least[0] < 0.0 or least[1] > -RESOLUTION
         deeper += least[0] < least[2] - 0.01
     assert deeper > 10  # something passes between the configurations

@@ -8,15 +8,14 @@ import pytest
 from viapoint.envs.arms.kinematics import link_poses
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles, unpack
-from viapoint.envs.geometry.shapes import Box, ConvexMesh, Sphere
+from viapoint.envs.geometry.shapes import Sphere
 from viapoint.envs.scenes.families_registry import (
     FAMILIES,
-    check_families,
     default_families,
     register_scene_family,
     scene_families,
 )
-from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Furniture, Layout, Place, Room, most_rows
+from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Furniture, Place, Room, most_rows
 from viapoint.envs.scenes.sampler import room_of
 from viapoint.envs.task import Task
 
@@ -123,56 +122,3 @@ def test_own_family_of_shapes_and_places_is_drawn():
     scenes = sampler([np.random.default_rng(seed) for seed in range(5)])
     assert (scenes.obstacles.centre == (0.45, 0.0, 0.45)).all()
     assert (scenes.obstacles.kind == 0).all()
-
-
-@pytest.mark.usefixtures("registry")
-@pytest.mark.parametrize(
-    "build",
-    [
-        lambda rng, room: None,
-        lambda rng, room: ([Sphere(0.1)] * 3,),
-        lambda rng, room: ([Box((0.1, 0.1, 0.1))],),
-        lambda rng, room: ([ConvexMesh.hull(np.eye(4, 3))],),
-        lambda rng, room: ([Sphere(0.1)], [Place((np.nan, 0.0, 0.0))]),
-        lambda rng, room: ([Sphere(0.1)], [Place((0.0, 0.0, 0.0))] * 9),
-        lambda rng, room: Layout([1.0], [], []),
-        lambda rng, room: ([{"shape": "sphere", "radius": -1.0}],),
-    ],
-)
-def test_wrong_results_of_own_families_name_the_family(build):
-    register_scene_family("own", build)
-    with pytest.raises(ValueError, match="'own'"):
-        scene_families(plane=False)["own"].build(np.random.default_rng(0), room(False, 2, ("sphere",)))
-
-
-def nothing(rng, room):
-    """Build nothing."""
-
-
-@pytest.mark.parametrize(
-    ("name", "build", "values", "error"),
-    [
-        (3, nothing, {}, TypeError),
-        ("x", lambda rng: None, {}, TypeError),
-        ("x", None, {}, TypeError),
-        ("", nothing, {}, ValueError),
-        ("shelf", nothing, {}, ValueError),
-        *(
-            ("x", nothing, values, ValueError)
-            for values in ({"kinds": ("ball",)}, {"kinds": ("convex_mesh",)})
-        ),
-        ("x", nothing, {"n_obstacles": 0}, ValueError),
-    ],
-)
-def test_registration_refuses(name, build, values, error):
-    with pytest.raises(error):
-        register_scene_family(name, build, **values)
-
-
-@pytest.mark.parametrize(
-    ("families", "kinds", "most"),
-    [("shelf", ALL, 9), ((), ALL, 9), (("attic",), ALL, 9), (("shelf",), ("sphere",), 9), (("bin",), ALL, 4)],
-)
-def test_families_without_room_are_refused(families, kinds, most):
-    with pytest.raises(ValueError, match="famil"):
-        check_families(families, False, kinds, most)

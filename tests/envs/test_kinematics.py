@@ -1,4 +1,4 @@
-"""Kinematics, dynamics and inverse kinematics agree with MuJoCo and with one another."""
+"""Kinematics, dynamics, inverse kinematics and control agree with MuJoCo and with one another."""
 
 import re
 
@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from viapoint import primitives
 from viapoint.envs.arms.arm import arm_from_xml
 from viapoint.envs.arms.inverse_kinematics import (
     in_planar_reach,
@@ -110,9 +111,8 @@ def test_inverse_kinematics_finds_what_forward_kinematics_gives(arm):
         np.testing.assert_allclose(forward(arm.chain, joints)[1], frame, atol=1e-4)
 
 
-@pytest.mark.parametrize("place", [(3.0, 0.0, 0.2), (0.1, 1.8, 0.5), (0.0, 0.0, -2.0)])
-def test_a_pose_out_of_reach_is_an_error_with_the_nearest_distance(place):
-    arm = arm_of("panda")
+def test_a_pose_out_of_reach_is_an_error_with_the_nearest_distance():
+    arm, place = arm_of("panda"), (0.1, 1.8, 0.5)
     with pytest.raises(ValueError, match=r"nearest place found is [0-9.]+ mm") as error:
         inverse_kinematics(arm, place)
     told = 1e-3 * float(re.search(r"is ([0-9.]+) mm", str(error.value))[1])
@@ -174,3 +174,30 @@ def test_spheres_contain_the_geoms_and_stick_out_little(arm):
             from_axis = np.linalg.norm(centres - centre - share[:, None] * axis, axis=1)
             outside = np.minimum(outside, from_axis + radii - radius)
         assert outside.max() <= arm.excess + 1e-9 <= 0.005 + 2e-9
+
+
+@pytest.mark.parametrize("name", ["planar", "panda"])
+@pytest.mark.parametrize("stride", [1, 4])
+def test_movements_at_half_of_the_speed_limits_are_tracked_within_a_milliradian(name, stride):
+    arm = arm_of(name)
+    rng = np.random.default_rng(0)
+    low, high = arm.joint_range.T
+    limit = np.minimum(arm.velocity_limit, 3.0)
+    model = arm.compile(0)
+    data = mujoco.MjData(model)
+    for _ in range(8):
+        start, goal = rng.uniform(low, high, (2, len(low)))
+        duration = float((1.875 * np.abs(goal - start) / (0.5 * limit)).max())
+        movement = primitives.point_to_point(start, goal, duration)
+        time = arm.timestep * np.arange(round(duration / arm.timestep) + 1)
+        motion = [part[None] for part in movement.sample(time)]
+        controls = arm.controls(*motion, stride)[0]
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = start
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        error = 0.0
+        for k in range(len(time) - 1):
+            data.ctrl[:] = controls[k]
+            mujoco.mj_step(model, data)
+            error = max(error, np.abs(data.qpos - motion[0][0, k + 1]).max())
+        assert error < 1e-3

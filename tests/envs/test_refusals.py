@@ -1,16 +1,56 @@
 """Bad input raises one error where it enters: the input, and the type of the error."""
 
 import copy
+import functools
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
-from episodes import JUMP, MOVING, OBSTACLES, PANDA, STEP
+from episodes import (
+    CRATE,
+    ENDS,
+    HOME,
+    JUMP,
+    MOVING,
+    OBSTACLES,
+    OTHER,
+    PANDA,
+    PANDA_ENDS,
+    STEP,
+    post,
+    same_scenes,
+)
 
-from viapoint.envs import ReachVectorEnv, Task
+from viapoint.envs import (
+    Box,
+    Capsule,
+    ConvexMesh,
+    HalfSpace,
+    Place,
+    PointCloud,
+    Pose,
+    ReachVectorEnv,
+    Sphere,
+    Task,
+    arm_of,
+    observation_rows,
+    obstacles_from_json,
+    obstacles_from_rows,
+    register_arm,
+    register_mesh,
+    register_scene_family,
+    scene_from_json,
+    signed_distances,
+)
 from viapoint.envs.env import RecordMovements
-from viapoint.envs.plans import ActionLayout, Plan
+from viapoint.envs.geometry.obstacles import add_to_model, geom_meshes, pack
+from viapoint.envs.geometry.shapes import check_kinds
+from viapoint.envs.plans import Plan
 from viapoint.envs.rewards import RewardWeights
+from viapoint.envs.scenes.families_registry import scene_families
+from viapoint.envs.scenes.layout import Layout
+from viapoint.envs.scenes.sampler import room_of
 
 KINDS = (OBSTACLES, STEP, MOVING, PANDA)
 ANY_ENVIRONMENT = [
@@ -158,13 +198,8 @@ def test_goals_that_are_moved(goals):
     np.testing.assert_array_equal(env.observe()["goal"], before["goal"])
 
 
-HAND = {
-    "space": "hand",
-    "names_of_axes": ("along", "across"),
-    "via_scale": (0.1, 0.2),
-    "duration_range": (0.5, 1.0),
-}
-LAYOUT = ActionLayout(**HAND)
+CUBE = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]) / 10
+POINT, BALL = np.ones(3), Sphere(0.1)
 
 
 def record(**change):
@@ -177,39 +212,146 @@ def recorder(mode):
     return RecordMovements(env, "nowhere")
 
 
-def decoded(*shapes):
-    return LAYOUT.decode(*map(np.ones, shapes))
+def nothing(rng, room):
+    """Build nothing."""
 
 
-def encoded(*shapes):
-    return LAYOUT.encode(Plan(*map(np.ones, shapes)))
+def family(name, build=nothing, **values):
+    register_scene_family(name, build, **values)
+
+
+def built(result):
+    """Return the layout of a family of one's own that answers so."""
+    register_scene_family("own", lambda rng, room: result)
+    room = room_of(arm_of("panda"), ("sphere",), (1, 2), False)
+    return scene_families(plane=False)["own"].build(np.random.default_rng(0), room)
+
+
+def from_rows(shape):
+    """Return obstacles of rows of an observation, for a shape that has none."""
+    return obstacles_from_rows(observation_rows(pack([[shape]]), (shape.kind,)), (shape.kind,))
 
 
 CALLS = [
     (ReachVectorEnv, [(0,), (-1,), (1.5,), (True,), ("two",)]),
-    (lambda change: ActionLayout(**{**HAND, **change}), [
-        *(({"n_via": number},) for number in (-1, 1.5, 17)),
-        *(({"via_scale": scale},) for scale in ((np.inf, 0.1), (0.1,), ("far", 0.1), 0.1, (0.0, 0.1))),
-        ({"timing": "free"},), ({"space": "joints", "rate_limit": (1.0, 1.0)},),
-    ]),
-    (decoded, [
-        ((2,), (2,), (2,)), ((5,), (2,), (2,)), ((4, 2), (4, 2), (4, 2)), ((), (2,), (2,)), ((3,), (3,), (3,)),
-        ((3,), (2,), (3,)),
-    ]),
-    (encoded, [((4, 2), (3,)), ((3, 3), (2,)), ((2,), (1,)), ((3, 2), (3,))]),
     (lambda change: record(**change), [({"arm": "none"},), ({"n_via": 99},)]),
     (lambda weights: RewardWeights(**weights), [
         ({"success": np.nan},), ({"success": "much"},), ({"duration": -0.1},), ({"progress": True},),
     ]),
     (recorder, [(None,), ("human",), ("rgb_array",)]),
+    (lambda sensor: Task.of(sensor=sensor), [
+        ("eyes",), (3,), ({"lens": 1},), ({"columns": 0},), ({"columns": 1.5},), ({"rows": 2, "columns": 40_000},),
+        ({"field_of_view": 7.0},), ({"rows": 4, "field_of_view": 3.1},), ({"range": 0.0},), ({"noise": -1.0},),
+        ({"dropped": 1.0},), ({"position": (0.0, np.nan, 0.0)},), ({"quaternion": (1.0, 1.0, 0.0, 0.0)},),
+        ({"mount": "foot"},), ({"looks": 0},),
+        ({"looks": 2},),  # an episode of one decision has one look
+    ]),
+    (lambda change: Task.of(**change), [({"sensor": "rays", "n_obstacles": 0},), ({"decide_at": ["sight"]},)]),
+    (arm_of, [("large",)]),
+    (register_arm, [(arm_of("panda"),)]),
+    (family, [("",), ("shelf",)]),
+    (lambda values: family("x", **values), [
+        ({"kinds": ("ball",)},), ({"kinds": ("convex_mesh",)},), ({"n_obstacles": 0},),
+    ]),
+    (built, [
+        (None,), (Layout([1.0], [], []),),
+        *((([BALL], places),) for places in ([Place((np.nan, 0.0, 0.0))], [Place((0.0, 0.0, 0.0))] * 9)),
+        *(((shapes,),) for shapes in (
+            [BALL] * 3, [Box((0.1, 0.1, 0.1))], [ConvexMesh.hull(CUBE)], [{"shape": "sphere", "radius": -1.0}],
+        )),
+    ]),
+    (scene_from_json, [
+        (None,), (b"\xff",), ("[]",), ("{}",), ("{",), ("[" * 100_000,), ("1" * (2 << 20),),
+        ('{"format": "viapoint-scene", "obstacle": []}',), ('{"format": "viapoint-scene", "obstacles": 3}',),
+        ('{"format": "viapoint-scene", "obstacles": [{"shape": "cube"}]}',),
+    ]),
+    (obstacles_from_json, [("[",), ("{}",), ("[" * 100_000,), (None,), ('[{"shape": 1}]',)]),
+    (HalfSpace.facing, [((0, 0, 0),), ((0, np.nan, 1),), ((0, 1),)]),
+    (lambda end: Capsule.between((0, 0, 1), end, 0.1), [((0, 0, 1),), ((0, 1),), ((0, 0, np.inf),)]),
+    (ConvexMesh.hull, [(CUBE[:4],), (CUBE[:3],)]),
+    (PointCloud.covering, [(CUBE, -1.0), (CUBE, 0.0), (CUBE, 0.2, -0.1)]),
+    (BALL.distance, [
+        *((points,) for points in (0.1, (0.1, 0.2), np.zeros((3, 4)), POINT * np.nan, "a")),
+        *((POINT, radius) for radius in (np.nan, -0.1, "a", None, 1j, [0.1, np.inf])),
+    ]),
+    (signed_distances, [
+        *((each, POINT) for each in (BALL, None, "box", [{"shape": "boxx"}])), ([], (0, 1)), ([], POINT * np.nan),
+    ]),
+    (register_mesh, [("box", CUBE), ("a b", CUBE), (3, CUBE), ("", CUBE), ("dent", [*CUBE, (0.05, 0.05, 0.05)])]),
+    (check_kinds, [(["boxx"],), (["box", "box"],), ([3],)]),
+    (add_to_model, [(mujoco.MjSpec(), [Sphere(0.1, name="obstacle_1"), BALL])]),
+    (geom_meshes, [(pack([[ConvexMesh(CUBE)]]),), (pack([[PointCloud(CUBE)]]),)]),
+    (observation_rows, [(pack([[BALL]]), ("box",)), (pack([[ConvexMesh(CUBE)]]), ("box",))]),
+    (from_rows, [(PointCloud(CUBE),), (ConvexMesh(CUBE),)]),
+    (lambda rows: pack([[BALL] * 6], rows=rows), [(5,)]),
 ]  # fmt: skip
+OF_ANOTHER_TYPE = [
+    (lambda change: record(**change), [({"speed": 1},), ({"shapes": 1},)]),
+    (register_arm, [("small",)]),
+    (family, [(3,), ("x", lambda rng: None), ("x", None)]),
+]
+ROWS = [
+    *((call, arguments, ValueError) for call, arguments in CALLS),
+    *((call, arguments, TypeError) for call, arguments in OF_ANOTHER_TYPE),
+]
 
 
-@pytest.mark.parametrize(("call", "arguments"), CALLS)
-def test_arguments_of_classes_and_functions(call, arguments):
+@pytest.mark.usefixtures("registry")
+@pytest.mark.parametrize(("call", "arguments", "error"), ROWS)
+def test_arguments_of_classes_and_functions(call, arguments, error):
     for each in arguments:
-        with pytest.raises(ValueError):
+        with pytest.raises(error):
             call(*each)
+
+
+HOUSE = Box((0.3, 0.3, 0.3), position=(0.3, 0.0, 0.5))
+POST = {"obstacles": [post(-0.1, 0.6, 0.03)]}
+OTHER_SHAPES = {"shapes": ("box", "point_cloud", "convex_mesh"), "families": "clutter"}
+IN_SPACE = [
+    *({"obstacles": given} for given in (
+        [HOUSE], [[CRATE, HOUSE.to_dict()]], [HalfSpace(position=(0, 0, 0.6))],
+        [Box((2.5, 0.1, 0.1))], [Box((0.1, 0.1, 0.1), position=(3.0, 0.0, 0.0))],
+        [Box((1.0, 1.0, 1.0))],  # contains the base
+        [Sphere(0.05, position=(0.2, 0.7, 0.4), velocity=(3.0, 0.0, 0.0))],
+        [ConvexMesh.hull(CUBE)], [PointCloud(CUBE)], [{"shape": "pyramid"}],
+        [CRATE] * 17, CRATE, CRATE.to_dict(), None, "[]]", np.zeros((1, 9, 15)), [[], []], [[CRATE], 3, []],
+        [{"shape": "sphere", "radius": np.nan}], [{"shape": "sphere", "size": 0.1}],
+    )),
+    *({"start": start} for start in (np.full(7, 9.0), HOME[:6], np.full(7, np.nan), "home")),
+    {"start": HOME, "goal": HOME},
+    *({"goal": goal} for goal in (
+        Pose((3.0, 0.0, 0.0)), {"quaternion": (1, 0, 0, 0)}, [Pose((0.5, 0.0, 0.4))] * 3,
+        Pose((0.5, 0.0, 0.4), (0.5, 0.0, 0.0, 0.0)), Pose((0.5, np.nan, 0.4)),
+        {"position": (0.5, 0.0, 0.4), "angle": 3.0}, np.array([0, 1.7, 0, -3.0, 0, 0.1, 0.0]),
+    )),
+    {"jumps": [[0.3, *HOME]]}, {"turns": [[0.3, 0.1, 0.0, 0.0]]}, {"begin": HOME}, {1: HOME},
+]  # fmt: skip
+IN_THE_PLANE = [
+    *({**ENDS, "jumps": jumps} for jumps in (
+        [[0.0, *OTHER]], [[-0.1, *OTHER]], [[0.5, *OTHER], [0.4, 0.1, 0.4]], [[0.2, 3.0, 0.0]], [[0.2, 3.0]],
+        [[0.2, np.nan, 0.3]], [["soon", 0.0, 0.3]], [[0.1 * k, *OTHER] for k in range(1, 7)],
+    )),
+    {**ENDS, "obstacles": [post(*OTHER, 0.03)], "jumps": [[0.2, *OTHER]]},
+    {"turns": [[0.1, 0.0, 0.1, 0.0]]},  # of obstacles that are drawn
+    *({**ENDS, **POST, "turns": turns} for turns in (
+        [[0.1, 0.0]], [[-0.2, 0.1, 0.0, 0.0]], [[0.3, 3.0, 0.0, 0.0]],
+    )),
+    *({**ENDS, "goal": goal} for goal in ((0.1, 0.4, 0.3), (2.0, 0.0), ENDS["start"], Pose((2.0, 0.0, 0.0)))),
+    {**ENDS, "start": (0.0, 0.02)},
+]  # fmt: skip
+REACHES = [  # too short or long, too fast, not finite, of an obstacle that is not there, of another shape
+    [[0.0, 0.0, 0.1, 0.0, 0.0]], [[0.0, 1e-9, 0.0, 0.0, 0.0]], [[0.0, -1.0, 0.1, 0.0, 0.0]],
+    [[0.0, 0.1, 0.4, 0.0, 0.0]], [[0.0, 1e9, 0.1, 0.0, 0.0]], [[np.nan, 1.0, 0.1, 0.0, 0.0]],
+    [[0.0] * 5, [0.0, 1.0, 0.1, 0.0, 0.0]], [[0.0, 1.0, 0.1, 0.0]],
+]  # fmt: skip
+SCENES = [
+    *((PANDA, {}, {**ends, **options}) for options in IN_SPACE for ends in ({}, PANDA_ENDS)),
+    *((MOVING, {}, options) for options in IN_THE_PLANE),
+    *((MOVING, {"courses": "reaches"}, {**ENDS, **POST, "reaches": reaches}) for reaches in REACHES),
+    (PANDA, OTHER_SHAPES, {**PANDA_ENDS, "obstacles": [PointCloud(CUBE, 0.02, position=(0.2, 0.7, 0.4))]}),
+    (PANDA, OTHER_SHAPES, {**PANDA_ENDS, "obstacles": [ConvexMesh.hull(CUBE)]}),
+    ("viapoint/PlanarSensed-v0", {}, {"obstacles": [post(0.03, 0.0, 0.05)]}),  # contains the sensor
+]
 
 
 def test_a_copy_of_a_task_is_equal():
@@ -217,8 +359,16 @@ def test_a_copy_of_a_task_is_equal():
     assert copy.deepcopy(task) == task
 
 
-def test_records_of_tasks():
-    assert record() == Task.of()
-    for change in ({"speed": 1}, {"shapes": 1}):
-        with pytest.raises(TypeError):
-            record(**change)
+@functools.cache
+def kept(env_id, **kwargs):
+    return gym.make(env_id, **kwargs).unwrapped
+
+
+@pytest.mark.parametrize(("env_id", "kwargs", "options"), SCENES)
+def test_impossible_scenes_change_nothing(env_id, kwargs, options):
+    env = kept(env_id, **kwargs)
+    env.reset(seed=0)
+    scenes = env.batch.scenes
+    with pytest.raises(ValueError):
+        env.reset(seed=1, options=options)
+    same_scenes(env.batch.scenes, scenes)

@@ -1,12 +1,13 @@
 """Pictures and films of movements."""
 
 import gymnasium as gym
+import imageio_ffmpeg
 import mujoco
 import numpy as np
 import pytest
-from episodes import AROUND, DRAWN, OBSTACLES, STRAIGHT, moved
+from episodes import AROUND, DRAWN, JUMP, OBSTACLES, STRAIGHT, moved, play
 
-from viapoint.envs import HalfSpace, Sphere, arm_of
+from viapoint.envs import HalfSpace, RecordMovements, Sphere, arm_of
 from viapoint.envs.rendering import gl, renderer
 
 WHOLE_ARM = "viapoint.envs:viapoint/PlanarWholeArm-v0"
@@ -138,15 +139,28 @@ def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
     assert shown[-1] == "closed"
 
 
-@pytest.mark.parametrize("touches", [True, False])
-def test_in_space_spheres_are_seen_and_turn_red_with_the_link_that_touches_them(make, touches):
-    arm = arm_of("panda")
-    goal = arm.home + np.array([1.2, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
-    place = arm.hand(0.5 * (arm.home + goal)) if touches else (0.3, -0.5, 0.4)
-    env = make("viapoint.envs:viapoint/PandaObstacles-v0", side=160)
-    env.reset(options={"start": arm.home, "goal": goal, "obstacles": [Sphere(0.08, position=place)]})
-    before = env.render().astype(int)
-    assert (before[..., 0] - before[..., 2] > 40).sum() > 150
-    *_, info = env.step(np.zeros(8, np.float32))
-    assert info["collision"] == touches
-    assert (red(env.render()) > 100) == touches
+def frames_of(path):
+    """Number of frames of a video."""
+    reader = imageio_ffmpeg.read_frames(str(path))
+    next(reader)
+    return sum(1 for _ in reader)
+
+
+@pytest.mark.parametrize("env_id", [OBSTACLES, JUMP])
+def test_each_frame_of_a_movement_of_one_or_several_steps_is_recorded_once(env_id, make, tmp_path):
+    made = make(f"viapoint.envs:{env_id}", "rgb_array_list", side=64, duration_range=(0.4, 0.6))
+    env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
+    env.reset(seed=0)
+    steps = len(play(env, 0.3))
+    expected = 1 + round(env.unwrapped.last_rollout.time[-1] * env.metadata["render_fps"])
+    env.close()
+    assert (steps > 1) == (env_id == JUMP)
+    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == pytest.approx(expected, abs=1)
+
+
+def test_gymnasium_records_two_frames_of_a_movement_and_a_warning_says_so(make, tmp_path):
+    env = gym.wrappers.RecordVideo(make(side=64), str(tmp_path / "videos"), episode_trigger=lambda _: True)
+    with pytest.warns(UserWarning, match="RecordMovements"):
+        moved(env, AROUND)
+    env.close()
+    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == 2

@@ -19,7 +19,6 @@ from viapoint.envs import (
 )
 from viapoint.envs.events import NEW_DISTANCE, NEW_POINTS, Event
 from viapoint.envs.geometry.obstacles import add_to_model, pack, unpack
-from viapoint.training import evaluate
 from viapoint.training.planning.beliefs import Sight, fitted_boxes, thick_points
 from viapoint.training.planning.search import registered_task
 
@@ -180,58 +179,3 @@ def test_looks_do_not_depend_on_the_batch_and_are_restored() -> None:
     many.unwrapped.restore(state)
     again = many.step(-action)[0]
     assert all(np.array_equal(once[name], again[name]) for name in once)
-
-
-def test_looking_again_helps_a_search() -> None:
-    solved = {}
-    for when, kwargs in {
-        "once": {"sensor": "hand_rays"},
-        "again": {"sensor": "hand_rays", "decide_at": ("sight", "clearance")},
-    }.items():
-        result = evaluate(
-            env="viapoint/PlanarSensed-v0",
-            env_kwargs=kwargs,
-            scenes="validation",
-            n_scenes=60,
-            baselines=["thick:search128"],
-            time_decisions=False,
-        )
-        solved[when] = result.success_rate
-    assert solved["again"] > solved["once"] + 0.08
-
-
-@pytest.mark.parametrize(
-    ("sensor", "error"),
-    [
-        ("eyes", ValueError),
-        (3, ValueError),
-        ({"lens": 1}, ValueError),
-        ({"columns": 0}, ValueError),
-        ({"columns": 1.5}, ValueError),
-        ({"rows": 2, "columns": 40_000}, ValueError),
-        ({"field_of_view": 7.0}, ValueError),
-        ({"rows": 4, "field_of_view": 3.1}, ValueError),
-        ({"range": 0.0}, ValueError),
-        ({"noise": -1.0}, ValueError),
-        ({"dropped": 1.0}, ValueError),
-        ({"position": (0.0, np.nan, 0.0)}, ValueError),
-        ({"quaternion": (1.0, 1.0, 0.0, 0.0)}, ValueError),
-        ({"mount": "foot"}, ValueError),
-        ({"looks": 0}, ValueError),
-        ({"looks": 2}, ValueError),  # an episode of one decision has one look
-    ],
-)
-def test_impossible_sensors_are_refused(sensor, error) -> None:
-    with pytest.raises(error, match="sensor"):
-        Task.of(sensor=sensor)
-
-
-def test_sensors_that_see_nothing_are_refused() -> None:
-    with pytest.raises(ValueError, match="nothing to see"):
-        Task.of(sensor="rays", n_obstacles=0)
-    with pytest.raises(ValueError, match="sensor"):
-        Task.of(decide_at=["sight"])
-    env = gym.make("viapoint/PlanarSensed-v0")
-    with pytest.raises(ValueError, match="sensor"):
-        env.reset(options={"obstacles": [Cylinder(0.05, 0.04, position=(0.03, 0.0, 0.0))]})
-    env.reset(seed=0)  # it stays usable

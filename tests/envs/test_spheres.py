@@ -1,14 +1,11 @@
 """Capsules contain the geoms that they cover, and contact in MuJoCo implies that spheres overlap."""
 
-import itertools
-
 import mujoco
 import numpy as np
 import pytest
 from self_contact import check_contact_implies_overlap
 
-from viapoint.envs.arms import capsule_fit
-from viapoint.envs.arms.capsule_fit import cover_geom, cover_points, polytope_around
+from viapoint.envs.arms.capsule_fit import cover_geom, polytope_around
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.geometry.shapes import ConvexMesh
 
@@ -75,14 +72,3 @@ def test_spheres_and_capsules_of_a_file_stay_as_they_are():
     np.testing.assert_array_equal(ball.ends, np.zeros((2, 3)))
     np.testing.assert_array_equal(rod.ends, [(0.0, 0.0, -0.1), (0.0, 0.0, 0.1)])
     assert (ball.radius, rod.radius, ball.excess, rod.excess) == (0.05, 0.04, 0.0, 0.0)
-
-
-def test_a_cube_takes_one_ball_and_many_where_little_may_stick_out(monkeypatch):
-    cube = 0.05 * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    (ball,) = cover_points(cube, 0.04)
-    assert ball.radius == pytest.approx(0.05 * 3**0.5, abs=2e-3)
-    assert 2 < len(cover_points(cube, 0.02)) < 20
-    monkeypatch.setattr(capsule_fit, "MOST_SMALL", 20)
-    monkeypatch.setattr(capsule_fit, "MOST_CAPSULES", 30)
-    assert len(cover_points(cube, 0.005)) == 20
-    assert len(cover_points(3.0 * cube, 0.005)) == 30

@@ -5,7 +5,7 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from episodes import GOAL, START, STEP, WALL, given, post
+from episodes import GOAL, STEP, WALL, given, post
 
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import Motion
@@ -29,46 +29,39 @@ def some_motion(number=5, seed=0):
     return Motion(*values[:3]), values[3]
 
 
-def towards(env, observation, points):
-    """Steer the hand past points to the last of them, and return all steps of the episode."""
-    points = [np.asarray(point, dtype=float) for point in points]
-    along = (GOAL - START) / np.linalg.norm(GOAL - START)
-    frame = np.stack((along, (-along[1], along[0])))
-    steps = []
+def towards(env, observation, *points):
+    """Steer the hand past points to its goal, and return all steps of the episode."""
+    start, steps = observation["hand"][:2], []
     while True:
-        hand = observation["hand"][:2]
-        if len(points) > 1 and np.linalg.norm(hand - points[0]) < 0.03:
+        hand, goal = observation["hand"][:2], observation["goal"][:2]
+        if points and np.linalg.norm(hand - points[0]) < 0.03:
             points = points[1:]
-        velocity = 8.0 * (points[0] - hand) - 0.3 * observation["velocity"]
-        action = frame @ velocity / np.array(env.task.steering.top_speed)
+        velocity = 8.0 * ((points[0] if points else goal) - hand) - 0.3 * observation["velocity"]
+        # Components of actions are along and across the line from the start to the present goal.
+        along = (goal - start) / np.linalg.norm(goal - start)
+        frame = np.stack((along, (-along[1], along[0])))
+        action = np.clip(frame @ velocity / env.task.steering.top_speed, -1.0, 1.0)
         observation, *rest = env.step(action.astype(np.float32))
         steps.append((observation, *rest))
         if rest[1] or rest[2]:
             return steps
 
 
-def test_each_derivative_of_the_reference_is_that_of_the_one_before_and_control_steps_join():
-    fine = steering(2e-4, 200)
+def test_the_filter_obeys_its_equation_and_control_steps_join():
+    """Each derivative is that of the one before, and the jerk cost is the integral."""
+    fine = steering(1e-4, 400)
     motion, _ = some_motion()
     for _, wanted in (some_motion(seed=seed) for seed in range(3)):
-        whole = fine.follow(motion, wanted, 200)
-        for value, rate in itertools.pairwise(whole):
+        whole, w = fine.follow(motion, wanted, 400), fine.bandwidth
+        law = w**2 * (wanted[:, None] - whole.velocity) - 2.0 * w * whole.acceleration
+        for value, rate in itertools.pairwise((*whole, law)):
             slope = (value[:, 2:] - value[:, :-2]) / (2.0 * fine.timestep)
             np.testing.assert_allclose(slope, rate[:, 1:-1], atol=1e-4 * np.abs(rate).max())
         for part, begin in zip(whole, motion, strict=True):
             np.testing.assert_allclose(part[:, 0], begin, rtol=1e-12)
+        cost = 0.5 * np.trapezoid((law**2).sum(axis=-1), dx=fine.timestep, axis=-1)
+        np.testing.assert_allclose(fine.jerk_cost(motion, wanted), cost, rtol=1e-4)
         motion = Motion(*(part[:, -1] for part in whole))
-
-
-def test_the_filter_obeys_its_equation_and_the_jerk_cost_is_its_integral():
-    fine = steering(1e-4, 400)
-    motion, wanted = some_motion()
-    reference, w = fine.follow(motion, wanted, 400), fine.bandwidth
-    law = w**2 * (wanted[:, None] - reference.velocity) - 2.0 * w * reference.acceleration
-    slope = np.gradient(reference.acceleration, fine.timestep, axis=1)
-    np.testing.assert_allclose(slope[:, 1:-1], law[:, 1:-1], atol=1e-4 * np.abs(law).max())
-    cost = 0.5 * np.trapezoid((law**2).sum(axis=-1), dx=fine.timestep, axis=-1)
-    np.testing.assert_allclose(fine.jerk_cost(motion, wanted), cost, rtol=1e-5)
 
 
 @pytest.mark.parametrize("space", ["hand", "joints"])
@@ -87,30 +80,19 @@ def test_the_zero_action_brings_to_rest_and_no_action_exceeds_the_bounds(space):
     assert np.abs(motion.velocity).max() < 1e-4
 
 
-def test_it_arrives_where_nothing_is_in_the_way():
-    env, observation = given(STEP)
-    steps = towards(env, observation, [GOAL])
-    *_, terminated, truncated, info = steps[-1]
-    assert terminated
-    assert not truncated
-    assert info["is_success"]
-    assert len(steps) * 0.04 == pytest.approx(info["duration"] + SETTLING, abs=0.041)
-    assert info["path_length"] == pytest.approx(0.4, abs=0.02)
-    assert info["tracking_error"] < 1e-3
-    rollout = env.last_rollout
-    assert rollout.planned.shape == (len(steps) * env.task.steering.physics_steps, 2)
-    assert np.abs(rollout.hand[:, :2] - rollout.planned).max() < 2e-3
-    np.testing.assert_allclose(rollout.hand[-1, :2], GOAL, atol=0.01)
-
-
 def test_the_way_round_succeeds_where_the_straight_line_crashes():
-    crash = towards(*given(STEP, [WALL]), [GOAL])[-1]
+    crash = towards(*given(STEP, [WALL]))[-1]
     assert crash[2]
     assert crash[-1]["collision"]
     assert not crash[-1]["is_success"]
-    around = towards(*given(STEP, [WALL]), [(-0.2, 0.56), (-0.05, 0.56), GOAL])
-    info = around[-1][-1]
+    env, observation = given(STEP, [WALL])
+    around = towards(env, observation, (-0.2, 0.56), (-0.05, 0.56))
+    info, rollout = around[-1][-1], env.last_rollout
     assert info["is_success"]
+    assert len(around) * 0.04 == pytest.approx(info["duration"] + SETTLING, abs=0.041)
+    assert len(rollout.planned) == len(around) * env.task.steering.physics_steps
+    assert np.abs(rollout.hand[:, :2] - rollout.planned).max() < 2e-3
+    np.testing.assert_allclose(rollout.hand[-1, :2], GOAL, atol=0.01)
     assert 0.0 < info["min_clearance"] < 0.1
     progress = sum(step[-1]["reward_progress"] for step in around)
     assert progress == pytest.approx(1.0 - info["goal_error"] / 0.4)
@@ -120,15 +102,8 @@ def test_the_way_round_succeeds_where_the_straight_line_crashes():
 def test_a_hand_that_follows_a_jumping_target_arrives_at_the_last_place(seed):
     env = gym.make("viapoint/PlanarTargetJumpStep-v0").unwrapped
     seen, _ = env.reset(seed=seed)
-    start, times, over = seen["hand"][:2], env.batch.scenes.jump_times, False
-    while not over:
-        velocity = 8.0 * (seen["goal"] - seen["hand"])[:2] - 0.3 * seen["velocity"]
-        # Components of actions are along and across the line from the start to the present goal.
-        along = (seen["goal"][:2] - start) / np.linalg.norm(seen["goal"][:2] - start)
-        action = np.array([along @ velocity, along[0] * velocity[1] - along[1] * velocity[0]])
-        action = np.clip(action / np.array(env.task.steering.top_speed), -1.0, 1.0)
-        seen, _, terminated, truncated, info = env.step(action.astype(np.float32))
-        over = terminated or truncated
+    times = env.batch.scenes.jump_times
+    info = towards(env, seen)[-1][-1]
     assert info["is_success"]
     assert info["time"] > times[times < NEVER].max()
 

@@ -97,20 +97,6 @@ def test_no_other_times_nearby_fit_better(free_ends, n_via, rng):
             assert squares_at(knots + change, time, position) >= least * (1.0 - 1e-9)
 
 
-def test_errors_fall_as_the_root_of_the_number_of_samples():
-    errors = {}
-    for count in (50, 800):
-        found = []
-        for seed in range(30):
-            rng = np.random.default_rng(seed)
-            waypoints, _, trajectory = movement(rng, 1)
-            time, position = samples(trajectory, False, rng, count, noise=0.002)
-            fit = fit_via_points(time, position, 1, free_ends=False)
-            found.append(np.square(fit.via_points[0] - waypoints[1]).sum())
-        errors[count] = math.sqrt(np.median(found))
-    assert 2.5 < errors[50] / errors[800] < 6.4  # 4 is the root of the ratio of the samples
-
-
 def test_the_noise_is_not_that_which_the_fit_explains():
     """With few samples, residuals are smaller than the noise by the share of the fitted numbers."""
     squares = []
@@ -145,28 +131,22 @@ def test_a_batch_holds_the_fits_of_its_movements(rng):
         several.append(samples(movement(rng, n_via)[2], True, rng, noise=0.001))
     time, position = (np.stack(part) for part in zip(*several, strict=True))
     batch = fit_via_points(time.reshape(2, 2, 100), position.reshape(2, 2, 100, 2))
-    listed = fit_via_points(list(time), list(position))
+    starts = 5 * np.arange(4)  # movements of a list may have different lengths
+    parts = [(own[0][start:], own[1][start:]) for own, start in zip(several, starts, strict=True)]
+    listed = fit_via_points([own_time for own_time, _ in parts], [own_position for _, own_position in parts])
     assert batch.via_points.shape == (2, 2, 2, 2)
     assert listed.via_points.shape == (4, 2, 2)
-    for i, (own_time, own_position) in enumerate(several):
-        one = fit_via_points(own_time, own_position)
-        count = int(one.n_via)
-        for found, row in ((batch, np.unravel_index(i, (2, 2))), (listed, (i,))):
+    for i in range(4):
+        for found, row, recording in ((batch, divmod(i, 2), several[i]), (listed, (i,), parts[i])):
+            one = fit_via_points(*recording)
+            count = int(one.n_via)
             np.testing.assert_array_equal(found.via_points[row][:count], one.via_points)
             assert np.isnan(found.via_points[row][count:]).all()
             assert np.isnan(found.passage_times[row][count:]).all()
             np.testing.assert_array_equal(found.bic[row], one.bic)
-            np.testing.assert_allclose(found(own_time)[row], one(own_time), atol=1e-12)
-
-
-def test_movements_of_different_length_are_fitted_together(rng):
-    several = [samples(movement(rng, 1)[2], True, rng, count, 0.001) for count in (30, 80)]
-    fit = fit_via_points([time for time, _ in several], [position for _, position in several], 1)
-    for i, (time, position) in enumerate(several):
-        np.testing.assert_array_equal(fit.via_points[i], fit_via_points(time, position, 1).via_points)
-    shared = np.linspace(0.0, 1.0, 30)
-    together = fit_via_points(shared, [several[0][1], several[0][1]], 1)
-    np.testing.assert_array_equal(together.end[0], together.end[1])
+            np.testing.assert_allclose(found(recording[0])[row], one(recording[0]), atol=1e-12)
+    shared = fit_via_points(time[0], [position[0], position[0]], 1)
+    np.testing.assert_array_equal(shared.end[0], shared.end[1])
 
 
 def test_the_kind_of_the_positions_is_kept(rng):
@@ -179,42 +159,3 @@ def test_the_kind_of_the_positions_is_kept(rng):
     single = fit_via_points(time.astype(np.float32), position.astype(np.float32), 1)
     assert single.via_points.dtype == np.float32
     assert_same(single, expected, atol=1e-3)
-
-
-TIME, REACH = np.linspace(0.0, 1.0, 20), through([[0.0, 0.0], [0.3, 0.1]], [1.0])(np.linspace(0.0, 1.0, 20))
-MISSING = np.where(np.arange(20)[:, None] == 3, np.nan, REACH)
-NOT_ASCENDING = np.where(np.arange(20) == 3, TIME[2], TIME)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ((TIME, MISSING), r"position must be finite.*\(3, 0\).*leave out"),
-        ((TIME * np.nan, REACH), "time must be finite"),
-        ((TIME, REACH[:10]), "time must have shape"),
-        ((TIME, REACH[:, 0]), "position must have shape"),
-        ((TIME[:10], REACH[:10], 3), "position must have 11 or more samples"),
-        ((TIME[::-1], REACH), "time must ascend.*sort"),
-        ((NOT_ASCENDING, REACH), "time must ascend.*equal times"),
-        ((TIME, np.ones((20, 2))), "position must change"),
-        ((TIME, REACH, -1), "n_via must be"),
-        ((TIME, REACH, 9), "n_via must be"),
-        ((TIME, REACH, 1.5), "n_via must be"),
-        ((TIME, REACH, (2, 1)), "n_via must be"),
-        ((TIME, REACH, (0, 1, 2)), "n_via must be"),
-        ((TIME, REACH, "1"), "n_via must be"),
-        ((TIME, REACH, True), "n_via must be"),
-        (([TIME, TIME], [REACH, MISSING]), r"position\[1\] must be finite"),
-        (([TIME], [REACH, REACH]), "time must hold an array for each of 2 movements"),
-        (([TIME, TIME], [REACH, REACH[:, :1]]), "position must hold movements of one dimension"),
-        ((TIME, np.ones((0, 20, 2))), "position must hold one movement or more"),
-        ((TIME, []), "position must have shape"),
-        ((TIME, [[[0.0], [1.0, 2.0]]]), "position must be"),
-        ((TIME, None), "position must be an array"),
-    ],
-)
-def test_bad_input_is_refused_with_advice(arguments, words):
-    with pytest.raises(ValueError, match=words):
-        fit_via_points(*arguments)
-    with pytest.raises(ValueError):
-        fit_via_points(TIME, REACH, free_ends="no")

@@ -71,18 +71,6 @@ def test_no_shift_of_a_passage_time_lowers_the_cost(vias, ends, rng):
             assert (through(waypoints, moved, **moving).cost() >= best * (1 - 1e-12)).all()
 
 
-@pytest.mark.parametrize("vias", [1, 3])
-def test_points_of_the_straight_movement_are_passed_when_it_passes_them(vias, rng):
-    times = (np.arange(vias) + rng.uniform(0.1, 0.9, (30, vias))) / vias
-    along = 10 * times**3 - 15 * times**4 + 6 * times**5
-    along = np.concatenate([np.zeros((30, 1)), along, np.ones((30, 1))], axis=-1)
-    waypoints = along[..., None] * np.array([3.0, -4.0])
-    durations = passage_durations(waypoints, 2.0)
-    expected = 2.0 * np.diff(times, axis=-1, prepend=0.0, append=1.0)
-    np.testing.assert_allclose(durations, expected, rtol=1e-6)
-    np.testing.assert_allclose(through(waypoints, durations).cost(), 360 * 25 / 2.0**5, rtol=1e-12)
-
-
 def test_equal_neighbours_are_merged():
     waypoints = np.array([[0.0, 0], [1, 1], [1, 1], [2, -1], [3, 0], [3, 0]])
     durations = passage_durations(waypoints, 1.0)

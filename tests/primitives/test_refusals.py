@@ -12,6 +12,10 @@ TENSORS = vp.point_to_point(torch.zeros(2), torch.ones(2), 1.0)
 BATCH = vp.point_to_point(np.zeros((3, 2)), np.ones((3, 2)), 1.0)
 LINE = [[0.0, 0.0], [0.4, 0.3], [1.0, 0.0]]
 GOAL = [1.0, 1.0]
+TIME = np.linspace(0.0, 1.0, 20)
+SEEN, ONES = REACH(TIME), np.ones((20, 2))
+MISSING = np.where(np.arange(20)[:, None] == 3, np.nan, SEEN)
+TWICE = np.where(np.arange(20) == 3, TIME[2], TIME)
 
 NO_NUMBERS = ["ab", 1j, {}, object(), [[1.0], [1.0, 2.0]], [torch.ones(1, requires_grad=True)]]
 NOT_FINITE = [np.nan, [0.0, np.inf], torch.tensor([np.nan, 0.0])]
@@ -89,6 +93,13 @@ VALUES = [  # call, then bad values
     (lambda bad: vp.spectral_arc_length(REACH, padding=bad), [1.5, -1, None, "4", True, 4.0, [4], 10**9]),
     (lambda bad: vp.point_to_point([0.0], [1.0], bad).extrema(2), [1e-300]),
     (lambda bad: vp.point_to_point(torch.zeros(2), torch.ones(2), bad).peak(2), [1e-30]),
+    (lambda bad: vp.fit_via_points(bad, SEEN), [TIME * np.nan, TIME[:10], TIME[::-1], TWICE]),
+    (lambda bad: vp.fit_via_points(TIME, bad), [MISSING, SEEN[:, 0], ONES, [], [[[0.0], [1.0, 2.0]]], None]),
+    (lambda bad: vp.fit_via_points(TIME, bad), [[SEEN, MISSING], [SEEN, SEEN[:, :1]], np.ones((0, 20, 2))]),
+    (lambda bad: vp.fit_via_points([TIME], bad), [[SEEN, SEEN]]),
+    (lambda bad: vp.fit_via_points(TIME, SEEN, bad), [-1, 9, 1.5, (2, 1), (0, 1, 2), "1", True]),
+    (lambda bad: vp.fit_via_points(TIME[:10], SEEN[:10], bad), [3]),  # too few samples for them
+    (lambda bad: vp.fit_via_points(TIME, SEEN, free_ends=bad), ["no"]),
     (lambda bad: REACH.stretched(bad), [torch.tensor(0.3)]),  # tensors for a NumPy trajectory
     (lambda bad: REACH.transformed(scale=bad), [torch.tensor(0.3)]),
     (lambda bad: vp.retarget(REACH, bad, GOAL, 1.0), [torch.tensor(0.3)]),

@@ -57,7 +57,6 @@ def test_single_precision_holds_any_duration_and_so_do_gradients(seconds, order,
 def test_gradients_of_passage_times_equal_finite_differences(vias, tensor, rng):
     waypoints, velocity, acceleration = tensor(2, vias + 2, 2), tensor(2, 2, scale=0.3), tensor(2, 2)
     duration = torch.tensor(rng.uniform(0.5, 2, 2), requires_grad=True)
-    assert torch.autograd.gradcheck(vp.passage_durations, (waypoints, duration), atol=1e-5, fast_mode=True)
     assert torch.autograd.gradcheck(
         lambda w, d, v, a: vp.passage_durations(
             w, d, start_velocity=v, goal_velocity=vp.FREE, goal_acceleration=a
@@ -119,17 +118,6 @@ def test_still_and_steady_movements_of_a_batch_do_not_change_the_gradients_of_ot
     assert torch.isfinite(torch.autograd.grad(both[1], shift)[0]).all()
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_the_gradient_of_curvature_on_a_grid_with_rest_is_that_without_it(dimension, tensor):
-    waypoints, inside = tensor(3, dimension), torch.linspace(0.1, 0.9, 9, dtype=torch.float64)
-    movement = vp.through(waypoints, [0.4, 0.6])
-    (expected,) = torch.autograd.grad(vp.curvature(movement, inside).sum(), waypoints, retain_graph=True)
-    values = vp.curvature(movement, torch.cat([torch.zeros(1), inside]))
-    assert values[0].isnan()
-    (found,) = torch.autograd.grad(values.nansum(), waypoints)
-    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0.0)
-
-
 @pytest.mark.parametrize("number", [float, np.float64, np.float32, np.array])
 def test_a_number_beside_tensors_adds_no_dimension(number):
     reach = vp.point_to_point(torch.zeros(2), torch.ones(2), number(1.0))
@@ -181,19 +169,6 @@ def test_closed_forms_equal_autograd(order, tensor, rng):
     expected = [closed.waypoints, closed.durations, *(getattr(closed, name) for name in ends)]
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a.numpy(), b.detach().numpy(), atol=1e-9 * float(a.abs().max()))
-
-
-@pytest.mark.parametrize("vias", [1, 2, 4])
-def test_with_free_passage_times_the_closed_form_is_the_derivative_of_the_optimum(vias, tensor):
-    waypoints, duration = tensor(vias + 2, 2), torch.tensor(1.3, dtype=torch.float64, requires_grad=True)
-    trajectory = vp.through(waypoints, vp.passage_durations(waypoints, duration))
-    closed = vp.cost_gradient(trajectory)
-    by_points, by_duration = torch.autograd.grad(trajectory.cost(), (waypoints, duration))
-    size = float(trajectory.cost().detach())
-    torch.testing.assert_close(closed.waypoints, by_points, rtol=1e-6, atol=1e-6 * size)
-    # At free passage times the Hamiltonian is the same in all segments (Eq. C10), and the cost falls as T^-5.
-    for slope in (*closed.durations, by_duration):
-        torch.testing.assert_close(slope, -5 * trajectory.cost() / duration, rtol=1e-6, atol=0.0)
 
 
 def test_a_free_end_has_no_force(rng):
