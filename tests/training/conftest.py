@@ -33,6 +33,20 @@ def env():
     env.close()
 
 
+@pytest.fixture
+def made():
+    """Function that makes environments, which SB3 takes and which are closed at the end."""
+    opened = []
+
+    def make(env_id=ENV, number=8, **kwargs):
+        opened.append(ViaVecEnv(env_id, number, seed=0, **kwargs))
+        return opened[-1]
+
+    yield make
+    for env in opened:
+        env.close()
+
+
 @pytest.fixture(scope="session")
 def small_scenes():
     """Forty scenes, with the share of 32 random actions that solve each."""

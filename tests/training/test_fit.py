@@ -134,8 +134,3 @@ def test_a_full_disk_leaves_no_half_of_a_figure(file, tmp_path, failed, monkeypa
     monkeypatch.setattr("os.fsync", full)
     assert "fit.png" in failed("fit", file, "--out", tmp_path / "fit")
     assert not list((tmp_path / "fit").iterdir())
-
-
-@pytest.mark.parametrize("numbers", [(2, 1), (0, 1, 2), (9,), (-1,)])
-def test_a_wrong_number_of_via_points_is_told_before_the_file_is_read(numbers, failed):
-    assert "--n-via must be" in failed("fit", "nothing.csv", "--n-via", *numbers)

@@ -4,9 +4,8 @@ import functools
 
 import numpy as np
 import pytest
-from stable_baselines3.common.env_util import make_vec_env
 
-from viapoint.training import ViaQ, ViaRank, ViaVecEnv, evaluate
+from viapoint.training import ViaRank, ViaVecEnv, evaluate
 from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.places import places_of
 from viapoint.training.planning.problem import Problem, moves_of
@@ -92,55 +91,3 @@ def test_sets_of_scenes_are_solvable_and_partly_hidden() -> None:
     problem = Problem.of_scenes(frozen.scenes, task)
     straight = np.zeros((len(frozen.share), 1, task.action.size))
     assert (plan_clearances(task, problem, straight, 0.01, 0.0)[:, 0] < 0.01).all()
-
-
-@pytest.mark.parametrize(
-    ("env_id", "algorithm", "policy", "arguments"),
-    [
-        ("viapoint/PlanarObstacles-v0", ViaRank, "ViaRankPolicy", {}),
-        (ENV, ViaRank, "ViaRankPolicy", {"labels": 100}),
-        (ENV, ViaRank, "ViaRankPolicy", {"labels": "all"}),
-        (ENV, ViaQ, "ViaQPolicy", {}),
-    ],
-)
-def test_other_tasks_are_refused(env_id, algorithm, policy, arguments) -> None:
-    with pytest.raises(ValueError):
-        algorithm(policy, ViaVecEnv(env_id, 1), **arguments)
-
-
-@pytest.mark.parametrize("algorithm", [ViaQ, ViaRank])
-def test_environments_of_others_are_refused(algorithm) -> None:
-    with pytest.raises(ValueError):
-        algorithm(f"{algorithm.__name__}Policy", make_vec_env("Pendulum-v1"))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"ranges": np.full((2, 192), np.nan, np.float32)},
-        {"ranges": np.ones((2, 100), np.float32)},
-        {"points": np.ones((2, 576), np.float32)},
-        {"obstacles": np.zeros((2, 3), np.float32)},
-    ],
-    ids=["not finite", "other rays", "another place of the sensor", "another task"],
-)
-def test_other_observations_are_refused(agent, change) -> None:
-    with pytest.raises(ValueError):
-        agent.predict({**ViaVecEnv(ENV, 2, seed=0).reset(), **change})
-
-
-@pytest.mark.parametrize(
-    ("env_id", "name"),
-    [
-        ("viapoint/PlanarObstacles-v0", "cautious64"),
-        ("viapoint/PlanarObstacles-v0", "thick:search64"),
-        (ENV, "cautious0"),
-        (ENV, "thin:search64"),
-        (ENV, "thick:straight"),
-        (ENV, "thick:cautious64"),
-        (ENV, "thick:points:search64"),
-    ],
-)
-def test_baselines_that_mean_nothing_are_refused(env_id, name) -> None:
-    with pytest.raises(ValueError):
-        evaluate(env=env_id, baselines=[name], n_scenes=2)
