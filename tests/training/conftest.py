@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from viapoint.training import scene_sets
+from viapoint.training import ViaVecEnv, scene_sets
 from viapoint.training.cli import entry
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.scene_sets import FrozenScenes
 
 sys.path.append(str(Path(__file__).parent))

@@ -6,15 +6,13 @@ import torch
 from gymnasium.spaces import Box
 from tasks import MOVING, PANDA, PLANE, REACH, SENSED, WHOLE, problem_of, scenes_of
 
-from viapoint.training import load_agent
+from viapoint.training import ViaQ, ViaVecEnv, load_agent
 from viapoint.training.agents.agent import SAC
-from viapoint.training.agents.viaq import ViaQ
 from viapoint.training.agents.viaq_policy import ViaQPolicy
 from viapoint.training.io.files import BadFileError
 from viapoint.training.planning.candidates import sobol_actions
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.rollouts.vec_env import ViaVecEnv
 
 NUMBER = 12
 """Number of scenes."""

@@ -26,16 +26,6 @@ def test_every_command_has_help(command, capsys):
     assert f"viapoint {command}" in re.search("Example: (.+)", shown).group(1)
 
 
-def test_the_help_fits_a_screen(capsys):
-    with pytest.raises(SystemExit) as end:
-        run("--help")
-    lines = capsys.readouterr().out.splitlines()
-    assert not end.value.code
-    assert all(any(line.strip().startswith(command) for line in lines) for command in cli.COMMANDS)
-    assert len(lines) <= 24
-    assert max(map(len, lines)) <= 80
-
-
 def test_output_that_nobody_reads_ends_the_command_without_a_word():
     command = [sys.executable, "-c", "from viapoint.training.cli.entry import main; main()", "--help"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
@@ -96,14 +86,6 @@ def test_train_then_evaluate_then_play(trained, shipped, tmp_path, capsys):
     assert video.stat().st_size > 1000
 
 
-def test_arguments_of_the_environment_are_taken(capsys, failed):
-    words = "evaluate --env viapoint/PlanarSensed-v0 --scenes validation --n-scenes 4 --baselines search16 --env-kwargs"
-    run(*words.split(), "sensor=hand_rays", "decide_at=[sight]")
-    assert "search16" in capsys.readouterr().out
-    for argument, named in (("sensr=rays", "sensor"), ("sensor=nose", "hand_rays"), ("n_via=a", "n_via")):
-        assert named in failed(*words.split(), argument)
-
-
 def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, tmp_path):
     few, file = shipped.take(slice(3, 6)), tmp_path / "validation.npz"
     few.save(file)
@@ -116,21 +98,6 @@ def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, 
         run("evaluate", trained, "--baselines", "straight", "--scenes", *words)
     kept = [json.loads(path.read_text()) for path in (trained / "evaluations").glob("validation-*.json")]
     assert sorted(each["methods"]["straight"]["scenes"] for each in kept) == [3, 4, 40]
-
-
-def test_an_agent_of_another_task_meets_scenes_of_that_task(tmp_path, failed):
-    folder = tmp_path / "run"
-    run(
-        "train", "--out", folder, "--n-timesteps", 32, "--n-envs", 32, "--eval-every", 0, "--no-progress",
-        "--env-kwargs", "n_obstacles=3", "threads=1",
-    )  # fmt: skip
-    run("evaluate", folder, "--baselines", "straight", "--n-scenes", 3)
-    (path,) = (folder / "evaluations").iterdir()
-    record = json.loads(path.read_text())
-    assert [each["scenes"] for each in record["methods"].values()] == [3, 3]
-    run("play", folder, "--n-scenes", 1, "--video", tmp_path / "film.mp4")
-    assert (tmp_path / "film.mp4").stat().st_size > 1000
-    assert "validation, test" in failed("evaluate", folder, "--scenes", "hard")
 
 
 def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys, failed):

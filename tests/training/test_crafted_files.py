@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file, save, save_file
+from tasks import PLANE as ENV
+from tasks import SENSED
 
 from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES
@@ -22,7 +24,6 @@ from viapoint.training.config.presets import PRESETS
 from viapoint.training.io.files import BadFileError
 from viapoint.training.runs.checkpoints import read_checkpoint, read_state, write_checkpoint
 
-ENV = "viapoint/PlanarObstacles-v0"
 RECORD, WEIGHTS = "model.json", "weights.safetensors"
 SMALL = {"learning_starts": 8, "batch_size": 8, "buffer_size": 64, "policy_kwargs": {"net_arch": [8]}}
 
@@ -123,12 +124,10 @@ def test_content_that_is_none_is_refused(name, content, model):
         {"format": 99},
         {"algorithm": "os.system"},
         {"policy": "CnnPolicy2"},
-        {"hyperparameters": {"policy_kwargs": {"net_arch": "a lot"}}},
         {"hyperparameters": {"tensorboard_log": "x"}},
         {"hyperparameters": {"learning_rate": {"kind": "eval"}}},
         *({"env": {"id": name, "kwargs": {}}} for name in ("../../etc/passwd", "os:system", None, ["x"])),
         {"env": {"id": ENV, "kwargs": {"nothing": 1}}},
-        {"num_timesteps": "many"},
     ],
 )
 def test_a_record_of_something_else_is_refused(change, model):
@@ -180,24 +179,21 @@ def test_what_describes_more_than_its_weights_is_refused_before_memory_is_taken(
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 * 1024
 
 
-SEARCHES = [
-    ("PlanarObstacles", {"candidates": 10**9}),
-    ("PlanarObstacles", {"per_refinement": 10**9}),
-    ("PlanarObstacles", {"refinements": 10**9}),
-    ("PlanarObstacles", {"refinements": 64, "per_refinement": 1024}),
-    ("PlanarObstacles", {"refine": 10**9}),
-    ("PlanarSensed", {"candidates": 10**9}),
-    ("PlanarSensed", {"instants": 10**9}),
-]
-
-
-@pytest.mark.parametrize(("task", "change"), SEARCHES)
-def test_what_could_not_decide_in_time_is_refused(task, change, tmp_path):
-    load_agent(f"viapoint/{task}-v0").save(tmp_path / "model")
-    hyperparameters = json.loads((tmp_path / "model" / RECORD).read_text())["hyperparameters"]
+@pytest.mark.parametrize(
+    ("env_id", "change"),
+    [
+        (ENV, {"candidates": 10**9}),
+        (ENV, {"refinements": 64, "per_refinement": 1024}),
+        (ENV, {"refine": 10**9}),
+        (SENSED, {"instants": 10**9}),
+    ],
+)
+def test_what_could_not_decide_in_time_is_refused(env_id, change, tmp_path):
+    load_agent(env_id).save(tmp_path)
+    hyperparameters = json.loads((tmp_path / RECORD).read_text())["hyperparameters"]
     policy = {**hyperparameters["policy_kwargs"], **change}
-    edit(tmp_path / "model", hyperparameters={**hyperparameters, "policy_kwargs": policy})
-    check_refused(tmp_path / "model", RECORD)
+    edit(tmp_path, hyperparameters={**hyperparameters, "policy_kwargs": policy})
+    check_refused(tmp_path, RECORD)
 
 
 @pytest.mark.parametrize("name", [RECORD, WEIGHTS])

@@ -15,6 +15,7 @@ minari = pytest.importorskip("minari")
 
 PLANE = "viapoint/PlanarObstacles-v0"
 CUSTOM = "test/TwoPosts-v0"
+UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 
 
 @pytest.fixture(autouse=True)
@@ -66,6 +67,7 @@ def assert_replays(dataset):
         ("straight", ("--env", "viapoint/PlanarTargetJump-v0")),
         ("straight", ("--arm", "panda")),
         ("random", ("--env", CUSTOM)),
+        ("straight", ("--env", "viapoint/Reach-v0", "--arm", UR5E)),
     ],
 )
 def test_a_dataset_replays_bit_for_bit(method, words, capsys):
@@ -76,17 +78,13 @@ def test_a_dataset_replays_bit_for_bit(method, words, capsys):
     assert_replays(dataset)
 
 
-def test_an_arm_of_a_file_is_found_again():
-    arm = Path(__file__).parents[2] / "docs" / "ur5e.xml"
-    record("straight", "--arm", arm, "--env", "viapoint/Reach-v0", "--episodes", 1, "--dataset", "own-v0")
-    assert_replays(minari.load_dataset("own-v0"))
-
-
 def test_episodes_are_those_of_the_method_and_have_names_by_default(folder):
     record("straight", "--env", PLANE, "--episodes", 2)
     dataset = minari.load_dataset("viapoint/PlanarObstacles/straight-v0")
     assert (folder / "viapoint/PlanarObstacles/straight-v0/data").is_dir()
     assert [np.abs(episode.actions).max() for episode in dataset.iterate_episodes()] == [0.0, 0.0]
+    record("thick:search4", "--env", "viapoint/PlanarSensed-v0", "--episodes", 1)
+    assert minari.load_dataset("viapoint/PlanarSensed/thick-search4-v0").total_episodes == 1
 
 
 @pytest.mark.parametrize(
@@ -109,18 +107,13 @@ def test_what_cannot_be_recorded_is_told_before_anything_is(words, told, failed,
     assert not folder.exists()
 
 
-def test_a_dataset_is_never_replaced():
-    method = make_method("straight", PLANE)
-    record_dataset("same-v0", PLANE, {}, method, 1)
-    with pytest.raises(ValueError, match="exists"):
-        record_dataset("same-v0", PLANE, {}, method, 1)
-
-
 @pytest.mark.parametrize("error", [OSError("No space left on device"), KeyboardInterrupt()])
 def test_a_dataset_that_cannot_be_written_leaves_nothing(error, folder, monkeypatch):
     method = make_method("straight", PLANE)
     record_dataset("group/kept-v0", PLANE, {}, method, 1)
     before = sorted(folder.rglob("*"))
+    with pytest.raises(ValueError):  # a dataset is never replaced
+        record_dataset("group/kept-v0", PLANE, {}, method, 1)
 
     def full(*_):
         raise error
@@ -132,11 +125,6 @@ def test_a_dataset_that_cannot_be_written_leaves_nothing(error, folder, monkeypa
                 record_dataset(name, PLANE, {}, method, 1)
     assert sorted(folder.rglob("*")) == before
     record_dataset("group/new-v0", PLANE, {}, method, 1)
-
-
-def test_a_name_by_default_is_one_that_minari_allows():
-    record("thick:search4", "--env", "viapoint/PlanarSensed-v0", "--episodes", 1)
-    assert minari.load_dataset("viapoint/PlanarSensed/thick-search4-v0").total_episodes == 1
 
 
 def test_without_the_library_its_extra_is_named(monkeypatch, failed):

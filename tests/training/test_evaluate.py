@@ -6,17 +6,12 @@ import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import VecNormalize
 
+from viapoint.training import ViaVecEnv, evaluate
 from viapoint.training.agents.agent import PPO
-from viapoint.training.evaluation.evaluator import (
-    SLOW_DECISION,
-    MethodResult,
-    evaluate,
-    evaluate_methods,
-)
+from viapoint.training.evaluation.evaluator import SLOW_DECISION, MethodResult, evaluate_methods
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.scene_sets import BANDS, drawn
 
 ENV, MOVING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"

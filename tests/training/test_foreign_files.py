@@ -4,17 +4,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from viapoint.training import load_agent
+from viapoint.training import Run, TrainConfig, load_agent, train
 from viapoint.training.agents.agent import find_model
 from viapoint.training.agents.model_io import weights
 from viapoint.training.cli import demo
 from viapoint.training.cli import entry as cli
-from viapoint.training.config.configs import DemoConfig, PaperConfig, TrainConfig
+from viapoint.training.config.configs import DemoConfig, PaperConfig
 from viapoint.training.io.files import BadFileError
 from viapoint.training.paper import run as paper
 from viapoint.training.plotting.video import record_video
-from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import train
 
 REACH = "viapoint/PlanarReach-v0"
 NOTES = b"years of work with viapoint \xff"

@@ -7,8 +7,8 @@ import frozen_scenes as make
 import numpy as np
 import pytest
 
-from viapoint.envs import Task
-from viapoint.envs.registration import ENV_IDS, twin_of
+from viapoint.envs import ENV_IDS, Task
+from viapoint.envs.registration import twin_of
 from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training import scene_sets
 from viapoint.training.planning.baselines import make_method

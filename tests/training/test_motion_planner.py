@@ -4,20 +4,19 @@ import sys
 
 import numpy as np
 import pytest
+from tasks import PANDA, PLANE, WHOLE
 
 from viapoint.envs import Box
 from viapoint.envs.scenes.options import draw_given
+from viapoint.training import plan_motion
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planning import ompl_paths
 from viapoint.training.planning import plan_motion as module
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems
 from viapoint.training.planning.ompl_paths import points_on
-from viapoint.training.planning.plan_motion import plan_motion
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets import load, shipped_path
-
-PLANE = "viapoint/PlanarObstacles-v0"
 
 
 def test_without_the_library_its_extra_is_named(monkeypatch):
@@ -42,16 +41,6 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
     np.testing.assert_allclose(result.outcomes["duration"], durations)
 
 
-def test_every_link_of_the_whole_arm_clears():
-    pytest.importorskip("ompl")
-    simulation = SceneSimulation("viapoint/PlanarWholeArm-v0", 4)
-    scenes = simulation.task.sampler()([np.random.default_rng(0)] * 4)
-    method = make_method("ompl", "viapoint/PlanarWholeArm-v0")
-    done = method.execute(scenes, method.decide({}, scenes))
-    assert done.success.mean() > 0.5
-    assert not (done.success & (done.info["min_clearance"] <= 0.0)).any()
-
-
 def test_where_there_is_no_way_it_gives_up(monkeypatch):
     """A ring of bars around the start."""
     pytest.importorskip("ompl")
@@ -69,7 +58,7 @@ def test_where_there_is_no_way_it_gives_up(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["ompl", "plan_motion"])
-@pytest.mark.parametrize("env_id", [PLANE, "viapoint/PandaObstacles-v0"])
+@pytest.mark.parametrize("env_id", [PLANE, WHOLE, PANDA])
 def test_plans_are_as_clear_as_they_are_said_to_be(env_id, name):
     if name == "ompl":
         pytest.importorskip("ompl")

@@ -12,25 +12,24 @@ from viapoint.envs import (
     Capsule,
     ConvexMesh,
     Cylinder,
+    Plan,
     PointCloud,
     Pose,
     Sphere,
     Task,
     arm_of,
+    load_arm,
     obstacles_to_json,
 )
 from viapoint.envs.arms.kinematics import torques
-from viapoint.envs.arms.load import load_arm
 from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import pack
-from viapoint.envs.plans import Plan
-from viapoint.training import plan_motion, plan_motions
+from viapoint.training import UnsafePlanError, plan_motion, plan_motions, read_motion, write_motion
 from viapoint.training.cli.entry import main
 from viapoint.training.planning import plan_motion as module
 from viapoint.training.planning import refine
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems, read_problems
-from viapoint.training.planning.export import read_motion, write_motion
-from viapoint.training.planning.motion_plan import UnsafePlanError, execute_plans
+from viapoint.training.planning.motion_plan import execute_plans
 from viapoint.training.planning.movements import OUTSIDE, Movement, movement_table
 from viapoint.training.planning.search import registered_task
 from viapoint.training.scene_sets import BANDS, scenes_for

@@ -17,11 +17,21 @@ from tasks import PLANE as ENV
 
 from viapoint.envs import Pose, Sphere, Task, arm_of
 from viapoint.envs.geometry.obstacles import no_obstacles
-from viapoint.training import evaluate, load_agent, plan_motion, plan_motions
+from viapoint.training import (
+    GeometrySearch,
+    Run,
+    TrainConfig,
+    ViaQ,
+    ViaRank,
+    ViaVecEnv,
+    evaluate,
+    load_agent,
+    plan_motion,
+    plan_motions,
+    train,
+)
 from viapoint.training.agents.agent import SAC, find_model
 from viapoint.training.agents.model_io import ALGORITHMS
-from viapoint.training.agents.viaq import ViaQ
-from viapoint.training.agents.viarank import ViaRank
 from viapoint.training.config.checks import ELSEWHERE
 from viapoint.training.config.configs import (
     DemoConfig,
@@ -30,7 +40,6 @@ from viapoint.training.config.configs import (
     PaperConfig,
     PlayConfig,
     StudyConfig,
-    TrainConfig,
     from_words,
 )
 from viapoint.training.evaluation import statistics
@@ -38,13 +47,9 @@ from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.benchmark import benchmark_planner
-from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.video import record_video
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets import load, scenes_for, shipped_path
 
 CHANGING = MOVING, JUMPS

@@ -12,15 +12,12 @@ import pytest
 
 from viapoint.envs import arm_of, register_arm
 from viapoint.envs.arms import registry
-from viapoint.training.agents.model_io import build, describe, load_model, save_model, weights
-from viapoint.training.config.configs import TrainConfig
+from viapoint.training import Run, TrainConfig, ViaVecEnv
+from viapoint.training.agents.model_io import build, describe, load_model, save_model
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.io import files
 from viapoint.training.io.files import BadFileError
-from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs import run_dir
-from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
-from viapoint.training.runs.run_dir import Run
 
 ENV = "viapoint/PlanarObstacles-v0"
 
@@ -141,18 +138,6 @@ def test_checkpoints_are_kept_two_deep_and_torn_ones_passed_over(env, run, capsy
         path.write_text("{}")
     with pytest.raises(BadFileError):
         run.restore(new("td3", env))
-
-
-def test_a_checkpoint_is_of_one_model(env, tmp_path):
-    model = new("td3", env)
-    model._setup_learn(100)
-    write_checkpoint(model, tmp_path / "checkpoint", {})
-    with pytest.raises(BadFileError):
-        read_checkpoint(new("td3", env, batch_size=8), tmp_path / "checkpoint")
-    same = new("td3", env)
-    assert read_checkpoint(same, tmp_path / "checkpoint") == {}
-    for name, array in weights(model).items():
-        np.testing.assert_array_equal(weights(same)[name], array)
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):

@@ -241,12 +241,3 @@ def test_what_cannot_be_run_is_an_error_when_the_file_is_read(change, tmp_path):
     path.write_text(yaml.safe_dump({**GIVEN, **change}))
     with pytest.raises(ValueError, match=r"study\.yaml"):
         Study.from_yaml(path)
-
-
-@pytest.mark.parametrize("out", ["", "file", "file/deeper", "/proc/study"])
-def test_a_study_begins_in_no_place_that_cannot_be_written_to(out, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError):
-        run_study(Study.from_dict(GIVEN), out=out)
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -15,18 +15,16 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from viapoint.training import Run, TrainConfig, ViaVecEnv, train
 from viapoint.training.agents.model_io import load_model
 from viapoint.training.cli import entry as cli
-from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError, read_arrays
 from viapoint.training.planning.baselines import agent_method
-from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs import trainer
 from viapoint.training.runs.checkpoints import read_state
-from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import TrainingFailedError, TrainingStoppedError, train
+from viapoint.training.runs.trainer import TrainingFailedError, TrainingStoppedError
 from viapoint.training.scene_sets import scenes_for
 
 OFF_POLICY = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16}

@@ -3,16 +3,11 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3 import SAC
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
+from tasks import PLANE, STEP
 
-from viapoint.envs.scenes.options import scene_from_json, scene_to_json
-from viapoint.training import TrainConfig, evaluate, train
-from viapoint.training.rollouts.vec_env import ViaVecEnv
-
-ENV, STEP = "viapoint/PlanarObstacles-v0", "viapoint/PlanarObstaclesStep-v0"
+from viapoint.envs import scene_from_json, scene_to_json
+from viapoint.training import TrainConfig, ViaVecEnv, evaluate, train
 
 
 def actions(env, seed=0):
@@ -20,7 +15,7 @@ def actions(env, seed=0):
     return generator.uniform(-0.5, 0.5, (env.num_envs, *env.action_space.shape)).astype(np.float32)
 
 
-@pytest.mark.parametrize(("env_id", "steps"), [(ENV, 3), (STEP, 100)])
+@pytest.mark.parametrize(("env_id", "steps"), [(PLANE, 3), (STEP, 100)])
 def test_it_is_the_vector_environment(env_id, steps):
     env, native = ViaVecEnv(env_id, 6, seed=3, threads=1), gym.make_vec(env_id, num_envs=6, threads=1)
     expected, _ = native.reset(seed=3)
@@ -93,19 +88,6 @@ def test_an_own_id_needs_a_vector_environment(register, tmp_path):
             refused()
 
 
-def test_observations_keep_their_values(env):
-    first = env.reset()
-    kept = {name: part.copy() for name, part in first.items()}
-    _, _, _, infos = env.step(actions(env))
-    ends = [{name: part.copy() for name, part in each["terminal_observation"].items()} for each in infos]
-    env.step(actions(env, 1))
-    for name, part in first.items():
-        np.testing.assert_array_equal(part, kept[name])
-    for info, end in zip(infos, ends, strict=True):
-        for name, part in end.items():
-            np.testing.assert_array_equal(info["terminal_observation"][name], part)
-
-
 def test_seeds_options_and_attributes(env):
     env.seed(5)
     first = env.reset()
@@ -126,28 +108,5 @@ def test_seeds_options_and_attributes(env):
     assert env.get_attr("num_envs", [-1, 5]) == [6, 6]
     env.set_attr("mark", 1)
     assert env.get_attr("mark", indices=[2, 3]) == [1, 1]
+    assert env.env_is_wrapped(Monitor) == [True] * 6  # as the infos tell what a monitor tells
     assert env.env_method("__str__", indices=1) == [str(env.venv.unwrapped)]
-
-
-def test_episodes_are_told_as_a_monitor_tells_them(env, recwarn):
-    """So SB3 takes returns and lengths from the infos, and does not ask for a wrapper."""
-    assert env.env_is_wrapped(Monitor) == [True] * 6
-    model = SAC("MultiInputPolicy", env, buffer_size=10)
-    rewards, lengths = evaluate_policy(model, env, n_eval_episodes=12, return_episode_rewards=True)
-    assert not [each for each in recwarn if "Monitor" in str(each.message)]
-    assert lengths == [1] * 12
-    assert len(set(rewards)) == 12
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("env_id", [ENV, STEP])
-def test_infos_hold_what_those_of_make_vec_env_hold(env_id):
-    both = make_vec_env(env_id, n_envs=2, seed=0), ViaVecEnv(env_id, 2, seed=0, threads=1)
-    action = np.zeros((2, *both[0].action_space.shape), np.float32)
-    for each in both:
-        each.reset()
-    ended = 0
-    while ended < 2:
-        (*_, done, theirs), (*_, mine) = (each.step(action) for each in both)
-        assert [info.keys() for info in mine] == [info.keys() for info in theirs]
-        ended += done.sum()

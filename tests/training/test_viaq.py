@@ -11,11 +11,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 from tasks import MOVING, PANDA, PLANE, REACH
 
+from viapoint.training import ViaQ, ViaVecEnv
 from viapoint.training.agents.outcome_buffer import Outcomes, outcome_of
-from viapoint.training.agents.viaq import ViaQ
 from viapoint.training.agents.viaq_policy import ViaQPolicy
 from viapoint.training.planning.baselines import agent_method
-from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
+from viapoint.training.rollouts.vec_env import TERMS
 
 FEW = {"width": 8, "instants": 8, "candidates": 32, "refinements": 1, "per_refinement": 16}
 SMALL = {
