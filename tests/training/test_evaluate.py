@@ -1,21 +1,25 @@
 """Every method meets the same scenes, and the figures are what their names say."""
 
+import io
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
+from PIL import Image
 from stable_baselines3.common.vec_env import VecNormalize
+from tasks import MOVING, REACH
+from tasks import PLANE as ENV
 
 from viapoint.training import ViaVecEnv, evaluate
 from viapoint.training.agents.agent import PPO
+from viapoint.training.evaluation import report
 from viapoint.training.evaluation.evaluator import SLOW_DECISION, MethodResult, evaluate_methods
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
+from viapoint.training.plotting import plots
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets import BANDS, drawn
-
-ENV, MOVING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
-
 
 ZEROS = np.zeros((40, 3))
 
@@ -72,7 +76,7 @@ def test_every_method_meets_the_same_scenes(small_scenes, solutions):
     assert len(record["outcomes"]["a"]["action"]) == 40
 
 
-@pytest.mark.parametrize("env_id", ["viapoint/PlanarReach-v0", "viapoint/PlanarReachStep-v0", MOVING])
+@pytest.mark.parametrize("env_id", [REACH, "viapoint/PlanarReachStep-v0", MOVING])
 def test_a_model_of_normalised_observations_sees_such_ones(env_id, monkeypatch):
     env = VecNormalize(ViaVecEnv(env_id, 8, seed=0, threads=1), norm_reward=False)
     model = PPO("MultiInputPolicy", env, n_steps=2, batch_size=16, seed=0).learn(16)
@@ -195,13 +199,41 @@ def test_decisions_are_timed_one_by_one_and_slow_ones_by_the_batch(small_scenes,
 
 
 def test_every_decision_of_an_episode_is_timed_where_plans_are_revised():
-    env_id = "viapoint/PlanarMovingObstacles-v0"
-    frozen = drawn("test", registered_task(env_id), 4)
-    (result,) = evaluate_methods([make_method("straight", env_id)], frozen, env_id).results
+    frozen = drawn("test", registered_task(MOVING), 4)
+    (result,) = evaluate_methods([make_method("straight", MOVING)], frozen, MOVING).results
     assert len(result.decision_times) == result.outcomes["decisions"].sum() - 1 > 4
 
 
-def test_fewer_scenes_than_asked_for_are_told(small_scenes, capsys):
-    result = evaluate(Given("a", ZEROS), env=ENV, scenes=small_scenes, n_scenes=50, time_decisions=False)
-    assert len(result.results[0].success) == 40
-    assert "40 scenes, not 50" in capsys.readouterr().err
+@pytest.fixture(scope="module")
+def record(small_scenes):
+    return run([Given("still [bold]", ZEROS), make_method("search32", ENV)], small_scenes).to_dict()
+
+
+def test_the_document_holds_every_method_and_metric(record, tmp_path):
+    report.write(record, tmp_path / "new")
+    document, data = (tmp_path / "new" / f"table.{suffix}" for suffix in ("md", "json"))
+    lines = [line for line in document.read_text().splitlines() if line.startswith("|")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert {len(line) for line in cells} == {len(cells[0])}
+    assert [line[0] for line in cells[2:]] == ["still [bold]", "search32"]
+    summary = record["methods"]["search32"]
+    search = dict(zip(cells[0], cells[3], strict=True))
+    assert search["success"] == f"{100 * summary['success']['rate']:.1f} %"
+    assert search["clearance [mm]"] == f"{1e3 * summary['min_clearance']:.1f}"
+    assert json.loads(data.read_text()) == record
+    assert record["sha256"][:12] in document.read_text()
+    rate = summary["success"]["rate"]
+    csv = pd.read_csv(io.StringIO(report.formatted(record, "csv"))).set_index("method")
+    assert csv["success rate"]["search32"] == rate
+    parsed = json.loads(report.formatted(record, "json"))
+    assert parsed["methods"]["search32"]["success"]["rate"] == rate
+    assert f"{100 * rate:.1f} %" in report.formatted(record, "table")
+
+
+def test_pictures_are_drawn(record, tmp_path):
+    rates = ({"rate": r, "low": r - 0.1, "high": r + 0.1} for r in (0.2, 0.5, 0.9))
+    curve = [{"decisions": 10 * i, "seconds": float(i), "success": rate} for i, rate in enumerate(rates)]
+    line = plots.learning_curve(tmp_path / "a" / "curve.png", curve)
+    bars = plots.success_by_band(tmp_path / "bars.png", record)
+    for path in (line, bars):
+        assert np.asarray(Image.open(path).convert("L")).std() > 5.0

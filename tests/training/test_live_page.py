@@ -11,16 +11,16 @@ pytest.importorskip("viser", reason="the extra `live` is not installed")
 pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 
 from browser import Browser, chromium, wait_for
+from tasks import PANDA
+from tasks import PLANE as PLANAR
 from viser import transforms
 
 from viapoint.training import LivePage
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine")
 
-PLANAR, PANDA = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
-REPLANNING = "viapoint/PlanarTargetJump-v0"
 MESSAGE = "#viapoint-message"
-SHIFT, UP, ASIDE = np.array([0.06, 0.08]), np.array([0.0, 0.05]), np.array([0.05, 0.05])
+SHIFT, UP = np.array([0.06, 0.08]), np.array([0.0, 0.05])
 """Displacements, [m]."""
 UPSTREAM = "Unable to preventDefault inside passive event listener invocation."
 """Message of the library's client at every press on something that can be dragged; it changes nothing."""

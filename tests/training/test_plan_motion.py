@@ -1,11 +1,13 @@
-"""Laws of planning around known obstacles."""
+"""Laws of planning around known obstacles, also with the library OMPL."""
 
 import dataclasses
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tasks import WHOLE, scenes_of
+from tasks import PANDA as PANDA_TASK
+from tasks import PLANE, WHOLE, scenes_of
 
 from viapoint.envs import (
     Box,
@@ -24,15 +26,19 @@ from viapoint.envs import (
 from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.scenes.options import draw_given
 from viapoint.training import UnsafePlanError, plan_motion, plan_motions, read_motion, write_motion
 from viapoint.training.cli.entry import main
+from viapoint.training.evaluation.evaluator import evaluate_methods
+from viapoint.training.planning import ompl_paths, refine
 from viapoint.training.planning import plan_motion as module
-from viapoint.training.planning import refine
+from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems, read_problems
 from viapoint.training.planning.motion_plan import execute_plans
 from viapoint.training.planning.movements import OUTSIDE, Movement, movement_table
 from viapoint.training.planning.search import registered_task
-from viapoint.training.scene_sets import BANDS, scenes_for
+from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.scene_sets import BANDS, load, scenes_for, shipped_path
 
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 PANDA = arm_of("panda")
@@ -476,3 +482,67 @@ def test_points_of_an_obstacle_are_planned_around_like_the_obstacle() -> None:
     assert plan.success
     assert plan.seeds < 50
     assert plan.clearance > 0.0
+
+
+def test_without_the_library_its_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ompl.base", None)
+    ompl_paths.import_ompl.cache_clear()
+    with pytest.raises(ValueError, match=r"pip install 'viapoint\[planning\]'"):
+        make_method("ompl", PLANE)
+
+
+def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
+    pytest.importorskip("ompl")
+    frozen = load(shipped_path("validation", PLANE))
+    frozen = frozen.take(np.concatenate([np.flatnonzero(frozen.band == band)[:3] for band in range(4)]))
+    result = evaluate_methods(
+        [make_method("ompl", PLANE)], frozen, PLANE, batch=20, time_decisions=False
+    ).results[0]
+    summary = result.summary()
+    assert summary["success"]["rate"] >= 0.9
+    assert summary["collision"]["rate"] <= 0.1
+    counts = result.actions[:, 0].astype(int)
+    durations = [row[1 : 2 + count].sum() for row, count in zip(result.actions, counts, strict=True)]
+    np.testing.assert_allclose(result.outcomes["duration"], durations)
+
+
+def test_where_there_is_no_way_it_gives_up(monkeypatch):
+    """A ring of bars around the start."""
+    pytest.importorskip("ompl")
+    monkeypatch.setattr(module, "OMPL_MARGINS", module.OMPL_MARGINS[:1])
+    monkeypatch.setattr(module, "OMPL_PATIENCE", 0.05)
+    x, y = -0.25, 0.35
+    across = [Box((0.01, 0.08, 0.04), position=(x + side, y, 0.0)) for side in (-0.07, 0.07)]
+    along = [Box((0.08, 0.01, 0.04), position=(x, y + side, 0.0)) for side in (-0.07, 0.07)]
+    simulation = SceneSimulation(PLANE, 1)
+    given = {"start": (x, y), "goal": (0.15, 0.35), "obstacles": [*across, *along]}
+    scenes = draw_given(given, simulation.task.sampler(), [np.random.default_rng(0)])
+    method = make_method("ompl", PLANE)
+    assert not method.plan(scenes).success
+    assert not method.execute(scenes, method.decide({}, scenes)).success.any()
+
+
+@pytest.mark.parametrize("name", ["ompl", "plan_motion"])
+@pytest.mark.parametrize("env_id", [PLANE, WHOLE, PANDA_TASK])
+def test_plans_are_as_clear_as_they_are_said_to_be(env_id, name):
+    if name == "ompl":
+        pytest.importorskip("ompl")
+    scenes = load(shipped_path("validation", env_id)).scenes.take(np.arange(0, 240, 20))
+    method = make_method(name, env_id)
+    plans = [method.plan(scenes.take([row])) for row in range(12)]
+    for plan in plans:
+        done = plan.execute(force=True)
+        assert done.is_success[0] or plan.clearance < 0.002
+        assert done.min_clearance[0] > plan.clearance - 0.002
+    assert sum(plan.success for plan in plans) > 6
+
+
+def test_where_no_seed_is_free_a_path_is_followed():
+    pytest.importorskip("ompl")
+    arm = benchmark_panda()
+    problem = next(each for each in benchmark_problems() if each.name == "bookshelf_thin 20")
+    plan = plan_motion(arm, problem.start, problem.goal, problem.obstacles, seeds=0, n_via=1, time_limit=20.0)
+    assert (plan.success, plan.source) == (True, "ompl")
+    assert not plan_motion(
+        arm, problem.start, problem.goal, problem.obstacles, seeds=0, n_via=1, ompl=False
+    ).success

@@ -73,7 +73,6 @@ CONFIGURATIONS = [
     (EvaluateConfig, {"baselines": ("ompl", "ompl"), "env": ENV}),
     *((EvaluateConfig, {"env": ENV, "checks": checks}) for checks in ((8,), ())),
     (EvaluateConfig, {"agent": ENV, "checks": (-1,)}),
-    (EvaluateConfig, {"agent": ENV, "n_scenes": 0}),
     (EvaluateConfig, {"agent": "runs/x", "pretrained": ENV}),
     (EvaluateConfig, {"pretrained": "nobody"}),
     (PlayConfig, {}),
@@ -81,7 +80,6 @@ CONFIGURATIONS = [
     (LiveConfig, {"port": 70_000}),
     (LiveConfig, {"env": "nothing"}),
     (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}),
-    (StudyConfig, {"file": "study.yaml", "workers": 0}),
     *((kind, {"out": ""}) for kind in (TrainConfig, DemoConfig, PaperConfig)),
     (EvaluateConfig, {"env": ENV, "json": ""}),
 ]
@@ -130,18 +128,10 @@ HYPERPARAMETERS = [
     *(("sac", {"train_freq": pair}) for pair in ([0, "step"], [1, "episode"])),
     *(("sac", {"policy_kwargs": values}) for values in ({"speed": 1}, {"net_arch": [-3]})),
     *(("td3", {"action_noise": {"kind": "normal", "sigma": sigma}}) for sigma in (-0.1, math.nan, "x")),
-    *(("td3", {name: -1}) for name in ("policy_delay", "target_policy_noise", "buffer_size")),
-    *(("ppo", {name: 0}) for name in ("n_steps", "clip_range")),
     *(("ppo", {name: 1.5}) for name in ("n_epochs", "gae_lambda")),
-    ("ppo", {"batch_size": 1}),
-    *(("viaq", {name: 0}) for name in ("temperature", "explore_candidates", "next_candidates")),
-    *(("viaq", {name: 1.5}) for name in ("explore_uniformly", "policy_kwargs")),
+    *(("ppo", values) for values in ({"batch_size": 1}, {"clip_range": 0})),
     *(("viaq", {name: 1}) for name in ("action_noise", "use_sde")),
     *(("viaq", {"policy_kwargs": {"width": value}}) for value in (0, 128.0, "wide")),
-    *(
-        ("viaq", {"policy_kwargs": {name: -1}})
-        for name in ("candidates", "instants", "refinements", "checks")
-    ),
     *(("viaq", {"policy_kwargs": {name: 3}}) for name in ("optimizer_kwargs", "task", "heads")),
 ]
 UNTRAINABLE = [

@@ -14,7 +14,7 @@ from viapoint.training.planning.baselines import StepAgentMethod, Straight, agen
 from viapoint.training.planning.predictions import Seen, fitted_reaches, known_courses
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, whole_task
-from viapoint.training.scene_sets import drawn, load
+from viapoint.training.scene_sets import drawn
 
 MOVING_STEP = "viapoint/PlanarMovingObstaclesStep-v0"
 REACHING = {"courses": "reaches"}
@@ -60,14 +60,6 @@ def test_two_looks_at_a_reach_tell_its_end():
     np.testing.assert_allclose(fitted_reaches(looks, scene), places, atol=0.02)
     # One look leaves the end open.
     assert np.abs(fitted_reaches(Seen(*(part[1:] for part in looks)), scene) - places).max() > 0.02
-
-
-def test_sets_of_reaching_obstacles_are_stored_with_their_reaches(tmp_path):
-    frozen = drawn("validation", registered_task(MOVING, **REACHING), 5)
-    frozen.save(tmp_path / "set.npz")
-    again = load(tmp_path / "set.npz")
-    np.testing.assert_array_equal(again.scenes.reach, frozen.scenes.reach)
-    assert again.sha256 == frozen.sha256
 
 
 def test_a_jumping_target_is_reached_by_revision_only():
