@@ -2,20 +2,24 @@
 
 import io
 import json
+import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tasks import PLANE as ENV
 from tasks import REACH
 
-from viapoint.training import TrainConfig
+from viapoint.training import Run, TrainConfig, evaluate, load_agent
 from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
-from viapoint.training.cli import demo
+from viapoint.training.cli import demo, doctor
 from viapoint.training.cli import entry as cli
+from viapoint.training.cli.entry import main
 from viapoint.training.config.configs import DemoConfig, EvaluateConfig, from_words, to_words
 from viapoint.training.config.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
 from viapoint.training.runs.trainer import RunCallback, TrainingStoppedError
@@ -226,3 +230,146 @@ def test_an_interrupted_demo_goes_on_and_what_is_done_is_not_done_again(quick, c
         monkeypatch.setattr(demo, name, pytest.fail)
     demo.run(quick)
     assert written == {name: (quick.out / name).stat().st_mtime_ns for name in demo.FILES}
+
+
+UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
+
+
+def not_filmed(monkeypatch) -> list[str]:
+    """Let `play` decide without rendering; the arms of its videos are listed."""
+    filmed: list[str] = []
+
+    def record(path, env, scenes, decide, **_) -> None:
+        observation, _ = env.reset(seed=0)
+        decide({name: value[None] for name, value in observation.items()}, scenes)
+        filmed.append(env.unwrapped.task.arm.file)
+
+    monkeypatch.setattr("viapoint.training.plotting.video.record_video", record)
+    return filmed
+
+
+def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
+    shutil.copy(UR5E, tmp_path / "my_arm.xml")
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "run"
+    main(
+        [
+            "train", "--arm", "my_arm.xml", "--env-kwargs", "n_obstacles=2",
+            "--n-timesteps", "64", "--n-envs", "16", "--eval-every", "0", "--out", str(run),
+        ]
+    )  # fmt: skip
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert Run(run).config.env_kwargs["arm"] == str(tmp_path / "my_arm.xml")
+    agent = load_agent(run)
+    result = evaluate(agent, baselines=["straight"], scenes="validation", n_scenes=4)
+    assert len(result.rows) == 2
+
+    seen = agent.observation_space.sample()
+    action, _ = agent.predict(seen, deterministic=True)
+    (tmp_path / "my_arm.xml").unlink()  # the run keeps a copy
+    kept = load_agent(run)
+    assert Run(run).config.env_kwargs["arm"] == str(run / "arm.xml")
+    np.testing.assert_array_equal(kept.predict(seen, deterministic=True)[0], action)
+    main(["evaluate", str(run), "--baselines", "straight", "--n-scenes", "4", "--scenes", "validation"])
+    filmed = not_filmed(monkeypatch)
+    main(["play", str(run), "--n-scenes", "1", "--scenes", "validation", "--video", str(tmp_path / "a.mp4")])
+    assert filmed == [kept.env_kwargs["arm"]]
+
+
+def test_a_run_goes_on_with_its_copy_of_an_arm(tmp_path, capsys) -> None:
+    file = tmp_path / "my_arm.xml"
+    shutil.copy(UR5E, file)
+    settings = ("--n-envs", "16", "--eval-every", "0", "--out", str(tmp_path / "run"))
+    main(["train", "--arm", str(file), "--n-timesteps", "16", *settings])
+    shutil.copytree(tmp_path / "run", tmp_path / "same")
+    decisions = 16
+    # The run goes on without the file, and then with the file again; the other run the other way round.
+    for name in ("elsewhere.xml", "my_arm.xml"):
+        decisions += 16
+        main(["train", "--resume", "--out", str(tmp_path / "same"), "--n-timesteps", str(decisions)])
+        file = file.rename(tmp_path / name)
+        main(["train", "--resume", "--out", str(tmp_path / "run"), "--n-timesteps", str(decisions)])
+    assert "damaged" not in capsys.readouterr().err
+    assert Run(tmp_path / "run").config == Run(tmp_path / "same").config
+    first, second = (tmp_path / name / "final" / "weights.safetensors" for name in ("run", "same"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch, failed) -> None:
+    arm = ["--arm", str(UR5E), "--scenes", "validation"]
+    out = tmp_path / "results.json"
+    main(["evaluate", *arm, "--baselines", "straight", "plan_motion", "--n-scenes", "4", "--json", str(out)])
+    assert out.is_file()
+    filmed = not_filmed(monkeypatch)
+    main(["play", *arm, "--n-scenes", "1", "--video", str(tmp_path / "b.mp4")])
+    assert filmed == [str(UR5E)]
+    assert "nowhere.xml" in failed("evaluate", "--arm", "nowhere.xml")
+
+
+GOOD, GONE = "print('fine')", "import no_such_module"
+EXTRA = ("torch", "stable_baselines3", "sb3_contrib", "tyro", "rich", "matplotlib", "safetensors")
+
+
+def report(capsys, *words):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["doctor", *words])
+    return end.value.code, capsys.readouterr().out
+
+
+def test_all_is_well_here(capsys, tmp_path):
+    code, printed = report(capsys, "--out", str(tmp_path / "runs"))
+    assert (code, "MISSING" in printed) == (0, False)
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "exit_code", "remedy"), [("MuJoCo engine", 1, "'mujoco>=4'"), ("OpenGL", 0, "libegl1")]
+)
+def test_what_is_missing_is_named_with_the_remedy(name, exit_code, remedy, capsys, monkeypatch):
+    checks = {each: check._replace(script=GOOD) for each, check in doctor.CHECKS.items()}
+    checks[name] = checks[name]._replace(script=GONE)
+    monkeypatch.setattr(doctor, "CHECKS", checks)
+    code, printed = report(capsys)
+    assert code == exit_code
+    assert "no_such_module" in printed
+    assert remedy in printed
+
+
+def test_a_crash_and_a_hang_end_no_report(monkeypatch):
+    assert not doctor.outcome("import os; os.abort()")[0]
+    monkeypatch.setattr(doctor, "PATIENCE", 0.2)
+    assert not doctor.outcome("import time; time.sleep(60)")[0]
+
+
+def test_runs_need_a_folder_that_can_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    assert doctor.outcome(doctor.FOLDER, str(tmp_path / "a" / "b"))[0]
+    for nowhere in (tmp_path / "file" / "runs", "/proc", "/proc/runs"):
+        works, said = doctor.outcome(doctor.FOLDER, str(nowhere))
+        assert not works
+        assert said.endswith("cannot be written")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def ran(words, folder):
+    """Run the command where a folder comes first on the path of Python."""
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join((str(folder), os.environ.get("PYTHONPATH", "")))}
+    script = f"import sys; sys.argv[1:] = {words}; from viapoint.training.cli.entry import main; main()"
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=env)
+
+
+@pytest.mark.parametrize(("words", "code"), [(["train"], 2), (["--help"], 2), (["doctor"], 1)])
+def test_without_the_extra_everything_says_what_to_install(words, code, tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys\n"
+        "class Blocked:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name.partition('.')[0] in {EXTRA}:\n"
+        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
+        "sys.meta_path.insert(0, Blocked())\n"
+    )
+    failed = ran(words, tmp_path)
+    assert failed.returncode == code
+    assert "pip install 'viapoint[training]'" in failed.stdout + failed.stderr
+    assert code == 1 or len(failed.stderr.splitlines()) == 1

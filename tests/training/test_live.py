@@ -289,8 +289,8 @@ def test_scene_files_are_exact_and_keep_names_and_changes(arenas):
     names = {}
     exec(again.to_python(MOVING, arena.arguments["any"]), names)
     unnamed = tuple(dataclasses.replace(shape, name="") for shape in again.obstacles)
-    drawn = arena.scene_of(names["env"].unwrapped.batch.scenes)
-    assert_same(drawn, again._replace(obstacles=unnamed), 1e-5)
+    made = arena.scene_of(names["env"].unwrapped.batch.scenes)
+    assert_same(made, again._replace(obstacles=unnamed), 1e-5)
 
 
 IN_THE_WAY = {"shape": "cylinder", "radius": 0.03, "half_length": 0.1, "position": [0.1, 0.4, 0.0]}

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecExtractDictObs, VecNormalize
 from tasks import JUMPS, MOVING, PANDA, REACH, SENSED, STEP
 from tasks import PLANE as ENV
 
-from viapoint.envs import Pose, Sphere, Task, arm_of
+from viapoint.envs import PointCloud, Pose, Sphere, Task, arm_of
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.training import (
     GeometrySearch,
@@ -180,6 +180,12 @@ def moved(**changes):
     return plan_motion(**{**given, **changes})
 
 
+def many_points():
+    """Return more points than a scene of the physics may have, far from the arm."""
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (300, 3))
+    return PointCloud(points, 0.01, position=(0.0, -0.8, 0.2))
+
+
 def scenes(number):
     return SceneSimulation(ENV, 1).task.sampler()([np.random.default_rng(0)] * number)
 
@@ -274,6 +280,7 @@ CALLS = [
     *(lambda goals=goals: plan_motions(PANDA_ARM, 2 * [PANDA_ARM.home], goals, [[], []])
       for goals in ([PANDA_ARM.home, np.zeros(3)], [PANDA_ARM.home])),
     lambda: plan_motions(PANDA_ARM, [PANDA_ARM.home], [PANDA_ARM.home], [[]], threads=2.5),
+    lambda: moved(obstacles=[many_points()]).execute(force=True),
     lambda: scenes_for("tests", Task.of()),
     *(lambda env_id=env_id: scenes_for(shipped_path("validation", env_id), Task.of()) for env_id in CHANGING),
     *(lambda name=name: evaluate(env=ENV, baselines=["straight"], scenes=load(shipped_path("test", name)))
@@ -349,6 +356,7 @@ COMMANDS = [
     ("train --resume --out full", "full"),
     ("evaluate", "--env"),
     ("evaluate nowhere", "nowhere"),
+    ("evaluate --scenes motionbenchmaker --baselines nothing", "plan_motion+ompl"),
     (f"evaluate --env {ENV} --baselines straight --scenes nowhere.npz", "nowhere.npz"),
     (f"evaluate --env {SENSED} --baselines search16 --env-kwargs sensor=nose", "hand_rays"),
     (f"evaluate --env {ENV} --json /proc/x", "--json /proc/x cannot be written"),

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.monitor import Monitor
 from tasks import PLANE, STEP
 
@@ -45,34 +46,24 @@ def test_it_is_the_vector_environment(env_id, steps):
     env.close()
 
 
-VECTOR = {"vector_entry_point": "viapoint.envs.vector_env:ReachVectorEnv"}
-
-
-@pytest.fixture
-def register():
+def register(monkeypatch, **kwargs):
     """Register an id of one's own for the test alone."""
-
-    def made(**kwargs):
-        usual = {"arm": "planar", "decide_at": "steps"}
-        gym.register("me/Own-v0", "viapoint.envs.env:ReachEnv", kwargs=usual, **kwargs)
-        return "me/Own-v0"
-
-    yield made
-    del gym.registry["me/Own-v0"]
+    usual = {"arm": "planar", "decide_at": "steps"}
+    spec = EnvSpec("me/Own-v0", "viapoint.envs.env:ReachEnv", kwargs=usual, **kwargs)
+    monkeypatch.setitem(gym.registry, spec.id, spec)
+    return spec.id
 
 
-def test_an_own_id_has_the_limit_of_decisions_of_gymnasium(register, tmp_path, monkeypatch):
-    env_id = register(**VECTOR, max_episode_steps=3)
+def test_an_own_id_has_the_limit_of_decisions_of_gymnasium(tmp_path, monkeypatch):
+    vector = "viapoint.envs.vector_env:ReachVectorEnv"
+    env_id = register(monkeypatch, vector_entry_point=vector, max_episode_steps=3)
     env = ViaVecEnv(env_id, 2, seed=0, threads=1)
     env.reset()
     cut = [[info["TimeLimit.truncated"] for info in env.step(actions(env))[-1]] for _ in range(6)]
     assert cut == 2 * [[False] * 2, [False] * 2, [True] * 2]
-    hyperparameters = {"n_steps": 4, "batch_size": 8}
     settings = {"n_timesteps": 16, "n_envs": 2, "eval_scenes": 4, "progress": False}
-    config = TrainConfig(
-        env=env_id, algo="ppo", out=tmp_path / "run", hyperparameters=hyperparameters, **settings
-    )
-    run = train(config)
+    settings["hyperparameters"] = {"n_steps": 4, "batch_size": 8}
+    run = train(TrainConfig(env=env_id, algo="ppo", out=tmp_path / "run", **settings))
     result = evaluate(run.folder, scenes="validation", n_scenes=4)
     with monkeypatch.context() as patch:
         patch.delitem(gym.registry, env_id)  # where the model is loaded, the id need not be known
@@ -81,10 +72,10 @@ def test_an_own_id_has_the_limit_of_decisions_of_gymnasium(register, tmp_path, m
         assert (each.results[0].outcomes["decisions"] == 3).all()
 
 
-def test_an_own_id_needs_a_vector_environment(register, tmp_path):
-    env_id = register()
+def test_an_own_id_needs_a_vector_environment(monkeypatch):
+    env_id = register(monkeypatch)
     for refused in (lambda: TrainConfig(env=env_id), lambda: evaluate(env=env_id, baselines=["straight"])):
-        with pytest.raises(ValueError, match="vector_entry_point"):
+        with pytest.raises(ValueError):
             refused()
 
 
