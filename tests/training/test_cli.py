@@ -19,7 +19,6 @@ from viapoint.training import Run, TrainConfig, evaluate, load_agent
 from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
 from viapoint.training.cli import demo, doctor
 from viapoint.training.cli import entry as cli
-from viapoint.training.cli.entry import main
 from viapoint.training.config.configs import DemoConfig, EvaluateConfig, from_words, to_words
 from viapoint.training.config.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
 from viapoint.training.runs.trainer import RunCallback, TrainingStoppedError
@@ -138,20 +137,14 @@ def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys, failed):
 
 
 def test_the_configuration_of_a_training_survives_json():
-    config = TrainConfig(
-        algo="ppo", out=Path("x"), env_kwargs={"n_via": 2}, hyperparameters={"batch_size": 3}
-    )
+    given = {"env_kwargs": {"n_via": 2}, "hyperparameters": {"batch_size": 3}}
+    config = TrainConfig(algo="ppo", out=Path("x"), **given)
     assert TrainConfig(**json.loads(json.dumps(config.as_json()))) == config
 
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [
-        ("1e-3", 0.001),
-        ("[1,8]", [1, 8]),
-        ('{"a":[16]}', {"a": [16]}),
-        ("a=b", "a=b"),
-    ],
+    [("1e-3", 0.001), ("[1,8]", [1, 8]), ('{"a":[16]}', {"a": [16]}), ("a=b", "a=b")],
 )
 def test_words_are_values_in_yaml(text, value):
     assert from_words([f"x={text}"]) == {"x": value}
@@ -166,14 +159,8 @@ def test_words_become_a_configuration():
     words = "train --env viapoint/PlanarReach-v0 --algo sac --seed 3 --n-timesteps 9"
     words += " --env-kwargs n_via=2 timing=learned --hyperparameters tau=0.1"
     config = cli.parse(shlex.split(words))
-    assert config == TrainConfig(
-        env="viapoint/PlanarReach-v0",
-        algo="sac",
-        seed=3,
-        n_timesteps=9,
-        env_kwargs={"n_via": 2, "timing": "learned"},
-        hyperparameters={"tau": 0.1},
-    )
+    given = {"env_kwargs": {"n_via": 2, "timing": "learned"}, "hyperparameters": {"tau": 0.1}}
+    assert config == TrainConfig(env=REACH, algo="sac", seed=3, n_timesteps=9, **given)
     assert cli.parse(shlex.split(config.command)[1:]) == config
     config = cli.parse(shlex.split("evaluate runs/x --baselines planner --json a.json"))
     assert config == EvaluateConfig(agent="runs/x", baselines=("planner",), json=Path("a.json"))
@@ -196,8 +183,6 @@ def test_every_algorithm_has_presets_that_fit():
         for algo, preset in presets.items():
             assert preset.policy in ALGORITHMS[algo].policy_aliases
             check_hyperparameters(algo, preset.arguments())
-    for algo, preset in PRESETS.items():
-        assert TrainConfig(algo=algo).total_timesteps == preset.n_timesteps
 
 
 @pytest.fixture
@@ -251,60 +236,57 @@ def not_filmed(monkeypatch) -> list[str]:
 def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     shutil.copy(UR5E, tmp_path / "my_arm.xml")
     monkeypatch.chdir(tmp_path)
-    run = tmp_path / "run"
-    main(
-        [
-            "train", "--arm", "my_arm.xml", "--env-kwargs", "n_obstacles=2",
-            "--n-timesteps", "64", "--n-envs", "16", "--eval-every", "0", "--out", str(run),
-        ]
+    folder = tmp_path / "run"
+    run(
+        "train", "--arm", "my_arm.xml", "--env-kwargs", "n_obstacles=2",
+        "--n-timesteps", 64, "--n-envs", 16, "--eval-every", 0, "--out", folder,
     )  # fmt: skip
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    assert Run(run).config.env_kwargs["arm"] == str(tmp_path / "my_arm.xml")
-    agent = load_agent(run)
+    assert Run(folder).config.env_kwargs["arm"] == str(tmp_path / "my_arm.xml")
+    agent = load_agent(folder)
     result = evaluate(agent, baselines=["straight"], scenes="validation", n_scenes=4)
     assert len(result.rows) == 2
 
     seen = agent.observation_space.sample()
     action, _ = agent.predict(seen, deterministic=True)
     (tmp_path / "my_arm.xml").unlink()  # the run keeps a copy
-    kept = load_agent(run)
-    assert Run(run).config.env_kwargs["arm"] == str(run / "arm.xml")
+    kept = load_agent(folder)
+    assert Run(folder).config.env_kwargs["arm"] == str(folder / "arm.xml")
     np.testing.assert_array_equal(kept.predict(seen, deterministic=True)[0], action)
-    main(["evaluate", str(run), "--baselines", "straight", "--n-scenes", "4", "--scenes", "validation"])
+    run("evaluate", folder, "--baselines", "straight", "--n-scenes", 4, "--scenes", "validation")
     filmed = not_filmed(monkeypatch)
-    main(["play", str(run), "--n-scenes", "1", "--scenes", "validation", "--video", str(tmp_path / "a.mp4")])
+    run("play", folder, "--n-scenes", 1, "--scenes", "validation", "--video", tmp_path / "a.mp4")
     assert filmed == [kept.env_kwargs["arm"]]
 
 
 def test_a_run_goes_on_with_its_copy_of_an_arm(tmp_path, capsys) -> None:
     file = tmp_path / "my_arm.xml"
     shutil.copy(UR5E, file)
-    settings = ("--n-envs", "16", "--eval-every", "0", "--out", str(tmp_path / "run"))
-    main(["train", "--arm", str(file), "--n-timesteps", "16", *settings])
+    settings = ("--n-envs", 16, "--eval-every", 0, "--out", tmp_path / "run")
+    run("train", "--arm", file, "--n-timesteps", 16, *settings)
     shutil.copytree(tmp_path / "run", tmp_path / "same")
     decisions = 16
     # The run goes on without the file, and then with the file again; the other run the other way round.
     for name in ("elsewhere.xml", "my_arm.xml"):
         decisions += 16
-        main(["train", "--resume", "--out", str(tmp_path / "same"), "--n-timesteps", str(decisions)])
+        run("train", "--resume", "--out", tmp_path / "same", "--n-timesteps", decisions)
         file = file.rename(tmp_path / name)
-        main(["train", "--resume", "--out", str(tmp_path / "run"), "--n-timesteps", str(decisions)])
+        run("train", "--resume", "--out", tmp_path / "run", "--n-timesteps", decisions)
     assert "damaged" not in capsys.readouterr().err
     assert Run(tmp_path / "run").config == Run(tmp_path / "same").config
     first, second = (tmp_path / name / "final" / "weights.safetensors" for name in ("run", "same"))
     assert first.read_bytes() == second.read_bytes()
 
 
-def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch, failed) -> None:
-    arm = ["--arm", str(UR5E), "--scenes", "validation"]
+def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
+    arm = ["--arm", UR5E, "--scenes", "validation"]
     out = tmp_path / "results.json"
-    main(["evaluate", *arm, "--baselines", "straight", "plan_motion", "--n-scenes", "4", "--json", str(out)])
+    run("evaluate", *arm, "--baselines", "straight", "plan_motion", "--n-scenes", 4, "--json", out)
     assert out.is_file()
     filmed = not_filmed(monkeypatch)
-    main(["play", *arm, "--n-scenes", "1", "--video", str(tmp_path / "b.mp4")])
+    run("play", *arm, "--n-scenes", 1, "--video", tmp_path / "b.mp4")
     assert filmed == [str(UR5E)]
-    assert "nowhere.xml" in failed("evaluate", "--arm", "nowhere.xml")
 
 
 GOOD, GONE = "print('fine')", "import no_such_module"

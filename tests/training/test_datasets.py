@@ -6,6 +6,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from tasks import JUMPS, MOVING, PLANE, SENSED, STEP
 
 from viapoint.training.cli import entry as cli
 from viapoint.training.planning.baselines import make_method
@@ -13,7 +14,6 @@ from viapoint.training.rollouts.datasets import record_dataset
 
 minari = pytest.importorskip("minari")
 
-PLANE = "viapoint/PlanarObstacles-v0"
 CUSTOM = "test/TwoPosts-v0"
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 
@@ -62,9 +62,9 @@ def assert_replays(dataset):
     [
         (PLANE, ()),
         ("search16", ("--env", PLANE, "--env-kwargs", "n_obstacles=[1,3]")),
-        ("random", ("--env", "viapoint/PlanarObstaclesStep-v0")),
-        ("viapoint/PlanarMovingObstacles-v0", ()),
-        ("straight", ("--env", "viapoint/PlanarTargetJump-v0")),
+        ("random", ("--env", STEP)),
+        (MOVING, ()),
+        ("straight", ("--env", JUMPS)),
         ("straight", ("--arm", "panda")),
         ("random", ("--env", CUSTOM)),
         ("straight", ("--env", "viapoint/Reach-v0", "--arm", UR5E)),
@@ -83,8 +83,12 @@ def test_episodes_are_those_of_the_method_and_have_names_by_default(folder):
     dataset = minari.load_dataset("viapoint/PlanarObstacles/straight-v0")
     assert (folder / "viapoint/PlanarObstacles/straight-v0/data").is_dir()
     assert [np.abs(episode.actions).max() for episode in dataset.iterate_episodes()] == [0.0, 0.0]
-    record("thick:search4", "--env", "viapoint/PlanarSensed-v0", "--episodes", 1)
+    record("thick:search4", "--env", SENSED, "--episodes", 1)
     assert minari.load_dataset("viapoint/PlanarSensed/thick-search4-v0").total_episodes == 1
+
+
+NAMES = "../name-v0", "t/a-v0", "name", "group//name-v0", "a b-v0", ""
+"""Names that no dataset can have."""
 
 
 @pytest.mark.parametrize(
@@ -93,12 +97,9 @@ def test_episodes_are_those_of_the_method_and_have_names_by_default(folder):
         (("straight",), "--env"),
         (("nothing", "--env", PLANE), "baseline must be"),
         (("plan_motion", "--env", PLANE), "no actions"),
-        (("straight", "--env", "viapoint/PlanarObstaclesStep-v0"), "random"),
+        (("straight", "--env", STEP), "random"),
         (("straight", "--env", PLANE, "--episodes", 0), "episodes"),
-        *(
-            (("straight", "--env", PLANE, "--dataset", name), "group/name-v0")
-            for name in ("../name-v0", "t/a-v0", "name", "group//name-v0", "a b-v0", "")
-        ),
+        *((("straight", "--env", PLANE, "--dataset", name), "group/name-v0") for name in NAMES),
         ((PLANE, "--env-kwargs", "n_via=2"), "env_kwargs"),
     ],
 )

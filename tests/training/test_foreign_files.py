@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from tasks import PLANE, REACH
 
 from viapoint.training import Run, TrainConfig, load_agent, train
 from viapoint.training.agents.agent import find_model
@@ -14,7 +15,6 @@ from viapoint.training.io.files import BadFileError
 from viapoint.training.paper import run as paper
 from viapoint.training.plotting.video import record_video
 
-REACH = "viapoint/PlanarReach-v0"
 NOTES = b"years of work with viapoint \xff"
 FOREIGN_JSON = b'{"env": "viapoint/PlanarReach-v0", "layers": [8, 8]}'
 
@@ -78,7 +78,7 @@ def test_an_agent_is_saved_over_a_model_alone(case, tmp_path):
 
 
 def test_an_own_model_is_replaced_also_behind_a_link(tmp_path):
-    agent, other = load_agent(REACH), load_agent("viapoint/PlanarObstacles-v0")
+    agent, other = load_agent(REACH), load_agent(PLANE)
     (tmp_path / "empty").mkdir()
     for folder in (tmp_path / "empty", tmp_path / "new"):
         other.save(folder)
@@ -88,7 +88,7 @@ def test_an_own_model_is_replaced_also_behind_a_link(tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "new")
     other.save(tmp_path / "link")
     assert (tmp_path / "link").is_symlink()
-    assert load_agent(tmp_path / "new").env_id == "viapoint/PlanarObstacles-v0"
+    assert load_agent(tmp_path / "new").env_id == PLANE
 
 
 def begin_demo(path):

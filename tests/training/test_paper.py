@@ -1,6 +1,8 @@
 """The paper reproduced: every number of the table against its expected range, and the command with its files."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,8 +28,12 @@ def made(tmp_path_factory):
     return out
 
 
+def claims_of(folder):
+    return json.loads((folder / "table.json").read_text())["claims"]
+
+
 def test_every_number_is_as_promised(made):
-    claims = json.loads((made / "table.json").read_text())["claims"]
+    claims = claims_of(made)
     assert {claim["row"] for claim in claims} == set(ROWS)
     for claim in claims:
         numbers = [name for name in ("model", "arm") if claim[name] is not None]
@@ -42,6 +48,19 @@ def test_every_number_is_as_promised(made):
     assert max(claim["deviation_mm"] for claim in carried if "torque" not in claim["claim"]) < 1.0
     for name in DRAWINGS:
         assert (made / f"{name}.png").stat().st_size > 5_000
+
+
+def test_the_guide_says_what_the_command_computes(made):
+    text = (Path(__file__).parents[2] / "docs" / "flash-hogan.md").read_text()
+    lines = [line.strip("| ").split(" | ") for line in text.splitlines() if re.match(r"\| \d", line)]
+    assert len(lines) >= 10
+    claims = {(claim["row"], claim["claim"]): claim for claim in claims_of(made)}
+    for row, words, model, arm in lines:
+        claim = claims[int(row), words]
+        assert float(model) == pytest.approx(claim["model"], rel=1e-3)
+        assert (arm == "-") == (claim["arm"] is None)
+        if arm != "-":
+            assert float(arm) == pytest.approx(claim["arm"], rel=5e-3)
 
 
 @pytest.mark.parametrize(

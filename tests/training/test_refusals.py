@@ -356,6 +356,7 @@ COMMANDS = [
     ("train --resume --out full", "full"),
     ("evaluate", "--env"),
     ("evaluate nowhere", "nowhere"),
+    ("evaluate --arm nowhere.xml", "nowhere.xml"),
     ("evaluate --scenes motionbenchmaker --baselines nothing", "plan_motion+ompl"),
     (f"evaluate --env {ENV} --baselines straight --scenes nowhere.npz", "nowhere.npz"),
     (f"evaluate --env {SENSED} --baselines search16 --env-kwargs sensor=nose", "hand_rays"),

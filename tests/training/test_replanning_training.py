@@ -11,7 +11,6 @@ from viapoint.training.agents.model_io import build
 from viapoint.training.config.presets import STEP_PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planning.baselines import StepAgentMethod, Straight, agent_method, make_method
-from viapoint.training.planning.predictions import Seen, fitted_reaches, known_courses
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, whole_task
 from viapoint.training.scene_sets import drawn
@@ -43,23 +42,6 @@ def test_episodes_with_the_same_ends_are_not_mixed_up():
         one = scenes.take([row])
         alone = method.execute(one, method.decide(simulation.observe(one), one))
         assert alone.reward[0] == together.reward[row]
-
-
-def test_two_looks_at_a_reach_tell_its_end():
-    begin, duration, way = -0.2, 0.9, np.array([0.2, -0.1, 0.0])
-    scene = registered_task(MOVING).sampler()([np.random.default_rng(0)]).with_rows(1)
-    scene.reach[0, 0] = [begin, duration, *way]
-    scene.obstacles.velocity[:] = 0.0
-    scene.turn_velocity[:] = 0.0
-    time = np.array([0.0, 0.28])
-    seen = [scene.obstacles_at(time[k : k + 1]) for k in range(2)]
-    looks = Seen(
-        time, *(np.concatenate([getattr(each, part) for each in seen]) for part in ("centre", "velocity"))
-    )
-    places = known_courses(looks, scene)
-    np.testing.assert_allclose(fitted_reaches(looks, scene), places, atol=0.02)
-    # One look leaves the end open.
-    assert np.abs(fitted_reaches(Seen(*(part[1:] for part in looks)), scene) - places).max() > 0.02
 
 
 def test_a_jumping_target_is_reached_by_revision_only():

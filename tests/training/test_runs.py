@@ -19,8 +19,6 @@ from viapoint.training.io import files
 from viapoint.training.io.files import BadFileError
 from viapoint.training.runs import run_dir
 
-ENV = "viapoint/PlanarObstacles-v0"
-
 
 def new(algo, env, **hyperparameters):
     preset = PRESETS[algo]
