@@ -79,7 +79,7 @@ TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
         ([*TABLE[:3], "", "  ", "0.2,0.1"], "2 values in line 6"),
         ([*TABLE[:2], "", "0.1,far,0.2"], "line 4, column x: far"),
         (["y", "0.1"], "no column time"),
-        ([TABLE[0], *TABLE[:0:-1]], "time must ascend"),
+        ([TABLE[0], *(f"{-time},0.1,0.2" for time in range(12))], "time must ascend"),
         (TABLE[:1], "holds no samples"),
         (["", *TABLE[:3], "0.1,,0.2"], "line 5, column x: nothing"),
         (["time,x,y,x", "0.0,0.1,0.2,0.1"], "several columns x"),
