@@ -31,6 +31,11 @@ def test_it_is_the_vector_environment(env_id, steps):
         np.testing.assert_array_equal(done, terminated | truncated)
         returns += reward
         lengths += 1
+        for i, told in enumerate(infos):
+            reported = info["final_info"] if done[i] else info
+            for name in reported:
+                if not name.startswith(("_", "final_")):
+                    np.testing.assert_equal(told[name], reported[name][i])
         for i in np.flatnonzero(done):
             told = infos[i]
             assert told["is_success"] is bool(info["final_info"]["is_success"][i])
