@@ -36,6 +36,7 @@ from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems, read_problems
 from viapoint.training.planning.motion_plan import execute_plans
 from viapoint.training.planning.movements import OUTSIDE, Movement, movement_table
+from viapoint.training.planning.ompl_paths import points_on
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets import BANDS, load, scenes_for, shipped_path
@@ -537,3 +538,15 @@ def test_where_no_seed_is_free_a_path_is_followed():
     assert not plan_motion(
         arm, problem.start, problem.goal, problem.obstacles, seeds=0, n_via=1, ompl=False
     ).success
+
+
+def test_points_lie_on_the_path_and_keep_its_corners():
+    path = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [2.0, 2.0]])
+    np.testing.assert_array_equal(points_on(path, 2), path)
+    np.testing.assert_allclose(points_on(path, 1), [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])
+    for count in (3, 4, 8, 12):
+        points = points_on(path, count)
+        assert len(points) == count + 2
+        assert all((np.abs(points - corner).max(axis=-1) < 1e-12).any() for corner in path)
+        length = np.linalg.norm(np.diff(points, axis=0), axis=-1).sum()
+        assert length == pytest.approx(4.0)
