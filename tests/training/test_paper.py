@@ -11,6 +11,7 @@ from viapoint.training.cli import entry as cli
 from viapoint.training.paper import obstacles, run
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.double_step import double_step, excess_cost
+from viapoint.training.paper.movements import construction, via_waypoints
 from viapoint.training.paper.run import DRAWINGS, ROWS
 
 FEWER = 9
@@ -80,6 +81,12 @@ def test_a_failed_claim_ends_the_command_with_code_1(tmp_path, monkeypatch, caps
     assert end.value.code == 1
     assert "row 1, too much" in capsys.readouterr().err
     assert json.loads((tmp_path / "table.json").read_text())["holds"] is False
+
+
+def test_the_construction_is_undone():
+    along, height = np.array([0.2, 0.9]), np.array([0.4, -0.3])
+    found = construction(via_waypoints((0.1, -0.2), (0.4, 0.3), along, height))
+    np.testing.assert_allclose(found, (along, abs(height)), atol=1e-14)
 
 
 @pytest.mark.parametrize("moment", [0.04, 0.2, 0.55])
