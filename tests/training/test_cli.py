@@ -1,4 +1,4 @@
-"""The command: configurations from its words, and what it does until the files."""
+"""The commands, from configurations and words to files: training, evaluation, play, demo and doctor."""
 
 import io
 import json
@@ -22,6 +22,8 @@ from viapoint.training.cli import entry as cli
 from viapoint.training.config.configs import DemoConfig, EvaluateConfig, from_words, to_words
 from viapoint.training.config.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
 from viapoint.training.runs.trainer import RunCallback, TrainingStoppedError
+
+UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 
 
 def run(*words):
@@ -215,9 +217,6 @@ def test_an_interrupted_demo_goes_on_and_what_is_done_is_not_done_again(quick, c
         monkeypatch.setattr(demo, name, pytest.fail)
     demo.run(quick)
     assert written == {name: (quick.out / name).stat().st_mtime_ns for name in demo.FILES}
-
-
-UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 
 
 def not_filmed(monkeypatch) -> list[str]:

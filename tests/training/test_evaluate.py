@@ -1,4 +1,4 @@
-"""Every method meets the same scenes, and the figures are what their names say."""
+"""Agents and baselines are measured in the same scenes, and figures, intervals and tables are what they say."""
 
 import io
 import itertools

@@ -1,4 +1,4 @@
-"""ViaQ works as any algorithm of Stable-Baselines3: environments, seeds, saving, and training that goes on."""
+"""ViaQ works as any algorithm of Stable-Baselines3, and its policy obeys the symmetries of the task."""
 
 import copy
 import io
@@ -31,6 +31,10 @@ SMALL = {
     "explore_candidates": 16,
     "policy_kwargs": FEW,
 }
+
+
+NUMBER = 12
+"""Number of scenes in which policies are compared."""
 
 
 def model_on(env, **kwargs):
@@ -144,10 +148,6 @@ def test_refinement_solves_more_than_as_many_checks(made):
     replanning.policy.refine = 4
     with pytest.raises(ValueError, match="refine"):
         replanning.predict(replanning.env.reset())
-
-
-NUMBER = 12
-"""Number of scenes."""
 
 
 def policy_of(task, **kwargs):
