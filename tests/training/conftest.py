@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from viapoint.training import scene_sets
+from viapoint.training import ViaVecEnv, scene_sets
 from viapoint.training.cli import entry
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.scene_sets import FrozenScenes
 
 sys.path.append(str(Path(__file__).parent))
@@ -31,6 +30,20 @@ def env():
     env = ViaVecEnv(ENV, 6, seed=3, threads=1)
     yield env
     env.close()
+
+
+@pytest.fixture
+def made():
+    """Function that makes environments, which SB3 takes and which are closed at the end."""
+    opened = []
+
+    def make(env_id=ENV, number=8, **kwargs):
+        opened.append(ViaVecEnv(env_id, number, seed=0, **kwargs))
+        return opened[-1]
+
+    yield make
+    for env in opened:
+        env.close()
 
 
 @pytest.fixture(scope="session")

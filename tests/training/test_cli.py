@@ -1,16 +1,29 @@
-"""The command, from the words to the files."""
+"""The commands, from configurations and words to files: training, evaluation, play, demo and doctor."""
 
 import io
 import json
+import os
 import re
+import shlex
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
+from tasks import PLANE as ENV
+from tasks import REACH
 
+from viapoint.training import Run, TrainConfig, evaluate, load_agent
+from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
+from viapoint.training.cli import demo, doctor
 from viapoint.training.cli import entry as cli
+from viapoint.training.config.configs import DemoConfig, EvaluateConfig, from_words, to_words
+from viapoint.training.config.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
+from viapoint.training.runs.trainer import RunCallback, TrainingStoppedError
 
-ENV, REACH = "viapoint/PlanarObstacles-v0", "viapoint/PlanarReach-v0"
+UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 
 
 def run(*words):
@@ -96,14 +109,6 @@ def test_train_then_evaluate_then_play(trained, shipped, tmp_path, capsys):
     assert video.stat().st_size > 1000
 
 
-def test_arguments_of_the_environment_are_taken(capsys, failed):
-    words = "evaluate --env viapoint/PlanarSensed-v0 --scenes validation --n-scenes 4 --baselines search16 --env-kwargs"
-    run(*words.split(), "sensor=hand_rays", "decide_at=[sight]")
-    assert "search16" in capsys.readouterr().out
-    for argument, named in (("sensr=rays", "sensor"), ("sensor=nose", "hand_rays"), ("n_via=a", "n_via")):
-        assert named in failed(*words.split(), argument)
-
-
 def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, tmp_path):
     few, file = shipped.take(slice(3, 6)), tmp_path / "validation.npz"
     few.save(file)
@@ -116,21 +121,6 @@ def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, 
         run("evaluate", trained, "--baselines", "straight", "--scenes", *words)
     kept = [json.loads(path.read_text()) for path in (trained / "evaluations").glob("validation-*.json")]
     assert sorted(each["methods"]["straight"]["scenes"] for each in kept) == [3, 4, 40]
-
-
-def test_an_agent_of_another_task_meets_scenes_of_that_task(tmp_path, failed):
-    folder = tmp_path / "run"
-    run(
-        "train", "--out", folder, "--n-timesteps", 32, "--n-envs", 32, "--eval-every", 0, "--no-progress",
-        "--env-kwargs", "n_obstacles=3", "threads=1",
-    )  # fmt: skip
-    run("evaluate", folder, "--baselines", "straight", "--n-scenes", 3)
-    (path,) = (folder / "evaluations").iterdir()
-    record = json.loads(path.read_text())
-    assert [each["scenes"] for each in record["methods"].values()] == [3, 3]
-    run("play", folder, "--n-scenes", 1, "--video", tmp_path / "film.mp4")
-    assert (tmp_path / "film.mp4").stat().st_size > 1000
-    assert "validation, test" in failed("evaluate", folder, "--scenes", "hard")
 
 
 def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys, failed):
@@ -156,3 +146,221 @@ def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys, failed):
     run(*begun, "--resume")
     run("train", "--out", folder, "--resume", "--n-timesteps", 96, "--no-progress")
     assert "96 of 96 decisions" in capsys.readouterr().out
+
+
+def test_the_configuration_of_a_training_survives_json():
+    given = {"env_kwargs": {"n_via": 2}, "hyperparameters": {"batch_size": 3}}
+    config = TrainConfig(algo="ppo", out=Path("x"), **given)
+    assert TrainConfig(**json.loads(json.dumps(config.as_json()))) == config
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1e-3", 0.001), ("[1,8]", [1, 8]), ('{"a":[16]}', {"a": [16]}), ("a=b", "a=b")],
+)
+def test_words_are_values_in_yaml(text, value):
+    assert from_words([f"x={text}"]) == {"x": value}
+
+
+@pytest.mark.parametrize("value", [1e-7, True, None, [1, 8], {"a": [16]}, "learned", "2", "true", "", "a: b"])
+def test_values_survive_the_way_to_words_and_back(value):
+    assert from_words(to_words({"x": value})) == {"x": value}
+
+
+def test_words_become_a_configuration():
+    words = "train --env viapoint/PlanarReach-v0 --algo sac --seed 3 --n-timesteps 9"
+    words += " --env-kwargs n_via=2 timing=learned --hyperparameters tau=0.1"
+    config = cli.parse(shlex.split(words))
+    given = {"env_kwargs": {"n_via": 2, "timing": "learned"}, "hyperparameters": {"tau": 0.1}}
+    assert config == TrainConfig(env=REACH, algo="sac", seed=3, n_timesteps=9, **given)
+    assert cli.parse(shlex.split(config.command)[1:]) == config
+    config = cli.parse(shlex.split("evaluate runs/x --baselines planner --json a.json"))
+    assert config == EvaluateConfig(agent="runs/x", baselines=("planner",), json=Path("a.json"))
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_a_short_training_begins_to_learn_in_proportion(algo):
+    usual = TrainConfig(algo=algo)
+    short = TrainConfig(algo=algo, n_timesteps=usual.total_timesteps // 8)
+    if "learning_starts" in usual.all_hyperparameters:
+        ratio = short.all_hyperparameters["learning_starts"] / usual.all_hyperparameters["learning_starts"]
+        assert ratio == pytest.approx(1 / 8)
+    given = TrainConfig(algo="sac", n_timesteps=64, hyperparameters={"learning_starts": 100})
+    assert given.all_hyperparameters["learning_starts"] == 100
+
+
+def test_every_algorithm_has_presets_that_fit():
+    assert set(PRESETS) == set(ALGORITHMS)
+    for presets in (PRESETS, STEP_PRESETS, REACH_PRESETS, REPLANNING_PRESETS):
+        for algo, preset in presets.items():
+            assert preset.policy in ALGORITHMS[algo].policy_aliases
+            check_hyperparameters(algo, preset.arguments())
+
+
+@pytest.fixture
+def quick(monkeypatch, shipped, tmp_path):
+    monkeypatch.setattr(demo, "PICTURES", 2)
+    monkeypatch.setattr(demo, "MOVEMENTS", 1)
+    return DemoConfig(out=tmp_path / "demo", n_timesteps=64, n_scenes=8)
+
+
+def test_an_interrupted_demo_goes_on_and_what_is_done_is_not_done_again(quick, capsys, monkeypatch):
+    begin = RunCallback._on_training_start
+
+    def interrupted(self):
+        begin(self)
+        self._stop = True
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunCallback, "_on_training_start", interrupted)
+        with pytest.raises(TrainingStoppedError):
+            demo.run(quick)
+    demo.run(quick)
+    told = capsys.readouterr().out
+    written = {name: (quick.out / name).stat().st_mtime_ns for name in demo.FILES}
+    assert all(str(quick.out / name) in told for name in (*demo.FILES, "best"))
+    methods = json.loads((quick.out / "table.json").read_text())["methods"]
+    assert {"agent", "agent, 16 checks", "untrained", "search512"} <= set(methods)
+    assert methods["straight"]["success"]["rate"] == 0.0
+
+    for name in ("evaluate", "gallery", "record_video"):
+        monkeypatch.setattr(demo, name, pytest.fail)
+    demo.run(quick)
+    assert written == {name: (quick.out / name).stat().st_mtime_ns for name in demo.FILES}
+
+
+def not_filmed(monkeypatch) -> list[str]:
+    """Let `play` decide without rendering; the arms of its videos are listed."""
+    filmed: list[str] = []
+
+    def record(path, env, scenes, decide, **_) -> None:
+        observation, _ = env.reset(seed=0)
+        decide({name: value[None] for name, value in observation.items()}, scenes)
+        filmed.append(env.unwrapped.task.arm.file)
+
+    monkeypatch.setattr("viapoint.training.plotting.video.record_video", record)
+    return filmed
+
+
+def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
+    shutil.copy(UR5E, tmp_path / "my_arm.xml")
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "run"
+    run(
+        "train", "--arm", "my_arm.xml", "--env-kwargs", "n_obstacles=2",
+        "--n-timesteps", 64, "--n-envs", 16, "--eval-every", 0, "--out", folder,
+    )  # fmt: skip
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert Run(folder).config.env_kwargs["arm"] == str(tmp_path / "my_arm.xml")
+    agent = load_agent(folder)
+    result = evaluate(agent, baselines=["straight"], scenes="validation", n_scenes=4)
+    assert len(result.rows) == 2
+
+    seen = agent.observation_space.sample()
+    action, _ = agent.predict(seen, deterministic=True)
+    (tmp_path / "my_arm.xml").unlink()  # the run keeps a copy
+    kept = load_agent(folder)
+    assert Run(folder).config.env_kwargs["arm"] == str(folder / "arm.xml")
+    np.testing.assert_array_equal(kept.predict(seen, deterministic=True)[0], action)
+    run("evaluate", folder, "--baselines", "straight", "--n-scenes", 4, "--scenes", "validation")
+    filmed = not_filmed(monkeypatch)
+    run("play", folder, "--n-scenes", 1, "--scenes", "validation", "--video", tmp_path / "a.mp4")
+    assert filmed == [kept.env_kwargs["arm"]]
+
+
+def test_a_run_goes_on_with_its_copy_of_an_arm(tmp_path, capsys) -> None:
+    file = tmp_path / "my_arm.xml"
+    shutil.copy(UR5E, file)
+    settings = ("--n-envs", 16, "--eval-every", 0, "--out", tmp_path / "run")
+    run("train", "--arm", file, "--n-timesteps", 16, *settings)
+    shutil.copytree(tmp_path / "run", tmp_path / "same")
+    decisions = 16
+    # The run goes on without the file, and then with the file again; the other run the other way round.
+    for name in ("elsewhere.xml", "my_arm.xml"):
+        decisions += 16
+        run("train", "--resume", "--out", tmp_path / "same", "--n-timesteps", decisions)
+        file = file.rename(tmp_path / name)
+        run("train", "--resume", "--out", tmp_path / "run", "--n-timesteps", decisions)
+    assert "damaged" not in capsys.readouterr().err
+    assert Run(tmp_path / "run").config == Run(tmp_path / "same").config
+    first, second = (tmp_path / name / "final" / "weights.safetensors" for name in ("run", "same"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
+    arm = ["--arm", UR5E, "--scenes", "validation"]
+    out = tmp_path / "results.json"
+    run("evaluate", *arm, "--baselines", "straight", "plan_motion", "--n-scenes", 4, "--json", out)
+    assert out.is_file()
+    filmed = not_filmed(monkeypatch)
+    run("play", *arm, "--n-scenes", 1, "--video", tmp_path / "b.mp4")
+    assert filmed == [str(UR5E)]
+
+
+GOOD, GONE = "print('fine')", "import no_such_module"
+EXTRA = ("torch", "stable_baselines3", "sb3_contrib", "tyro", "rich", "matplotlib", "safetensors")
+
+
+def report(capsys, *words):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["doctor", *words])
+    return end.value.code, capsys.readouterr().out
+
+
+def test_all_is_well_here(capsys, tmp_path):
+    code, printed = report(capsys, "--out", str(tmp_path / "runs"))
+    assert (code, "MISSING" in printed) == (0, False)
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "exit_code", "remedy"), [("MuJoCo engine", 1, "'mujoco>=4'"), ("OpenGL", 0, "libegl1")]
+)
+def test_what_is_missing_is_named_with_the_remedy(name, exit_code, remedy, capsys, monkeypatch):
+    checks = {each: check._replace(script=GOOD) for each, check in doctor.CHECKS.items()}
+    checks[name] = checks[name]._replace(script=GONE)
+    monkeypatch.setattr(doctor, "CHECKS", checks)
+    code, printed = report(capsys)
+    assert code == exit_code
+    assert "no_such_module" in printed
+    assert remedy in printed
+
+
+def test_a_crash_and_a_hang_end_no_report(monkeypatch):
+    assert not doctor.outcome("import os; os.abort()")[0]
+    monkeypatch.setattr(doctor, "PATIENCE", 0.2)
+    assert not doctor.outcome("import time; time.sleep(60)")[0]
+
+
+def test_runs_need_a_folder_that_can_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    assert doctor.outcome(doctor.FOLDER, str(tmp_path / "a" / "b"))[0]
+    for nowhere in (tmp_path / "file" / "runs", "/proc", "/proc/runs"):
+        works, said = doctor.outcome(doctor.FOLDER, str(nowhere))
+        assert not works
+        assert said.endswith("cannot be written")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def ran(words, folder):
+    """Run the command where a folder comes first on the path of Python."""
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join((str(folder), os.environ.get("PYTHONPATH", "")))}
+    script = f"import sys; sys.argv[1:] = {words}; from viapoint.training.cli.entry import main; main()"
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=env)
+
+
+@pytest.mark.parametrize(("words", "code"), [(["train"], 2), (["--help"], 2), (["doctor"], 1)])
+def test_without_the_extra_everything_says_what_to_install(words, code, tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys\n"
+        "class Blocked:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name.partition('.')[0] in {EXTRA}:\n"
+        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
+        "sys.meta_path.insert(0, Blocked())\n"
+    )
+    failed = ran(words, tmp_path)
+    assert failed.returncode == code
+    assert "pip install 'viapoint[training]'" in failed.stdout + failed.stderr
+    assert code == 1 or len(failed.stderr.splitlines()) == 1

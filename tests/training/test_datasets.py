@@ -6,6 +6,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from tasks import JUMPS, MOVING, PLANE, SENSED, STEP
 
 from viapoint.training.cli import entry as cli
 from viapoint.training.planning.baselines import make_method
@@ -13,8 +14,8 @@ from viapoint.training.rollouts.datasets import record_dataset
 
 minari = pytest.importorskip("minari")
 
-PLANE = "viapoint/PlanarObstacles-v0"
 CUSTOM = "test/TwoPosts-v0"
+UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 
 
 @pytest.fixture(autouse=True)
@@ -61,11 +62,12 @@ def assert_replays(dataset):
     [
         (PLANE, ()),
         ("search16", ("--env", PLANE, "--env-kwargs", "n_obstacles=[1,3]")),
-        ("random", ("--env", "viapoint/PlanarObstaclesStep-v0")),
-        ("viapoint/PlanarMovingObstacles-v0", ()),
-        ("straight", ("--env", "viapoint/PlanarTargetJump-v0")),
+        ("random", ("--env", STEP)),
+        (MOVING, ()),
+        ("straight", ("--env", JUMPS)),
         ("straight", ("--arm", "panda")),
         ("random", ("--env", CUSTOM)),
+        ("straight", ("--env", "viapoint/Reach-v0", "--arm", UR5E)),
     ],
 )
 def test_a_dataset_replays_bit_for_bit(method, words, capsys):
@@ -76,17 +78,17 @@ def test_a_dataset_replays_bit_for_bit(method, words, capsys):
     assert_replays(dataset)
 
 
-def test_an_arm_of_a_file_is_found_again():
-    arm = Path(__file__).parents[2] / "docs" / "ur5e.xml"
-    record("straight", "--arm", arm, "--env", "viapoint/Reach-v0", "--episodes", 1, "--dataset", "own-v0")
-    assert_replays(minari.load_dataset("own-v0"))
-
-
 def test_episodes_are_those_of_the_method_and_have_names_by_default(folder):
     record("straight", "--env", PLANE, "--episodes", 2)
     dataset = minari.load_dataset("viapoint/PlanarObstacles/straight-v0")
     assert (folder / "viapoint/PlanarObstacles/straight-v0/data").is_dir()
     assert [np.abs(episode.actions).max() for episode in dataset.iterate_episodes()] == [0.0, 0.0]
+    record("thick:search4", "--env", SENSED, "--episodes", 1)
+    assert minari.load_dataset("viapoint/PlanarSensed/thick-search4-v0").total_episodes == 1
+
+
+NAMES = "../name-v0", "t/a-v0", "name", "group//name-v0", "a b-v0", ""
+"""Names that no dataset can have."""
 
 
 @pytest.mark.parametrize(
@@ -95,12 +97,9 @@ def test_episodes_are_those_of_the_method_and_have_names_by_default(folder):
         (("straight",), "--env"),
         (("nothing", "--env", PLANE), "baseline must be"),
         (("plan_motion", "--env", PLANE), "no actions"),
-        (("straight", "--env", "viapoint/PlanarObstaclesStep-v0"), "random"),
+        (("straight", "--env", STEP), "random"),
         (("straight", "--env", PLANE, "--episodes", 0), "episodes"),
-        *(
-            (("straight", "--env", PLANE, "--dataset", name), "group/name-v0")
-            for name in ("../name-v0", "t/a-v0", "name", "group//name-v0", "a b-v0", "")
-        ),
+        *((("straight", "--env", PLANE, "--dataset", name), "group/name-v0") for name in NAMES),
         ((PLANE, "--env-kwargs", "n_via=2"), "env_kwargs"),
     ],
 )
@@ -109,18 +108,13 @@ def test_what_cannot_be_recorded_is_told_before_anything_is(words, told, failed,
     assert not folder.exists()
 
 
-def test_a_dataset_is_never_replaced():
-    method = make_method("straight", PLANE)
-    record_dataset("same-v0", PLANE, {}, method, 1)
-    with pytest.raises(ValueError, match="exists"):
-        record_dataset("same-v0", PLANE, {}, method, 1)
-
-
 @pytest.mark.parametrize("error", [OSError("No space left on device"), KeyboardInterrupt()])
 def test_a_dataset_that_cannot_be_written_leaves_nothing(error, folder, monkeypatch):
     method = make_method("straight", PLANE)
     record_dataset("group/kept-v0", PLANE, {}, method, 1)
     before = sorted(folder.rglob("*"))
+    with pytest.raises(ValueError):  # a dataset is never replaced
+        record_dataset("group/kept-v0", PLANE, {}, method, 1)
 
     def full(*_):
         raise error
@@ -132,11 +126,6 @@ def test_a_dataset_that_cannot_be_written_leaves_nothing(error, folder, monkeypa
                 record_dataset(name, PLANE, {}, method, 1)
     assert sorted(folder.rglob("*")) == before
     record_dataset("group/new-v0", PLANE, {}, method, 1)
-
-
-def test_a_name_by_default_is_one_that_minari_allows():
-    record("thick:search4", "--env", "viapoint/PlanarSensed-v0", "--episodes", 1)
-    assert minari.load_dataset("viapoint/PlanarSensed/thick-search4-v0").total_episodes == 1
 
 
 def test_without_the_library_its_extra_is_named(monkeypatch, failed):

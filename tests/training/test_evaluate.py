@@ -1,26 +1,28 @@
-"""Every method meets the same scenes, and the figures are what their names say."""
+"""Agents and baselines are measured in the same scenes, and figures, intervals and tables are what they say."""
 
+import io
+import itertools
 import json
+import math
+from statistics import NormalDist
 
 import numpy as np
+import pandas as pd
 import pytest
+from PIL import Image
 from stable_baselines3.common.vec_env import VecNormalize
+from tasks import MOVING, REACH
+from tasks import PLANE as ENV
 
+from viapoint.training import ViaVecEnv, evaluate
 from viapoint.training.agents.agent import PPO
-from viapoint.training.evaluation.evaluator import (
-    SLOW_DECISION,
-    MethodResult,
-    evaluate,
-    evaluate_methods,
-)
+from viapoint.training.evaluation import report, statistics
+from viapoint.training.evaluation.evaluator import SLOW_DECISION, MethodResult, evaluate_methods
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
+from viapoint.training.plotting import plots
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.scene_sets import BANDS, drawn
-
-ENV, MOVING = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
-
 
 ZEROS = np.zeros((40, 3))
 
@@ -77,7 +79,7 @@ def test_every_method_meets_the_same_scenes(small_scenes, solutions):
     assert len(record["outcomes"]["a"]["action"]) == 40
 
 
-@pytest.mark.parametrize("env_id", ["viapoint/PlanarReach-v0", "viapoint/PlanarReachStep-v0", MOVING])
+@pytest.mark.parametrize("env_id", [REACH, "viapoint/PlanarReachStep-v0", MOVING])
 def test_a_model_of_normalised_observations_sees_such_ones(env_id, monkeypatch):
     env = VecNormalize(ViaVecEnv(env_id, 8, seed=0, threads=1), norm_reward=False)
     model = PPO("MultiInputPolicy", env, n_steps=2, batch_size=16, seed=0).learn(16)
@@ -200,13 +202,133 @@ def test_decisions_are_timed_one_by_one_and_slow_ones_by_the_batch(small_scenes,
 
 
 def test_every_decision_of_an_episode_is_timed_where_plans_are_revised():
-    env_id = "viapoint/PlanarMovingObstacles-v0"
-    frozen = drawn("test", registered_task(env_id), 4)
-    (result,) = evaluate_methods([make_method("straight", env_id)], frozen, env_id).results
+    frozen = drawn("test", registered_task(MOVING), 4)
+    (result,) = evaluate_methods([make_method("straight", MOVING)], frozen, MOVING).results
     assert len(result.decision_times) == result.outcomes["decisions"].sum() - 1 > 4
 
 
+@pytest.fixture(scope="module")
+def record(small_scenes):
+    return run([Given("still [bold]", ZEROS), make_method("search32", ENV)], small_scenes).to_dict()
+
+
+def test_the_document_holds_every_method_and_metric(record, tmp_path):
+    report.write(record, tmp_path / "new")
+    document, data = (tmp_path / "new" / f"table.{suffix}" for suffix in ("md", "json"))
+    lines = [line for line in document.read_text().splitlines() if line.startswith("|")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert {len(line) for line in cells} == {len(cells[0])}
+    assert [line[0] for line in cells[2:]] == ["still [bold]", "search32"]
+    summary = record["methods"]["search32"]
+    search = dict(zip(cells[0], cells[3], strict=True))
+    assert search["success"] == f"{100 * summary['success']['rate']:.1f} %"
+    assert search["clearance [mm]"] == f"{1e3 * summary['min_clearance']:.1f}"
+    assert json.loads(data.read_text()) == record
+    assert record["sha256"][:12] in document.read_text()
+    rate = summary["success"]["rate"]
+    csv = pd.read_csv(io.StringIO(report.formatted(record, "csv"))).set_index("method")
+    assert csv["success rate"]["search32"] == rate
+    parsed = json.loads(report.formatted(record, "json"))
+    assert parsed["methods"]["search32"]["success"]["rate"] == rate
+    assert f"{100 * rate:.1f} %" in report.formatted(record, "table")
+
+
+@pytest.mark.parametrize("number", [1, 12])
+def test_the_table_fits_a_terminal_of_80_columns(record, number):
+    (summary, *_) = record["methods"].values()
+    names = [f"untrained, {16 * i} checks" for i in range(number)]
+    shown = report.text({**record, "methods": dict.fromkeys(names, summary)})
+    assert max(map(len, shown.splitlines())) <= 80
+    assert shown.count("untrained") == number
+
+
 def test_fewer_scenes_than_asked_for_are_told(small_scenes, capsys):
-    result = evaluate(Given("a", ZEROS), env=ENV, scenes=small_scenes, n_scenes=50, time_decisions=False)
+    baselines = ["straight"]
+    result = evaluate(env=ENV, scenes=small_scenes, n_scenes=50, baselines=baselines, time_decisions=False)
     assert len(result.results[0].success) == 40
     assert "40 scenes, not 50" in capsys.readouterr().err
+
+
+def test_pictures_are_drawn(record, tmp_path):
+    rates = ({"rate": r, "low": r - 0.1, "high": r + 0.1} for r in (0.2, 0.5, 0.9))
+    curve = [{"decisions": 10 * i, "seconds": float(i), "success": rate} for i, rate in enumerate(rates)]
+    line = plots.learning_curve(tmp_path / "a" / "curve.png", curve)
+    bars = plots.success_by_band(tmp_path / "bars.png", record)
+    for path in (line, bars):
+        assert np.asarray(Image.open(path).convert("L")).std() > 5.0
+
+
+def test_wilson_equals_published_values():
+    # Newcombe 1998, Stat. Med. 17, 857-872, table I, method 3
+    for successes, trials, low, high in (
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (1, 29, 0.0061, 0.1718),
+    ):
+        interval = statistics.wilson(successes, trials)
+        assert (round(interval.low, 4), round(interval.high, 4)) == (low, high)
+    assert statistics.wilson(0, 20).low == 0.0
+    assert round(statistics.wilson(0, 20).high, 4) == 0.1611
+
+
+def test_mcnemar_counts_scenes_in_which_one_alone_succeeds():
+    first, second = np.random.default_rng(0).random((2, 80)) < [[0.7], [0.5]]
+    result = statistics.mcnemar(first, second)
+    assert result["difference"] == pytest.approx(first.mean() - second.mean())
+    alone = (first & ~second).sum(), (second & ~first).sum()
+    assert (result["only_first"], result["only_second"]) == alone
+    assert list(statistics.mcnemar(first, first).values()) == [0.0, 0, 0, 1.0]
+    assert statistics.mcnemar([True] * 5, [False] * 5)["p_value"] == pytest.approx(2 / 2**5)
+
+
+def test_across_seeds_draws_whole_agents():
+    """Three agents, each the same in all scenes: all 27 draws of three of them can be written down."""
+    rates = np.array([0.2, 0.5, 0.6])
+    scores = np.repeat(rates[:, None], 40, axis=1)
+    interval = statistics.across_seeds(scores, np.zeros(40), np.random.default_rng(0), samples=20_000)
+    draws = sorted(np.mean(each) for each in itertools.product(rates, repeat=3))
+    assert interval.estimate == pytest.approx(rates.mean())
+    assert interval.low == pytest.approx(draws[0])  # one draw of 27 is more than 2.5 %
+    assert interval.high == pytest.approx(draws[-1])
+    trimmed = statistics.across_seeds(
+        np.array([[0.0], [0.5], [0.6], [0.7], [1.0]]), [0], np.random.default_rng(0)
+    )
+    assert trimmed.estimate == pytest.approx(0.6)
+
+
+def test_across_seeds_draws_scenes_within_their_strata():
+    success = np.random.default_rng(0).random(400) < 0.7
+    one = statistics.across_seeds(success[None], np.zeros(400), np.random.default_rng(1), samples=4000)
+    half = 1.96 * math.sqrt(success.mean() * (1 - success.mean()) / 400)
+    assert one.high - one.low == pytest.approx(2 * half, rel=0.1)
+    score = np.where(success, 0.9, 0.2)
+    known = statistics.across_seeds(score[None], success, np.random.default_rng(1))
+    assert known == pytest.approx((score.mean(),) * 3)  # within a stratum all are alike
+
+
+def test_across_seeds_covers_the_truth():
+    """Agents of different worth in scenes of different difficulty: other agents and scenes are foreseen."""
+    generator = np.random.default_rng(5)
+    covered = 0
+    for _ in range(100):
+        worth, ease = generator.normal(1.0, 0.5, (8, 1)), generator.normal(0.0, 1.0, (1, 100))
+        scores = generator.normal(size=(8, 100)) < worth + ease
+        interval = statistics.across_seeds(scores, np.zeros(100), generator, samples=200)
+        truth = NormalDist().cdf(1.0 / math.sqrt(1.0 + 0.25 + 1.0))
+        covered += interval.low <= truth <= interval.high
+    assert covered >= 85
+
+
+def test_across_seeds_without_any_spread_is_wilsons():
+    for value in (0.0, 1.0):
+        interval = statistics.across_seeds(np.full((5, 20), value), np.zeros(20), np.random.default_rng(0))
+        assert interval == statistics.wilson(int(20 * value), 20)
+    strata = np.arange(20) < 5
+    interval = statistics.across_seeds(np.tile(strata, (3, 1)), strata, np.random.default_rng(0))
+    assert interval == statistics.wilson(5, 20)
+
+
+def test_spl_by_its_formula():
+    assert statistics.success_weighted_path_length([1, 1, 0, 1], [1, 1, 1, 2], [1, 2, 1, 1]) == pytest.approx(
+        2.5 / 4
+    )

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from tasks import JUMPS, PANDA, REACH, STEP
+from tasks import PLANE as OBSTACLES
 
 from viapoint.envs.geometry.obstacles import POSE_SIZE
-from viapoint.training.agents.extractors import SceneExtractor
-from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training import SceneExtractor, ViaVecEnv
 
-REACH, OBSTACLES, STEP = (
-    f"viapoint/{name}-v0" for name in ("PlanarReach", "PlanarObstacles", "PlanarObstaclesStep")
-)
 ENDS = 7
 """Features of start and goal: middle and line of both, and their distance."""
 
@@ -36,13 +34,16 @@ def turned(vectors, turn):
     return result
 
 
-@pytest.mark.parametrize("env_id", [REACH, OBSTACLES, STEP])
+@pytest.mark.parametrize("env_id", [REACH, OBSTACLES, STEP, PANDA, JUMPS])
 def test_features_are_as_many_as_stated_and_of_size_one(env_id):
+    """Also where the hand is at the goal, as it may be after the last step of an episode."""
     extractor, observation = observed(env_id)
-    features = extractor(observation)
-    assert features.shape == (16, extractor.features_dim)
-    assert torch.isfinite(features).all()
-    assert features.abs().max() < 10.0
+    for seen in (observation, {**observation, "hand": observation["goal"]}):
+        for dtype in (torch.float64, torch.float32):
+            features = extractor.to(dtype)({name: part.to(dtype) for name, part in seen.items()})
+            assert features.shape == (16, extractor.features_dim)
+            assert torch.isfinite(features).all()
+            assert features.abs().max() < 10.0
 
 
 @pytest.mark.parametrize("env_id", [OBSTACLES, STEP])
@@ -65,17 +66,6 @@ def test_every_obstacle_that_is_there_matters_and_no_other():
         after = extractor({**observation, "obstacles": moved.flatten(1)})
         different = ((after - before).abs() > 1e-9).any(dim=-1)
         assert (different == present[:, row]).all()
-
-
-@pytest.mark.parametrize(
-    "env_id", [REACH, OBSTACLES, STEP, "viapoint/PandaObstacles-v0", "viapoint/PlanarTargetJump-v0"]
-)
-def test_features_are_finite_where_the_hand_is_at_the_goal(env_id):
-    """As it may be after the last step of an episode."""
-    extractor, observation = observed(env_id, 4)
-    there = {**observation, "hand": observation["goal"]}
-    assert torch.isfinite(extractor(there)).all()
-    assert torch.isfinite(extractor.float()({name: part.float() for name, part in there.items()})).all()
 
 
 def test_a_turn_about_the_base_changes_only_the_features_of_start_and_goal():

@@ -6,24 +6,18 @@ import dataclasses
 import frozen_scenes as make
 import numpy as np
 import pytest
+from tasks import MOVING, REACH
+from tasks import PLANE as ENV
 
-from viapoint.envs import Task
-from viapoint.envs.registration import ENV_IDS, twin_of
+from viapoint.envs import ENV_IDS, Task
+from viapoint.envs.registration import twin_of
 from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training import scene_sets
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.scene_sets import (
-    BANDS,
-    SETS,
-    load,
-    scenes_for,
-    shipped_path,
-    shipped_set,
-)
+from viapoint.training.scene_sets import BANDS, SETS, drawn, load, scenes_for, shipped_path, shipped_set
 
-ENV, REACH = "viapoint/PlanarObstacles-v0", "viapoint/PlanarReach-v0"
 SHIPPED = sorted(shipped_path("test", ENV).parent.glob("*.npz"))
 
 
@@ -118,7 +112,7 @@ def test_frozen_scenes_are_met_where_they_fit(kwargs, capsys):
         (ENV, {"n_obstacles": 3}, 3),
         (ENV, {"arm": "panda"}, 5),
         ("viapoint/Obstacles-v0", {"arm": "planar"}, 16),
-        ("viapoint/PlanarMovingObstacles-v0", {"n_obstacles": 2}, 2),
+        (MOVING, {"n_obstacles": 2}, 2),
     ],
 )
 def test_others_are_drawn_always_the_same_and_it_is_said(env_id, kwargs, rows, capsys):
@@ -146,16 +140,18 @@ def test_a_file_is_met_wherever_its_scenes_are_possible(some, tmp_path):
 
 
 def refused(path):
-    with pytest.raises(ValueError) as error:
+    with pytest.raises(ValueError):
         load(path)
-    assert path.name in str(error.value)
 
 
 def test_a_file_comes_back_as_it_was_and_any_damage_is_noticed(some, tmp_path, monkeypatch):
     path = tmp_path / "some.npz"
     refused(path)
-    some.save(path)
-    assert load(path).sha256 == some.sha256
+    for frozen in (drawn("validation", registered_task(MOVING, courses="reaches"), 5), some):
+        frozen.save(path)
+        again = load(path)
+        assert again.sha256 == frozen.sha256
+        np.testing.assert_array_equal(again.scenes.reach, frozen.scenes.reach)
     whole = path.read_bytes()
     np.save(tmp_path / "one.npy", np.zeros(3))
     for content in (b"", b"no archive", b"PK", whole[: len(whole) // 2], (tmp_path / "one.npy").read_bytes()):
@@ -174,8 +170,6 @@ FORGED = [
     ("share", lambda share: share[:3]),
     ("share", lambda share: share + 9.0),
     ("start", lambda start: start * np.nan),
-    ("goal", lambda goal: goal.astype(complex)),
-    ("kind", lambda kind: kind[:, :0]),
     ("kind", lambda kind: kind + 9),
     ("centre", lambda centre: centre[..., :2]),
     ("family", lambda family: np.arange(len(family))),

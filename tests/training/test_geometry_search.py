@@ -3,18 +3,18 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from tasks import JUMPS, MOVING, PANDA, PLANE, REACH, WHOLE
 
 from viapoint import primitives
-from viapoint.envs import Cylinder
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
+from viapoint.training import GeometrySearch
 from viapoint.training.planning import search as search_module
 from viapoint.training.planning.baselines import make_method
-from viapoint.training.planning.movements import INSTANTS, table_with
+from viapoint.training.planning.movements import INSTANTS, OUTSIDE, table_with
 from viapoint.training.planning.problem import Problem, moves_of, worth_of
 from viapoint.training.planning.search import (
     CLEARANCE_MARGIN,
     INFEASIBLE,
-    GeometrySearch,
     merits,
     plan_clearances,
     refined_actions,
@@ -22,28 +22,13 @@ from viapoint.training.planning.search import (
 from viapoint.training.rollouts.rollout import SceneSimulation
 from viapoint.training.scene_sets import scenes_for
 
-PLANE, WHOLE_ARM, PANDA = (
-    f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarWholeArm", "PandaObstacles")
-)
-MOVING = "viapoint/PlanarMovingObstacles-v0"
-AMONG_OBSTACLES = (PLANE, WHOLE_ARM, PANDA)
+AMONG_OBSTACLES = (PLANE, WHOLE, PANDA)
 
 
-def made(env_id, number=16, **kwargs):
+def drawn(env_id, number=16, **kwargs):
     env = gym.make_vec(env_id, num_envs=number, **kwargs).unwrapped
     observation, _ = env.reset(seed=1)
     return env, observation, Problem.of_observation(observation, env.task)
-
-
-@pytest.mark.parametrize("env_id", AMONG_OBSTACLES)
-def test_what_the_search_holds_for_clear_is_clear_when_executed(env_id):
-    simulation = SceneSimulation(env_id)
-    scenes = scenes_for("validation", simulation.task, 200).take(slice(200)).scenes
-    problem = Problem.of_scenes(scenes, simulation.task)
-    actions = GeometrySearch(simulation.task, n_checks=256).solve(problem)
-    clear = plan_clearances(simulation.task, problem, actions[:, None], 0.0, 0.0, exact=True)[:, 0] >= 0.0
-    assert clear.mean() > 0.7
-    np.testing.assert_array_equal(simulation(scenes, actions).success[clear], True)
 
 
 def random_actions(task, *shape, seed=0):
@@ -60,7 +45,7 @@ def decoded(task, problem, actions):
 @pytest.mark.parametrize("n_via", [0, 1, 2, 3])
 @pytest.mark.parametrize("env_id", [PLANE, PANDA])
 def test_planned_movements_are_nearly_those_of_the_environment(env_id, n_via, timing):
-    env, _, problem = made(env_id, 6, n_via=n_via, timing=timing)
+    env, _, problem = drawn(env_id, 6, n_via=n_via, timing=timing)
     actions = random_actions(env.task, 6, 20)
     plan = decoded(env.task, problem, actions)
     moves = moves_of(env.task, problem, actions)
@@ -75,25 +60,26 @@ def test_planned_movements_are_nearly_those_of_the_environment(env_id, n_via, ti
 
 @pytest.mark.parametrize("env_id", AMONG_OBSTACLES)
 def test_what_is_planned_to_be_clear_succeeds(env_id):
-    env, observation, problem = made(env_id, 64, threads=1)
-    actions = GeometrySearch(env.task, 128).decide(observation)
-    actions[::4] = random_actions(env.task, 16)  # some touch something
-    clearance = plan_clearances(env.task, problem, actions[:, None], 0.1, -0.1)[:, 0]
+    env, observation, problem = drawn(env_id, 200, threads=1)
+    actions = GeometrySearch(env.task, 256).decide(observation)
+    actions[::4] = random_actions(env.task, 50)  # some touch something
+    clearance = plan_clearances(env.task, problem, actions[:, None], 0.1, -0.1, exact=True)[:, 0]
     worth = worth_of(env.task, problem, moves_of(env.task, problem, actions[:, None]))[:, 0]
     decision = env.execute_actions(actions)
+    success = decision.info["is_success"]
+    assert success[clearance >= 0.0].all()
     # Spheres are up to 5 mm outside the arm, so that a movement may touch a sphere but not the arm.
-    success, near = decision.info["is_success"], (clearance > -0.006) & (clearance < 0.003)
-    np.testing.assert_array_equal((clearance > 0.0)[~near], success[~near])
-    assert 8 < success.sum() < 64
+    assert not success[(clearance < -0.006) & (clearance > OUTSIDE)].any()
+    assert 100 < success.sum() < 200
     low, high = CLEARANCE_RANGE
     expected = worth + env.task.weights.clearance * np.clip(clearance, low, high) / CLEARANCE_UNIT
     kept = success & (decision.info["stretch"] == 1.0)
     assert np.median(np.abs(expected - decision.reward)[kept]) < 0.02
 
 
-@pytest.mark.parametrize("env_id", [*AMONG_OBSTACLES, MOVING, "viapoint/PlanarReach-v0"])
+@pytest.mark.parametrize("env_id", [*AMONG_OBSTACLES, MOVING, REACH])
 def test_looking_at_the_most_promising_plans_first_finds_the_best(env_id):
-    env, _, problem = made(env_id)
+    env, _, problem = drawn(env_id)
     actions = random_actions(env.task, 16, 200)
     found = merits(env.task, problem, actions)
     clearance = plan_clearances(env.task, problem, actions, CLEARANCE_RANGE[1], CLEARANCE_MARGIN)
@@ -124,7 +110,7 @@ def test_tables_hold_the_movements_of_the_primitives(n_via):
 
 @pytest.mark.parametrize("env_id", AMONG_OBSTACLES)
 def test_more_checks_never_give_a_worse_plan(env_id):
-    env, observation, problem = made(env_id)
+    env, observation, problem = drawn(env_id)
     before = np.full(16, 3.0 * INFEASIBLE)
     for more in ({"n_checks": 1}, {"n_checks": 16}, {"n_checks": 64}, {"n_checks": 64, "refinements": 3}):
         actions = GeometrySearch(env.task, **more).decide(observation)
@@ -137,7 +123,7 @@ def test_more_checks_never_give_a_worse_plan(env_id):
 
 @pytest.mark.parametrize("env_id", [*AMONG_OBSTACLES, MOVING])
 def test_a_decision_depends_on_its_scene_alone(env_id):
-    env, observation, _ = made(env_id, 40)
+    env, observation, _ = drawn(env_id, 40)
     search = GeometrySearch(env.task, 64, refinements=2, per_round=16)
     together = search.decide(observation)
     for row in (0, 17, 39):
@@ -149,29 +135,15 @@ def test_a_decision_depends_on_its_scene_alone(env_id):
     assert (np.abs(together) <= 1.0).all()
 
 
-@pytest.mark.parametrize("env_id", [PLANE, PANDA])
-def test_the_order_of_obstacles_does_not_matter(env_id):
-    env, observation, problem = made(env_id)
-    actions = random_actions(env.task, 16, 20)
-    rows = env.task.observation.rows(observation["obstacles"])
-    mixed = {**observation, "obstacles": rows[:, ::-1].reshape(observation["obstacles"].shape)}
-    again = Problem.of_observation(mixed, env.task)
-    np.testing.assert_allclose(
-        plan_clearances(env.task, problem, actions, 0.1, -0.1),
-        plan_clearances(env.task, again, actions, 0.1, -0.1),
-        atol=1e-6,
-    )
-
-
 @pytest.mark.parametrize(
     ("env_id", "name", "number", "least"),
     [
-        ("viapoint/PlanarReach-v0", "search16", 100, 1.0),
+        (REACH, "search16", 100, 1.0),
         (PLANE, "search512", 100, 0.9),
-        (WHOLE_ARM, "search512", 100, 0.85),
+        (WHOLE, "search512", 100, 0.85),
         ("viapoint/PandaReach-v0", "search16", 100, 0.95),
         (PANDA, "search512", 100, 0.85),
-        ("viapoint/PlanarTargetJump-v0", "search64", 30, 0.95),
+        (JUMPS, "search64", 30, 0.95),
         (MOVING, "search512", 40, 0.9),
         ("viapoint/PandaMovingObstacles-v0", "search64", 16, 0.7),
     ],
@@ -185,16 +157,8 @@ def test_the_search_succeeds(env_id, name, number, least):
     assert done.success.mean() >= least
 
 
-@pytest.mark.parametrize(("duration", "component"), [(0.05, 1.0), (2.0, -1.0)])
-def test_movements_take_the_time_of_the_greatest_reward(duration, component):
-    env, observation, _ = made("viapoint/PlanarReach-v0", 4, reward_weights={"duration": duration})
-    actions = GeometrySearch(env.task, 16).decide(observation)
-    np.testing.assert_allclose(actions[:, 2], component, atol=0.15)
-    assert (GeometrySearch(env.task, 1).decide(observation) == 0.0).all()
-
-
 def test_exactly_the_stated_number_of_plans_is_checked(monkeypatch):
-    env, observation, _ = made(PLANE, 4)
+    env, observation, _ = drawn(PLANE, 4)
     counted = []
 
     def counting(task, problem, actions, setting=None):
@@ -209,7 +173,7 @@ def test_exactly_the_stated_number_of_plans_is_checked(monkeypatch):
 
 
 def test_a_plan_that_stays_clear_is_kept():
-    env, observation, _ = made(MOVING, 64)
+    env, observation, _ = drawn(MOVING, 64)
     observation, *_ = env.step(0.3 * random_actions(env.task, 64).astype(np.float32))
     problem = Problem.of_observation(observation, env.task)
     actions = GeometrySearch(env.task, 64).decide(observation)
@@ -220,19 +184,10 @@ def test_a_plan_that_stays_clear_is_kept():
     assert (actions[under_way & (clearance > 0.003)] == 0.0).all(axis=-1).mean() > 0.9
 
 
-def test_a_plan_may_have_no_obstacles_or_more_than_the_task():
-    search = GeometrySearch("viapoint/PlanarReach-v0", 32)
-    plan = search.plan((-0.2, 0.3), (0.1, 0.4))
-    np.testing.assert_allclose(plan.waypoints[1], (-0.05, 0.35), atol=1e-6)
-    search = GeometrySearch(PLANE, 64)
-    post = Cylinder(0.03, 0.1, position=(-0.05, 0.35, 0.0))
-    assert np.abs(search.plan((-0.2, 0.3), (0.1, 0.4), [post]).waypoints[1] - (-0.05, 0.35)).max() > 0.03
-
-
 @pytest.mark.parametrize("kwargs", [{}, {"n_via": 2, "timing": "learned"}])
-@pytest.mark.parametrize("env_id", [WHOLE_ARM, PANDA])
+@pytest.mark.parametrize("env_id", [WHOLE, PANDA])
 def test_refined_actions_are_clear_more_often_and_keep_their_duration(env_id, kwargs):
-    env, _, problem = made(env_id, 24, **kwargs)
+    env, _, problem = drawn(env_id, 24, **kwargs)
     actions = random_actions(env.task, 24, 2)
     refined = refined_actions(env.task, problem, actions)
     at = env.task.n_via * env.task.action.dimension

@@ -2,7 +2,6 @@
 
 import json
 import re
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,9 @@ from viapoint.training.cli import entry as cli
 from viapoint.training.paper import obstacles, run
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.double_step import double_step, excess_cost
-from viapoint.training.paper.movements import Profile, construction, via_waypoints
-from viapoint.training.paper.one_via import passage_polynomial, roots_of
+from viapoint.training.paper.movements import construction, via_waypoints
 from viapoint.training.paper.run import DRAWINGS, ROWS
 
-GUIDE = Path(__file__).parents[2] / "docs" / "flash-hogan.md"
 FEWER = 9
 """Every ninth scene of the rows of lights, so that the search takes seconds."""
 
@@ -55,13 +52,12 @@ def test_every_number_is_as_promised(made):
 
 
 def test_the_guide_says_what_the_command_computes(made):
-    lines = [
-        line.strip("| ").split(" | ") for line in GUIDE.read_text().splitlines() if re.match(r"\| \d", line)
-    ]
+    text = (Path(__file__).parents[2] / "docs" / "flash-hogan.md").read_text()
+    lines = [line.strip("| ").split(" | ") for line in text.splitlines() if re.match(r"\| \d", line)]
     assert len(lines) >= 10
     claims = {(claim["row"], claim["claim"]): claim for claim in claims_of(made)}
-    for row, text, model, arm in lines:
-        claim = claims[int(row), text]
+    for row, words, model, arm in lines:
+        claim = claims[int(row), words]
         assert float(model) == pytest.approx(claim["model"], rel=1e-3)
         assert (arm == "-") == (claim["arm"] is None)
         if arm != "-":
@@ -87,26 +83,10 @@ def test_a_failed_claim_ends_the_command_with_code_1(tmp_path, monkeypatch, caps
     assert json.loads((tmp_path / "table.json").read_text())["holds"] is False
 
 
-def test_the_passage_polynomial_knows_the_symmetric_movement():
-    (root,) = roots_of(passage_polynomial((Fraction(1, 2), Fraction(1, 3)), (Fraction(1), Fraction(0))))
-    assert root == pytest.approx(0.5, abs=1e-15)
-
-
 def test_the_construction_is_undone():
     along, height = np.array([0.2, 0.9]), np.array([0.4, -0.3])
     found = construction(via_waypoints((0.1, -0.2), (0.4, 0.3), along, height))
     np.testing.assert_allclose(found, (along, abs(height)), atol=1e-14)
-
-
-def test_a_profile_finds_peaks_and_valley():
-    time = np.linspace(0.0, 1.0, 501)
-    speed = 1.0 - np.cos(4 * np.pi * time) * 0.8 - 0.1 * time
-    velocity = np.stack((speed, np.zeros_like(speed)), axis=-1)
-    profile = Profile(time, np.zeros((501, 2)), velocity, np.zeros((501, 2)))
-    assert profile.valley == pytest.approx(0.5, abs=2e-3)
-    assert profile.peaks[:, 0] == pytest.approx([0.25, 0.75], abs=2e-3)
-    assert 0.0 < profile.valley_depth < 0.2
-    assert np.isnan(profile.bend[0])
 
 
 @pytest.mark.parametrize("moment", [0.04, 0.2, 0.55])

@@ -9,15 +9,29 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import FlattenObservation, NormalizeObservation, RescaleAction
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecExtractDictObs, VecNormalize
+from tasks import JUMPS, MOVING, PANDA, REACH, SENSED, STEP
+from tasks import PLANE as ENV
 
-from viapoint.envs import Sphere, Task
-from viapoint.training import evaluate, load_agent
+from viapoint.envs import PointCloud, Pose, Sphere, Task, arm_of
+from viapoint.envs.geometry.obstacles import no_obstacles
+from viapoint.training import (
+    GeometrySearch,
+    Run,
+    TrainConfig,
+    ViaQ,
+    ViaRank,
+    ViaVecEnv,
+    evaluate,
+    load_agent,
+    plan_motion,
+    plan_motions,
+    train,
+)
 from viapoint.training.agents.agent import SAC, find_model
 from viapoint.training.agents.model_io import ALGORITHMS
-from viapoint.training.agents.viaq import ViaQ
-from viapoint.training.agents.viarank import ViaRank
 from viapoint.training.config.checks import ELSEWHERE
 from viapoint.training.config.configs import (
     DemoConfig,
@@ -26,7 +40,6 @@ from viapoint.training.config.configs import (
     PaperConfig,
     PlayConfig,
     StudyConfig,
-    TrainConfig,
     from_words,
 )
 from viapoint.training.evaluation import statistics
@@ -34,20 +47,12 @@ from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.benchmark import benchmark_planner
-from viapoint.training.planning.search import GeometrySearch
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.video import record_video
 from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import train
 from viapoint.training.scene_sets import load, scenes_for, shipped_path
 
-ENV, REACH, STEP = (
-    f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarReach", "PlanarObstaclesStep")
-)
-MOVING, SENSED = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarSensed-v0"
-CHANGING = MOVING, "viapoint/PlanarTargetJump-v0"
+CHANGING = MOVING, JUMPS
 STALLING = {"stop_when_stalled": 0.3}
 
 CONFIGURATIONS = [
@@ -68,7 +73,6 @@ CONFIGURATIONS = [
     (EvaluateConfig, {"baselines": ("ompl", "ompl"), "env": ENV}),
     *((EvaluateConfig, {"env": ENV, "checks": checks}) for checks in ((8,), ())),
     (EvaluateConfig, {"agent": ENV, "checks": (-1,)}),
-    (EvaluateConfig, {"agent": ENV, "n_scenes": 0}),
     (EvaluateConfig, {"agent": "runs/x", "pretrained": ENV}),
     (EvaluateConfig, {"pretrained": "nobody"}),
     (PlayConfig, {}),
@@ -76,7 +80,6 @@ CONFIGURATIONS = [
     (LiveConfig, {"port": 70_000}),
     (LiveConfig, {"env": "nothing"}),
     (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}),
-    (StudyConfig, {"file": "study.yaml", "workers": 0}),
     *((kind, {"out": ""}) for kind in (TrainConfig, DemoConfig, PaperConfig)),
     (EvaluateConfig, {"env": ENV, "json": ""}),
 ]
@@ -125,18 +128,10 @@ HYPERPARAMETERS = [
     *(("sac", {"train_freq": pair}) for pair in ([0, "step"], [1, "episode"])),
     *(("sac", {"policy_kwargs": values}) for values in ({"speed": 1}, {"net_arch": [-3]})),
     *(("td3", {"action_noise": {"kind": "normal", "sigma": sigma}}) for sigma in (-0.1, math.nan, "x")),
-    *(("td3", {name: -1}) for name in ("policy_delay", "target_policy_noise", "buffer_size")),
-    *(("ppo", {name: 0}) for name in ("n_steps", "clip_range")),
     *(("ppo", {name: 1.5}) for name in ("n_epochs", "gae_lambda")),
-    ("ppo", {"batch_size": 1}),
-    *(("viaq", {name: 0}) for name in ("temperature", "explore_candidates", "next_candidates")),
-    *(("viaq", {name: 1.5}) for name in ("explore_uniformly", "policy_kwargs")),
+    *(("ppo", values) for values in ({"batch_size": 1}, {"clip_range": 0})),
     *(("viaq", {name: 1}) for name in ("action_noise", "use_sde")),
     *(("viaq", {"policy_kwargs": {"width": value}}) for value in (0, 128.0, "wide")),
-    *(
-        ("viaq", {"policy_kwargs": {name: -1}})
-        for name in ("candidates", "instants", "refinements", "checks")
-    ),
     *(("viaq", {"policy_kwargs": {name: 3}}) for name in ("optimizer_kwargs", "task", "heads")),
 ]
 UNTRAINABLE = [
@@ -167,6 +162,30 @@ def predicted(**changes):
     return agent().predict({**observation, **changes})
 
 
+def sensed(**changes):
+    return ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1)).predict(
+        {**ViaVecEnv(SENSED, 2, seed=0).reset(), **changes}
+    )
+
+
+def revising(**changes):
+    return ViaQ("ViaQPolicy", ViaVecEnv(MOVING, 1), **changes)
+
+
+PANDA_ARM = arm_of("panda")
+
+
+def moved(**changes):
+    given = {"arm": PANDA_ARM, "start": PANDA_ARM.home, "goal": PANDA_ARM.home + 0.1}
+    return plan_motion(**{**given, **changes})
+
+
+def many_points():
+    """Return more points than a scene of the physics may have, far from the arm."""
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (300, 3))
+    return PointCloud(points, 0.01, position=(0.0, -0.8, 0.2))
+
+
 def scenes(number):
     return SceneSimulation(ENV, 1).task.sampler()([np.random.default_rng(0)] * number)
 
@@ -190,11 +209,9 @@ CALLS = [
     *(lambda name=name: make_method(name, ENV) for name in ("magic", "search", "search3", "sobol0", "unrevised")),
     *(lambda name=name: make_method(name, MOVING) for name in ("constant", "random16", "ompl")),
     lambda: SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2, replay_buffer_class=HerReplayBuffer),
-    *(lambda name=name: make_method(name, ENV) for name in ("search99999999999", "sobol65537")),
-    lambda: make_method("cautious99999999999", SENSED),
     lambda: benchmark_planner("search99999999999"),
     *(lambda more=more: GeometrySearch(ENV, **more) for more in (
-        {"n_checks": 10**6}, {"refinements": 10**9}, {"per_round": 10**9}, {"refinements": 64, "per_round": 2048},
+        {"n_checks": 10**6}, {"refinements": 64, "per_round": 2048}, {"n_checks": 1.5}, {"refinements": -1},
     )),
     *(lambda name=name, value=value: setattr(agent().policy, name, value) for name, value in (
         ("checks", -1), ("checks", 1.5), ("refine", True), ("candidates", 0), ("refinements", 10**9),
@@ -207,62 +224,71 @@ CALLS = [
     *(lambda given=given: evaluate(env=ENV, baselines=given) for given in (
         5, [3], [None], ["straight", "straight"], [Decides("a", ZERO), Decides("a", ZERO)],
     )),
-    lambda: evaluate(ENV, checks=[4, 4]),
-    *(lambda scenes=scenes: evaluate(ENV, scenes=scenes) for scenes in (5, None, ["test"])),
+    *(lambda checks=checks: evaluate(ENV, checks=checks) for checks in ([4, 4], [0, 1.5])),
+    *(lambda scenes=scenes: evaluate(ENV, scenes=scenes) for scenes in (5, None, ["test"], "nowhere.npz")),
     *(lambda given=given: evaluate(env=ENV, baselines=[Decides("a", given)], n_scenes=2) for given in (
         None, "left", ZERO[0], ZERO[:1], ZERO[:, :2], ZERO + math.nan, ZERO.astype(object),
     )),
-    lambda: evaluate(ENV, baselines=["unrevised"]),
     lambda: evaluate(baselines=["straight"]),
     lambda: evaluate(env=ENV, baselines=["untrained"]),
+    *(lambda name=name: make_method(name, ENV) for name in ("cautious64", "thick:search64")),
+    *(lambda name=name: make_method(name, SENSED) for name in (
+        "cautious0", "thin:search64", "thick:straight", "thick:cautious64", "thick:points:search64",
+    )),
     lambda: evaluate("nowhere"),
-    lambda: load_agent(Path(__file__)),
-    lambda: load_agent(Path(__file__).parent),
+    *(lambda path=path: load_agent(path) for path in (Path(__file__), Path(__file__).parent)),
     *(lambda wrap=wrap: evaluate(SAC("MlpPolicy", NormalizeObservation(wrap(FlattenObservation(gym.make(ENV))))))
       for wrap in (lambda env: env, Monitor)),
     lambda: evaluate(SAC("MlpPolicy", VecExtractDictObs(ViaVecEnv(ENV, 2), "goal"))),
     lambda: evaluate(SAC("MultiInputPolicy", RescaleAction(gym.make(ENV), np.float32(0), np.float32(1)))),
     lambda: evaluate(ENV, baselines="straight"),
-    lambda: evaluate(ENV, checks=[0, 1.5]),
     lambda: evaluate(ENV, n_scenes=0),
-    lambda: evaluate(ENV, scenes="nowhere.npz"),
-    *(lambda name=name, value=value: GeometrySearch(ENV, **{name: value})
-      for name, value in (("n_checks", 1.5), ("refinements", -1), ("per_round", True))),
-    lambda: plan(start=(0.1, 0.2, 0.3)),
-    lambda: plan(goal=(np.nan, 0.4)),
-    lambda: plan(goal=(0.9, 0.4)),
-    lambda: plan(goal=(-0.2, 0.3)),  # where it starts
-    lambda: plan(obstacles=[(0.0, 0.3, 0.1)]),
+    *(lambda goal=goal: plan(goal=goal) for goal in ((0.1, 0.2, 0.3), (0.9, 0.4), (-0.2, 0.3))),
     lambda: plan(obstacles=[Sphere(0.02, position=(-0.2, 0.3, 0.0), name="can")]),  # touches the arm
     lambda: agent().plan((-0.2, 0.3), (0.1, 0.4), [Sphere(0.01, position=(0.5, 0.1 * i, 0.0)) for i in range(9)]),
-    lambda: ViaQ("ViaQPolicy", ViaVecEnv(MOVING, 1)).plan((-0.2, 0.3), (0.1, 0.4)),
+    lambda: revising().plan((-0.2, 0.3), (0.1, 0.4)),
+    lambda: revising(policy_kwargs={"refine": 4}),
+    lambda: agent_method("agent", revising(), refine=4),
     lambda: agent().learn(8),  # loaded for decisions
     lambda: predicted(wind=np.zeros(2)),
     lambda: predicted(goal=np.array([np.nan, 0.3])),
     lambda: predicted(goal=gym.make(ENV).reset(seed=0)[0]["hand"]),
+    *(lambda changes=changes: sensed(**changes) for changes in (
+        {"ranges": np.full((2, 192), np.nan)}, {"ranges": np.ones((2, 100))},
+        {"points": np.ones((2, 576))}, {"obstacles": np.zeros((2, 3))},
+    )),
     lambda: ViaVecEnv("viapoint/Nothing-v0", 2),
     lambda: ViaVecEnv("CartPole-v1", 2),
     lambda: SceneSimulation("Nothing-v3"),
     lambda: load_agent("viapoint/Reach-v0"),
     lambda: Task.from_dict({**agent().get_env().get_attr("task")[0].as_dict(), "arm": "octopus"}),
-    *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, "Pendulum-v1")),
+    *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, SENSED)),
+    lambda: ViaQ("ViaQPolicy", make_vec_env("Pendulum-v1")),
     lambda: ViaQ("ViaQPolicy", VecNormalize(ViaVecEnv(ENV, 2))),
+    lambda: ViaRank("ViaRankPolicy", ViaVecEnv(ENV, 1)),
+    *(lambda labels=labels: ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1), labels=labels)
+      for labels in (100, "all")),
+    lambda: ViaRank("ViaRankPolicy", make_vec_env("Pendulum-v1")),
     lambda: ViaRank("ViaRankPolicy", VecNormalize(ViaVecEnv(SENSED, 2))),
-    lambda: load(Path("tests")),
+    *(lambda changes=changes: moved(**changes) for changes in (
+        {"start": PANDA_ARM.home[:6]}, {"goal": np.full(7, np.nan)}, {"goal": Pose((2.0, 0.0, 0.3))},
+        {"goal": {"position": (0.4, 0.3, 0.4), "angle": 3.0}}, {"arm": "robot"}, {"space": "hand"},
+        {"n_via": 4}, {"seeds": -1}, {"seeds": np.zeros((2, 3, 7))}, {"margin": -0.1}, {"rng": -1},
+        {"time_limit": np.nan}, {"duration": 0.0}, {"velocity": np.zeros(3)},
+        {"obstacles": [{"shape": "box"}]}, {"obstacles": no_obstacles(2)},
+    )),
+    *(lambda goals=goals: plan_motions(PANDA_ARM, 2 * [PANDA_ARM.home], goals, [[], []])
+      for goals in ([PANDA_ARM.home, np.zeros(3)], [PANDA_ARM.home])),
+    lambda: plan_motions(PANDA_ARM, [PANDA_ARM.home], [PANDA_ARM.home], [[]], threads=2.5),
+    lambda: moved(obstacles=[many_points()]).execute(force=True),
     lambda: scenes_for("tests", Task.of()),
     *(lambda env_id=env_id: scenes_for(shipped_path("validation", env_id), Task.of()) for env_id in CHANGING),
     *(lambda name=name: evaluate(env=ENV, baselines=["straight"], scenes=load(shipped_path("test", name)))
-      for name in ("viapoint/PandaObstacles-v0", *CHANGING)),
-    lambda: scenes_for("hard", Task.of(n_obstacles=3)),
-    lambda: scenes_for(shipped_path("test", ENV), Task.of(n_obstacles=1)),
-    lambda: scenes_for(shipped_path("test", ENV), Task.of(arm="panda")),
-    lambda: film("film.gif"),
-    lambda: film("film"),
-    lambda: film(mode=None),
-    lambda: film(number=0),
+      for name in (PANDA, *CHANGING)),
+    *(lambda changes=changes: film(**changes)
+      for changes in ({"path": "film.gif"}, {"mode": None}, {"number": 0})),
     lambda: plots.learning_curve("none.png", []),
-    lambda: statistics.wilson(5, 4),
-    lambda: statistics.wilson(-1, 4),
+    *(lambda successes=successes: statistics.wilson(successes, 4) for successes in (5, -1)),
 ]  # fmt: skip
 
 
@@ -322,22 +348,22 @@ COMMANDS = [
     ("train --n-timesteps 1e5", "--n-timesteps: must be a whole number, got '1e5'"),
     ("train --n-timesteps 16 --n-envs 16 --out=", "--out: must be a path, got ''"),
     ("train --env-kwargs n_vias=2 --out full", "did you mean 'n_via'"),
-    ("train --env-kwargs n_obstacles=999", "n_obstacles"),
     ("train --env-kwargs n_via", "n_via"),
     ("train --env-kwargs num_envs=4", "--n-envs"),
-    ("train --hyperparameters gamma=7 --out new", "gamma"),
     ('train --hyperparameters policy_kwargs={"width":0} --out new', "width"),
     ("train --out /proc/x/y", "/proc/x/y cannot be written"),
     ("train --n-timesteps 1 --out full", "full"),
     ("train --resume --out full", "full"),
     ("evaluate", "--env"),
     ("evaluate nowhere", "nowhere"),
-    (f"evaluate --env {ENV} --baselines magic", "magic"),
+    ("evaluate --arm nowhere.xml", "nowhere.xml"),
+    ("evaluate --scenes motionbenchmaker --baselines nothing", "plan_motion+ompl"),
     (f"evaluate --env {ENV} --baselines straight --scenes nowhere.npz", "nowhere.npz"),
+    (f"evaluate --env {SENSED} --baselines search16 --env-kwargs sensor=nose", "hand_rays"),
     (f"evaluate --env {ENV} --json /proc/x", "--json /proc/x cannot be written"),
-    (f"evaluate --env {ENV} --baselines straight --json full", "full"),
     (f"evaluate {REACH} --baselines unrevised", "unrevised"),
-    ("paper --out full/notes.txt", "notes.txt"),
+    *((f"fit nothing.csv --n-via {numbers}", "--n-via must be") for numbers in ("2 1", "0 1 2", "9", "-1")),
+    ("fit nothing.csv", "nothing.csv"),
     (f"paper --agent {find_model('viapoint/PlanarReach-v0')}", "PlanarReach"),
     ("demo --out full", "full"),
     ("study nowhere.yaml", "nowhere.yaml"),

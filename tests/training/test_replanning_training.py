@@ -3,34 +3,20 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from tasks import JUMPS, MOVING, STEP, scenes_of
 
-from viapoint.envs.scenes.options import scene_from_json, scene_to_json
+from viapoint.envs import scene_from_json, scene_to_json
+from viapoint.training import ViaVecEnv, evaluate
 from viapoint.training.agents.model_io import build
 from viapoint.training.config.presets import STEP_PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.planning.baselines import StepAgentMethod, Straight, agent_method, make_method
-from viapoint.training.planning.predictions import Seen, fitted_reaches, known_courses
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation, whole_task
-from viapoint.training.rollouts.vec_env import ViaVecEnv
-from viapoint.training.scene_sets import drawn, load, scenes_for
+from viapoint.training.scene_sets import drawn
 
-MOVING, JUMPS = "viapoint/PlanarMovingObstacles-v0", "viapoint/PlanarTargetJump-v0"
-STEP = "viapoint/PlanarObstaclesStep-v0"
+MOVING_STEP = "viapoint/PlanarMovingObstaclesStep-v0"
 REACHING = {"courses": "reaches"}
-
-
-def rate(env_id, name, number=12):
-    simulation = SceneSimulation(env_id, number)
-    frozen = scenes_for("validation", simulation.task)
-    some = frozen.take(np.arange(number) * (len(frozen.share) // number))
-    found = evaluate_methods([make_method(name, env_id)], some, env_id, time_decisions=False)
-    return found.success_rate
-
-
-def test_the_search_revises_around_moving_obstacles():
-    assert rate(MOVING, "search256") > 0.9
-    assert rate(MOVING, "straight") < 0.5
 
 
 def test_courses_are_predicted_the_better_the_more_is_known():
@@ -49,7 +35,7 @@ def test_courses_are_predicted_the_better_the_more_is_known():
 def test_episodes_with_the_same_ends_are_not_mixed_up():
     simulation = SceneSimulation(MOVING, 8, **REACHING)
     method = make_method("reach:search64", MOVING, **REACHING)
-    scenes = simulation.task.sampler()([np.random.default_rng((5, each)) for each in range(6)])
+    scenes = scenes_of(simulation.task, 6, 5)
     scenes.start[:], scenes.goal[:] = scenes.start[0], scenes.goal[0]
     together = method.execute(scenes, method.decide(simulation.observe(scenes), scenes))
     for row in range(6):
@@ -58,39 +44,11 @@ def test_episodes_with_the_same_ends_are_not_mixed_up():
         assert alone.reward[0] == together.reward[row]
 
 
-def test_two_looks_at_a_reach_tell_its_end():
-    begin, duration, way = -0.2, 0.9, np.array([0.2, -0.1, 0.0])
-    scene = registered_task(MOVING).sampler()([np.random.default_rng(0)]).with_rows(1)
-    scene.reach[0, 0] = [begin, duration, *way]
-    scene.obstacles.velocity[:] = 0.0
-    scene.turn_velocity[:] = 0.0
-    time = np.array([0.0, 0.28])
-    seen = [scene.obstacles_at(time[k : k + 1]) for k in range(2)]
-    looks = Seen(
-        time, *(np.concatenate([getattr(each, part) for each in seen]) for part in ("centre", "velocity"))
-    )
-    places = known_courses(looks, scene)
-    np.testing.assert_allclose(fitted_reaches(looks, scene), places, atol=0.02)
-    # One look leaves the end open.
-    assert np.abs(fitted_reaches(Seen(*(part[1:] for part in looks)), scene) - places).max() > 0.02
-
-
-def test_sets_of_reaching_obstacles_are_stored_with_their_reaches(tmp_path):
-    frozen = drawn("validation", registered_task(MOVING, **REACHING), 5)
-    frozen.save(tmp_path / "set.npz")
-    again = load(tmp_path / "set.npz")
-    np.testing.assert_array_equal(again.scenes.reach, frozen.scenes.reach)
-    assert again.sha256 == frozen.sha256
-
-
 def test_a_jumping_target_is_reached_by_revision_only():
-    assert (rate(JUMPS, "straight"), rate(JUMPS, "unrevised")) == (1.0, 0.0)
-
-
-@pytest.fixture(scope="module")
-def model():
-    preset = STEP_PRESETS["sac"]
-    return build("sac", preset.policy, ViaVecEnv(STEP, 4), {**preset.arguments(), "buffer_size": 10}, seed=0)
+    result = evaluate(
+        env=JUMPS, baselines=["straight", "unrevised"], n_scenes=12, scenes="validation", time_decisions=False
+    )
+    assert [row["success"]["rate"] for row in result.rows] == [1.0, 0.0]
 
 
 class Forwards:
@@ -112,21 +70,10 @@ def test_the_whole_movement_of_a_step_wise_task_has_no_reward_for_progress():
     assert whole_task(MOVING, {"n_via": 2}) == {"n_via": 2}
 
 
-def test_an_agent_of_steps_is_measured_where_the_task_changes_during_an_episode():
-    step = "viapoint/PlanarMovingObstaclesStep-v0"
-    twin = SceneSimulation(step, 2, **whole_task(step, {}))
-    assert twin.task.replanning
-    scenes = twin.task.sampler()([np.random.default_rng((0, each)) for each in range(2)])
-    method = StepAgentMethod("forwards", Forwards(), step, {})
-    decided = method.decide(twin.observe(scenes), scenes)
-    assert decided.shape == (2, 2)
-    assert method.execute(scenes, decided).success.shape == (2,)
-
-
 def test_what_a_method_carries_out_is_what_the_single_environment_does():
     method = StepAgentMethod("forwards", Forwards(), STEP, {})
     simulation = SceneSimulation(STEP, 6)
-    scenes = simulation.task.sampler()([np.random.default_rng((1, each)) for each in range(6)])
+    scenes = scenes_of(simulation.task, 6, 1)
     together = method.execute(scenes, method.decide(simulation.observe(scenes), scenes))
     env = gym.make(STEP)
     for i in range(6):
@@ -145,13 +92,17 @@ def test_what_a_method_carries_out_is_what_the_single_environment_does():
     assert len(np.unique(together.info["duration"])) > 1
 
 
-def test_an_agent_of_steps_stands_in_one_table_with_the_others(model, small_scenes):
-    assert isinstance(agent_method("agent", model), StepAgentMethod)
-    env_kwargs = whole_task(STEP, {})
-    methods = [agent_method("agent", model), Straight(SceneSimulation(STEP, 4, **env_kwargs))]
-    found = evaluate_methods(
-        methods, small_scenes.take(slice(0, 12)), STEP, env_kwargs=env_kwargs, batch=5, time_decisions=False
-    )
+@pytest.mark.parametrize("env_id", [STEP, MOVING_STEP])
+def test_an_agent_of_steps_stands_in_one_table_with_the_others(env_id):
+    preset = STEP_PRESETS["sac"]
+    settings = {**preset.arguments(), "buffer_size": 10}
+    agent = agent_method("agent", build("sac", preset.policy, ViaVecEnv(env_id, 4), settings, seed=0))
+    assert isinstance(agent, StepAgentMethod)
+    env_kwargs = whole_task(env_id, {})
+    simulation = SceneSimulation(env_id, 4, **env_kwargs)
+    scenes = drawn("validation", simulation.task, 12)
+    methods = [agent, Straight(simulation)]
+    found = evaluate_methods(methods, scenes, env_id, env_kwargs=env_kwargs, batch=5, time_decisions=False)
     for each in found.results:
         assert each.summary()["scenes"] == 12
     assert set(found.results[1].outcomes) <= set(found.results[0].outcomes)

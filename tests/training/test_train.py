@@ -2,6 +2,7 @@
 
 import dataclasses
 import errno
+import itertools
 import json
 import math
 import os
@@ -13,20 +14,19 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
+from tasks import MOVING, PLANE, STEP
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from viapoint.training import Run, TrainConfig, ViaVecEnv, train
 from viapoint.training.agents.model_io import load_model
 from viapoint.training.cli import entry as cli
-from viapoint.training.config.configs import TrainConfig
 from viapoint.training.config.presets import PRESETS
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError, read_arrays
 from viapoint.training.planning.baselines import agent_method
-from viapoint.training.rollouts.vec_env import ViaVecEnv
 from viapoint.training.runs import trainer
 from viapoint.training.runs.checkpoints import read_state
-from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import TrainingFailedError, TrainingStoppedError, train
+from viapoint.training.runs.trainer import TrainingFailedError, TrainingStoppedError
 from viapoint.training.scene_sets import scenes_for
 
 OFF_POLICY = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16}
@@ -38,9 +38,6 @@ TINY = {
     "tqc": OFF_POLICY,
 }
 STEPS = 192
-WHOLE, MOVING, STEP = (
-    f"viapoint/{name}-v0" for name in ("PlanarObstacles", "PlanarMovingObstacles", "PlanarObstaclesStep")
-)
 
 
 def config(folder, algo="viaq", **changes):
@@ -82,32 +79,44 @@ def same_state(one, other, name=""):
         assert torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other, name
 
 
-def kill_after(monkeypatch, steps):
-    """The process dies in the step after so many."""
+def after_steps(monkeypatch, steps, event):
+    """Let something happen after so many steps."""
     step_wait = ViaVecEnv.step_wait
-    left = iter(range(steps))
+    number = itertools.count()
 
-    def mortal(self):
-        if next(left, None) is None:
-            raise SystemError("killed")
+    def step(self):
+        if next(number) == steps:
+            event()
         return step_wait(self)
 
-    monkeypatch.setattr(ViaVecEnv, "step_wait", mortal)
+    monkeypatch.setattr(ViaVecEnv, "step_wait", step)
+
+
+def die():
+    raise SystemError("killed")
+
+
+def press_ctrl_c():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def go_on(run, **changes):
+    return train(TrainConfig(out=run.folder, resume=True, progress=False, **changes))
 
 
 @pytest.mark.parametrize(
-    ("env_id", "algo"), [*((WHOLE, algo) for algo in TINY), (MOVING, "viaq"), (STEP, "sac")]
+    ("env_id", "algo"), [*((PLANE, algo) for algo in TINY), (MOVING, "viaq"), (STEP, "sac")]
 )
 def test_a_killed_run_resumes_to_the_same_result(env_id, algo, tmp_path, monkeypatch):
     whole = train(config(tmp_path / "whole", algo, env=env_id))
     assert whole.decisions >= STEPS
     with monkeypatch.context() as patch:
-        kill_after(patch, 7)  # between the checkpoints at 64 and 128 decisions
+        after_steps(patch, 7, die)  # between the checkpoints at 64 and 128 decisions
         with pytest.raises(SystemError):
             train(config(tmp_path / "killed", algo, env=env_id))
-    assert 0 < Run(tmp_path / "killed").decisions < STEPS
-    resumed = train(TrainConfig(out=tmp_path / "killed", resume=True, progress=False))
-    same_result(whole, resumed)
+    killed = Run(tmp_path / "killed")
+    assert 0 < killed.decisions < STEPS
+    same_result(whole, go_on(killed))
 
 
 def test_a_run_is_the_same_watched_or_not(tmp_path):
@@ -130,7 +139,7 @@ def test_what_a_run_leaves(tmp_path, capsys):
     assert run.best.name == "best"
     method = agent_method("agent", load_model(run.best))
     scenes = scenes_for("validation", run.config.task, 8)
-    (again,) = evaluate_methods([method], scenes, WHOLE, time_decisions=False).results
+    (again,) = evaluate_methods([method], scenes, PLANE, time_decisions=False).results
     assert again.success.mean() == best
 
     events = EventAccumulator(str(run.folder / "tensorboard"))
@@ -149,7 +158,7 @@ def test_ctrl_c_is_heard_after_the_last_decision_too(tmp_path, monkeypatch):
 
     def interrupted(self, name, model):
         if name == "final":
-            os.kill(os.getpid(), signal.SIGINT)
+            press_ctrl_c()
         return save(self, name, model)
 
     monkeypatch.setattr(Run, "save", interrupted)
@@ -160,16 +169,8 @@ def test_ctrl_c_is_heard_after_the_last_decision_too(tmp_path, monkeypatch):
 
 def test_ctrl_c_saves_and_leaves_and_the_rest_follows(tmp_path, monkeypatch):
     whole = train(config(tmp_path / "whole", checkpoint_every=10_000))
-    step_wait = ViaVecEnv.step_wait
-    left = iter(range(5))
-
-    def interrupted(self):
-        if next(left, "over") == 4:
-            os.kill(os.getpid(), signal.SIGINT)
-        return step_wait(self)
-
     with monkeypatch.context() as patch:
-        patch.setattr(ViaVecEnv, "step_wait", interrupted)
+        after_steps(patch, 4, press_ctrl_c)
         with pytest.raises(TrainingStoppedError, match="go on with") as stop:
             train(config(tmp_path / "stopped", checkpoint_every=10_000))
     told = shlex.split(str(stop.value).partition("go on with: ")[2])
@@ -180,7 +181,7 @@ def test_ctrl_c_saves_and_leaves_and_the_rest_follows(tmp_path, monkeypatch):
     stopped = Run(tmp_path / "stopped")
     assert stopped.decisions == 80
     assert load_model(stopped.folder / "final").num_timesteps == 80
-    same_result(whole, train(TrainConfig(out=stopped.folder, resume=True, progress=False)))
+    same_result(whole, go_on(stopped))
 
 
 STALLING = {"stop_when_stalled": 0.4, "n_timesteps": 640}
@@ -214,15 +215,14 @@ def test_a_training_that_stalls_ends_there_also_if_it_was_interrupted(algo, tmp_
     assert (run.stalled, run.ended, run.decisions) == (True, True, 320)
     assert load_model(run.final).num_timesteps == 320
     assert heard.ended == 1
-    again = train(TrainConfig(out=run.folder, resume=True, n_timesteps=1280, progress=False))
-    same_result(run, again)
+    same_result(run, go_on(run, n_timesteps=1280))
     with monkeypatch.context() as patch:
-        kill_after(patch, 18)  # between the checkpoints at 256 and 320 decisions
+        after_steps(patch, 18, die)  # between the checkpoints at 256 and 320 decisions
         with pytest.raises(SystemError):
             train(config(tmp_path / "killed", algo, **STALLING))
     killed = Run(tmp_path / "killed")
     assert (killed.stalled, killed.ended, killed.decisions) == (False, False, 256)
-    same_result(run, train(TrainConfig(out=killed.folder, resume=True, progress=False)))
+    same_result(run, go_on(killed))
 
 
 @pytest.mark.parametrize("algo", ["viaq", "td3", "ppo"])
@@ -233,7 +233,7 @@ def test_a_training_that_a_callback_stops_goes_on_to_the_same_result(algo, tmp_p
     assert stopped.decisions == (96 if algo == "ppo" else 80)
     assert load_model(stopped.final).num_timesteps == stopped.decisions
     assert heard.ended == 1
-    same_result(whole, train(TrainConfig(out=stopped.folder, resume=True, progress=False)))
+    same_result(whole, go_on(stopped))
 
 
 class Heard(BaseCallback):
@@ -256,7 +256,7 @@ def test_a_run_keeps_its_settings_when_the_presets_change(tmp_path, monkeypatch)
     run = train(config(tmp_path / "run", n_timesteps=64))
     preset = dataclasses.replace(PRESETS["viaq"], n_envs=3, hyperparameters={"learning_rate": 0.5})
     monkeypatch.setitem(PRESETS, "viaq", preset)
-    assert train(TrainConfig(out=run.folder, resume=True, n_timesteps=128, progress=False)).decisions == 128
+    assert go_on(run, n_timesteps=128).decisions == 128
 
 
 def small(folder, **changes):
@@ -302,15 +302,13 @@ def test_a_full_disk_stops_training_and_keeps_what_was_there(full_disk, tmp_path
     assert 0 < run.decisions < 320
     assert not list(run.folder.rglob(".*.part"))
     full_disk()  # there is room again
-    resumed = train(TrainConfig(out=run.folder, resume=True, progress=False))
-    whole = train(small(tmp_path / "whole"))
-    same_weights(resumed, whole, "final")
+    same_weights(go_on(run), train(small(tmp_path / "whole")), "final")
 
 
 def test_other_versions_are_told(tmp_path, capsys):
     run = train(small(tmp_path / "run", n_timesteps=32))
     (run.folder / "versions.json").write_text(json.dumps({**run.versions, "mujoco": "3.3.0"}))
-    train(TrainConfig(out=run.folder, resume=True, n_timesteps=64, progress=False))
+    go_on(run, n_timesteps=64)
     assert "mujoco 3.3.0" in capsys.readouterr().err
     (run.folder / "versions.json").write_text(json.dumps({"viapoint": "7.2.0"}))
     (run.folder / "config.json").write_text(json.dumps({"colour": "red"}))
@@ -330,8 +328,7 @@ def test_what_cannot_learn_is_told(tmp_path, capsys):
 def test_half_a_training_and_the_other_half_are_a_whole_one(tmp_path):
     """With a constant learning rate even where the first half was meant to be all."""
     whole = train(small(tmp_path / "whole", n_timesteps=128))
-    train(small(tmp_path / "halves", n_timesteps=64))
-    halves = train(TrainConfig(out=tmp_path / "halves", resume=True, n_timesteps=128, progress=False))
+    halves = go_on(train(small(tmp_path / "halves", n_timesteps=64)), n_timesteps=128)
     one, other = (read_state(run.checkpoints()[-1]) for run in (whole, halves))
     for state in (one, other):  # what was meant to be all differs
         del state["arrays"]["counters"]["_total_timesteps"]

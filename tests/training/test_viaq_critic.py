@@ -5,6 +5,7 @@ import inspect
 import numpy as np
 import pytest
 import torch
+from tasks import MOVING, PANDA, PLANE, WHOLE, problem_of
 
 import viapoint.envs.geometry.clearance
 import viapoint.envs.geometry.distance
@@ -12,23 +13,17 @@ import viapoint.training.planning.movements
 import viapoint.training.planning.search
 from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import BOX, bounding_boxes, no_obstacles
-from viapoint.envs.registration import TASKS
-from viapoint.envs.task import Task
+from viapoint.training import ViaQ
 from viapoint.training.agents import viaq_policy
-from viapoint.training.agents.outcome_buffer import OutcomeReplayBuffer, Outcomes, outcome_of
+from viapoint.training.agents.outcome_buffer import OutcomeReplayBuffer, Outcomes
 from viapoint.training.agents.pairs import CLEAR, NO_OBSTACLE, pairs_of
-from viapoint.training.agents.viaq import ViaQ
 from viapoint.training.agents.viaq_critic import Values, _Saturated
 from viapoint.training.planning.candidates import best_duration, candidate_actions, sobol_actions
 from viapoint.training.planning.movements import INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
-from viapoint.training.planning.search import INFEASIBLE, plan_clearances
-from viapoint.training.rollouts.vec_env import TERMS, ViaVecEnv
+from viapoint.training.planning.search import INFEASIBLE, plan_clearances, registered_task
+from viapoint.training.rollouts.vec_env import TERMS
 
-PLANE, WHOLE, SPACE, MOVING = (
-    f"viapoint/{name}-v0"
-    for name in ("PlanarObstacles", "PlanarWholeArm", "PandaObstacles", "PlanarMovingObstacles")
-)
 KNOW_OBSTACLES = (
     viapoint.envs.geometry.clearance,
     viapoint.envs.geometry.distance,
@@ -38,18 +33,22 @@ FEW = {"candidates": 32, "refinements": 1, "per_refinement": 16, "width": 8}
 EVERY = np.arange(INSTANTS)
 
 
-def small(env_id, **kwargs):
-    env = ViaVecEnv(env_id, 8, seed=0, threads=1, **kwargs)
+@pytest.fixture
+def small(made):
+    """Function that makes a small model and its environment."""
     settings = {"learning_starts": 16, "batch_size": 16, "gradient_steps": 1, "explore_candidates": 8}
-    model = ViaQ("ViaQPolicy", env, seed=0, policy_kwargs=dict(FEW), **settings)
-    return model, env
+
+    def make(env_id, **kwargs):
+        env = made(env_id, threads=1, **kwargs)
+        return ViaQ("ViaQPolicy", env, seed=0, policy_kwargs=dict(FEW), **settings), env
+
+    return make
 
 
 def movements(env_id, number=6, **kwargs):
     """Return a task, problems and movements of 8 actions in each."""
-    task = Task.of(**{**TASKS[env_id], **kwargs})
-    scenes = task.sampler()([np.random.default_rng((3, each)) for each in range(number)])
-    problem = Problem.of_scenes(scenes, task)
+    task = registered_task(env_id, **kwargs)
+    problem = problem_of(task, number, 3)
     actions = np.broadcast_to(sobol_actions(8, task.action.size), (number, 8, task.action.size))
     return task, problem, actions, moves_of(task, problem, actions)
 
@@ -69,8 +68,8 @@ def refuse_geometry(monkeypatch):
                         monkeypatch.setattr(user, name, refuse)
 
 
-@pytest.mark.parametrize("env_id", [PLANE, WHOLE, SPACE, MOVING])
-def test_nothing_is_learned_or_decided_from_distances_of_obstacles(env_id, monkeypatch):
+@pytest.mark.parametrize("env_id", [PLANE, WHOLE, PANDA, MOVING])
+def test_nothing_is_learned_or_decided_from_distances_of_obstacles(small, env_id, monkeypatch):
     model, env = small(env_id)
     model.learn(32)
     observation = env.reset()
@@ -84,12 +83,11 @@ def test_nothing_is_learned_or_decided_from_distances_of_obstacles(env_id, monke
     model.policy.checks = 4
     with pytest.raises(AssertionError, match="geometry"):
         model.predict(observation)
-    env.close()
 
 
 def test_of_an_obstacle_only_bounding_box_and_kind_are_seen():
     """The compiled part cannot be refused, so what it returns must not depend on the surface."""
-    task, problem, _, moves = movements(SPACE, shapes=("sphere", "box", "cylinder"))
+    task, problem, _, moves = movements(PANDA, shapes=("sphere", "box", "cylinder"))
     _, half = bounding_boxes(problem.obstacles)
     kind = np.where(problem.obstacles.present, BOX, problem.obstacles.kind)
     boxes = problem._replace(obstacles=problem.obstacles._replace(kind=kind, size=half))
@@ -99,19 +97,18 @@ def test_of_an_obstacle_only_bounding_box_and_kind_are_seen():
     assert (after.features[..., 7:] != before.features[..., 7:]).any()
 
 
-@pytest.mark.parametrize("env_id", [PLANE, SPACE])
-def test_without_obstacles_the_margin_is_constant(env_id):
+@pytest.mark.parametrize("env_id", [PLANE, PANDA])
+def test_without_obstacles_the_margin_is_constant(small, env_id):
     task, problem, _, _ = movements(env_id)
-    model, env = small(env_id)
+    model, _ = small(env_id)
     empty = problem._replace(obstacles=no_obstacles(len(problem.start)))
     actions = np.broadcast_to(sobol_actions(8, task.action.size), (len(problem.start), 8, task.action.size))
     values = model.policy.critic(model.policy.inputs(empty, actions))
     assert (values.margin == NO_OBSTACLE).all()
-    env.close()
 
 
 def test_the_clearance_of_the_arm_from_itself_is_computed():
-    task, problem, actions, moves = movements(SPACE)
+    task, problem, actions, moves = movements(PANDA)
     found = pairs_of(task, problem, moves, EVERY)
     shape = actions.shape[:2]
     ends = (np.broadcast_to(each[:, None], (*shape, each.shape[1])) for each in (problem.start, problem.goal))
@@ -141,11 +138,15 @@ def test_only_instants_that_were_carried_out_count():
     torch.testing.assert_close(endless.features, whole.features)
 
 
-@pytest.mark.parametrize("checks", [1, 3, 11, 64])
-@pytest.mark.parametrize("env_id", [WHOLE, MOVING])
-def test_as_many_plans_are_checked_as_one_says_and_the_best_of_them_is_taken(env_id, checks, monkeypatch):
+@pytest.mark.parametrize("checks", [1, 11, 64])
+@pytest.mark.parametrize("env_id", [WHOLE, PANDA, MOVING])
+def test_as_many_plans_are_checked_as_one_says_and_the_best_of_them_is_taken(
+    small, env_id, checks, monkeypatch
+):
     model, env = small(env_id)
     observation, checked, exact = env.reset(), {}, viaq_policy.merits
+    model.policy.checks = 0
+    unchecked = model.policy.decide(observation)
 
     def counted(task, problem, actions):
         found = exact(task, problem, actions)
@@ -158,26 +159,26 @@ def test_as_many_plans_are_checked_as_one_says_and_the_best_of_them_is_taken(env
     decided = model.policy.decide(observation)
     most = min(checks, 48)  # there are 48 candidates
     problem = Problem.of_observation(observation, model.policy.task)
-    for goal, action in zip(problem.goal, decided, strict=True):
+    for goal, action, alone in zip(problem.goal, decided, unchecked, strict=True):
         actions, worth = (np.concatenate(each) for each in zip(*checked[goal.tobytes()], strict=True))
         np.testing.assert_array_equal(action, actions[worth.argmax()])
         assert len(actions) <= most
+        # A plan is never worse than an unchecked one, which is among those that are checked.
+        assert checks == 1 or (actions == alone).all(axis=-1).any()
         if env_id == MOVING:  # the plan under way is among them
             assert (actions == 0.0).all(axis=-1).any()
         elif len(actions) < most:  # further plans are checked only where none is clear
             assert worth.max() > 0.5 * INFEASIBLE
-    env.close()
 
 
-def test_merit_prefers_likely_success_and_orders_the_rest_by_its_probability():
-    model, env = small(PLANE)
+def test_merit_prefers_likely_success_and_orders_the_rest_by_its_probability(small):
+    model, _ = small(PLANE)
     zero = torch.zeros(1, 4)
     no_contact, effort = torch.tensor([[5.0, 5.0, -1.0, -3.0]]), torch.tensor([[0.0, -0.3, 9.0, 99.0]])
     values = Values(zero, zero, no_contact, zero + 5.0, zero, effort)
     merit = model.policy.critic.merit(values)[0]
     assert merit.argsort(descending=True).tolist() == [0, 1, 2, 3]
     torch.testing.assert_close(merit[:2], model.policy.critic.value(values)[0, :2])
-    env.close()
 
 
 def test_a_saturated_prediction_is_pulled_back_but_never_pushed_out():
@@ -193,8 +194,8 @@ def step(clearance, done=False, **more):
     return info, sum(info[name] for name in TERMS), done
 
 
-def test_clearance_is_summed_over_an_episode_and_the_decision_that_lowered_it_is_known():
-    env = ViaVecEnv(MOVING, 1, seed=0)
+def test_clearance_is_summed_over_an_episode_and_the_decision_that_lowered_it_is_known(made):
+    env = made(MOVING, 1)
     buffer = OutcomeReplayBuffer(16, env.observation_space, env.action_space, n_envs=1, device="cpu")
     observation = {name: part[:1] for name, part in env.reset().items()}
     for info, reward, done in (
@@ -212,12 +213,10 @@ def test_clearance_is_summed_over_an_episode_and_the_decision_that_lowered_it_is
         reward, info = np.array([clearance]), step(clearance)[0]
         buffer.add(observation, observation, action, reward, np.array([False]), [info])
     assert np.allclose(buffer.outcomes[7:10, 0, Outcomes._fields.index("clearance")], [-0.3, 0.04, 0.04])
-    env.close()
 
 
-def test_without_terms_only_the_sum_is_learned_from():
-    assert np.isnan(outcome_of({"is_success": True}, 1.0)).all()
-    model, env = small(PLANE)
+def test_without_terms_only_the_sum_is_learned_from(small):
+    model, _ = small(PLANE)
     model.learn(64)
     model.replay_buffer.outcomes[:] = np.nan
     before = model.policy.critic.pairs.layers[0].weight.clone()
@@ -226,11 +225,10 @@ def test_without_terms_only_the_sum_is_learned_from():
     assert all(loss.item() == 0.0 for name, loss in losses.items() if name != "reward")
     model.train(20, 16)
     assert not torch.equal(before, model.policy.critic.pairs.layers[0].weight)
-    env.close()
 
 
-def test_what_follows_counts_only_where_an_episode_goes_on():
-    model, env = small(MOVING, n_obstacles=1)
+def test_what_follows_counts_only_where_an_episode_goes_on(small):
+    model, _ = small(MOVING, n_obstacles=1)
     model.learn(128)
     batch = model.replay_buffer.sample_outcomes(64)
 
@@ -239,11 +237,10 @@ def test_what_follows_counts_only_where_an_episode_goes_on():
         return model._losses(batch._replace(ended=np.full_like(batch.ended, ended)))["effort"].item()
 
     assert effort(1.0, 0.5) == effort(1.0, 1.0) != effort(0.0, 1.0)
-    env.close()
 
 
 @pytest.mark.parametrize("temperature", [1e-3, 1e6])
-def test_exploration_goes_from_the_best_candidate_to_any(temperature, monkeypatch):
+def test_exploration_goes_from_the_best_candidate_to_any(small, temperature, monkeypatch):
     model, env = small(PLANE)
     model.explore_uniformly, model.temperature, model.num_timesteps = 0.0, temperature, 100
     model._last_obs = env.reset()
@@ -260,12 +257,11 @@ def test_exploration_goes_from_the_best_candidate_to_any(temperature, monkeypatc
         chosen += (seen["candidates"] == actions[:, None]).all(axis=-1).argmax(axis=1).tolist()
     counts = np.bincount(chosen, minlength=8)
     assert counts[7] == 480 if temperature < 1.0 else counts.min() > 30  # of 60 each
-    env.close()
 
 
-@pytest.mark.parametrize("env_id", [PLANE, SPACE])
+@pytest.mark.parametrize("env_id", [PLANE, PANDA])
 def test_candidates_are_different_allowed_and_begin_with_the_straight_movement(env_id):
-    task = Task.of(**TASKS[env_id])
+    task = registered_task(env_id)
     actions = candidate_actions(task, 64, replanning=False)
     assert (actions[0] == 0.0).all()
     assert (np.abs(actions) <= 1.0).all()
