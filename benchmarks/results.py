@@ -2,6 +2,7 @@
 
 python benchmarks/results.py                                  # all tasks; hours
 python benchmarks/results.py --env viapoint/PandaObstacles-v0 # others keep their numbers
+python benchmarks/results.py --only agents                    # only shipped agents, searches and planners
 python benchmarks/results.py --only runs                      # only the trainings of benchmarks/sb3.py
 python benchmarks/results.py --only looking                   # only searches that look again on the way
 python benchmarks/results.py --only reaches                   # only obstacles on reaches of their own
@@ -10,6 +11,7 @@ python benchmarks/results.py --only reaches                   # only obstacles o
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,8 +60,8 @@ REACHES = [f"{name}, reaches" for name in INTERVALS]
 """Names of these variants."""
 PAGES = Path("docs/results.md"), Path("docs/results-details.md")
 PICTURE = Path("docs/images/results.png")
-DETAILS = ("points:", "fitted:", "agent, seed")
-"""Beginnings of methods that are on the second page, as are agents with other beliefs."""
+DETAILS = ("points:", "fitted:", "agent, seed", "untrained, ")
+"""Beginnings of methods that are on the second page or in the file only."""
 STYLES = {
     "plan_motion": ("#c0504d", "D"),
     "ompl": ("#c0504d", "P"),
@@ -69,18 +71,20 @@ STYLES = {
     "known:search512": ("#7f7f7f", "h"),
     "seen:search512": ("#7f7f7f", "^"),
     "cautious512": ("#7f7f7f", "X"),
-    "thick:search512": ("#7f7f7f", "s"),
-    "thick:plan_motion": ("#c0504d", "D"),
+    "thick:search512": ("#7f7f7f", "<"),
+    "thick:plan_motion": ("#c0504d", "p"),
     "agent": ("#1f5fa8", "o"),
     "agent, 16 checks": ("#1f5fa8", "p"),
-    "agent, 4 refined": ("#1f5fa8", "*"),
-    "agent, 16 refined": ("#1f5fa8", "*"),
+    "agent, 4 refined": ("#1f5fa8", ">"),
+    "agent, 16 refined": ("#1f5fa8", ">"),
     "untrained": ("#9dc3e6", "o"),
     "SAC": ("#2a9d8f", "o"),
     "TQC": ("#2a9d8f", "s"),
     "PPO": ("#2a9d8f", "^"),
 }
 """Colours and marks of methods in the figure: planners, searches, agents, and those of Stable-Baselines3."""
+PRIVILEGED = ("known:", "seen:")
+"""Beginnings of methods that know the truth, which have hollow marks."""
 FIELDS = ("env", "scenes", "method", "success", "low", "high", "count", "jerk_ratio", "milliseconds")
 
 
@@ -94,9 +98,9 @@ class Config:
     """Ids of environments with a shipped agent."""
     n_scenes: int | None = None
     """Number of scenes of each set; default: all of them."""
-    only: Literal["everything", "runs", "looking", "reaches"] = "everything"
-    """Part that is measured: the trainings in `runs`, searches that look again, or obstacles on reaches of their own;
-    other numbers stay."""
+    only: Literal["everything", "agents", "runs", "looking", "reaches"] = "everything"
+    """Part that is measured: shipped agents and their baselines, the trainings in `runs`, searches that look again, or
+    obstacles on reaches of their own; other numbers stay."""
     runs: Path = Path("runs/sb3")
     """Folder of trainings of algorithms of Stable-Baselines3 by benchmarks/sb3.py, which get a row each."""
     reaches: Path = Path("runs/reaches")
@@ -113,7 +117,7 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
         settings = {"checks": [0, 16], "baselines": REPLANNING_BASELINES}
     common: dict[str, Any] = {"env": env_id, "scenes": name, "n_scenes": config.n_scenes}
     common["time_decisions"] = name == "test"
-    if config.only == "everything":
+    if config.only in ("everything", "agents"):
         for row in evaluate(load_agent(env_id), **common, **settings).rows:
             yield _numbers(env_id, name, row["method"], row)
     short = env_id.removeprefix("viapoint/").removesuffix("-v0")
@@ -125,17 +129,18 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
             searches = ["thick:search512", "known:search512"]
             for row in evaluate(**common, env_kwargs=kwargs, baselines=searches).rows:
                 yield _numbers(LOOKS, name, f"{row['method']}, {when}", row)
-    if config.only in ("looking", "reaches"):
+    if config.only not in ("everything", "runs"):
         return
     for folder in sorted(config.runs.glob(f"{short}-*")):
         run = Run(folder)
-        method = f"{run.config.algorithm.upper()}, {run.curve[-1]['decisions']:,} decisions"
+        agent = load_agent(folder)  # the best by validation
+        method = f"{run.config.algorithm.upper()}, {agent.num_timesteps:,} of {run.curve[-1]['decisions']:,}"
         last = folder.name.rpartition("-")[2]
         if run.config.algorithm == "viarank":  # with another belief
             method = f"{last}:agent"
         elif run.config.algorithm == "viaq":
             method = f"agent, seed {last}"
-        row = evaluate(load_agent(folder), **common, baselines=[]).rows[0]
+        row = evaluate(agent, **common, baselines=[]).rows[0]
         yield _numbers(env_id, name, method, row)
 
 
@@ -191,7 +196,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def is_detail(method: str) -> bool:
-    """Return True for methods that are on the second page."""
+    """Return True for methods that are not in the table of their task."""
     return method.startswith(DETAILS) or method.endswith(":agent")
 
 
@@ -205,7 +210,7 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
             found[heading] = table(mine)
             continue
         found[heading] = table([row for row in mine if not is_detail(row["method"])])
-        for kind, part in {"beliefs": ":", "seeds": "seed"}.items():
+        for kind, part in {"beliefs": ":", "seeds": "agent, seed", "untrained": "untrained, "}.items():
             some = [row for row in mine if part in row["method"]]
             if some:
                 found[f"{heading}, {kind}"] = table(some)
@@ -226,25 +231,28 @@ def write_pages(rows: list[dict[str, Any]]) -> None:
 
 def draw(rows: list[dict[str, Any]]) -> None:
     """Draw success in `test` against the time of a decision, a panel for each task with obstacles."""
-    shown = [name for name in SHIPPED_IDS if registered_task(name).n_obstacles[1]]
+    headings = re.findall(r"### (.*)", PAGES[0].read_text(encoding="utf-8"))
     figure = Figure(figsize=(9.0, 11.0), layout="constrained")
     panels = figure.subplots(4, 2, sharex=True, sharey=True).flat
     marks: dict[str, Any] = {}
-    for env_id, axes in zip(shown, panels, strict=False):
+    for heading, axes in zip(headings, panels, strict=False):
         for row in rows:
             name = row["method"] if row["method"] in STYLES else row["method"].partition(",")[0]
-            known = row["env"] == env_id and row["scenes"] == "test" and not is_detail(row["method"])
-            if not known or name not in STYLES:
+            shown = row["env"] == f"viapoint/{heading}-v0" and row["scenes"] == "test"
+            if not shown or is_detail(row["method"]) or name not in STYLES:
                 continue
             color, mark = STYLES[name]
             success = float(row["success"])
             bars = [[success - float(row["low"])], [float(row["high"]) - success]]
+            hollow = name.startswith(PRIVILEGED)
             marks[name] = axes.errorbar(
                 float(row["milliseconds"]), success, bars, color=color, marker=mark, markersize=7.0,
-                markeredgecolor="white", linewidth=1.0,
+                markerfacecolor="white" if hollow else color, linestyle="none", elinewidth=1.2,
             )  # fmt: skip
-        axes.set_title(env_id.removeprefix("viapoint/").removesuffix("-v0"), fontsize=11)
+        axes.set_title(heading, fontsize=11)
         axes.set_xscale("log")
+        axes.set_xticks([1, 10, 100], ["1", "10", "100"])
+        axes.tick_params(labelbottom=True, labelleft=True)
         axes.set_ylim(0.0, 103.0)
         axes.grid(alpha=0.25)
         style_axes(axes)

@@ -117,9 +117,7 @@ STEP_PRESETS: dict[str, Preset] = {
 # Presets of tasks without obstacles, which need fewer decisions
 REACH_PRESETS = {"viaq": _changed(PRESETS["viaq"], 8_000)}
 # Presets of replanning tasks
-REPLANNING_PRESETS = {
-    "viaq": _changed(PRESETS["viaq"], 24_000, gradient_steps=6, next_candidates=4, policy_kwargs={})
-}
+REPLANNING_PRESETS = {"viaq": _changed(PRESETS["viaq"], 24_000, gradient_steps=6, next_candidates=4)}
 JOINT_DECISIONS = 16_000  # Decisions in joint space, where one costs several times as much
 # Settings of viarank in joint space, where the arm has many more places in a movement
 JOINT_SIGHT: dict[str, Any] = {
