@@ -22,11 +22,13 @@ from viapoint.training.agents.plan_agent import Numbers, Observation, PlanPolicy
 from viapoint.training.agents.viaq_critic import PlanInputs, ViaQCritic
 from viapoint.training.planning.movements import FINE_INSTANTS, INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
-from viapoint.training.planning.search import INFEASIBLE, VERIFIED, best_of, merits, refined_actions
+from viapoint.training.planning.search import INFEASIBLE, best_of, merits, refined_actions
 
 KEEP = 0.1  # Minimum gain of Q for which a running plan is revised
 # Greatest number of proposals that are checked; all further checks are of plans around the best of them
 PROPOSALS = 32
+# Greatest number of best candidates of which one within reach is sought; those of later rounds are close together
+REACHED = 64
 LOCAL_ROUNDS = 4  # Rounds of checks around the best checked plans
 BLOCK = 64  # Scenes that are decided together
 MOTION_SCALES = (1.0, 0.1)  # Scales of velocity and acceleration at the input of the critic
@@ -178,7 +180,7 @@ class ViaQPolicy(PlanPolicy):
         """
         best = values.argmax(axis=1)
         rows = np.arange(0 if self.replanning else len(best))
-        for _ in range(VERIFIED if rows.size else 0):
+        for _ in range(REACHED if rows.size else 0):
             alone = problem.take(rows)._replace(obstacles=no_obstacles(len(rows)))
             moves = moves_of(self.task, alone, actions[rows, best[rows]][:, None], exact=True)
             pairs = pairs_of(self.task, alone, moves, np.arange(FINE_INSTANTS), exact=True)

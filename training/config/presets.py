@@ -62,15 +62,10 @@ _OWN: dict[str, Any] = {"n_timesteps": 40_000, "eval_every": 5_000, "checkpoint_
 
 # Presets by the names of algorithms on the command line
 PRESETS: dict[str, Preset] = {
-    # Otherwise the defaults of the own policies are their settings. More rounds solve more of the narrow scenes of the
-    # plane, and gain nothing in space.
+    # The defaults of the own policies are their settings.
     "viaq": Preset(
         policy="ViaQPolicy",
-        hyperparameters={
-            "learning_starts": 4096,
-            "learning_rate": _falling(3e-3, 3e-5),
-            "policy_kwargs": {"refinements": 4},
-        },
+        hyperparameters={"learning_starts": 4096, "learning_rate": _falling(3e-3, 3e-5)},
         **_OWN,
     ),
     "viarank": Preset(
@@ -117,7 +112,10 @@ STEP_PRESETS: dict[str, Preset] = {
 # Presets of tasks without obstacles, which need fewer decisions
 REACH_PRESETS = {"viaq": _changed(PRESETS["viaq"], 8_000)}
 # Presets of replanning tasks
-REPLANNING_PRESETS = {"viaq": _changed(PRESETS["viaq"], 24_000, gradient_steps=6, next_candidates=4)}
+MORE_ROUNDS = {"refinements": 4}  # In the plane; in space they gain nothing
+REPLANNING_PRESETS = {
+    "viaq": _changed(PRESETS["viaq"], 24_000, gradient_steps=6, next_candidates=4, policy_kwargs=MORE_ROUNDS)
+}
 JOINT_DECISIONS = 16_000  # Decisions in joint space, where one costs several times as much
 # Settings of viarank in joint space, where the arm has many more places in a movement
 JOINT_SIGHT: dict[str, Any] = {
