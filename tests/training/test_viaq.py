@@ -260,3 +260,13 @@ def test_an_environment_of_another_task_is_to_blame_and_not_the_file():
     with pytest.raises(ValueError, match="env does not fit the agent") as raised:
         load_agent(PLANE, env=ViaVecEnv(PLANE, 2, n_via=2))
     assert not isinstance(raised.value, BadFileError)
+
+
+def test_one_of_many_good_plans_out_of_reach_is_not_taken():
+    """In these scenes, the plans around the best one are out of reach, as it is."""
+    agent = load_agent(PLANE)
+    agent.policy.refinements = 4
+    scenes = scenes_of(agent.policy.task, 175, seed=78).take([103, 114, 174])
+    simulation = SceneSimulation(PLANE, 3)
+    actions = agent.predict(simulation.observe(scenes))[0]
+    assert (simulation(scenes, actions).info["duration"] > 0.0).all()
