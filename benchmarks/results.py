@@ -102,7 +102,8 @@ class Config:
     """Part that is measured: shipped agents and their baselines, the trainings in `runs`, searches that look again, or
     obstacles on reaches of their own; other numbers stay."""
     runs: Path = Path("runs/sb3")
-    """Folder of trainings of algorithms of Stable-Baselines3 by benchmarks/sb3.py, which get a row each."""
+    """Folder of trainings, which get a row each: those of benchmarks/sb3.py, viaq with other seeds, viarank with other
+    beliefs."""
     reaches: Path = Path("runs/reaches")
     """Folder of trainings among obstacles on reaches of their own, such as `PlanarMovingObstacles-0` for seed 0."""
 

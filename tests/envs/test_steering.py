@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from episodes import GOAL, STEP, WALL, given, post
+from scipy.integrate import simpson
 
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import Motion
@@ -59,8 +60,8 @@ def test_the_filter_obeys_its_equation_and_control_steps_join():
             np.testing.assert_allclose(slope, rate[:, 1:-1], atol=1e-4 * np.abs(rate).max())
         for part, begin in zip(whole, motion, strict=True):
             np.testing.assert_allclose(part[:, 0], begin, rtol=1e-12)
-        cost = 0.5 * np.trapezoid((law**2).sum(axis=-1), dx=fine.timestep, axis=-1)
-        np.testing.assert_allclose(fine.jerk_cost(motion, wanted), cost, rtol=1e-4)
+        cost = 0.5 * simpson((law**2).sum(axis=-1), dx=fine.timestep, axis=-1)
+        np.testing.assert_allclose(fine.jerk_cost(motion, wanted), cost, rtol=1e-5)
         motion = Motion(*(part[:, -1] for part in whole))
 
 

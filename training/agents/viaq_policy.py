@@ -27,7 +27,8 @@ from viapoint.training.planning.search import INFEASIBLE, best_of, merits, refin
 KEEP = 0.1  # Minimum gain of Q for which a running plan is revised
 # Greatest number of proposals that are checked; all further checks are of plans around the best of them
 PROPOSALS = 32
-# Greatest number of best candidates of which one within reach is sought; those of later rounds are close together
+# Greatest number of candidates, best first, that are looked at for one within reach. Candidates of a round are close
+# together: where the best is out of reach, so are many of the next.
 REACHED = 64
 LOCAL_ROUNDS = 4  # Rounds of checks around the best checked plans
 BLOCK = 64  # Scenes that are decided together

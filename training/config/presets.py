@@ -111,11 +111,10 @@ STEP_PRESETS: dict[str, Preset] = {
 
 # Presets of tasks without obstacles, which need fewer decisions
 REACH_PRESETS = {"viaq": _changed(PRESETS["viaq"], 8_000)}
-# Presets of replanning tasks
-MORE_ROUNDS = {"refinements": 4}  # In the plane; in space they gain nothing
-REPLANNING_PRESETS = {
-    "viaq": _changed(PRESETS["viaq"], 24_000, gradient_steps=6, next_candidates=4, policy_kwargs=MORE_ROUNDS)
-}
+REPLANNING_PRESETS = {"viaq": _changed(PRESETS["viaq"], 24_000, gradient_steps=6, next_candidates=4)}
+"""Presets of replanning tasks."""
+HAND_ROUNDS = {"refinements": 4}
+"""Settings of the policy of viaq where plans of the hand are revised; twice the usual rounds solve a little more."""
 JOINT_DECISIONS = 16_000  # Decisions in joint space, where one costs several times as much
 # Settings of viarank in joint space, where the arm has many more places in a movement
 JOINT_SIGHT: dict[str, Any] = {
@@ -142,7 +141,9 @@ def preset_of(task: Task, algo: Algorithm) -> Preset:
     elif not task.n_obstacles[1]:
         preset = REACH_PRESETS.get(algo, preset)
     if algo == "viaq" and not task.space.of_hand:
-        return _changed(preset, min(preset.n_timesteps, JOINT_DECISIONS), policy_kwargs={})
+        return _changed(preset, min(preset.n_timesteps, JOINT_DECISIONS))
+    if algo == "viaq" and task.replanning:
+        return _changed(preset, preset.n_timesteps, policy_kwargs=HAND_ROUNDS)
     if algo == "viarank" and not task.space.of_hand:
         return _changed(preset, JOINT_DECISIONS, **JOINT_SIGHT)
     return preset
