@@ -308,18 +308,16 @@ def report(capsys, *words):
     return end.value.code, capsys.readouterr().out
 
 
-def test_all_is_well_here(capsys, tmp_path):
-    code, printed = report(capsys, "--out", str(tmp_path / "runs"))
-    assert (code, "MISSING" in printed) == (0, False)
-    assert not (tmp_path / "runs").exists()
+def test_all_is_well_here(capsys):
+    code, printed = report(capsys)
+    assert (code, "FAILS" in printed) == (0, False)
 
 
 @pytest.mark.parametrize(
-    ("name", "exit_code", "remedy"), [("MuJoCo engine", 1, "'mujoco>=4'"), ("OpenGL", 0, "libegl1")]
+    ("name", "exit_code", "remedy"), [("MuJoCo", 1, "'mujoco>=4'"), ("pictures", 0, "libegl1")]
 )
 def test_what_is_missing_is_named_with_the_remedy(name, exit_code, remedy, capsys, monkeypatch):
-    checks = {each: check._replace(script=GOOD) for each, check in doctor.CHECKS.items()}
-    checks[name] = checks[name]._replace(script=GONE)
+    checks = {each: (GONE if each == name else GOOD, advice) for each, (_, advice) in doctor.CHECKS.items()}
     monkeypatch.setattr(doctor, "CHECKS", checks)
     code, printed = report(capsys)
     assert code == exit_code
@@ -329,18 +327,8 @@ def test_what_is_missing_is_named_with_the_remedy(name, exit_code, remedy, capsy
 
 def test_a_crash_and_a_hang_end_no_report(monkeypatch):
     assert not doctor.outcome("import os; os.abort()")[0]
-    monkeypatch.setattr(doctor, "PATIENCE", 0.2)
+    monkeypatch.setattr(doctor, "LIMIT", 0.2)
     assert not doctor.outcome("import time; time.sleep(60)")[0]
-
-
-def test_runs_need_a_folder_that_can_be_written(tmp_path):
-    (tmp_path / "file").write_text("")
-    assert doctor.outcome(doctor.FOLDER, str(tmp_path / "a" / "b"))[0]
-    for nowhere in (tmp_path / "file" / "runs", "/proc", "/proc/runs"):
-        works, said = doctor.outcome(doctor.FOLDER, str(nowhere))
-        assert not works
-        assert said.endswith("cannot be written")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def ran(words, folder):

@@ -10,11 +10,10 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from viapoint.training.cli import doctor
+from viapoint.training.extras import explain_import_error
 
 if TYPE_CHECKING:
     from viapoint.training.config.configs import TrainConfig
@@ -71,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             _leave("stopped", 130)
         if isinstance(error, ImportError) and words[:1] == ["doctor"]:
             # It says what is missing, without the package that reads options.
-            doctor.run(SimpleNamespace(out=Path("runs")))
+            doctor.run(None)
         if debug:
             raise
         _leave(_one_line(error), getattr(error, "exit_code", 2))
@@ -147,7 +146,7 @@ def _complaint(text: str, command: str, kind: type[Any]) -> str:
 
 def _one_line(error: Exception) -> str:
     if isinstance(error, ImportError):
-        return doctor.explain_import_error(error)
+        return explain_import_error(error)
     known = isinstance(error, ValueError | OSError) or type(error).__module__.startswith(
         ("viapoint", "gymnasium")
     )

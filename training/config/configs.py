@@ -592,8 +592,6 @@ class DoctorConfig(Config):
     Example: viapoint doctor
     """
 
-    out: Path = Path("runs")  # Folder for runs, which is checked for write access.
-
 
 @dataclass(frozen=True, kw_only=True)
 class StudyConfig(Config):

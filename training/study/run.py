@@ -18,11 +18,11 @@ import pandas as pd
 from stable_baselines3.common.callbacks import BaseCallback
 
 from viapoint.training.agents.model_io import load_model, untrained
-from viapoint.training.cli.doctor import explain_import_error
 from viapoint.training.config.checks import check_folder, named_path
 from viapoint.training.config.configs import StudyConfig
 from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.evaluation.statistics import across_seeds, wilson
+from viapoint.training.extras import explain_import_error
 from viapoint.training.io.files import BadFileError, read_json, write_bytes, write_json
 from viapoint.training.planning.baselines import Method, agent_method, make_method
 from viapoint.training.planning.search import registered_task
