@@ -1,4 +1,4 @@
-"""What to install where an import fails."""
+"""Message of a failed import: what to install."""
 
 # Extras of packages that a command imports when it needs them; others belong to `training`
 EXTRAS = {"minari": "minari", "mjviser": "live", "optuna": "study", "ray": "study", "viser": "live"}
