@@ -34,7 +34,7 @@ LEAST_SHARE = 0.3  # Least length along an axis across which a body is cut, as a
 # First and last step of the search for the ends, and last one where cuts are compared, as shares of the size
 FIRST_STEP, LAST_STEP, COARSE_STEP = 0.25, 5e-4, 0.05
 # Greatest number of capsules for one geom, and where their excess is at most SMALL, [m]
-MOST_CAPSULES, MOST_SMALL, SMALL = 128, 48, 0.02
+MOST_CAPSULES, MOST_SMALL, SMALL = 256, 48, 0.02
 _ONE_WAY = np.concatenate((np.eye(6), np.kron([[1.0, 1.0], [1.0, -1.0]], np.eye(3))))
 # Directions in which the search moves one end of a capsule, or both, shape (24, 2, 3)
 MOVES = np.concatenate((_ONE_WAY, -_ONE_WAY)).reshape(-1, 2, 3)
@@ -76,7 +76,7 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
         return [FittedCapsule(ends, float(size[0]), 0.0, np.empty((0, 3)), geom)]
     try:
         corners, larger = polytope_around(model, geom)
-        found = cover_points(corners, tolerance - larger)
+        found = cover_points(corners, tolerance - larger, SMALL - larger)
     except ValueError as error:
         raise ValueError(f"geom {model.geom(geom).name or geom}: {error}") from None
     return [each._replace(excess=each.excess + larger, geom=geom) for each in found]
@@ -132,17 +132,17 @@ def _rim(number: int) -> Float:
     return np.stack((wide * np.cos(angle), wide * np.sin(angle), 0.0 * angle), axis=-1)
 
 
-def cover_points(points: Float, tolerance: float) -> list[FittedCapsule]:
+def cover_points(points: Float, tolerance: float, small: float) -> list[FittedCapsule]:
     """Return capsules and spheres that together contain the convex hull of points, shape (n, 3), [m].
 
-    Their excess is at most the tolerance, if MOST_CAPSULES suffice for that.
+    Their excess is at most the tolerance, if MOST_CAPSULES suffice for that; below `small` MOST_SMALL are enough.
     """
     body = _body(points)
     found = [_fit_capsule(np.asarray(body.shape.vertices), body)]
     while True:
         worst = max(range(len(found)), key=lambda index: found[index].excess)
         excess = found[worst].excess
-        most = MOST_SMALL if excess <= SMALL else MOST_CAPSULES
+        most = MOST_SMALL if excess <= small else MOST_CAPSULES
         if excess <= tolerance or len(found) >= most:
             return found
         found += _best_halves(found.pop(worst).corners, body, tolerance)

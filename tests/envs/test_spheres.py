@@ -18,6 +18,7 @@ GEOMS = """<mujoco>
     <geom type="cylinder" size=".06 .15" euler="0 60 10"/>
     <geom type="ellipsoid" size=".04 .06 .12" pos=".3 0 0" euler="0 60 10"/>
     <geom type="mesh" mesh="wedge" pos="1 0 0" euler="0 30 10"/>
+    <geom type="cylinder" size=".28 .165" pos="2 0 0"/>
   </worldbody>
 </mujoco>"""
 
@@ -51,7 +52,7 @@ def depth(capsule, points):
 
 
 @pytest.mark.parametrize("tolerance", [0.02, 0.2])
-@pytest.mark.parametrize("geom", range(2, 6))
+@pytest.mark.parametrize("geom", range(2, 7))
 def test_capsules_contain_a_geom_and_reach_no_farther_beyond_it_than_the_tolerance(geom, tolerance):
     model, rng = mujoco.MjModel.from_xml_string(GEOMS), np.random.default_rng(2)
     found = cover_geom(model, geom, tolerance)
