@@ -68,6 +68,15 @@ def test_a_plane_movement_needs_no_other_columns_and_is_that_of_the_function(tmp
     assert "via1_z" not in written
 
 
+@pytest.mark.parametrize("column", ["time", "x"])
+def test_other_units_than_seconds_and_metres_are_told(column, tmp_path, capsys):
+    table = recorded("time", "x", "y")
+    table[column] *= 1000.0
+    table.to_csv(tmp_path / "one.csv", index=False)
+    run(tmp_path / "one.csv", "--out", tmp_path, "--n-via", 1)
+    assert ("seconds" if column == "time" else "metres") in capsys.readouterr().err
+
+
 TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
 
 
@@ -79,6 +88,7 @@ TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
         ([*TABLE[:3], "", "  ", "0.2,0.1"], "2 values in line 6"),
         ([*TABLE[:2], "", "0.1,far,0.2"], "line 4, column x: far"),
         (["y", "0.1"], "no column time"),
+        (["time;x;y", "0.0;0.1;0.2"], "separate columns by commas"),
         ([TABLE[0], *(f"{-time},0.1,0.2" for time in range(12))], "time must ascend"),
         (TABLE[:1], "holds no samples"),
         (["", *TABLE[:3], "0.1,,0.2"], "line 5, column x: nothing"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import itertools
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ UNNAMED = (
     "null",
 )  # Entries of a column `movement` that name none, in any case
 TABLE, FIGURE = "fit.csv", "fit.png"  # Files that are written
+# Distances of samples, [s], and extents of movements, [m], above which the units are probably others
+SLOW, WIDE = 0.5, 5.0
 DRAWN = 6  # Greatest number of movements in the figure
 
 Fits = dict[str, ViaPointFit]  # Fits by the names of the movements
@@ -50,6 +53,7 @@ def run(config: FitConfig) -> None:
             fits[name] = fit_via_points(time, position, config.numbers, free_ends=config.free_ends)
         except ValueError as error:
             raise BadFileError(config.file, f"movement {name}: {error}") from None
+    _warn(movements)
     print(_printed(fits))
     fitted_movements(figure, dict(itertools.islice(movements.items(), DRAWN)), fits)
     write_bytes(table, _written(fits).to_csv(index=False).encode())
@@ -63,8 +67,9 @@ def read_movements(path: Path) -> Movements:
     missing = [name for name in REQUIRED if name not in table]
     if missing:
         found = ", ".join(map(str, table.columns))
+        advice = "; separate columns by commas" if len(table.columns) == 1 else ""
         raise BadFileError(
-            path, f"has no column {', '.join(missing)}; its first line names the columns {found}"
+            path, f"has no column {', '.join(missing)}; its first line names the columns {found}{advice}"
         )
     names = [name for name in ("time", *COORDINATES) if name in table]
     numbers = table[names].apply(pd.to_numeric, errors="coerce")
@@ -87,6 +92,16 @@ def read_movements(path: Path) -> Movements:
     if not movements:
         raise BadFileError(path, "holds no samples")
     return movements
+
+
+def _warn(movements: Movements) -> None:
+    """Print what looks like other units than seconds and metres."""
+    for name, (time, position) in movements.items():
+        gap, extent = float(np.ptp(time)) / len(time), float(np.ptp(position, axis=0).max())
+        if gap > SLOW:
+            print(f"movement {name}: samples are {gap:g} s apart; `time` is in seconds", file=sys.stderr)
+        if extent > WIDE:
+            print(f"movement {name}: the hand moves {extent:g} m; positions are in metres", file=sys.stderr)
 
 
 def _read_table(path: Path) -> pd.DataFrame:

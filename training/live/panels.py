@@ -208,7 +208,7 @@ class Panels:
         self._duration.on_update(_by_user(lambda value: act("change", duration=value)))
         methods = gui.add_dropdown("Method", arena.methods, hint="Decides after each change of the scene")
         methods.on_update(_by_user(lambda name: act("change", method=name, **anew)))
-        most = action.n_via if arena.task.replanning else max(4, action.n_via)
+        most = action.n_via if arena.task.replanning else max(3, action.n_via)
         self._vias = gui.add_slider("Via-points", 0, most, 1, action.n_via, disabled=most == action.n_via)
         self._vias.on_update(_by_user(lambda value: act("change", n_via=value, by_hand=None)))
         if hasattr(getattr(arena.agent, "policy", None), "checks"):
