@@ -63,7 +63,7 @@ def main() -> None:
 
 def write_problems(folder: Path) -> None:
     """Write the numeric file of the package from a folder of the original files."""
-    problems = benchmark.read_problems(folder)
+    problems, _ = benchmark.read_problems(folder)
     shapes = [shape for problem in problems for shape in problem.obstacles]
     np.savez_compressed(
         Path(benchmark.__file__).parent / "data" / "motionbenchmaker.npz",
@@ -88,7 +88,7 @@ def write_table(problems: list[BenchmarkProblem]) -> None:
     _, _, after = after.partition(END)
     PAGE.write_text(f"{before}{BEGIN}\n{page_table(found)}\n{END}{after}", encoding="utf-8")
     unsolved = lines[
-        lines.planner.str.startswith("plan_motion") & ~lines.refused & ~(lines.solved & lines.physics)
+        lines.planner.str.startswith("plan_motion") & (lines.refused == "") & ~(lines.solved & lines.physics)
     ]
     print(unsolved[["planner", "set", "number", "solved", "physics", "clearance", "seeds"]].to_string())
 

@@ -267,17 +267,24 @@ def _least_distance(arm: Arm, position: Float, begin: Float) -> float:
     """Return the least distance between tool and a place that is found from some configurations, (N, J), [m]."""
     from scipy.optimize import least_squares  # here, because it is needed where nothing was found only
 
+    def away(configurations: Float) -> Float:
+        return np.asarray(np.linalg.norm(arm.hand(configurations) - position, axis=-1))
+
     low, high = arm.joint_range.T
-    order = np.argsort(np.linalg.norm(arm.hand(begin) - position, axis=-1))
-    least = np.inf
-    for configuration in begin[order[:NEAREST]]:
-        found = least_squares(
-            lambda joints: arm.hand(joints) - position,
-            np.clip(configuration, low + INSIDE, high - INSIDE),
-            bounds=(low, high),
-        )
-        least = min(least, float(np.linalg.norm(found.fun)))
-    return least
+    some = begin[np.argsort(away(begin))[:NEAREST]]
+    for configuration in some:
+        _descend(arm, position, None, configuration)
+    inside = np.clip(some[away(some).argmin()], low + INSIDE, high - INSIDE)
+    found = least_squares(lambda joints: arm.hand(joints) - position, inside, bounds=(low, high))
+    return float(np.linalg.norm(found.fun))
+
+
+def _descend(arm: Arm, position: Float, axes: Float | None, joints: Float) -> float:
+    """Move joints towards a target, see :func:`descend`; without axes any orientation will do."""
+    number = len(joints) + 1
+    memory = np.empty((number, 3, 3)), np.empty((number, 3))
+    target = np.eye(3) if axes is None else axes
+    return descend(arm.chain, arm.joint_range, position, target, axes is not None, joints, *memory)
 
 
 class UnreachableError(ValueError):
@@ -316,7 +323,7 @@ def inverse_kinematics(
         [0.5, 0.2, 0.4]
     """
     position = finite_array("position", position, (3,))
-    axes = np.eye(3)
+    axes = None
     if quaternion is not None:
         axes = frame_matrices(unit_quaternion("quaternion", quaternion))
     number = whole_number("n_seeds", n_seeds, 1)
@@ -324,21 +331,9 @@ def inverse_kinematics(
     rng = np.random.default_rng(0) if rng is None else rng
     low, high = arm.joint_range.T
     begin = np.concatenate((first[None], rng.uniform(low, high, (number - 1, len(low)))))
-    joints = len(low)
-    rotation = np.empty((joints + 1, 3, 3))
-    origin = np.empty((joints + 1, 3))
     found: list[Float] = []
     for configuration in begin.copy():
-        error = descend(
-            arm.chain,
-            arm.joint_range,
-            position,
-            axes,
-            quaternion is not None,
-            configuration,
-            rotation,
-            origin,
-        )
+        error = _descend(arm, position, axes, configuration)
         if error == 0.0 and all(np.abs(configuration - other).max() > SAME for other in found):
             found.append(configuration)
     if not found:

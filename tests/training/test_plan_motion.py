@@ -284,17 +284,41 @@ def test_gradient_of_the_objective(kwargs) -> None:
 
 def test_problems_of_a_batch_share_no_generator(monkeypatch) -> None:
     drawn_first = []
-    monkeypatch.setattr(module, "plan_motion", lambda *_, rng: drawn_first.append(rng.uniform()))
+
+    def draw(*_, rng=None, **__):
+        if rng is not None:
+            drawn_first.append(rng.uniform())
+
+    monkeypatch.setattr(module, "plan_motion", draw)
     plan_motions(PANDA, [PANDA.home] * 2, [GOAL] * 2, [[]] * 2, threads=1, rng=np.random.default_rng(1))
     children = np.random.default_rng(1).spawn(2)
     assert drawn_first == [child.uniform() for child in children]
 
 
-def test_a_batch_goes_on_after_a_pose_out_of_reach() -> None:
-    plans = plan_motions(PANDA, [PANDA.home] * 2, [Pose((2.0, 0.0, 0.5)), GOAL], [[], []])
-    assert [plan.success for plan in plans] == [False, True]
-    assert "out of reach" in plans[0].reason
+def test_a_batch_goes_on_after_problems_that_are_refused() -> None:
+    starts = [PANDA.home, PANDA.home[:6], PANDA.home * np.nan, PANDA.home, PANDA.home]
+    goals = [Pose((2.0, 0.0, 0.5)), *[GOAL] * 4]
+    plans = plan_motions(PANDA, starts, goals, [[], [], [], [{"shape": "blob"}], []])
+    assert [plan.success for plan in plans] == [False] * 4 + [True]
+    for number, word in enumerate(("reached", "shape (7,)", "finite", "blob")):
+        assert plans[number].reason.startswith(f"problem {number}: ")
+        assert word in plans[number].reason
     assert plan_motion(PANDA, PANDA.home, [Pose((2.0, 0.0, 0.5)), Pose((0.5, 0.2, 0.4))]).success
+
+
+def test_numbers_of_other_types_compile_nothing_anew() -> None:
+    wall = Box((0.1, 0.1, 0.3), position=(0.5, 0.15, 0.3))
+    expected = plan_motion(PANDA, PANDA.home, GOAL, [wall], duration=2.0, margin=0.0)
+    known = len(module.refine_seeds.signatures)
+    plan = plan_motion(PANDA, PANDA.home, GOAL, [wall], duration=np.uint8(2), margin=np.float32(0.0))
+    assert len(module.refine_seeds.signatures) == known
+    assert np.array_equal(plan.waypoints, expected.waypoints)
+
+
+def test_a_start_faster_than_the_limits_is_told_at_once() -> None:
+    plan = plan_motion(PANDA, PANDA.home, GOAL, velocity=[3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert (plan.success, plan.seeds) == (False, 0)
+    assert "'joint1'" in plan.reason
 
 
 def test_a_pose_is_reached_by_any_of_its_free_configurations() -> None:
@@ -441,7 +465,11 @@ world:
         f"start_state:\n  joint_state: {{name: [{names}], position: [0, 0, 0, -1, 0, 1, 0]}}\n"
         f"goal_constraints:\n  - joint_constraints:\n{goals}"
     )
-    [problem] = read_problems(tmp_path)
+    (folder / "request0007_more.yaml").touch()
+    (folder / "scene_sensed0007.yaml").touch()
+    (folder / "scene0008.yaml").touch()  # the others go on
+    [problem], [fault] = read_problems(tmp_path)
+    assert "scene0008.yaml" in fault
     assert problem.name == "cage 7"
     assert np.allclose(problem.goal, np.arange(1, 8) / 10)
     box, can = problem.obstacles

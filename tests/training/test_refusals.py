@@ -277,8 +277,9 @@ CALLS = [
         {"time_limit": np.nan}, {"duration": 0.0}, {"velocity": np.zeros(3)},
         {"obstacles": [{"shape": "box"}]}, {"obstacles": no_obstacles(2)},
     )),
-    *(lambda goals=goals: plan_motions(PANDA_ARM, 2 * [PANDA_ARM.home], goals, [[], []])
-      for goals in ([PANDA_ARM.home, np.zeros(3)], [PANDA_ARM.home])),
+    lambda: plan_motions(PANDA_ARM, 2 * [PANDA_ARM.home], [PANDA_ARM.home], [[], []]),
+    lambda: plan_motions(PANDA_ARM, [PANDA_ARM.home], [PANDA_ARM.home], [[]], n_via=4),
+    lambda: moved().joints(rate=1e9),
     lambda: plan_motions(PANDA_ARM, [PANDA_ARM.home], [PANDA_ARM.home], [[]], threads=2.5),
     lambda: moved(obstacles=[many_points()]).execute(force=True),
     lambda: scenes_for("tests", Task.of()),

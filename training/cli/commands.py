@@ -33,6 +33,8 @@ from viapoint.training.runs import trainer as training
 from viapoint.training.runs.run_dir import Run
 from viapoint.training.scene_sets import evenly_spread, scenes_for
 
+MOST_FAULTS = 10  # Greatest number of problems that are named with what is wrong
+
 
 def train(config: TrainConfig) -> None:
     """Train, and print the run."""
@@ -96,11 +98,11 @@ def _notes(config: EvaluateConfig) -> TextIO:
 
 def _measure_planners(config: EvaluateConfig) -> None:
     """Measure planners on the problems of MotionBenchMaker, print the table, and write one line for each problem."""
-    problems = (
-        benchmark.benchmark_problems()
-        if config.problems is None
-        else benchmark.read_problems(config.problems)
-    )
+    faults = list[str]()
+    if config.problems is None:
+        problems = benchmark.benchmark_problems()
+    else:
+        problems, faults = benchmark.read_problems(config.problems)
     problems = [problems[row] for row in evenly_spread(len(problems), config.n_scenes)]
     names = ("plan_motion",) if config.baselines == USUAL_BASELINES else config.baselines
     for name in names:
@@ -108,6 +110,11 @@ def _measure_planners(config: EvaluateConfig) -> None:
     with scene_progress() as progress:
         lines = [benchmark.measure_planner(name, problems, progress=progress) for name in names]
     table = pd.concat(lines)
+    refused = table[table.refused != ""].drop_duplicates(["set", "number"])
+    faults += [f"{each.set} {each.number}: {each.refused}" for each in refused.itertuples()]
+    if faults:
+        told = [*faults[:MOST_FAULTS], "..."] if len(faults) > MOST_FAULTS else faults
+        print(f"{len(faults)} problems are left out:", *told, sep="\n  ", file=sys.stderr)
     if config.format == "csv":
         print(table.to_csv(index=False).rstrip())
     elif config.format == "json":

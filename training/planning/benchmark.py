@@ -26,7 +26,7 @@ from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
 from viapoint.envs.arms.registry import PANDA_HOME
 from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.types import Float
-from viapoint.envs.common.validation import whole_number
+from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.obstacles import pack, quaternions_of
 from viapoint.envs.geometry.shapes import Box, Cylinder, Shape, as_obstacle
 from viapoint.envs.plans import Plan
@@ -150,18 +150,26 @@ def benchmark_problems() -> list[BenchmarkProblem]:
     return problems
 
 
-def read_problems(folder: str | Path) -> list[BenchmarkProblem]:
+def read_problems(folder: str | Path) -> tuple[list[BenchmarkProblem], list[str]]:
     """Return the problems of a folder of MotionBenchMaker's files, in the order of their sets and numbers.
 
-    The files are `sceneNNNN.yaml` and `requestNNNN.yaml`, in folders named after their sets.
+    The files are `sceneNNNN.yaml` and `requestNNNN.yaml`, in folders named after their sets. The second result has a
+    line for each problem that cannot be read, which names its file.
 
     Raises:
-        ValueError: There is no problem, or a file cannot be read; the message names it.
+        ValueError: There is no problem that can be read.
     """
     scenes = sorted(Path(folder).expanduser().rglob("scene*.yaml"))
-    if not scenes:
-        raise ValueError(f"{folder} holds no scene*.yaml of MotionBenchMaker")
-    return [_read(scene) for scene in scenes]
+    problems, faults = [], []
+    for scene in scenes:
+        if re.fullmatch(r"scene\d+", scene.stem):
+            try:
+                problems.append(_read(scene))
+            except ValueError as error:
+                faults.append(str(error))
+    if not problems:
+        raise ValueError(faults[0] if faults else f"{folder} holds no sceneNNNN.yaml of MotionBenchMaker")
+    return problems, faults
 
 
 def _read(scene: Path) -> BenchmarkProblem:
@@ -174,16 +182,15 @@ def _read(scene: Path) -> BenchmarkProblem:
         start = dict(zip(state["name"], state["position"], strict=True))
         wanted = asked["goal_constraints"][0]["joint_constraints"]
         goal = {each["joint_name"]: each["position"] for each in wanted}
-        begin = np.array([start[joint] for joint in JOINTS], dtype=np.float64)
-        end = np.array([goal[joint] for joint in JOINTS], dtype=np.float64)
+        begin = finite_array("start", [start[joint] for joint in JOINTS], (len(JOINTS),))
+        end = finite_array("goal", [goal[joint] for joint in JOINTS], (len(JOINTS),))
         obstacles = tuple(_shapes_of(world["collision_objects"]))
     except (KeyError, TypeError, IndexError, OSError, yaml.YAMLError) as error:
         raise ValueError(f"{scene}: no problem of MotionBenchMaker for the Panda ({error!r:.80})") from None
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from None
-    number = re.search(r"\d+", scene.stem)
-    assert number is not None
-    return BenchmarkProblem(scene.parent.name.removesuffix("_panda"), int(number[0]), begin, end, obstacles)
+    number = int(scene.stem.removeprefix("scene"))
+    return BenchmarkProblem(scene.parent.name.removesuffix("_panda"), number, begin, end, obstacles)
 
 
 def _shapes_of(objects: list[Mapping[str, Any]]) -> Iterator[Shape]:
@@ -278,7 +285,9 @@ def measure_planner(
                 "planner": name,
                 "set": problem.set,
                 "number": problem.number,
-                "refused": plan.reason.startswith(("the start", "the goal", "the arm")),
+                "refused": plan.reason
+                if plan.reason.startswith(("the start", "the goal", "the arm"))
+                else "",
                 "solved": plan.success,
                 "physics": False,
                 "milliseconds": milliseconds,
@@ -317,7 +326,7 @@ def summary(lines: pd.DataFrame) -> pd.DataFrame:
     names = [*dict.fromkeys(lines["set"]), "all"]
     for planner, name in itertools.product(dict.fromkeys(lines.planner), names):
         some = lines[(lines.planner == planner) & ((lines["set"] == name) | (name == "all"))]
-        asked = some[~some.refused]
+        asked = some[some.refused == ""]
         solved = asked[asked.solved]
         rows.append(
             {

@@ -32,6 +32,8 @@ from viapoint.envs.scenes.scene import resting
 from viapoint.envs.spaces import Space, space_of
 from viapoint.envs.task import MOST_OBSTACLES, Task
 
+HIGHEST_RATE = 1e6  # Instants per second of a movement of the joints are fewer, [Hz]
+
 
 class Limits(NamedTuple):
     """Greatest shares of the limits of the joints that a movement uses; more than 1 is beyond a limit."""
@@ -112,7 +114,7 @@ class MotionPlan:
     limits: Limits
     """Shares of the velocity and torque limits."""
     jerk: float
-    """Jerk cost relative to that of the straight movement of the same duration."""
+    """Jerk cost relative to that of the straight movement of the same duration; NaN where that does not move."""
     source: str
     """Origin of the via-points: `straight`, `straight, refined`, `given`, `random`, `ompl`, or another planner."""
     reason: str = ""
@@ -149,14 +151,14 @@ class MotionPlan:
         """Return the movement of the joints at a rate, from the start to the goal.
 
         Args:
-            rate: Instants per second, [Hz]; the last interval may be shorter.
+            rate: Instants per second, from 0.001 to less than 1e6, [Hz]; the last interval may be shorter.
             force: True for plans without success, too.
 
         Raises:
             UnsafePlanError: The plan has no success.
         """
         self.refuse_unsafe(force)
-        number_of_at_least("rate", rate, 1e-3)
+        number_of_at_least("rate", rate, 1e-3, HIGHEST_RATE)
         last = int(np.floor(self.duration * rate * (1.0 - 1e-12)))
         time = np.append(np.arange(last + 1) / rate, self.duration)
         motion = joint_motion(space_of(self.arm, self.space), *self.trajectory().sample(time))
