@@ -119,7 +119,9 @@ def _numpy_floats(named: dict[str, Any]) -> list[Any]:
                 raise TypeError(f"dtype {array.dtype}")
             arrays.append(array if array.dtype == dtype else array.astype(dtype))
         except (TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"{name} must be an array of real numbers, got {value!r} ({error})") from None
+            raise ValueError(
+                f"{name} must be an array of real numbers, got {value!r:.60} ({error})"
+            ) from None
     return arrays
 
 
@@ -174,7 +176,8 @@ def leading_shape(name: str, array: Array, *sizes: int | None) -> tuple[int, ...
     for size, found in zip(sizes, shape[max(first, 0) :], strict=False):
         fits = fits and (found >= 1 if size is None else found == size)
     if not fits:
-        wanted = ", ".join(["...", *("n" if size is None else str(size) for size in sizes)])
+        letters = iter("NDKM")
+        wanted = ", ".join(["...", *(next(letters) if size is None else str(size) for size in sizes)])
         raise ValueError(f"{name} must have shape ({wanted}), got shape {shape}")
     return shape[:first]
 

@@ -11,6 +11,7 @@ projection (Golub & Pereyra 1973). The search works in units of the recording: t
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, NamedTuple, TypeAlias
@@ -41,6 +42,9 @@ _BEYOND = 0.25
 # Shortest segment, in durations of the movement: via-points closer in time cannot be told apart; least share of the
 # recording that the movement takes.
 _SHORTEST, _LEAST = 0.02, 1e-3
+# Distance of a sample from the middle of its neighbours that makes it an outlier, in their distance and in the extent
+# of nearly all samples.
+_APART = 2.0
 # Number of instants among which the first passage times are chosen.
 _GRID = 8
 # Numbers of the best starts that go on, and of their steps.
@@ -179,9 +183,24 @@ def fit_via_points(
     movements, batch, kind = _recordings(time, position, 2 * counts[-1] + 5)
     fits = []
     for times, positions in movements:
+        _warn_of_outliers(positions)
         candidates = [_fit(times, positions, count, free_ends) for count in counts]
         fits.append(min(candidates, key=lambda fit: fit.bic))
     return _record(fits, batch, kind)
+
+
+def _warn_of_outliers(position: Floats) -> None:
+    """Warn of a sample that is far from both of its neighbours (N, D), which are near one another."""
+    away = np.abs(position[1:-1] - 0.5 * (position[2:] + position[:-2]))
+    low, high = np.quantile(position, (0.02, 0.98), axis=0)
+    wrong = np.argwhere(away > _APART * np.maximum(np.abs(position[2:] - position[:-2]), high - low))
+    if len(wrong):
+        sample, axis = wrong[0]
+        warnings.warn(
+            f"sample {sample + 1} is {away[sample, axis]:.3g} m away from those beside it; leave out what was not "
+            "measured",
+            stacklevel=3,
+        )
 
 
 def _counts(n_via: Any) -> range:
@@ -245,8 +264,9 @@ def _checked(time_name: str, time: Any, name: str, position: Any, fewest: int) -
     times = np.broadcast_to(to_numpy(time).astype(float), (*batch, count)).reshape(-1, count)
     places = np.broadcast_to(to_numpy(position).astype(float), (*batch, count, dimension))
     places = places.reshape(-1, count, dimension)
-    ascending = np.diff(times) > 0
-    require(ascending, time_name, times[:, 1:], "must ascend: sort the samples, and keep one of equal times")
+    ascending = np.diff(times, prepend=-np.inf) > 0
+    order = "must ascend: sort the samples, and keep one of equal times"
+    require(ascending.reshape(*batch, count), time_name, times.reshape(*batch, count), order)
     moves = np.ptp(places, axis=1).any(axis=-1)
     require(moves, name, 1.0 * moves, "must change: there is no movement in equal samples")
     return list(zip(times, places, strict=True)), batch, position

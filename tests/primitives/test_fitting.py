@@ -107,6 +107,14 @@ def test_the_noise_is_not_that_which_the_fit_explains():
     assert 0.0018 < math.sqrt(np.mean(squares)) < 0.0022
 
 
+def test_a_sample_far_from_its_neighbours_is_told():
+    time = np.linspace(0.0, 1.0, 60)
+    position = through([[0.0, 0.0], [0.2, 0.1], [0.4, 0.0]], [0.4, 0.6])(time)
+    position[20, 1] += 1.0
+    with pytest.warns(UserWarning, match="sample 20 "):
+        fit_via_points(time, position, 1)
+
+
 @pytest.mark.parametrize("part", [slice(0, 50), slice(50, 100), slice(30, 70)])
 def test_via_points_are_passed_within_the_recording(part, rng):
     for _ in range(5):

@@ -299,7 +299,7 @@ def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch) -> None
 
 
 GOOD, GONE = "print('fine')", "import no_such_module"
-EXTRA = ("torch", "stable_baselines3", "sb3_contrib", "tyro", "rich", "matplotlib", "safetensors")
+EXTRA = ("torch", "stable_baselines3", "sb3_contrib", "tyro", "rich", "matplotlib")
 
 
 def report(capsys, *words):

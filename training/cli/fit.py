@@ -119,7 +119,7 @@ def _read_table(path: Path) -> pd.DataFrame:
                 rows.append(entries)
                 lines.append(reader.line_num)
     except (UnicodeDecodeError, csv.Error) as error:
-        raise BadFileError(path, f"cannot be read as CSV ({error})") from None
+        raise BadFileError(path, f"cannot be read as CSV in UTF-8 ({error})") from None
     if not rows:
         raise BadFileError(path, "cannot be read as CSV (it is empty)")
     head, *samples = rows
@@ -131,7 +131,7 @@ def _read_table(path: Path) -> pd.DataFrame:
             raise BadFileError(
                 path,
                 f"has {len(entries)} values in line {line}; its first line names {len(head)} columns: "
-                f"{', '.join(head)}",
+                f"{', '.join(head)}; commas separate columns, and decimals have points",
             )
     return pd.DataFrame(samples, columns=head, index=lines[1:], dtype=str)
 

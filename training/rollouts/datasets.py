@@ -59,7 +59,10 @@ def record_dataset(
     if folder.exists():
         raise ValueError(f"dataset {dataset_id} exists in {folder}; name another one, or a new version")
     if isinstance(method, PlannerMethod | OpenLoopBaseline):
-        raise ValueError(f"movements of {method.name} are no actions, which a dataset holds")
+        raise ValueError(
+            f"movements of {method.name} are no actions, which a dataset holds; those of an agent, random or "
+            "search512 are"
+        )
     with closing(gym.make(env_id, **env_kwargs)) as env:
         buffers = []
         for episode in range(episodes):
