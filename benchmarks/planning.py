@@ -19,6 +19,7 @@ from viapoint.envs.geometry.obstacles import pack
 from viapoint.training.planning import benchmark
 from viapoint.training.planning.benchmark import BenchmarkProblem, benchmark_panda, benchmark_problems
 from viapoint.training.planning.plan_motion import plan_motion
+from viapoint.training.plotting.plots import METHOD_COLOURS
 
 DOCS = Path(__file__).parents[1] / "docs"
 TABLE = DOCS / "planning.csv"
@@ -38,7 +39,8 @@ LIMITS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 """Time limits of plan_motion, [ms]."""
 CHECKS = (16, 64, 256, 1024, 4096, 16384)
 """Numbers of plans that the search checks."""
-COLOURS = {"plan_motion": "#1f6fb2", "search": "#d1812f", "OMPL": "#4f8f4f"}
+CURVES = {"plan_motion": "plan_motion", "search": "search", "OMPL": "ompl"}
+"""Curves of the figure, with the names of their colours."""
 
 
 def main() -> None:
@@ -120,7 +122,7 @@ def page_table(found: pd.DataFrame) -> str:
 def draw_curves(problems: list[BenchmarkProblem]) -> None:
     """Draw share solved and jerk against the time that planners are given."""
     arm, scenes = benchmark_panda(), [pack([each.obstacles]) for each in problems]
-    curves: dict[str, list[tuple[float, float, float]]] = {name: [] for name in COLOURS}
+    curves: dict[str, list[tuple[float, float, float]]] = {name: [] for name in CURVES}
     for limit in LIMITS:
         plans = [
             plan_motion(
@@ -153,8 +155,8 @@ def draw_curves(problems: list[BenchmarkProblem]) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.0, 3.2), layout="constrained")
     for name, points in curves.items():
         time, share, jerk = np.array(points).T
-        left.plot(time, 100.0 * share, "o-", color=COLOURS[name], label=name, markersize=4)
-        right.plot(time, jerk, "o-", color=COLOURS[name], markersize=4)
+        left.plot(time, 100.0 * share, "o-", color=METHOD_COLOURS[CURVES[name]], label=name, markersize=4)
+        right.plot(time, jerk, "o-", color=METHOD_COLOURS[CURVES[name]], markersize=4)
     left.set(xscale="log", xlabel="time [ms]", ylabel="solved [%]", ylim=(0, 103))
     right.set(xscale="log", yscale="log", xlabel="time [ms]", ylabel="jerk, relative to straight")
     right.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from viapoint.training import Run, evaluate, load_agent
 from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.planning.search import registered_task
-from viapoint.training.plotting.plots import style_axes
+from viapoint.training.plotting.plots import METHOD_COLOURS, style_axes
 from viapoint.training.scene_sets import SETS, shipped_set
 
 BASELINES = ("untrained", "straight", "sobol64", "search512", "plan_motion", "ompl")
@@ -63,28 +63,21 @@ PICTURE = Path("docs/images/results.png")
 DETAILS = ("points:", "fitted:", "agent, seed", "untrained, ")
 """Beginnings of methods that are on the second page or in the file only."""
 STYLES = {
-    "plan_motion": ("#c0504d", "D"),
-    "ompl": ("#c0504d", "P"),
-    "search512": ("#7f7f7f", "s"),
-    "sobol64": ("#7f7f7f", "v"),
-    "known:plan_motion": ("#c0504d", "d"),
-    "known:search512": ("#7f7f7f", "h"),
-    "seen:search512": ("#7f7f7f", "^"),
-    "cautious512": ("#7f7f7f", "X"),
-    "thick:search512": ("#7f7f7f", "<"),
-    "thick:plan_motion": ("#c0504d", "p"),
-    "agent": ("#1f5fa8", "o"),
-    "agent, 16 checks": ("#1f5fa8", "p"),
-    "agent, 4 refined": ("#1f5fa8", ">"),
-    "agent, 16 refined": ("#1f5fa8", ">"),
-    "untrained": ("#9dc3e6", "o"),
-    "SAC": ("#2a9d8f", "o"),
-    "TQC": ("#2a9d8f", "s"),
-    "PPO": ("#2a9d8f", "^"),
+    "plan_motion": ("plan_motion", "D"),
+    "known:plan_motion": ("plan_motion", "D"),
+    "ompl": ("ompl", "P"),
+    "search512": ("search", "s"),
+    "cautious512": ("search", "X"),
+    "thick:search512": ("search", "<"),
+    "agent": ("agent", "o"),
+    "agent, 4 refined": ("agent", ">"),
+    "untrained": ("untrained", "o"),
+    "SAC": ("sac", "o"),
+    "PPO": ("ppo", "^"),
 }
-"""Colours and marks of methods in the figure: planners, searches, agents, and those of Stable-Baselines3."""
-PRIVILEGED = ("known:", "seen:")
-"""Beginnings of methods that know the truth, which have hollow marks."""
+"""Colours, by their names, and marks of the methods in the figure."""
+PRIVILEGED = "known:"
+"""Beginning of methods that know more than a sensor tells, which have hollow marks."""
 FIELDS = ("env", "scenes", "method", "success", "low", "high", "count", "jerk_ratio", "milliseconds")
 
 
@@ -238,11 +231,12 @@ def draw(rows: list[dict[str, Any]]) -> None:
     marks: dict[str, Any] = {}
     for heading, axes in zip(headings, panels, strict=False):
         for row in rows:
-            name = row["method"] if row["method"] in STYLES else row["method"].partition(",")[0]
+            name = row["method"] if row["method"].startswith("agent") else row["method"].partition(",")[0]
             shown = row["env"] == f"viapoint/{heading}-v0" and row["scenes"] == "test"
             if not shown or is_detail(row["method"]) or name not in STYLES:
                 continue
-            color, mark = STYLES[name]
+            kind, mark = STYLES[name]
+            color = METHOD_COLOURS[kind]
             success = float(row["success"])
             bars = [[success - float(row["low"])], [float(row["high"]) - success]]
             hollow = name.startswith(PRIVILEGED)

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from stable_baselines3.common.callbacks import BaseCallback
 
 from viapoint.training import TrainConfig, train
-from viapoint.training.plotting.plots import style_axes
+from viapoint.training.plotting.plots import METHOD_COLOURS, style_axes
 
 TASKS = (
     "PlanarObstacles",
@@ -35,7 +35,7 @@ TASKS = (
     "PlanarSensed",
     "PandaSensed",
 )
-COLORS = {"sac": "#1f5fa8", "tqc": "#2a9d8f", "ppo": "#d1495b"}
+ALGORITHMS = "sac", "tqc", "ppo"
 CURVES, PICTURE = Path("docs/sb3_curves.csv"), Path("docs/images/sb3_curves.png")
 
 
@@ -47,7 +47,7 @@ class Config:
     """Length of each training."""
     task: tuple[str, ...] = TASKS
     """Names of tasks."""
-    algo: tuple[str, ...] = tuple(COLORS)
+    algo: tuple[str, ...] = ALGORITHMS
     """Names of algorithms."""
     seed: int = 0
     """Seed of the trainings."""
@@ -103,10 +103,12 @@ def draw(rows: list[dict[str, Any]]) -> None:
         if task is None:
             panel.set_axis_off()
             continue
-        for algo, color in COLORS.items():
+        for algo in ALGORITHMS:
             mine = [row for row in rows if row["task"] == task and row["algo"] == algo]
             decisions = [row["decisions"] / 1000.0 for row in mine]
-            panel.plot(decisions, [row["success"] for row in mine], color=color, label=algo.upper())
+            panel.plot(
+                decisions, [row["success"] for row in mine], color=METHOD_COLOURS[algo], label=algo.upper()
+            )
         panel.set_title(task, fontsize=10)
         panel.set_ylim(0.0, 100.0)
         panel.set_xlim(left=0.0)

@@ -33,7 +33,7 @@ ROOT = Path(__file__).parents[2]
 IN_PLANE, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
 STILLS = {
     "planar_reach.png": ("viapoint/PlanarReach-v0", 0),
-    "planar_obstacles.png": (IN_PLANE, 0),
+    "planar_obstacles.png": (IN_PLANE, 9),
     "planar_whole_arm.png": ("viapoint/PlanarWholeArm-v0", 0),
     "planar_target_jump.png": ("viapoint/PlanarTargetJump-v0", 0),
     "planar_moving_obstacles.png": ("viapoint/PlanarMovingObstacles-v0", 0),

@@ -18,6 +18,11 @@ from viapoint.training.io.files import write_figure
 from viapoint.training.scene_sets import BANDS
 
 BLUE = "#1f5fa8"
+# Colours of methods in all figures of results
+METHOD_COLOURS = {
+    "agent": BLUE, "untrained": "#9dc3e6", "plan_motion": "#c0504d", "ompl": "#4f8f4f", "search": "#7f7f7f",
+    "sac": "#2a9d8f", "tqc": "#8e6bb0", "ppo": "#d1812f",
+}  # fmt: skip
 DOTS_PER_INCH = 130
 STYLE = files("viapoint.training") / "paper" / "paper.mplstyle"  # Style of figures in centimetres
 WIDTH, HEIGHT, LEGEND = 17.0, 5.4, 0.7  # Of a figure of fits, each movement, the legend, [cm]
