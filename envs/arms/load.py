@@ -91,11 +91,19 @@ class Parsed(NamedTuple):
         return frozenset(self.names[body] for body in bodies)
 
     def compared(self, exclude: Mapping[Pair, str]) -> list[Pair]:
-        """Return the pairs of bodies with geoms of links that are neither the same nor consecutive, nor excluded."""
+        """Return the pairs of bodies with geoms of different links that are not excluded."""
         found = []
         for first, second in itertools.combinations(self.geoms, 2):
-            apart = abs(self.links[first] - self.links[second])
-            if apart > 1 and (first, second) not in exclude:
+            if self.links[first] != self.links[second] and (first, second) not in exclude:
+                found.append((first, second))
+        return found
+
+    def consecutive(self) -> list[Pair]:
+        """Return the pairs of bodies of consecutive links; of the base, those that carry the first link count."""
+        found = []
+        for first, second in self.compared({}):
+            carries = first > 0 and first in ancestors(self.model, second)
+            if self.links[second] - self.links[first] == 1 and (self.links[first] or carries):
                 found.append((first, second))
         return found
 
@@ -220,6 +228,7 @@ def _load(
     parsed = _parse(whole, names, chosen, notes)
     # Pairs that cannot touch are not compared: those of the file, and those that are always near and always apart.
     exclude = dict.fromkeys(_excluded(parsed, urdf.never_touch), "excluded in the file")
+    exclude |= dict.fromkeys(parsed.consecutive(), "consecutive links")
     never = f"in contact in none of {NEAR_LOOKED_AT:,} configurations, though always near"
     pairs = parsed.compared(exclude)
     low, high = ranges.T

@@ -167,6 +167,31 @@ def test_bodies_that_never_touch_or_touch_at_home_are_left_out(gap, reason):
     assert [pair[:2] for pair in arm.left_out if reason in pair.reason] == [("a", "c")]
 
 
+POST = '<geom type="cylinder" size=".02 .5" pos="0 .25 .3"/>'
+
+
+@pytest.mark.parametrize(
+    ("in_world", "on_base", "name"), [(POST, "", "base_0"), ("", f'<body name="post">{POST}</body>', "post")]
+)
+def test_the_first_link_is_compared_with_the_base_except_with_bodies_that_carry_it(in_world, on_base, name):
+    text = f"""
+    <mujoco><compiler angle="radian"/><worldbody>{in_world}
+      <body name="base">{on_base}<geom type="cylinder" size=".05 .3"/>
+        <body name="upper" pos="0 0 .3"><joint name="one" axis="0 0 1" range="-2 2"/>
+          <geom type="capsule" fromto="0 0 0 .5 0 0" size=".03" mass="1"/>
+          <body name="fore" pos=".5 0 0"><joint name="two" axis="0 0 1" range="-2 2"/>
+            <geom type="capsule" fromto="0 0 0 .1 0 0" size=".03" mass="1"/>
+          </body>
+        </body>
+      </body>
+    </worldbody></mujoco>"""
+    arm = load_arm(text, velocity_limit=1.0, torque_limit=10.0)
+    names = arm.group_names
+    assert [(names[a], names[b]) for a, b in arm.spheres.pairs] == [(name, "upper")]
+    assert ("base", "upper", "consecutive links") in arm.left_out
+    check_contact_implies_overlap(arm)
+
+
 def near_arm(gap):
     """Three links, of which the third has a box at a distance from a ball of the first."""
     return f"""
