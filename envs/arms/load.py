@@ -535,18 +535,29 @@ def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: li
         raise ValueError(
             f"no geom moves with any of {', '.join(joints)}: nothing of the arm can collide; {'; '.join(notes)}"
         )
-    collides = (model.geom_contype | model.geom_conaffinity) > 0
-    others = {model.body(body).name or str(body) for body in model.geom_bodyid[collides] if body not in links}
-    if others:
-        notes.append(f"left out, not part of the arm: {', '.join(sorted(others))}")
-    _note_rest(model, joints, list(links), notes)
+    _note_rest(model, joints, tool, list(links), notes)
     return Parsed(model, rest, copy.copy(rest), joints, tool, links, names, geoms)
 
 
-def _note_rest(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[int], notes: list[str]) -> None:
-    """Note what the arm does not take from its file: planes, and forces of springs, dry friction and compensation."""
+def _note_rest(
+    model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, bodies: list[int], notes: list[str]
+) -> None:
+    """Note what the arm does not take from its file: other bodies and joints, planes, and forces such as of springs."""
     collides = (model.geom_contype | model.geom_conaffinity) > 0
-    if (collides & np.isin(model.geom_type, GROUNDS)).any():
+    ground = np.isin(model.geom_type, GROUNDS)
+    others = set(model.geom_bodyid[collides & ~ground].tolist()) - set(bodies)
+    still = {body for body in others if model.body_weldid[body] == 0}
+    if still:
+        walls = _body_names(model, still)
+        notes.append(f"{WARNING}left out, though the arm may hit them: {walls}; give them as obstacles")
+    if others - still:
+        notes.append(f"left out, not part of the arm: {_body_names(model, others - still)}")
+    carrying = (tool.body, *ancestors(model, tool.body))
+    fixed = np.isin(model.jnt_bodyid, carrying) & ~np.isin(model.jnt_type, MOVES)
+    if fixed.any():
+        named = ", ".join(model.joint(index).name for index in np.flatnonzero(fixed))
+        notes.append(f"fixed: {named}, neither a hinge nor a slide")
+    if (collides & ground).any():
         notes.append("left out: planes and height fields of the file; a floor is an obstacle, HalfSpace")
     numbers = [model.joint(name).id for name in joints]
     dofs = model.jnt_dofadr[numbers]
@@ -564,6 +575,11 @@ def _note_rest(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[int]
         notes.append(
             f"{WARNING}{followers} follows another joint in the file, but not in plans; joints= without it fixes it"
         )
+
+
+def _body_names(model: mujoco.MjModel, bodies: Iterable[int]) -> str:
+    """Return the names of bodies, or their numbers, in a row."""
+    return ", ".join(sorted(model.body(body).name or str(body) for body in bodies))
 
 
 def _collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, list[int]]:

@@ -220,6 +220,9 @@ ONE = TEXT[TEXT.index(SHOULDER) : TEXT.rindex(END)]
 LEFT = re.sub(r'name="(\w+)"', r'name="left_\1"', ONE)
 TWO = TEXT.replace(END, f'<body name="left" pos="0 1 0">{LEFT}</body>{END}')
 """Two arms side by side."""
+TIP_SLIDES = [
+    (HAND_OF_TEXT, f'<body><joint type="slide" limited="false"/>{HAND_OF_TEXT}<geom size=".01"/></body>')
+]
 REFUSED = [
     ({"file": 5}, TypeError), ({"file": None}, TypeError), ({"file": b"arm.xml"}, TypeError),
     ({"file": ""}, ValueError), ({"file": "none.xml"}, ValueError),
@@ -237,6 +240,8 @@ REFUSED = [
     *[({"tolerance": tolerance}, ValueError) for tolerance in (0.0, "fine", np.nan)],
     ({"file": near_arm(1e-4), "home": None, **THREE}, ValueError),  # bodies too close at home
     *[({"file": TWO, "base": base, "tool": None, "joints": None}, ValueError) for base in (None, "right")],
+    ({"file": TWO.replace("left_hand", "left_pinch"), "tool": None, "joints": None}, ValueError),
+    ({"file": changed(*TIP_SLIDES), "tool": None, "joints": None, "home": None}, ValueError),  # no limits
     *[({"file": without(pattern, other)}, ValueError) for pattern, other in (
         ('<joint name="elbow" range', '<joint name="elbow" type="ball" range'), (r"<geom[^>]*/>", ""),
         (r"<geom type[^>]*/>", ""),  # bodies without mass
@@ -458,12 +463,15 @@ def test_urdf_files_that_lack_something_are_refused(crane, old, new):
         load_arm(written(crane, (old, new)))
 
 
-def test_pairs_of_an_srdf_beside_it_are_not_compared(crane):
+@pytest.mark.parametrize(("robot", "note"), [("crane", "those of"), ("ship", "crane.srdf is not used")])
+def test_pairs_of_an_srdf_of_the_same_robot_beside_it_are_not_compared(crane, robot, note):
     path = written(crane)
     (crane / "urdf" / "crane.srdf").write_text(
-        '<robot name="crane"><disable_collisions link1="wrist" link2="post" reason="Never"/></robot>'
+        f'<robot name="{robot}"><disable_collisions link1="wrist" link2="post" reason="Never"/></robot>'
     )
-    assert ("post", "wrist", "excluded in the file") in {tuple(pair) for pair in load_arm(path).left_out}
+    arm = load_arm(path)
+    assert (("post", "wrist", "excluded in the file") in arm.left_out) == (robot == "crane")
+    assert note in "\n".join(arm.notes)
 
 
 def test_packages_are_looked_for_in_given_folders(crane, tmp_path):
@@ -528,7 +536,11 @@ MOBILE = (
     '<body name="carriage"><joint name="x" type="slide" limited="false"/><joint name="turn"/>'
     '<geom size=".05" mass="2"/>'
 )
-WALL = '<body name="wall" pos="2 0 0"><geom type="box" size=".1 1 1"/></body></worldbody>'
+WALL = '<body name="wall" pos="2 0 0">{}<geom type="box" size=".1 1 1"/></body></worldbody>'
+BASE_BALL = (
+    "<worldbody>",
+    '<worldbody><body name="torso"><joint type="ball" name="ball" range="0 1"/><geom size=".01"/>',
+)
 PINCH = gripper(2, "bar").replace("</body>", '<site name="pinch"/></body>', 1)
 
 
@@ -540,7 +552,8 @@ PINCH = gripper(2, "bar").replace("</body>", '<site name="pinch"/></body>', 1)
         ([(HAND_OF_TEXT, gripper(1, "gripperMover"))], "tool:"),
         ([(HAND_OF_TEXT, PINCH)], "fixed: bar_0_0"),  # its tool moves with the last joint of the arm
         ([(SHOULDER, MOBILE + SHOULDER), ("</body>\n  </worldbody>", "</body></body></worldbody>")], "fixed: turn, x"),
-        ([(END, WALL)], "left out, not part of the arm: wall"),
+        ([(END, WALL.format("<freejoint/>"))], "left out, not part of the arm: wall"),
+        ([BASE_BALL, (END, "</body>" + END)], "fixed: ball"),
         ([(END, f'<geom type="plane" size="1 1 1"/>{END}')], "left out: planes"),
     ],
 )  # fmt: skip
@@ -549,6 +562,11 @@ def test_what_is_not_part_of_the_arm_is_fixed_or_left_out_and_told(changes, note
     assert arm.joint_names == JOINTS
     assert any(each.startswith(note) for each in arm.notes)
     assert "wall" not in arm.group_names
+
+
+def test_a_body_that_stands_beside_the_arm_is_told_in_a_warning():
+    with pytest.warns(UserWarning, match="wall; give them as obstacles"):
+        load_arm(changed((END, WALL.format(""))))
 
 
 def test_a_visual_mesh_that_is_missing_is_left_out_and_one_that_collides_is_named(tmp_path):
