@@ -325,20 +325,46 @@ def _read(file: Any, packages: tuple[str | Path, ...]) -> tuple[mujoco.MjSpec, s
 
 
 def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
-    """Return the model of a specification without its visual geoms whose meshes are missing, which are noted."""
+    """Return the model of a specification without its visual meshes and textures that cannot be read; notes tell."""
     while True:
         try:
             return spec.compile()
         except ValueError as error:
-            missing = re.search(r"Error opening file '(.+)'", str(error))
-            lost = [mesh for mesh in spec.meshes if missing and mesh.file and missing[1].endswith(mesh.file)]
-            names = [mesh.name or Path(mesh.file).stem for mesh in lost]
-            geoms = [geom for geom in spec.geoms if geom.meshname in names]
-            if not lost or any(geom.contype or geom.conaffinity for geom in geoms):
-                raise ValueError(f"MuJoCo cannot read the file: {error}") from None
-            notes.append(f"left out: visual mesh {lost[0].file}, which is missing")
-            for part in (*geoms, *lost):
-                spec.delete(part)
+            notes.append(_leave_out(spec, str(error)))
+
+
+def _leave_out(spec: mujoco.MjSpec, fault: str) -> str:
+    """Delete the texture or the visual mesh that MuJoCo's message is about, and return a note of it.
+
+    Raises:
+        ValueError: The message is about something else, or about a mesh that collides.
+    """
+    quoted = [Path(each) for each in re.findall(r"'(.+?)'", fault)]
+
+    def is_meant(file: str) -> bool:
+        return bool(file) and any(path.match(file) for path in quoted)
+
+    for texture in spec.textures:
+        if any(map(is_meant, (texture.file, *texture.cubefiles))):
+            name = texture.name or Path(texture.file).stem
+            for material in spec.materials:
+                material.textures = ["" if each == name else each for each in material.textures]
+            spec.delete(texture)
+            return f"left out: texture {name}, which is missing or broken"
+    for mesh in spec.meshes:
+        name = mesh.name or Path(mesh.file).stem
+        if not is_meant(mesh.file) and not (mesh.file and f"Element name {name!r}" in fault):
+            continue
+        geoms = [geom for geom in spec.geoms if geom.meshname == name]
+        bodies = [geom.parent.name for geom in geoms if geom.contype or geom.conaffinity]
+        if bodies:
+            raise ValueError(
+                f"the mesh {mesh.file}, which collides, of {', '.join(bodies)} is no mesh: {fault}"
+            )
+        for part in (*geoms, mesh):
+            spec.delete(part)
+        return f"left out: visual mesh {Path(mesh.file).name}, which is missing or broken"
+    raise ValueError(f"MuJoCo cannot read the file: {fault}")
 
 
 def _joint_names(joints: Any) -> tuple[str, ...]:

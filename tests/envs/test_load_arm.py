@@ -569,15 +569,24 @@ def test_a_body_that_stands_beside_the_arm_is_told_in_a_warning():
         load_arm(changed((END, WALL.format(""))))
 
 
-def test_a_visual_mesh_that_is_missing_is_left_out_and_one_that_collides_is_named(tmp_path):
-    mesh = '<asset><mesh name="cover" file="cover.obj"/></asset><worldbody>'
-    geom = '<geom type="mesh" mesh="cover" contype="{0}" conaffinity="{0}" mass="0"/>'
+@pytest.mark.parametrize("suffix", ["obj", "stl", "msh"])
+@pytest.mark.parametrize("there", [False, True])
+def test_what_is_only_seen_may_be_missing_or_broken_and_what_collides_is_named(tmp_path, suffix, there):
+    assets = (
+        f'<asset><mesh name="cover" file="cover.{suffix}"/><texture name="skin" type="2d" file="skin.png"/>'
+        '<material name="skin" texture="skin"/></asset><worldbody>'
+    )
+    geom = '<geom type="mesh" mesh="cover" material="skin" contype="{0}" conaffinity="{0}" mass="0"/>'
+    if there:  # a pointer of Git LFS
+        for name in (f"cover.{suffix}", "skin.png"):
+            (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\nsize 12345\n")
     path = tmp_path / "arm.xml"
-    path.write_text(changed(("<worldbody>", mesh), (SHOULDER, SHOULDER + geom.format(0))))
+    path.write_text(changed(("<worldbody>", assets), (SHOULDER, SHOULDER + geom.format(0))))
     arm = load_arm(path, name="covered")
-    assert "left out: visual mesh cover.obj, which is missing" in arm.notes
-    path.write_text(changed(("<worldbody>", mesh), (SHOULDER, SHOULDER + geom.format(1))))
-    with pytest.raises(ValueError, match=r"cover\.obj"):
+    for part in (f"visual mesh cover.{suffix}", "texture skin"):
+        assert f"left out: {part}, which is missing or broken" in arm.notes
+    path.write_text(changed(("<worldbody>", assets), (SHOULDER, SHOULDER + geom.format(1))))
+    with pytest.raises(ValueError, match=rf"cover\.{suffix}.*shoulder"):
         load_arm(path)
 
 
