@@ -177,8 +177,6 @@ def load_arm(
         "tolerance": number_of_at_least("tolerance", tolerance, MIN_TOLERANCE, MAX_TOLERANCE),
     }
     notes = list(urdf.notes)
-    for number, joint in enumerate(spec.joints):
-        joint.name = joint.name or f"unnamed_{number}"
     whole = _compiled(spec, notes)
     arguments = {**given, "name": name, "notes": notes, "urdf": urdf[2:]}
     known_as = f"{name} {spec.modelname}"
@@ -295,6 +293,12 @@ def _load(
     )
 
 
+def read_model(file: str | Path) -> mujoco.MjModel:
+    """Return the model of an MJCF or URDF file as :func:`load_arm` reads it; visual meshes may be missing."""
+    spec, _, _ = _read(file, ())
+    return _compiled(spec, [])
+
+
 def _read(file: Any, packages: tuple[str | Path, ...]) -> tuple[mujoco.MjSpec, str, Urdf]:
     """Return a specification that may be changed, its name, and what MuJoCo does not take from a URDF."""
     nothing = Urdf("", "", {}, {}, (), ())
@@ -325,7 +329,12 @@ def _read(file: Any, packages: tuple[str | Path, ...]) -> tuple[mujoco.MjSpec, s
 
 
 def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
-    """Return the model of a specification without its visual meshes and textures that cannot be read; notes tell."""
+    """Return the model of a specification without its visual meshes and textures that cannot be read; notes tell.
+
+    Joints without a name get one.
+    """
+    for number, joint in enumerate(spec.joints):
+        joint.name = joint.name or f"unnamed_{number}"
     while True:
         try:
             return spec.compile()
@@ -358,9 +367,10 @@ def _leave_out(spec: mujoco.MjSpec, fault: str) -> str:
         geoms = [geom for geom in spec.geoms if geom.meshname == name]
         bodies = [geom.parent.name for geom in geoms if geom.contype or geom.conaffinity]
         if bodies:
-            raise ValueError(
-                f"the mesh {mesh.file}, which collides, of {', '.join(bodies)} is no mesh: {fault}"
-            )
+            named = f"the mesh {mesh.file} of {', '.join(bodies)}, which collides,"
+            # A text has no folder to look in.
+            advice = "; give the URDF as a file, and packages=" if "package:" in mesh.file else ""
+            raise ValueError(f"{named} is missing or broken: {fault}{advice}")
         for part in (*geoms, mesh):
             spec.delete(part)
         return f"left out: visual mesh {Path(mesh.file).name}, which is missing or broken"

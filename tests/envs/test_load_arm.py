@@ -482,6 +482,8 @@ def test_packages_are_looked_for_in_given_folders(crane, tmp_path):
     crane.rename(tmp_path / "store" / "parts")
     for packages in ([tmp_path / "store"], tmp_path / "store", str(tmp_path / "store")):
         assert load_arm(path, packages=packages).joint_names == ("lift", "turn", "tilt")
+    with pytest.raises(ValueError, match=r"wrist\.obj of wrist.*packages="):
+        load_arm(URDF)  # a text has no folder
 
 
 def test_of_two_arms_one_is_named():
