@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from typing import Any, NamedTuple
 
@@ -83,25 +84,30 @@ def choose_tool(model: mujoco.MjModel, given: Any, base: str | None) -> Tool:
         chain = chain_joints(model, body, base)
         if root in (body, *ancestors(model, body)) and len(chain) >= LEAST_CHAIN:
             chains[body] = chain
-    for pattern in TOOL_NAMES:
-        for kind, number in (("site", model.nsite), ("body", model.nbody)):
-            found: dict[int, str] = {}
-            for index in range(number):
-                part = getattr(model, kind)(index)
-                body = int(part.bodyid[0]) if kind == "site" else index
-                # The name of the robot may be its prefix.
-                fits = re.fullmatch(rf"(.*[_/:])?{pattern}", part.name, re.IGNORECASE)
-                if fits and body in chains:
-                    found.setdefault(body, part.name)
-            if not found:
-                continue
-            # Of several on one chain, the last one counts.
-            last = max(reversed(found), key=lambda body: len(chains[body]))
-            if any(not set(chains[body]) <= set(chains[last]) for body in found):
-                raise ValueError(
-                    f"there are several tools: {', '.join(found.values())}; name one with tool=, or a side with base="
-                )
-            return _named_tool(model, found[last], kind)
+    matches: list[tuple[str, dict[int, str]]] = []
+    kinds = (("site", model.nsite), ("body", model.nbody))
+    for pattern, (kind, number) in itertools.product(TOOL_NAMES, kinds):
+        found: dict[int, str] = {}
+        for index in range(number):
+            part = getattr(model, kind)(index)
+            body = int(part.bodyid[0]) if kind == "site" else index
+            # The name of the robot may be its prefix.
+            fits = re.fullmatch(rf"(.*[_/:])?{pattern}", part.name, re.IGNORECASE)
+            if fits and body in chains:
+                found.setdefault(body, part.name)
+        if found:
+            matches.append((kind, found))
+    if matches:
+        kind, found = matches[0]
+        # Of several on one chain, the last one counts.
+        last = max(reversed(found), key=lambda body: len(chains[body]))
+        rivals = [name for body, name in found.items() if not set(chains[body]) <= set(chains[last])]
+        for _, others in matches[1:]:  # less telling names matter on other arms alone
+            rivals += [name for body, name in others.items() if set(chains[body]).isdisjoint(chains[last])]
+        if rivals:
+            listed = ", ".join(dict.fromkeys([found[last], *rivals]))
+            raise ValueError(f"there are several tools: {listed}; name one with tool=, or a side with base=")
+        return _named_tool(model, found[last], kind)
     body = _tip(model, base)
     return Tool(body, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), f"the frame of {model.body(body).name!r}")
 
@@ -138,12 +144,17 @@ def chain_joints(model: mujoco.MjModel, body: int, base: str | None = None) -> l
 def arm_joints(model: mujoco.MjModel, chain: list[str], notes: list[str]) -> list[str]:
     """Return the joints of a chain without those of a mobile base, and without those of fingers.
 
-    A body with a slide that has no end is a mobile base. Fingers are what hangs on a body from
-    which several short branches move.
+    A body with a slide that has no end is a mobile base, unless a hinge carries it. Fingers are what hangs on a body
+    from which several short branches move.
     """
     carriers = {name: int(model.joint(name).bodyid[0]) for name in chain}
     endless = (model.jnt_type == MOVES[1]) & (model.jnt_limited == 0)
-    mobile = {name for name in chain if endless[model.jnt_bodyid == carriers[name]].any()}
+    mobile = set()
+    for name in chain:
+        if endless[model.jnt_bodyid == carriers[name]].any():
+            mobile.add(name)
+        elif model.joint(name).type[0] == MOVES[0]:
+            break
     below = {body: _joints_below(model, body) for body in range(model.nbody)}
     hands = set()
     for body in range(1, model.nbody):

@@ -91,11 +91,19 @@ class Parsed(NamedTuple):
         return frozenset(self.names[body] for body in bodies)
 
     def compared(self, exclude: Mapping[Pair, str]) -> list[Pair]:
-        """Return the pairs of bodies with geoms of links that are neither the same nor consecutive, nor excluded."""
+        """Return the pairs of bodies with geoms of different links that are not excluded."""
         found = []
         for first, second in itertools.combinations(self.geoms, 2):
-            apart = abs(self.links[first] - self.links[second])
-            if apart > 1 and (first, second) not in exclude:
+            if self.links[first] != self.links[second] and (first, second) not in exclude:
+                found.append((first, second))
+        return found
+
+    def consecutive(self) -> list[Pair]:
+        """Return the pairs of bodies of consecutive links; of the base, those that carry the first link count."""
+        found = []
+        for first, second in self.compared({}):
+            carries = first > 0 and first in ancestors(self.model, second)
+            if self.links[second] - self.links[first] == 1 and (self.links[first] or carries):
                 found.append((first, second))
         return found
 
@@ -169,8 +177,6 @@ def load_arm(
         "tolerance": number_of_at_least("tolerance", tolerance, MIN_TOLERANCE, MAX_TOLERANCE),
     }
     notes = list(urdf.notes)
-    for number, joint in enumerate(spec.joints):
-        joint.name = joint.name or f"unnamed_{number}"
     whole = _compiled(spec, notes)
     arguments = {**given, "name": name, "notes": notes, "urdf": urdf[2:]}
     known_as = f"{name} {spec.modelname}"
@@ -220,6 +226,7 @@ def _load(
     parsed = _parse(whole, names, chosen, notes)
     # Pairs that cannot touch are not compared: those of the file, and those that are always near and always apart.
     exclude = dict.fromkeys(_excluded(parsed, urdf.never_touch), "excluded in the file")
+    exclude |= dict.fromkeys(parsed.consecutive(), "consecutive links")
     never = f"in contact in none of {NEAR_LOOKED_AT:,} configurations, though always near"
     pairs = parsed.compared(exclude)
     low, high = ranges.T
@@ -286,6 +293,12 @@ def _load(
     )
 
 
+def read_model(file: str | Path) -> mujoco.MjModel:
+    """Return the model of an MJCF or URDF file as :func:`load_arm` reads it; visual meshes may be missing."""
+    spec, _, _ = _read(file, ())
+    return _compiled(spec, [])
+
+
 def _read(file: Any, packages: tuple[str | Path, ...]) -> tuple[mujoco.MjSpec, str, Urdf]:
     """Return a specification that may be changed, its name, and what MuJoCo does not take from a URDF."""
     nothing = Urdf("", "", {}, {}, (), ())
@@ -316,20 +329,52 @@ def _read(file: Any, packages: tuple[str | Path, ...]) -> tuple[mujoco.MjSpec, s
 
 
 def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
-    """Return the model of a specification without its visual geoms whose meshes are missing, which are noted."""
+    """Return the model of a specification without its visual meshes and textures that cannot be read; notes tell.
+
+    Joints without a name get one.
+    """
+    for number, joint in enumerate(spec.joints):
+        joint.name = joint.name or f"unnamed_{number}"
     while True:
         try:
             return spec.compile()
         except ValueError as error:
-            missing = re.search(r"Error opening file '(.+)'", str(error))
-            lost = [mesh for mesh in spec.meshes if missing and mesh.file and missing[1].endswith(mesh.file)]
-            names = [mesh.name or Path(mesh.file).stem for mesh in lost]
-            geoms = [geom for geom in spec.geoms if geom.meshname in names]
-            if not lost or any(geom.contype or geom.conaffinity for geom in geoms):
-                raise ValueError(f"MuJoCo cannot read the file: {error}") from None
-            notes.append(f"left out: visual mesh {lost[0].file}, which is missing")
-            for part in (*geoms, *lost):
-                spec.delete(part)
+            notes.append(_leave_out(spec, str(error)))
+
+
+def _leave_out(spec: mujoco.MjSpec, fault: str) -> str:
+    """Delete the texture or the visual mesh that MuJoCo's message is about, and return a note of it.
+
+    Raises:
+        ValueError: The message is about something else, or about a mesh that collides.
+    """
+    quoted = [Path(each) for each in re.findall(r"'(.+?)'", fault)]
+
+    def is_meant(file: str) -> bool:
+        return bool(file) and any(path.match(file) for path in quoted)
+
+    for texture in spec.textures:
+        if any(map(is_meant, (texture.file, *texture.cubefiles))):
+            name = texture.name or Path(texture.file).stem
+            for material in spec.materials:
+                material.textures = ["" if each == name else each for each in material.textures]
+            spec.delete(texture)
+            return f"left out: texture {name}, which is missing or broken"
+    for mesh in spec.meshes:
+        name = mesh.name or Path(mesh.file).stem
+        if not is_meant(mesh.file) and not (mesh.file and f"Element name {name!r}" in fault):
+            continue
+        geoms = [geom for geom in spec.geoms if geom.meshname == name]
+        bodies = [geom.parent.name for geom in geoms if geom.contype or geom.conaffinity]
+        if bodies:
+            named = f"the mesh {mesh.file} of {', '.join(bodies)}, which collides,"
+            # A text has no folder to look in.
+            advice = "; give the URDF as a file, and packages=" if "package:" in mesh.file else ""
+            raise ValueError(f"{named} is missing or broken: {fault}{advice}")
+        for part in (*geoms, mesh):
+            spec.delete(part)
+        return f"left out: visual mesh {Path(mesh.file).name}, which is missing or broken"
+    raise ValueError(f"MuJoCo cannot read the file: {fault}")
 
 
 def _joint_names(joints: Any) -> tuple[str, ...]:
@@ -526,18 +571,29 @@ def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: li
         raise ValueError(
             f"no geom moves with any of {', '.join(joints)}: nothing of the arm can collide; {'; '.join(notes)}"
         )
-    collides = (model.geom_contype | model.geom_conaffinity) > 0
-    others = {model.body(body).name or str(body) for body in model.geom_bodyid[collides] if body not in links}
-    if others:
-        notes.append(f"left out, not part of the arm: {', '.join(sorted(others))}")
-    _note_rest(model, joints, list(links), notes)
+    _note_rest(model, joints, tool, list(links), notes)
     return Parsed(model, rest, copy.copy(rest), joints, tool, links, names, geoms)
 
 
-def _note_rest(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[int], notes: list[str]) -> None:
-    """Note what the arm does not take from its file: planes, and forces of springs, dry friction and compensation."""
+def _note_rest(
+    model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, bodies: list[int], notes: list[str]
+) -> None:
+    """Note what the arm does not take from its file: other bodies and joints, planes, and forces such as of springs."""
     collides = (model.geom_contype | model.geom_conaffinity) > 0
-    if (collides & np.isin(model.geom_type, GROUNDS)).any():
+    ground = np.isin(model.geom_type, GROUNDS)
+    others = set(model.geom_bodyid[collides & ~ground].tolist()) - set(bodies)
+    still = {body for body in others if model.body_weldid[body] == 0}
+    if still:
+        walls = _body_names(model, still)
+        notes.append(f"{WARNING}left out, though the arm may hit them: {walls}; give them as obstacles")
+    if others - still:
+        notes.append(f"left out, not part of the arm: {_body_names(model, others - still)}")
+    carrying = (tool.body, *ancestors(model, tool.body))
+    fixed = np.isin(model.jnt_bodyid, carrying) & ~np.isin(model.jnt_type, MOVES)
+    if fixed.any():
+        named = ", ".join(model.joint(index).name for index in np.flatnonzero(fixed))
+        notes.append(f"fixed: {named}, neither a hinge nor a slide")
+    if (collides & ground).any():
         notes.append("left out: planes and height fields of the file; a floor is an obstacle, HalfSpace")
     numbers = [model.joint(name).id for name in joints]
     dofs = model.jnt_dofadr[numbers]
@@ -555,6 +611,11 @@ def _note_rest(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[int]
         notes.append(
             f"{WARNING}{followers} follows another joint in the file, but not in plans; joints= without it fixes it"
         )
+
+
+def _body_names(model: mujoco.MjModel, bodies: Iterable[int]) -> str:
+    """Return the names of bodies, or their numbers, in a row."""
+    return ", ".join(sorted(model.body(body).name or str(body) for body in bodies))
 
 
 def _collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, list[int]]:

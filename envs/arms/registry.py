@@ -48,7 +48,10 @@ def panda() -> Arm:
         torque_limit=(87.0,) * 4 + (12.0,) * 3,
         # Capsules of wrist and flange are always within 2 cm, though the links never touch: the 59 spheres of VAMP's
         # model (panda_spherized.urdf) leave them at least 7 mm apart, whatever the joint positions.
-        exclude={frozenset(("link5", "link7")): "never in contact"},
+        exclude={
+            frozenset(("link0", "link1")): "consecutive links",
+            frozenset(("link5", "link7")): "never in contact",
+        },
     )
 
 

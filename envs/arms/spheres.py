@@ -97,14 +97,17 @@ def _pairs(
     touching: Collection[frozenset[str]],
     exclude: Mapping[frozenset[str], str],
 ) -> tuple[list[tuple[int, int]], list[LeftOut]]:
-    """Return the pairs of groups that are compared, and those of different links that are not."""
+    """Return the pairs of groups that are compared, and those of different links that are not.
+
+    Consecutive links are not compared; which parts of the base carry the first link, `exclude` tells.
+    """
     pairs, left_out = [], []
     for (i, first), (j, second) in itertools.combinations(enumerate(names), 2):
         apart = abs(links[first] - links[second])
         pair = frozenset((first, second))
         if apart == 0:  # rigid to one another
             continue
-        if apart == 1:
+        if apart == 1 and min(links[first], links[second]) > 0:
             left_out.append(LeftOut(first, second, "consecutive links"))
         elif pair in exclude:
             left_out.append(LeftOut(first, second, exclude[pair]))
@@ -141,11 +144,11 @@ def grouped(
     for centre, radius in zip(centres, radii, strict=True):
         order = _neighbours(centre, np.arange(len(centre)))
         centre, radius = centre[order], radius[order]
-        balls.append(_bounding_ball(centre, radius))
+        balls.append(_bounding_ball(centre.mean(axis=0), centre, radius))
         if len(centre) > PART:
             for begin in range(0, len(centre), PART):
                 some = slice(begin, begin + PART)
-                part_balls.append(_bounding_ball(centre[some], radius[some]))
+                part_balls.append(_bounding_ball(centre[some].mean(axis=0), centre[some], radius[some]))
         spheres.append(np.column_stack((centre, radius)))
         first.append(first[-1] + len(centre))
         part.append(len(links) + len(part_balls))
@@ -190,19 +193,28 @@ def _along(capsule: Capsule, excess: float) -> tuple[Float, float]:
     return capsule.first + share * (capsule.second - capsule.first), float(radius)
 
 
-def _bounding_ball(centre: Float, radius: Float) -> Float:
+@compiled
+def _bounding_ball(start: Float, centre: Float, radius: Float) -> Float:
     """Return centre and radius of a ball around spheres that is hardly larger than the smallest one, shape (4,), [m].
 
-    In each round the centre moves towards the farthest sphere, by less and less (M. Badoiu and K. L. Clarkson, Smaller
-    core-sets for balls, 2003).
+    In each round the centre, at first `start`, moves towards the farthest sphere, by less and less (M. Badoiu and K. L.
+    Clarkson, Smaller core-sets for balls, 2003).
     """
-    middle = centre.mean(axis=0)
-    for k in range(ROUNDS):
-        away = centre - middle
-        far = np.sqrt((away * away).sum(axis=1)) + radius
-        middle = middle + away[far.argmax()] / (k + 2.0)
-    away = centre - middle
-    return np.append(middle, (np.sqrt((away * away).sum(axis=1)) + radius).max())
+    ball = np.append(start, 0.0)
+    for k in range(ROUNDS + 1):
+        farthest, reach = 0, 0.0
+        for i in range(len(centre)):
+            x = centre[i, 0] - ball[0]
+            y = centre[i, 1] - ball[1]
+            z = centre[i, 2] - ball[2]
+            far = np.sqrt(x * x + y * y + z * z) + radius[i]
+            if far > reach:
+                farthest, reach = i, far
+        ball[3] = reach
+        if k < ROUNDS:
+            for axis in range(3):
+                ball[axis] += (centre[farthest, axis] - ball[axis]) / (k + 2.0)
+    return ball
 
 
 @compiled

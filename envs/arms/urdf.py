@@ -79,7 +79,8 @@ def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
     compiler.attrib.pop("meshdir", None)
     compiler.attrib.update(COMPILER)
     text = ET.tostring(root, encoding="unicode")
-    return Urdf(text, root.get("name") or path.stem, assets, velocity, _srdf(path), tuple(notes))
+    never_touch = _srdf(path, root.get("name"), notes)
+    return Urdf(text, root.get("name") or path.stem, assets, velocity, never_touch, tuple(notes))
 
 
 def _root(path: Path) -> ET.Element:
@@ -230,16 +231,21 @@ def _places(file: str, path: Path, packages: tuple[str | Path, ...]) -> Iterator
             yield folder / "/".join(part for part in parts[first:] if part != "..")
 
 
-def _srdf(path: Path) -> tuple[tuple[str, str], ...]:
-    """Return the pairs of links that an SRDF file does not compare.
+def _srdf(path: Path, robot: str | None, notes: list[str]) -> tuple[tuple[str, str], ...]:
+    """Return the pairs of links that an SRDF file of the same robot does not compare.
 
     It has the same name and is beside the URDF or in the folder srdf beside that folder; or it is the only one beside.
     """
     beside = list(path.parent.glob("*.srdf"))
     places = [path.with_suffix(".srdf"), path.resolve().parents[1] / "srdf" / f"{path.stem}.srdf"]
     places += beside if len(beside) == 1 else []
-    for place in places:
-        if place.is_file():
-            pairs = _root(place).findall("disable_collisions")
+    for place in dict.fromkeys(places):
+        if not place.is_file():
+            continue
+        root = _root(place)
+        if root.get("name") == robot:
+            notes.append(f"pairs of links that are not compared: those of {place.name}")
+            pairs = root.findall("disable_collisions")
             return tuple((pair.get("link1", ""), pair.get("link2", "")) for pair in pairs)
+        notes.append(f"{place.name} is not used: it is for robot {root.get('name')!r}, not {robot!r}")
     return ()

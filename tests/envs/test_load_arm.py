@@ -167,6 +167,31 @@ def test_bodies_that_never_touch_or_touch_at_home_are_left_out(gap, reason):
     assert [pair[:2] for pair in arm.left_out if reason in pair.reason] == [("a", "c")]
 
 
+POST = '<geom type="cylinder" size=".02 .5" pos="0 .25 .3"/>'
+
+
+@pytest.mark.parametrize(
+    ("in_world", "on_base", "name"), [(POST, "", "base_0"), ("", f'<body name="post">{POST}</body>', "post")]
+)
+def test_the_first_link_is_compared_with_the_base_except_with_bodies_that_carry_it(in_world, on_base, name):
+    text = f"""
+    <mujoco><compiler angle="radian"/><worldbody>{in_world}
+      <body name="base">{on_base}<geom type="cylinder" size=".05 .3"/>
+        <body name="upper" pos="0 0 .3"><joint name="one" axis="0 0 1" range="-2 2"/>
+          <geom type="capsule" fromto="0 0 0 .5 0 0" size=".03" mass="1"/>
+          <body name="fore" pos=".5 0 0"><joint name="two" axis="0 0 1" range="-2 2"/>
+            <geom type="capsule" fromto="0 0 0 .1 0 0" size=".03" mass="1"/>
+          </body>
+        </body>
+      </body>
+    </worldbody></mujoco>"""
+    arm = load_arm(text, velocity_limit=1.0, torque_limit=10.0)
+    names = arm.group_names
+    assert [(names[a], names[b]) for a, b in arm.spheres.pairs] == [(name, "upper")]
+    assert ("base", "upper", "consecutive links") in arm.left_out
+    check_contact_implies_overlap(arm)
+
+
 def near_arm(gap):
     """Three links, of which the third has a box at a distance from a ball of the first."""
     return f"""
@@ -195,6 +220,9 @@ ONE = TEXT[TEXT.index(SHOULDER) : TEXT.rindex(END)]
 LEFT = re.sub(r'name="(\w+)"', r'name="left_\1"', ONE)
 TWO = TEXT.replace(END, f'<body name="left" pos="0 1 0">{LEFT}</body>{END}')
 """Two arms side by side."""
+TIP_SLIDES = [
+    (HAND_OF_TEXT, f'<body><joint type="slide" limited="false"/>{HAND_OF_TEXT}<geom size=".01"/></body>')
+]
 REFUSED = [
     ({"file": 5}, TypeError), ({"file": None}, TypeError), ({"file": b"arm.xml"}, TypeError),
     ({"file": ""}, ValueError), ({"file": "none.xml"}, ValueError),
@@ -212,6 +240,8 @@ REFUSED = [
     *[({"tolerance": tolerance}, ValueError) for tolerance in (0.0, "fine", np.nan)],
     ({"file": near_arm(1e-4), "home": None, **THREE}, ValueError),  # bodies too close at home
     *[({"file": TWO, "base": base, "tool": None, "joints": None}, ValueError) for base in (None, "right")],
+    ({"file": TWO.replace("left_hand", "left_pinch"), "tool": None, "joints": None}, ValueError),
+    ({"file": changed(*TIP_SLIDES), "tool": None, "joints": None, "home": None}, ValueError),  # no limits
     *[({"file": without(pattern, other)}, ValueError) for pattern, other in (
         ('<joint name="elbow" range', '<joint name="elbow" type="ball" range'), (r"<geom[^>]*/>", ""),
         (r"<geom type[^>]*/>", ""),  # bodies without mass
@@ -433,12 +463,15 @@ def test_urdf_files_that_lack_something_are_refused(crane, old, new):
         load_arm(written(crane, (old, new)))
 
 
-def test_pairs_of_an_srdf_beside_it_are_not_compared(crane):
+@pytest.mark.parametrize(("robot", "note"), [("crane", "those of"), ("ship", "crane.srdf is not used")])
+def test_pairs_of_an_srdf_of_the_same_robot_beside_it_are_not_compared(crane, robot, note):
     path = written(crane)
     (crane / "urdf" / "crane.srdf").write_text(
-        '<robot name="crane"><disable_collisions link1="wrist" link2="post" reason="Never"/></robot>'
+        f'<robot name="{robot}"><disable_collisions link1="wrist" link2="post" reason="Never"/></robot>'
     )
-    assert ("post", "wrist", "excluded in the file") in {tuple(pair) for pair in load_arm(path).left_out}
+    arm = load_arm(path)
+    assert (("post", "wrist", "excluded in the file") in arm.left_out) == (robot == "crane")
+    assert note in "\n".join(arm.notes)
 
 
 def test_packages_are_looked_for_in_given_folders(crane, tmp_path):
@@ -449,6 +482,8 @@ def test_packages_are_looked_for_in_given_folders(crane, tmp_path):
     crane.rename(tmp_path / "store" / "parts")
     for packages in ([tmp_path / "store"], tmp_path / "store", str(tmp_path / "store")):
         assert load_arm(path, packages=packages).joint_names == ("lift", "turn", "tilt")
+    with pytest.raises(ValueError, match=r"wrist\.obj of wrist.*packages="):
+        load_arm(URDF)  # a text has no folder
 
 
 def test_of_two_arms_one_is_named():
@@ -503,7 +538,11 @@ MOBILE = (
     '<body name="carriage"><joint name="x" type="slide" limited="false"/><joint name="turn"/>'
     '<geom size=".05" mass="2"/>'
 )
-WALL = '<body name="wall" pos="2 0 0"><geom type="box" size=".1 1 1"/></body></worldbody>'
+WALL = '<body name="wall" pos="2 0 0">{}<geom type="box" size=".1 1 1"/></body></worldbody>'
+BASE_BALL = (
+    "<worldbody>",
+    '<worldbody><body name="torso"><joint type="ball" name="ball" range="0 1"/><geom size=".01"/>',
+)
 PINCH = gripper(2, "bar").replace("</body>", '<site name="pinch"/></body>', 1)
 
 
@@ -515,7 +554,8 @@ PINCH = gripper(2, "bar").replace("</body>", '<site name="pinch"/></body>', 1)
         ([(HAND_OF_TEXT, gripper(1, "gripperMover"))], "tool:"),
         ([(HAND_OF_TEXT, PINCH)], "fixed: bar_0_0"),  # its tool moves with the last joint of the arm
         ([(SHOULDER, MOBILE + SHOULDER), ("</body>\n  </worldbody>", "</body></body></worldbody>")], "fixed: turn, x"),
-        ([(END, WALL)], "left out, not part of the arm: wall"),
+        ([(END, WALL.format("<freejoint/>"))], "left out, not part of the arm: wall"),
+        ([BASE_BALL, (END, "</body>" + END)], "fixed: ball"),
         ([(END, f'<geom type="plane" size="1 1 1"/>{END}')], "left out: planes"),
     ],
 )  # fmt: skip
@@ -526,15 +566,29 @@ def test_what_is_not_part_of_the_arm_is_fixed_or_left_out_and_told(changes, note
     assert "wall" not in arm.group_names
 
 
-def test_a_visual_mesh_that_is_missing_is_left_out_and_one_that_collides_is_named(tmp_path):
-    mesh = '<asset><mesh name="cover" file="cover.obj"/></asset><worldbody>'
-    geom = '<geom type="mesh" mesh="cover" contype="{0}" conaffinity="{0}" mass="0"/>'
+def test_a_body_that_stands_beside_the_arm_is_told_in_a_warning():
+    with pytest.warns(UserWarning, match="wall; give them as obstacles"):
+        load_arm(changed((END, WALL.format(""))))
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl", "msh"])
+@pytest.mark.parametrize("there", [False, True])
+def test_what_is_only_seen_may_be_missing_or_broken_and_what_collides_is_named(tmp_path, suffix, there):
+    assets = (
+        f'<asset><mesh name="cover" file="cover.{suffix}"/><texture name="skin" type="2d" file="skin.png"/>'
+        '<material name="skin" texture="skin"/></asset><worldbody>'
+    )
+    geom = '<geom type="mesh" mesh="cover" material="skin" contype="{0}" conaffinity="{0}" mass="0"/>'
+    if there:  # a pointer of Git LFS
+        for name in (f"cover.{suffix}", "skin.png"):
+            (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\nsize 12345\n")
     path = tmp_path / "arm.xml"
-    path.write_text(changed(("<worldbody>", mesh), (SHOULDER, SHOULDER + geom.format(0))))
+    path.write_text(changed(("<worldbody>", assets), (SHOULDER, SHOULDER + geom.format(0))))
     arm = load_arm(path, name="covered")
-    assert "left out: visual mesh cover.obj, which is missing" in arm.notes
-    path.write_text(changed(("<worldbody>", mesh), (SHOULDER, SHOULDER + geom.format(1))))
-    with pytest.raises(ValueError, match=r"cover\.obj"):
+    for part in (f"visual mesh cover.{suffix}", "texture skin"):
+        assert f"left out: {part}, which is missing or broken" in arm.notes
+    path.write_text(changed(("<worldbody>", assets), (SHOULDER, SHOULDER + geom.format(1))))
+    with pytest.raises(ValueError, match=rf"cover\.{suffix}.*shoulder"):
         load_arm(path)
 
 

@@ -235,11 +235,14 @@ def test_obstacles_of_every_shape_are_added_resized_drawn_and_kept_in_files(env_
     assert [each.kind for each in scene.without(0).obstacles] == [each.kind for each in scene.obstacles[1:]]
 
 
-def test_an_arm_of_ones_own_is_drawn_from_its_file():
+@pytest.mark.parametrize("asset", ["", '<asset><mesh name="gone" file="gone.obj"/></asset>'])
+def test_an_arm_of_ones_own_is_drawn_from_its_file(asset, tmp_path):
     """The drawn hand is where the arm's hand is, wherever the file puts the arm."""
     names = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
     home = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
-    file = Path(__file__).parents[2] / "docs" / "ur5e.xml"
+    text = (Path(__file__).parents[2] / "docs" / "ur5e.xml").read_text()
+    file = tmp_path / "ur5e.xml"
+    file.write_text(text.replace("<worldbody>", f"{asset}<worldbody>"))
     arm = ve.load_arm(file, tool="hand", joints=names, home=home, velocity_limit=np.pi)
     parts = drawing.ArmDrawing(arm, arm.compile(0), file)
     away = []

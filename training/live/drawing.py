@@ -13,6 +13,7 @@ import trimesh
 from mjviser.conversions import get_geom_texture_id, merge_geoms
 
 from viapoint.envs import Arm, Box, Capsule, HalfSpace, Shape, Sphere
+from viapoint.envs.arms.load import read_model
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Float
@@ -95,7 +96,7 @@ class ArmDrawing:
         if model_file is not None:
             own = _first_anchor(model, arm)
             try:
-                model = mujoco.MjModel.from_xml_path(str(model_file))
+                model = read_model(model_file)
             except (OSError, ValueError) as error:
                 raise ValueError(f"{model_file} cannot be drawn: {' '.join(str(error).split())}") from None
             self._offset = own - _first_anchor(model, arm)

@@ -339,7 +339,7 @@ class LivePage:
         port: Port to listen on; 0 for a free one.
         arm: Arm of the environment: the name of one, an MJCF or URDF file, or an arm. Without `env`, it moves among
             obstacles.
-        model_file: MJCF file whose visible geoms, such as meshes, are drawn; by default the one that `arm` names.
+        model_file: File whose visible geoms, such as meshes, are drawn; by default the one that `arm` names.
         seed: Seed of the random scenes.
         **env_kwargs: Arguments of the environment; by default those of the agent.
 
@@ -420,13 +420,9 @@ class LivePage:
         self.close()
 
     def _warm_up(self) -> None:
-        """Decide once, so that the first decision takes no longer than others; find the file that can be drawn."""
+        """Decide once, so that the first decision takes no longer than others; the file of the arm is drawn."""
         arena, _ = self._make()
-        file = arena.task.arm.file
-        if self._model_file is None and file:
-            with contextlib.suppress(ValueError):  # MuJoCo alone does not find the meshes of every URDF
-                ArmDrawing(arena.task.arm, arena.env("own").model, file)
-                self._model_file = file
+        self._model_file = self._model_file or arena.task.arm.file or None
         scene, _ = next(arena.scenes()["Random"])
         for method in arena.methods[:2]:
             decide(arena, State(scene=scene, drawn=scene, method=method))

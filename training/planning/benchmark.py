@@ -59,9 +59,9 @@ HIGHEST = (2.9671, 1.8326, 2.9671, 0.0873, 2.9671, 3.8223, 2.9671)
 FINGERS = {"leftfinger": 1.0, "rightfinger": -1.0}
 # Opening of a finger, and height of the fingers' frames over that of the hand, [m]
 OPEN, FINGER_HEIGHT = 0.065, 0.0584
-# Pairs of bodies, besides neighbours, that the published description does not compare (panda.srdf)
+# Pairs of bodies, besides consecutive moving ones, that the published description does not compare (panda.srdf)
 NEVER_TOUCH = {
-    "link0": ("link2", "link3", "link4"),
+    "link0": ("link1", "link2", "link3", "link4"),
     "link1": ("link3", "link4"),
     "link2": ("link4", "link6"),
     "link3": ("link5", "link6", "link7", "gripper", "leftfinger", "rightfinger"),
