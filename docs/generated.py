@@ -118,7 +118,9 @@ def with_head(text: str, name: str) -> str:
     size = len(task.action_names)
     keys = "\n".join(f"| `{key}` | {box.shape[0]} |" for key, box in task.observation.space().items())
     given = ", ".join(f"`{key}={value!r}`" for key, value in TASKS[env_id].items()) or "none"
-    apart = {"reward_weights"} | ({"whole_arm"} if task.space_name == "joints" else set())  # all of an arm in space
+    apart = {"reward_weights"} | (
+        {"whole_arm"} if task.space_name == "joints" else set()
+    )  # all of an arm in space
     values = {key: value for key, value in task.as_dict().items() if key not in apart}
     weights = ", ".join(f"{key} {value:g}" for key, value in task.as_dict()["reward_weights"].items())
     defaults = "\n".join(f"| `{key}` | {plain(value)} |" for key, value in values.items())

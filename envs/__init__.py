@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from viapoint.envs.arms.inverse_kinematics import inverse_kinematics
     from viapoint.envs.arms.load import load_arm
     from viapoint.envs.arms.registry import arm_of, register_arm
+    from viapoint.envs.arms.stored import write_arm
     from viapoint.envs.env import ReachEnv, RecordMovements
     from viapoint.envs.geometry.distance import signed_distances
     from viapoint.envs.geometry.obstacles import Obstacles, observation_rows, obstacles_from_rows
@@ -89,4 +90,5 @@ __all__ = [
     "scene_from_json",
     "scene_to_json",
     "signed_distances",
+    "write_arm",
 ]

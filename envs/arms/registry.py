@@ -117,5 +117,11 @@ def arm_of(arm: Any) -> Arm:
 @functools.lru_cache(maxsize=16)
 def _of_file(path: Path, changed: int) -> Arm:
     """Return the arm of a file, which was last changed at some time."""
-    stored = read_arm(path)
-    return dataclasses.replace(load_arm(path) if stored is None else stored, file=str(path))
+    arm = read_arm(path)
+    try:
+        arm = load_arm(path) if arm is None else arm
+    except ValueError as error:
+        raise ValueError(
+            f"{error}; with arguments of load_arm, write_arm makes a file that needs none"
+        ) from None
+    return dataclasses.replace(arm, file=str(path))

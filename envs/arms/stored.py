@@ -45,10 +45,19 @@ def with_kept_arm(env_kwargs: Mapping[str, Any], folder: Path) -> dict[str, Any]
     return found
 
 
-def write_arm(path: Path, arm: Arm) -> None:
-    """Write an arm as a self-contained MJCF file, from which :func:`read_arm` makes the same arm.
+def write_arm(path: str | Path, arm: Arm) -> None:
+    """Write an arm as a self-contained MJCF file, which is the same arm for :func:`arm_of`, `arm=` and `--arm`.
 
     Its geoms are the capsules that collide; visual meshes are left out.
+
+    Example:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from viapoint.envs import arm_of, write_arm
+        >>> file = Path(tempfile.mkdtemp()) / "arm.xml"
+        >>> write_arm(file, arm_of("planar"))  # or an arm of load_arm, which may have needed arguments
+        >>> arm_of(file).joint_names
+        ('shoulder', 'elbow')
     """
     choices = {
         "name": arm.name,
@@ -63,7 +72,7 @@ def write_arm(path: Path, arm: Arm) -> None:
         "notes": arm.notes,
     }
     model, _, _ = arm.xml.rpartition("</mujoco>")
-    path.write_text(f"{model}{_element(json.dumps(choices))}</mujoco>\n", encoding="utf-8")
+    Path(path).expanduser().write_text(f"{model}{_element(json.dumps(choices))}</mujoco>\n", encoding="utf-8")
 
 
 def _element(choices: str) -> str:
