@@ -371,9 +371,11 @@ def _leave_out(spec: mujoco.MjSpec, fault: str) -> str:
             # A text has no folder to look in.
             advice = "; give the URDF as a file, and packages=" if "package:" in mesh.file else ""
             raise ValueError(f"{named} is missing or broken: {fault}{advice}")
+        bare = [geom.parent.name for geom in geoms if len(geom.parent.geoms) == 1]
         for part in (*geoms, mesh):
             spec.delete(part)
-        return f"left out: visual mesh {Path(mesh.file).name}, which is missing or broken"
+        told = f"{WARNING}nothing of {', '.join(bare)} can collide: " if bare else ""
+        return f"{told}left out: visual mesh {Path(mesh.file).name}, which is missing or broken"
     raise ValueError(f"MuJoCo cannot read the file: {fault}")
 
 
@@ -558,6 +560,7 @@ def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: li
     root = int(model.body_rootid[carriers[0]])
     links: dict[int, int] = {}
     names: dict[int, str] = {}
+    taken = {model.body(body).name for body in range(model.nbody)}
     for body in range(model.nbody):
         link = int(moves_with[body])
         if link or body == 0 or model.body_rootid[body] == root:
@@ -565,6 +568,8 @@ def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: li
             name = str(model.body(body).name)
             if body == 0 or name in RESERVED or name.startswith("obstacle_"):
                 name = f"body_{body}" if link else f"base_{body}"
+                while name in taken:
+                    name += "_"
             names[body] = name
     geoms = _collision_geoms(model, links)
     if not any(links[body] for body in geoms):

@@ -171,7 +171,12 @@ POST = '<geom type="cylinder" size=".02 .5" pos="0 .25 .3"/>'
 
 
 @pytest.mark.parametrize(
-    ("in_world", "on_base", "name"), [(POST, "", "base_0"), ("", f'<body name="post">{POST}</body>', "post")]
+    ("in_world", "on_base", "name"),
+    [
+        (POST, "", "base_0"),
+        (POST, '<body name="base_0"/>', "base_0_"),
+        ("", f'<body name="post">{POST}</body>', "post"),
+    ],
 )
 def test_the_first_link_is_compared_with_the_base_except_with_bodies_that_carry_it(in_world, on_base, name):
     text = f"""
@@ -587,6 +592,9 @@ def test_what_is_only_seen_may_be_missing_or_broken_and_what_collides_is_named(t
     arm = load_arm(path, name="covered")
     for part in (f"visual mesh cover.{suffix}", "texture skin"):
         assert f"left out: {part}, which is missing or broken" in arm.notes
+    path.write_text(changed(("<worldbody>", assets), (END, f'<body name="lid">{geom.format(0)}</body>{END}')))
+    with pytest.warns(UserWarning, match="nothing of lid can collide"):
+        load_arm(path)
     path.write_text(changed(("<worldbody>", assets), (SHOULDER, SHOULDER + geom.format(1))))
     with pytest.raises(ValueError, match=rf"cover\.{suffix}.*shoulder"):
         load_arm(path)
