@@ -310,7 +310,7 @@ def report(capsys, *words):
 
 def test_all_is_well_here(capsys):
     code, printed = report(capsys)
-    assert (code, "FAILS" in printed) == (0, False)
+    assert (code, "fails" in printed) == (0, False)
 
 
 @pytest.mark.parametrize(
@@ -338,7 +338,7 @@ def ran(words, folder):
     return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=env)
 
 
-@pytest.mark.parametrize(("words", "code"), [(["train"], 2), (["--help"], 2), (["doctor"], 1)])
+@pytest.mark.parametrize(("words", "code"), [(["train"], 2), (["--help"], 2), (["doctor"], 0)])
 def test_without_the_extra_everything_says_what_to_install(words, code, tmp_path):
     (tmp_path / "sitecustomize.py").write_text(
         "import sys\n"
@@ -351,4 +351,4 @@ def test_without_the_extra_everything_says_what_to_install(words, code, tmp_path
     failed = ran(words, tmp_path)
     assert failed.returncode == code
     assert "pip install 'viapoint[training]'" in failed.stdout + failed.stderr
-    assert code == 1 or len(failed.stderr.splitlines()) == 1
+    assert code == 0 or len(failed.stderr.splitlines()) == 1

@@ -2,31 +2,30 @@
 
 import subprocess
 import sys
-from typing import Any
 
 LIMIT = 180.0  # Time limit of a check, [s]; the first one on a machine compiles machine code
 VERSIONS = "import sys, {0}; print(sys.version[:7], *(f'{{m.__name__}} {{m.__version__}}' for m in ({0})))"
 ENV = "import gymnasium, viapoint.envs as v; env = gymnasium.make(v.ENV_IDS[1], render_mode='rgb_array'); env.reset(); "
 STEP = ENV + "print(f'{env.step(env.action_space.sample())[4][\"duration\"]:.3f} s of movement')"
 AGENT = "from viapoint.training import load_agent; print(load_agent('viapoint/PlanarObstacles-v0').env_id)"
+EXTRAS = "from importlib.util import find_spec; print(*(name for name in {} if find_spec(name)))"
 # Script that fails, or prints what it found, and remedy, by the name of what is checked
 CHECKS = {
     "packages": (VERSIONS.format("numpy, gymnasium, mujoco, numba"), "pip install viapoint"),
     "MuJoCo": (STEP, "pip install 'mujoco>=4'"),
-    "agents": (AGENT, "pip install 'viapoint[training]'"),
+    "agents": (AGENT, "environments, primitives and plan_motion work without it"),
+    "extras": (EXTRAS.format(("torch", "ompl", "viser", "minari", "ray", "optuna")), ""),
     "pictures": (ENV + "print(*env.render().shape)", "on Debian: apt-get install libegl1 libgl1"),
 }
 
 
-def run(config: Any) -> None:
-    """Make all checks with the standard library alone; exit code 1 where one fails that all commands need."""
+def run(config: object) -> None:
+    """Make all checks with the standard library alone; exit code 1 where packages or MuJoCo fail."""
     code = 0
     for name, (script, remedy) in CHECKS.items():
         works, found = outcome(script)
-        print(f"{name:<9} {'works' if works else 'FAILS'}  {found}")
-        if not works:
-            print(f"{'':<9} install: {remedy}")
-            code |= name != "pictures"
+        print(f"{name:<9} {'works:' if works else 'fails:'} {found}{'' if works else f'; {remedy}'}")
+        code |= not works and name in ("packages", "MuJoCo")
     raise SystemExit(code)
 
 
