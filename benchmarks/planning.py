@@ -34,6 +34,8 @@ PUBLISHED = (
 FIGURE = DOCS / "images" / "planning.png"
 DEVELOPED_ON = 20
 """Greatest number of the problems that were looked at during development."""
+EVERY, PATIENCE = 4, 0.5
+"""Step between the problems whose jerk is compared with the least that is found in some time, [s]."""
 PLANNERS = ("straight", "plan_motion", "plan_motion+ompl", "search512", "ompl")
 LIMITS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 """Time limits of plan_motion, [ms]."""
@@ -88,11 +90,28 @@ def write_table(problems: list[BenchmarkProblem]) -> None:
     found.to_csv(TABLE, index=False, float_format="%.4g", lineterminator="\n")
     before, _, after = PAGE.read_text(encoding="utf-8").partition(BEGIN)
     _, _, after = after.partition(END)
-    PAGE.write_text(f"{before}{BEGIN}\n{page_table(found)}\n{END}{after}", encoding="utf-8")
+    text = f"{page_table(found)}\n\n{quality(problems, lines[lines.planner == 'plan_motion'])}"
+    PAGE.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
     unsolved = lines[
         lines.planner.str.startswith("plan_motion") & (lines.refused == "") & ~(lines.solved & lines.physics)
     ]
     print(unsolved[["planner", "set", "number", "solved", "physics", "clearance", "seeds"]].to_string())
+
+
+def quality(problems: list[BenchmarkProblem], lines: pd.DataFrame) -> str:
+    """Return a sentence on the jerk of plan_motion relative to the least that it finds in PATIENCE."""
+    arm, ratios = benchmark_panda(), []
+    for problem, jerk in zip(problems[::EVERY], lines.jerk[::EVERY], strict=True):
+        best = plan_motion(
+            arm, problem.start, problem.goal, problem.obstacles, enough=10**5, time_limit=PATIENCE, ompl=False
+        )
+        ratios.append(jerk / min(best.jerk, jerk))
+    found = pd.Series(ratios)
+    return (
+        f"Jerk of plan_motion relative to the least that it finds in {1e3 * PATIENCE:.0f} ms, each {EVERY}th problem: "
+        f"median {found.median():.2f}, 95 % {found.quantile(0.95):.2f}; at most 1.15 in "
+        f"{100 * (found <= 1.15).mean():.0f} %."
+    )
 
 
 def page_table(found: pd.DataFrame) -> str:

@@ -51,7 +51,7 @@ from viapoint.training.planning.refine import (
 )
 
 # Relative jerk cost above which more seeds are tried after a free movement, and how many of them
-ROUGH, MORE = 4.0, 4
+ROUGH, MORE = 2.0, 8
 # Spread of the first random seeds around the straight line, and of later ones, [rad]
 SPREADS = 0.8, 1.0
 HAND_SPREADS = 0.15, 0.3  # Spreads of the same seeds in hand space, [m]
