@@ -16,6 +16,7 @@ from viapoint.envs.common.validation import as_given, finite_array
 from viapoint.envs.episodes import History
 from viapoint.envs.outcome import Rollout
 from viapoint.envs.plans import Plan
+from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.vector_env import SINGLE_METADATA, ReachVectorEnv
 
 
@@ -49,6 +50,11 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         """Last movement at every physics step; None before the first."""
         rollouts = self.batch.last_rollout
         return rollouts[0] if rollouts else None
+
+    @property
+    def scenes(self) -> Scenes | None:
+        """The scene of the episode, as a batch of one; None before the first reset."""
+        return self.batch.scenes
 
     @property
     def last_plan(self) -> Plan | None:

@@ -456,5 +456,15 @@ class Episodes:
         self._began[:], self.begun[:] = state["began"], state["begun"]
         self.simulator.batch.state[:] = state["physics"]
         self.simulator.physics_steps = int(state["physics_steps"])
+        now = self.executor.state
+        for row in np.flatnonzero(now.steps):  # records begin here, at the present time
+            joints = now.joints[row : row + 1].copy()
+            here = (
+                now.steps[row : row + 1].copy(),
+                joints,
+                self.task.space.coordinates(joints),
+                np.zeros(1, bool),
+            )
+            self.executor.past[row] = [here]
         if self.looks is not None:
             self.looks = Looks(*(np.array(part) for part in state["looks"]))

@@ -35,8 +35,9 @@ CONTROL_STRIDE = 4  # Physics steps between two computed torques; those in betwe
 # Function of rows and a number of steps T that returns references from now on, shape (n, T + 1, D) each
 References = Callable[[Int, int], Motion]
 
-# Joint positions [rad] and references after each step, and contacts before it, in pieces of an episode
-Pieces = list[tuple[Float, Float, Bool]]
+# Numbers of physics steps, joint positions [rad] and references after each, and contacts before it, in pieces of an
+# episode
+Pieces = list[tuple[Int, Float, Float, Bool]]
 
 
 class Executor:
@@ -98,12 +99,13 @@ class Executor:
         """Return an episode that was recorded in pieces, in its scene."""
         arm = self.simulator.arm
         if pieces:
-            joints, planned, contact = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
+            steps, joints, planned, contact = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
         else:  # at rest at the start
             joints = scene.start.copy()
             planned = self.space.coordinates(joints)
             contact = np.zeros(1, bool)
-        time = np.asarray(self.simulator.timestep * np.arange(1, len(joints) + 1))
+            steps = np.ones(1, np.int64)
+        time = np.asarray(self.simulator.timestep * steps)
         every = scene.take(np.zeros(len(time), np.int64)).obstacles_at(time)
         clearance = configuration_clearances(arm.chain, arm.spheres, joints, every, np.zeros(len(time)))
         return Rollout(time, planned, joints, arm.hand(joints), contact, clearance[:, 0])
@@ -139,6 +141,7 @@ class Executor:
                 places = obstacles.centre[i] + times * obstacles.velocity[i]
                 ends = joints[i, k : k + 2]
                 contact[i, k + 1] = simulator.touches_between(int(rows[i]), ends, places, states)
+        begin = self.state.steps[rows]
         done = _measure(
             *body,
             arm.joint_range,
@@ -159,7 +162,10 @@ class Executor:
         )
         for i, row in enumerate(rows):
             end = done[i]
-            self.past[row].append((joints[i, :end], motion.position[i, 1 : end + 1], contact[i, :end]))
+            steps_done = begin[i] + np.arange(1, end + 1)
+            self.past[row].append(
+                (steps_done, joints[i, :end], motion.position[i, 1 : end + 1], contact[i, :end])
+            )
         self.state.unstable[rows] |= unstable
 
 

@@ -353,6 +353,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             "episodes": [each.state() for each in self._episodes],
             "over": self._over.copy(),
             "decisions": self._decisions.copy(),
+            "ended": np.stack((self.terminated, self.truncated)),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -365,7 +366,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         for each, part in zip(self._episodes, state["episodes"], strict=True):
             each.restore(part)
         self._over[:] = state["over"]
-        self._decisions[:] = state.get("decisions", 0)  # states of before had no limit
+        self._decisions[:] = state["decisions"]
+        self.terminated, self.truncated = np.array(state["ended"])
         self._running = True
 
     def __getstate__(self) -> dict[str, Any]:

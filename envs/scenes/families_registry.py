@@ -184,6 +184,8 @@ def _as_layout(shapes: Iterable[Shape], goals: Iterable[Place] = (), starts: Ite
     for shape in as_obstacles(list(shapes)):
         if shape.number in IN_TABLES:
             raise ValueError(f"kinds must be some of {', '.join(PLAIN_KINDS)}")
+        if shape.velocity.any():
+            raise ValueError("shapes must be at rest; tasks with moving_obstacles draw their courses")
         rows += [shape.number, *shape.position, *shape.rotation.ravel(), *shape.packed_size]
     return Layout(rows, _numbers(goals), _numbers(starts))
 

@@ -187,6 +187,8 @@ def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles) -> 
                 _solution(label, pose, sampler.task.arm, obstacles.take([i])) for i, pose in enumerate(poses)
             ]
             return np.array(found)
+        if any(pose.quaternion is not None for pose in poses):
+            raise ValueError(f"{label} must have no quaternion: in hand space an end is a place of the hand")
         value = [pose.position for pose in poses]
     if sampler.task.space_name == "joints":
         array = finite_array(label, value, (joints,), (number, joints))

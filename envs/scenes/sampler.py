@@ -39,7 +39,7 @@ from viapoint.envs.scenes.motions import (
     draw_jumps,
     numbers_of_jumps,
 )
-from viapoint.envs.scenes.scene import ENDS, Scenes, resting
+from viapoint.envs.scenes.scene import ENDS, FARTHEST, Scenes, extents, resting
 
 if TYPE_CHECKING:
     from viapoint.envs.task import Task
@@ -116,6 +116,9 @@ class SceneSampler:
                 rng.random(out=draft.numbers[i])
             found = np.zeros(len(pending), np.bool_)
             draw_ends(draft, pending, found)
+            if "obstacles" not in given:
+                largest = np.maximum(*extents(draft.scenes.obstacles.take(pending)))
+                found &= largest.max(axis=1, initial=0.0) <= FARTHEST
             if self.viewpoint is not None:
                 obstacles = draft.scenes.obstacles.take(pending)
                 found &= point_clearances(obstacles, self.viewpoint) >= VIEW_MARGIN

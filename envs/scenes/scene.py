@@ -224,15 +224,24 @@ def check_jumps(scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]] = ()) -
         before = time  # jumps are in order
 
 
+def extents(obstacles: Obstacles) -> tuple[Float, Float]:
+    """Return sizes of obstacles, and their distances from the origin along an axis, shape (N, n) each, [m].
+
+    Both are 0 for absent rows, and distances are for half-spaces.
+    """
+    kind, size = obstacles.kind, obstacles.size
+    largest = np.where(np.isin(kind, IN_TABLES), size[..., 1], size.max(axis=-1))
+    away = np.abs(obstacles.centre).max(axis=-1) * (kind != HALF_SPACE)
+    return largest * obstacles.present, away * obstacles.present
+
+
 def _check_obstacles(scenes: Scenes, names: Sequence[Sequence[str]]) -> None:
     """Check sizes, places and courses of obstacles."""
     obstacles, turn_time = scenes.obstacles, scenes.turn_time
-    kind, present, size = obstacles.kind, obstacles.present, obstacles.size
-    largest = np.where(np.isin(kind, IN_TABLES), size[..., 1], size.max(axis=-1))
-    _refuse(present & (largest > FARTHEST), f"must be at most {FARTHEST:g} m large", largest, names)
-    away = np.abs(obstacles.centre).max(axis=-1)
-    far = present & (kind != HALF_SPACE) & (away > FARTHEST)
-    _refuse(far, f"must be at most {FARTHEST:g} m from the origin along each axis", away, names)
+    present = obstacles.present
+    largest, away = extents(obstacles)
+    _refuse(largest > FARTHEST, f"must be at most {FARTHEST:g} m large", largest, names)
+    _refuse(away > FARTHEST, f"must be at most {FARTHEST:g} m from the origin along each axis", away, names)
     for velocity in (obstacles.velocity, scenes.turn_velocity):
         speed = norm(velocity)
         _refuse(present & (speed > FASTEST), f"must be at most {FASTEST:g} m/s fast", speed, names)

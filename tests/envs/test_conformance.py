@@ -99,10 +99,14 @@ def test_a_pickled_environment_goes_on_as_the_original(env_id):
     again = pickle.loads(pickle.dumps(env))
     assert again.unwrapped.task.weights.smoothness == 0.2
     assert again.unwrapped.task == env.unwrapped.task
+    assert again.unwrapped.terminated.tolist() == env.unwrapped.terminated.tolist()
     for action in actions[1:]:
         first, second = (each.step(np.tile(action, (2, 1))) for each in (env, again))
         same(first[0], second[0])
         np.testing.assert_array_equal(first[1], second[1])
+        for whole, rest in zip(env.unwrapped.last_rollout, again.unwrapped.last_rollout, strict=True):
+            for part, last in zip(whole, rest, strict=True):  # records of the copy begin where it was made
+                np.testing.assert_allclose(part[len(part) - len(last) + 1 :], last[1:], atol=1e-9)
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])

@@ -336,7 +336,9 @@ IN_THE_PLANE = [
     *({**ENDS, **POST, "turns": turns} for turns in (
         [[0.1, 0.0]], [[-0.2, 0.1, 0.0, 0.0]], [[0.3, 3.0, 0.0, 0.0]],
     )),
-    *({**ENDS, "goal": goal} for goal in ((0.1, 0.4, 0.3), (2.0, 0.0), ENDS["start"], Pose((2.0, 0.0, 0.0)))),
+    *({**ENDS, "goal": goal} for goal in (
+        (0.1, 0.4, 0.3), (2.0, 0.0), ENDS["start"], Pose((2.0, 0.0, 0.0)), Pose((0.1, 0.4, 0.0), (1, 0, 0, 0)),
+    )),
     {**ENDS, "start": (0.0, 0.02)},
 ]  # fmt: skip
 REACHES = [  # too short or long, too fast, not finite, of an obstacle that is not there, of another shape

@@ -1,5 +1,6 @@
 """Bad input raises one error where it enters: the input, and the type of the error."""
 
+import dataclasses
 import functools
 import math
 from pathlib import Path
@@ -47,6 +48,7 @@ from viapoint.training.evaluation.evaluator import evaluate_methods
 from viapoint.training.io.files import BadFileError
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.benchmark import benchmark_planner
+from viapoint.training.planning.search import registered_task
 from viapoint.training.plotting import plots
 from viapoint.training.plotting.video import record_video
 from viapoint.training.rollouts.rollout import SceneSimulation
@@ -168,6 +170,10 @@ def sensed(**changes):
     )
 
 
+def shorter():
+    return dataclasses.replace(registered_task(SENSED).sensor, range=0.4)
+
+
 def revising(**changes):
     return ViaQ("ViaQPolicy", ViaVecEnv(MOVING, 1), **changes)
 
@@ -264,6 +270,10 @@ CALLS = [
     lambda: Task.from_dict({**agent().get_env().get_attr("task")[0].as_dict(), "arm": "octopus"}),
     *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, SENSED)),
     lambda: ViaQ("ViaQPolicy", make_vec_env("Pendulum-v1")),
+    *(lambda wrapper=wrapper: ViaQ("ViaQPolicy", make_vec_env(ENV, 2, wrapper_class=wrapper))
+      for wrapper in (FlattenObservation, lambda env: RescaleAction(env, -2.0, 2.0))),
+    lambda: sensed(ranges=np.full((2, 192), 50.0)),
+    lambda: evaluate(load_agent(SENSED), scenes="validation", n_scenes=2, env_kwargs={"sensor": shorter()}),
     lambda: ViaQ("ViaQPolicy", VecNormalize(ViaVecEnv(ENV, 2))),
     lambda: ViaRank("ViaRankPolicy", ViaVecEnv(ENV, 1)),
     *(lambda labels=labels: ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1), labels=labels)

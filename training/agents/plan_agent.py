@@ -21,6 +21,7 @@ from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
 from viapoint.training.agents.model_io import check_arguments
 from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
+from viapoint.training.rollouts.vec_env import check_unwrapped
 
 N_ELITES = 8  # Number of candidates around which each round of refinement samples
 # Standard deviation of the first round of refinement, in the action space; each round halves it
@@ -150,7 +151,10 @@ class PlanPolicy(BasePolicy):
                     f"{name} must have {parts[name].shape[0]} values, as in training; got {size}"
                 )
             if not np.isfinite(np.asarray(each)).all():
-                raise ValueError(f"observation must be finite; {name} is {np.asarray(each)}")
+                wrong = np.argwhere(~np.isfinite(np.asarray(each)))
+                raise ValueError(
+                    f"observation must be finite; {name} is not, in {len(wrong)} places, first {wrong[0].tolist()}"
+                )
         several = is_vectorized_observation(cast(Any, dict(observation)), parts)
         batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
         if not len(batch[next(iter(batch))]):
@@ -229,7 +233,12 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
             raise ValueError(
                 f"{type(self).__name__} computes with metres: VecNormalize must be made with norm_obs=False"
             )
-        self._check_task(Task.from_dict(self.policy_kwargs["task"]), self._task_of(env))
+        check_unwrapped(env)
+        self.check_task(self._task_of(env))
+
+    def check_task(self, task: Task) -> None:
+        """Check that the agent can decide in another task than that of its training; ValueError if not."""
+        self._check_task(Task.from_dict(self.policy_kwargs["task"]), task)
 
     def _setup_model(self) -> None:
         if self.env is not None:

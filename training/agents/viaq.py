@@ -131,7 +131,7 @@ class ViaQ(PlanAlgorithm):
         if task is None or task.stepwise:
             raise ValueError(
                 "ViaQ needs an environment of this package in which an action is a whole movement, such as "
-                f"viapoint/PlanarObstacles-v0; got {env.observation_space} with {env.action_space}"
+                f"viapoint/PlanarObstacles-v0; got {'another one' if task is None else 'one with control steps'}"
             )
         if task.sensor is not None:
             raise ValueError(

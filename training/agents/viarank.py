@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -183,6 +184,10 @@ class ViaRankPolicy(PlanPolicy):
         super()._check_observation(batch)
         sensor, sight = self.task.sensor, Sight.of(batch, self.task)
         assert sensor is not None
+        if (sight.ranges > sensor.range + SAME_RAY).any():
+            raise ValueError(
+                f"ranges must be at most {sensor.range:g} m, as in training, got {sight.ranges.max():.3g}"
+            )
         rays = np.einsum("nij,rj->nri", sight.rotation, sensor.directions)
         apart = np.abs(sight.origin[:, None] + sight.ranges[..., None] * rays - sight.points).max(initial=0.0)
         if apart > SAME_RAY:
@@ -276,14 +281,18 @@ class ViaRank(PlanAlgorithm):
     def _task_of(self, env: VecEnv) -> Task:
         task = task_in(env)
         if task is None or task.sensor is None or not task.whole_movement:
+            got = "another one"
+            if task is not None:
+                got = "one without a sensor" if task.sensor is None else "one with several decisions"
             raise ValueError(
                 "viarank needs an environment of this package with a sensor in which an action is a whole movement, "
-                f"such as viapoint/PlanarSensed-v0; got {env.observation_space} with {env.action_space}"
+                f"such as viapoint/PlanarSensed-v0; got {got}"
             )
         return task
 
     def _check_task(self, mine: Task, theirs: Task) -> None:
-        if mine.sensor != theirs.sensor:
+        ideal = [each.sensor and replace(each.sensor, noise=0.0, dropped=0.0) for each in (mine, theirs)]
+        if ideal[0] != ideal[1]:  # noise and dropped rays may differ
             raise ValueError(
                 f"the environment must have the sensor of the agent, {mine.sensor}, got {theirs.sensor}"
             )

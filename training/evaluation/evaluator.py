@@ -227,6 +227,9 @@ def evaluate(
         agent = load_agent(agent)
     env_id, kwargs = _environment_of(agent, env, env_kwargs)
     task = registered_task(env_id, **kwargs)
+    check_task = getattr(agent, "check_task", None)
+    if task.sensor is not None and check_task is not None:
+        check_task(task)
     methods = _rows_of(agent, settings)
     for each in baselines:
         if not isinstance(each, str):

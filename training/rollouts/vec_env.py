@@ -50,17 +50,23 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
         raise ValueError(
             f"the environment must be one of this package, made by its id, got {inner if spec is None else spec.id}"
         )
-    for wrapper in (gym.ObservationWrapper, gym.ActionWrapper):
-        if any(inner.env_is_wrapped(wrapper, [0])):
-            raise ValueError(
-                f"the environment must have no {wrapper.__name__}: models know it by its id alone"
-            )
+    check_unwrapped(inner)
     usual = gym.spec(spec.id).kwargs
     return spec.id, {
         name: value
         for name, value in spec.kwargs.items()
         if name not in ("render_mode", "threads") and (name not in usual or usual[name] != value)
     }
+
+
+def check_unwrapped(env: VecEnv) -> None:
+    """Check that no wrapper changes observations or actions of single environments; ValueError otherwise."""
+    for wrapper in (gym.ObservationWrapper, gym.ActionWrapper):
+        if not isinstance(env.unwrapped, ViaVecEnv) and any(env.env_is_wrapped(wrapper, [0])):
+            raise ValueError(
+                f"the environment must have no {wrapper.__name__}, such as FlattenObservation or RescaleAction: models "
+                "know it by its id alone"
+            )
 
 
 def predicted_actions(model: BaseAlgorithm, observation: Any) -> NDArray[Any]:
