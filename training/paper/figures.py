@@ -145,7 +145,9 @@ def straight_movements() -> Figure:
             each.set(xlim=(0, 0.9), ylim=(-4.2, 4.2))
             zero(each)
         ax[3].set_xlabel("$t$ [s]")
-    for ax, text in zip(axes[1:, 0], ("speed [m/s]", r"$\ddot{y}$ [m/s²]", r"$\ddot{x}$ [m/s²]"), strict=True):
+    for ax, text in zip(
+        axes[1:, 0], ("speed [m/s]", r"$\ddot{y}$ [m/s²]", r"$\ddot{x}$ [m/s²]"), strict=True
+    ):
         ax.set_ylabel(text)
     axes[1, 1].legend(loc="upper right")
     return figure
@@ -183,7 +185,9 @@ def joints() -> Figure:
 def _two_movements(rows: int, height: float, titles: Sequence[str]) -> tuple[Figure, Any]:
     """Return a sheet for the paths of two movements and for `profiles`, with one scale in each row of these."""
     figure, axes = sheet(rows, 2, height, titles)
-    for row, text in zip(axes[1:], ("speed [m/s]", "curvature [1/m]", "$V_x$ [m/s]", "$V_y$ [m/s]"), strict=False):
+    for row, text in zip(
+        axes[1:], ("speed [m/s]", "curvature [1/m]", "$V_x$ [m/s]", "$V_y$ [m/s]"), strict=False
+    ):
         row[1].sharey(row[0])
         row[0].set_ylabel(text)
     return figure, axes
