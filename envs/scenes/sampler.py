@@ -116,11 +116,10 @@ class SceneSampler:
                 rng.random(out=draft.numbers[i])
             found = np.zeros(len(pending), np.bool_)
             draw_ends(draft, pending, found)
-            if "obstacles" not in given:
-                largest = np.maximum(*extents(draft.scenes.obstacles.take(pending)))
-                found &= largest.max(axis=1, initial=0.0) <= FARTHEST
+            obstacles = draft.scenes.obstacles.take(pending)
+            if "obstacles" not in given:  # what is drawn can be given back
+                found &= np.maximum(*extents(obstacles)).max(axis=1, initial=0.0) <= FARTHEST
             if self.viewpoint is not None:
-                obstacles = draft.scenes.obstacles.take(pending)
                 found &= point_clearances(obstacles, self.viewpoint) >= VIEW_MARGIN
             found[found] = self._change(draft, pending[found], generators, given)
             pending = pending[~found]

@@ -289,6 +289,8 @@ CALLS = [
     )),
     lambda: plan_motions(PANDA_ARM, 2 * [PANDA_ARM.home], [PANDA_ARM.home], [[], []]),
     lambda: plan_motions(PANDA_ARM, [PANDA_ARM.home], [PANDA_ARM.home], [[]], n_via=4),
+    lambda: plan_motions(PANDA_ARM, [PANDA_ARM.home], [PANDA_ARM.home], [[]], time_limit=math.nan),
+    lambda: plan_motions(PANDA_ARM, [PANDA_ARM.home], [PANDA_ARM.home], [[]], rng=-1),
     lambda: moved().joints(rate=1e9),
     lambda: plan_motions(PANDA_ARM, [PANDA_ARM.home], [PANDA_ARM.home], [[]], threads=2.5),
     lambda: moved(obstacles=[many_points()]).execute(force=True),

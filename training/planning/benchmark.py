@@ -279,15 +279,14 @@ def measure_planner(
         plan = planner(arm, problem)
         milliseconds = 1e3 * (time.perf_counter() - begin)
         plans.append(plan)
+        refused = plan.reason.startswith(("the start", "the goal", "the arm"))
         path = plan.trajectory()(np.linspace(0.0, plan.duration, PATH_INSTANTS))
         lines.append(
             {
                 "planner": name,
                 "set": problem.set,
                 "number": problem.number,
-                "refused": plan.reason
-                if plan.reason.startswith(("the start", "the goal", "the arm"))
-                else "",
+                "refused": plan.reason if refused else "",
                 "solved": plan.success,
                 "physics": False,
                 "milliseconds": milliseconds,

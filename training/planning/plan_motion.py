@@ -307,7 +307,10 @@ def plan_motions(
     rngs = rng.spawn(len(starts)) if isinstance(rng, np.random.Generator) else [rng] * len(starts)
 
     home = space_of(arm, kwargs.get("space") or arm.space).coordinates(arm.home)
-    nothing = plan_motion(arm, home, home, **{**kwargs, "time_limit": 0.0})  # raises what is a fault of all
+    # What is a fault of all problems is raised here.
+    number_of_at_least("time_limit", kwargs.get("time_limit", LONGEST_SEARCH), 0.0)
+    seed = None if isinstance(rng, np.random.Generator) else rng
+    nothing = plan_motion(arm, home, home, **{**kwargs, "time_limit": 0.0, "rng": seed})
 
     def plan(number: int) -> MotionPlan:
         try:
@@ -501,11 +504,12 @@ def _fault(problem: _Problem) -> tuple[str, float]:
             row = int(near.argmax())
             where = "in contact with" if rows[end, row] < 0.0 else "nearer than the margin to"
             return f"the {name} is {where} obstacle {row}, clearance {1e3 * rows[end, row]:.1f} mm", most
-    moving = joint_motion(space, ends[:1], problem.velocity[None], problem.acceleration[None])
-    share = np.abs(moving.velocity[0]) / arm.velocity_limit
-    if share.max() > 1.0:
-        fastest = arm.joint_names[int(share.argmax())]
-        return f"the start has {share.max():.2f} times the velocity limit of joint {fastest!r}", most
+    if problem.velocity.any():
+        moving = joint_motion(space, ends[:1], problem.velocity[None], problem.acceleration[None])
+        share = np.abs(moving.velocity[0]) / arm.velocity_limit
+        if share.max() > 1.0:
+            fastest = arm.joint_names[int(share.argmax())]
+            return f"the start has {share.max():.2f} times the velocity limit of joint {fastest!r}", most
     counted = both.present & (resting | np.array([[True], [False]]))
     nearest = min(float(own.min()), float(rows.min(where=counted, initial=most)))
     return "", max(problem.margin, min(most, nearest - ROUNDING))
