@@ -37,6 +37,10 @@ class Placed(NamedTuple):
     known: Bool  # True for groups whose spheres are placed, shape (G,)
     # Bound of the way of the spheres of links 0 to J since another configuration, shape (J + 1,), [m]
     way: Float
+    bend: Float  # Bound of how much longer than its chord this way is, shape (J + 1,), [m]
+    group_way: Float  # Bound of the way of the spheres of groups, shape (G,), [m]
+    last_rotation: Float  # Axes of the links' frames in the configuration before, shape (J + 1, 3, 3)
+    last_ball: Float  # Centres of the bounding balls in the configuration before, shape (G, 3), [m]
     apart: Float  # Lower bounds of the clearance of groups from obstacles in a movement, shape (G,), [m]
     pair_apart: Float  # Lower bounds of the clearance of pairs of groups in a movement, shape (P,), [m]
 
@@ -53,6 +57,10 @@ def memory(chain: Chain, spheres: Spheres) -> Placed:
         np.empty((len(spheres.radius), 3)),
         np.empty(groups, np.bool_),
         np.empty(joints + 1),
+        np.empty(joints + 1),
+        np.empty(groups),
+        np.empty((joints + 1, 3, 3)),
+        np.empty((groups, 3)),
         np.empty(groups),
         np.empty(len(spheres.pairs)),
     )
@@ -337,9 +345,19 @@ def movement_clearance(
     # A coarse look comes first: with a small clearance from the start, the second one skips most configurations.
     for stride in (COARSE, 1):
         _forget(placed)
+        last = -1  # the configuration of which the last places are
         for k in range(0, len(path), stride):
-            _move(reach, path[max(k - stride, 0)], path[k], stride * drift, spheres, placed)
+            _set_ways(reach, path[max(k - stride, 0)], path[k], spheres, placed)
             is_placed = False
+            if len(between) > 0 and stride == 1 and k > 0 and _matters(spheres, placed, drift, least):
+                if last != k - 1:
+                    place(chain, spheres, path[k - 1], placed)
+                    _keep_places(placed)
+                place(chain, spheres, path[k], placed)
+                _shorten_ways(spheres, placed)
+                _keep_places(placed)
+                is_placed, last = True, k
+            _move(stride * drift, spheres, placed)
             for group in range(len(spheres.link)):
                 if spheres.link[group] == 0 or placed.apart[group] >= least:
                     continue
@@ -353,7 +371,7 @@ def movement_clearance(
                 least = min(least, apart)
                 if len(between) == 0 or stride > 1 or k == 0:
                     continue
-                way = placed.way[spheres.link[group]] + drift
+                way = placed.group_way[group] + drift
                 low = min(least, least_self)
                 if way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
                     continue
@@ -419,10 +437,14 @@ def _place_between(
 
 @inlined
 def _way_of_pair(spheres: Spheres, placed: Placed, pair: int) -> float:
-    """Return how much a pair of groups has moved, seen from its first link, [m]: by the joints between both alone."""
-    one = spheres.link[spheres.pairs[pair, 0]]
-    other = spheres.link[spheres.pairs[pair, 1]]
-    return float(abs(placed.way[other] - placed.way[one]))
+    """Return how much a pair of groups may have moved, seen from one another, [m].
+
+    That is by the joints between both alone, and not by more than both have moved.
+    """
+    one = spheres.pairs[pair, 0]
+    other = spheres.pairs[pair, 1]
+    between = abs(placed.way[spheres.link[other]] - placed.way[spheres.link[one]])
+    return float(min(between, placed.group_way[one] + placed.group_way[other]))
 
 
 @inlined
@@ -435,14 +457,67 @@ def _forget(placed: Placed) -> None:
 
 
 @inlined
-def _move(reach: Float, first: Float, second: Float, drift: float, spheres: Spheres, placed: Placed) -> None:
-    """Lower the bounds of clearance by what spheres, and obstacles by `drift`, may move between two configurations."""
-    way = placed.way
+def _set_ways(reach: Float, first: Float, second: Float, spheres: Spheres, placed: Placed) -> None:
+    """Set bounds of the ways of links and groups between two configurations, with straight movements of the joints."""
+    way, bend = placed.way, placed.bend
     way[0] = 0.0
+    bend[0] = 0.0
+    turned = 0.0
     for joint in range(len(reach)):
-        way[joint + 1] = way[joint] + reach[joint] * abs(second[joint] - first[joint])
+        turn = abs(second[joint] - first[joint])
+        way[joint + 1] = way[joint] + reach[joint] * turn
+        # Half of a bound of the second derivative of the way, in which each pair of joints counts twice.
+        bend[joint + 1] = bend[joint] + 0.5 * reach[joint] * turn * (turn + 2.0 * turned)
+        turned += turn
+    for group in range(len(placed.group_way)):
+        placed.group_way[group] = way[spheres.link[group]]
+
+
+@inlined
+def _matters(spheres: Spheres, placed: Placed, drift: float, least: float) -> bool:
+    """Return True if the ways of the groups must be known better, because one may now be nearer than the least."""
     for group in range(len(placed.apart)):
-        placed.apart[group] -= way[spheres.link[group]] + drift
+        if spheres.link[group] > 0 and placed.apart[group] - placed.group_way[group] - drift < least:
+            return True
+    return False
+
+
+@inlined
+def _keep_places(placed: Placed) -> None:
+    """Keep the places of links and balls as those of the configuration before."""
+    for link in range(len(placed.way)):
+        for row in range(3):
+            for column in range(3):
+                placed.last_rotation[link, row, column] = placed.rotation[link, row, column]
+    for group in range(len(placed.apart)):
+        for axis in range(3):
+            placed.last_ball[group, axis] = placed.ball[group, axis]
+
+
+@inlined
+def _shorten_ways(spheres: Spheres, placed: Placed) -> None:
+    """Lower the bounds of the ways of groups to what follows from where they are now and were before.
+
+    No sphere of a group has a longer chord than that of the group's ball and of a point at its edge. The chord is the
+    mean of the velocity, from which the velocity differs by half of its greatest derivative at most.
+    """
+    for group in range(len(placed.apart)):
+        link = spheres.link[group]
+        turn = 0.0
+        for row in range(3):
+            for column in range(3):
+                change = placed.rotation[link, row, column] - placed.last_rotation[link, row, column]
+                turn += 0.5 * change * change
+        chord = math.sqrt(_square(placed.ball, group, placed.last_ball, group))
+        bound = chord + spheres.ball_radius[group] * math.sqrt(turn) + placed.bend[link]
+        placed.group_way[group] = min(placed.group_way[group], bound)
+
+
+@inlined
+def _move(drift: float, spheres: Spheres, placed: Placed) -> None:
+    """Lower the bounds of clearance by the ways of the spheres, and the one of the obstacles, `drift`, [m]."""
+    for group in range(len(placed.apart)):
+        placed.apart[group] -= placed.group_way[group] + drift
     for pair in range(len(placed.pair_apart)):
         placed.pair_apart[pair] -= _way_of_pair(spheres, placed, pair)
 

