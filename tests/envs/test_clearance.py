@@ -76,19 +76,21 @@ def test_clearance_of_a_movement_is_that_of_its_nearest_configuration(name, numb
         np.testing.assert_allclose(np.maximum(found, -FAR), np.maximum(each.min(axis=0), -FAR), atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["planar", "panda"])
-def test_clearance_between_configurations_is_that_of_many_more(name):
+@pytest.mark.parametrize(("name", "number"), [("planar", 9), ("panda", 9), ("panda", 97)])
+def test_clearance_between_configurations_is_that_of_many_more(name, number):
     """Of a path with few of them, among obstacles that move."""
     rng, arm = np.random.default_rng(1), arm_of(name)
     placed, between = memory(arm.chain, arm.spheres), np.empty(len(arm.home))
-    few, many, duration = np.linspace(0.0, 1.0, 9), np.linspace(0.0, 1.0, 4001), 0.5
+    corners, few, many = (np.linspace(0.0, 1.0, each) for each in (9, number, 4001))
+    duration = 0.5
     deeper = 0
     for _ in range(60):
         shapes = [
             dataclasses.replace(each, velocity=rng.uniform(-0.2, 0.2, 3)) for each in some_shapes(rng, 5)
         ]
-        path = np.ascontiguousarray(some_joints(rng, arm, 9))
-        dense = np.stack([np.interp(many, few, joint) for joint in path.T], axis=-1)
+        turns = some_joints(rng, arm, 9).T
+        path = np.stack([np.interp(few, corners, joint) for joint in turns], axis=-1)
+        dense = np.stack([np.interp(many, corners, joint) for joint in turns], axis=-1)
         body = arm.chain, arm.spheres, arm.reach
         least = []
         for joints, memory_of_it in ((path, between), (dense, np.empty(0)), (path, np.empty(0))):
@@ -98,5 +100,5 @@ def test_clearance_between_configurations_is_that_of_many_more(name):
         # Many configurations may miss something, too.
         assert least[1] - 3e-3 <= least[0] <= least[1] + ROUGHLY
         assert least[0] < 0.0 or least[1] > -RESOLUTION
-        deeper += least[0] < least[2] - 0.01
+        deeper += least[0] < least[2] - (0.01 if number == 9 else 1e-3)
     assert deeper > 10  # something passes between the configurations
