@@ -122,6 +122,8 @@ class Task:
                 raise TypeError(f"{name} must be True or False, got {value!r}")
         if courses not in COURSES:
             raise ValueError(f"courses must be one of {', '.join(COURSES)}, got {courses!r}")
+        if courses != COURSES[0] and not moving_obstacles:
+            raise ValueError(f"courses={courses!r} needs moving_obstacles=True")
         numbers = fewest_and_most("n_obstacles", n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
         plane = is_planar(arm)
         shapes = (PLANE_SHAPES if plane else SPACE_SHAPES) if shapes is None else shapes

@@ -54,7 +54,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         timing: `optimal` passage times, or `learned` ones as part of the action.
         duration_range: Shortest and longest movement: in hand space [s], in joint space multiples of the shortest
             movement that the velocity limits allow.
-        n_obstacles: Number of obstacles, or the fewest and the most.
+        n_obstacles: Number of obstacles, or the fewest and the most; families that are furniture may have fewer.
         shapes: Shapes that obstacles may have; by default cylinders and boxes in the plane, all but meshes and point
             clouds in space.
         families: Names of scene families that are drawn; by default those of training. A repeated name is drawn more

@@ -251,6 +251,11 @@ class Shape:
         radius = finite_array("radius", radius)
         if (radius < 0.0).any():
             raise ValueError(f"radius must be 0 or greater, got {radius.min()}")
+        batch = points.shape[:-1]
+        try:
+            np.broadcast_shapes(batch, radius.shape)
+        except ValueError:
+            raise ValueError(f"radius must broadcast with {batch}, got the shape {radius.shape}") from None
         flat = np.array(points.reshape(-1, 3))
         found = np.empty(len(flat))
         meshes = self.mesh or join_meshes([])
@@ -258,7 +263,7 @@ class Shape:
         _distances(
             self.number, self.packed_size, self.rotation, np.array(self.position), meshes, clouds, flat, found
         )
-        return found.reshape(points.shape[:-1]) - radius
+        return found.reshape(batch) - radius
 
     @property
     def packed_size(self) -> Float:

@@ -78,7 +78,8 @@ class Room(NamedTuple):
         allowed = [kind for kind in kinds if kind in self.kinds]
         if not allowed:
             raise ValueError(
-                f"this family needs one of the shapes {', '.join(kinds)}, got {', '.join(self.kinds)}"
+                f"to draw this family of scenes, shapes must have one of {', '.join(kinds)}, got "
+                f"{', '.join(self.kinds)}; obstacles that reset is given may have any of them"
             )
         return allowed
 

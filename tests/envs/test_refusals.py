@@ -60,7 +60,7 @@ ANY_ENVIRONMENT = [
     ({"max_episode_steps": 0}, ValueError),
     ({"arm": "ur5"}, ValueError), ({"arm": 5}, ValueError), ({"space": "hands"}, ValueError),
     ({"whole_arm": "yes"}, TypeError), ({"moving_obstacles": 1}, TypeError), ({"shapes": 3}, TypeError),
-    ({"courses": "walks"}, ValueError),
+    ({"courses": "walks"}, ValueError), ({"courses": "reaches", "moving_obstacles": False}, ValueError),
     ({"shapes": ()}, ValueError), ({"shapes": "pyramid"}, ValueError), ({"shapes": ("box", "box")}, ValueError),
     ({"families": 3}, TypeError), ({"families": ()}, ValueError), ({"families": "maze"}, ValueError),
     *(({"n_obstacles": number}, ValueError) for number in (-1, 1.5, True, (3, 2), (40, 50), (0, 257), "many")),
