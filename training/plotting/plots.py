@@ -23,6 +23,7 @@ METHOD_COLOURS = {
     "agent": BLUE, "untrained": "#9dc3e6", "plan_motion": "#c0504d", "ompl": "#4f8f4f", "search": "#7f7f7f",
     "sac": "#2a9d8f", "tqc": "#8e6bb0", "ppo": "#d1812f",
 }  # fmt: skip
+OTHER_COLOURS = "#c9b458", "#d9a6c2", "#b5a08c", "#a8c686", "#5c5c8a"  # Of methods that are not among them
 DOTS_PER_INCH = 130
 STYLE = files("viapoint.training") / "paper" / "paper.mplstyle"  # Style of figures in centimetres
 WIDTH, HEIGHT, LEGEND = 17.0, 5.4, 0.7  # Of a figure of fits, each movement, the legend, [cm]
@@ -64,7 +65,7 @@ def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
         shown = [(j, bands[band]) for j, band in enumerate(BANDS) if band in bands]
         x = np.array([j + (i - (len(summaries) - 1) / 2.0) * width for j, _ in shown])
         rate, low, high = _percent([each for _, each in shown])
-        ax.bar(x, rate, width=0.9 * width, label=name)
+        ax.bar(x, rate, width=0.9 * width, label=name, **_bar_style(name, list(summaries)))
         ax.errorbar(x, rate, yerr=(rate - low, high - rate), fmt="none", ecolor="0.25", elinewidth=1.0)
     ax.set_xticks(range(len(BANDS)), BANDS)
     ax.set_xlabel("solution share: random actions that solve the scene (easy to hard)")
@@ -152,6 +153,18 @@ def style_axes(ax: Any) -> None:
     ax.spines[["top", "right"]].set_visible(False)
     ax.grid(axis="y", color="0.9")
     ax.set_axisbelow(True)
+
+
+def _bar_style(name: str, names: Sequence[str]) -> dict[str, Any]:
+    """Return the colour of a method; a variant, such as an agent with checks, has the hatched colour of its method."""
+    method = name.rstrip("0123456789")
+    if method in METHOD_COLOURS:
+        return {"color": METHOD_COLOURS[method]}
+    for known, colour in METHOD_COLOURS.items():
+        if name.startswith(known):
+            return {"color": colour, "hatch": "///", "edgecolor": "white"}
+    others = [each for each in names if not each.startswith(tuple(METHOD_COLOURS))]
+    return {"color": OTHER_COLOURS[others.index(name) % len(OTHER_COLOURS)]}
 
 
 def _percent(rates: Sequence[Mapping[str, float]]) -> tuple[Float, Float, Float]:
