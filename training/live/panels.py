@@ -51,7 +51,7 @@ class Panels:
 
     def draw(self, state: State) -> None:
         """Show what was decided, and set the controls."""
-        remark = state.origin
+        remark = state.scene.origin if state.scene is state.drawn else ""
         limit = self._arena.limit(state.scene)
         plan = state.plan
         if limit and state.method == AGENT:
@@ -123,8 +123,8 @@ class Panels:
             rows.append((name, success, _number(movement.reward), clearance, jerk, f"{1e3 * seconds:.0f}"))
         names = "method", "success", "reward", "clearance [mm]", "jerk", "decided in [ms]"
         note = "Each row is simulated. Jerk is relative to the straight movement."
-        if state.comparing:
-            note = f"{state.comparing} ..."
+        if 0 < len(rows) < len(self._arena.methods):
+            note = f"{self._arena.methods[len(rows)]} ..."
         self._methods.content = (_table(names, rows) if rows else "") + NOTE.format(note)
 
     def _draw_selection(self, state: State) -> None:
@@ -196,7 +196,6 @@ class Panels:
             upload.on_upload(lambda event: act("load", event.target.value.content))
             self._button("Copy as Python", "show_code")
             self._button("Save picture (PNG)", "save_picture")
-        self._button("Reset the view", "reset_view")
         drag = "Drag start, goal, via-point and obstacles with the mouse."
         gui.add_html(NOTE.format(drag + ("" if arena.planar else " Hold Shift to move them up and down.")))
 
