@@ -195,6 +195,18 @@ def test_a_dragged_goal_is_reached_without_a_jump(arenas):
         assert restarts == int(late)
 
 
+def test_a_dragged_goal_jumps_no_more(arenas):
+    """Neither in the movement nor in the simulations of its proposals."""
+    arena = arenas(JUMPS)
+    scene = drawn(arena)
+    assert len(scene.jumps)
+    state = with_proposals(arena, decided(arena, scene.with_goal(scene.goal)))
+    assert state.plan.success
+    assert state.proposals[0].reward is not None
+    *_, movement = execute(arena, state)
+    assert not movement.scenes.jumps.any()
+
+
 @pytest.mark.parametrize("env_id", [PLANAR, PANDA])
 def test_a_dragged_end_is_where_it_was_dragged_to(env_id, arenas):
     arena = arenas(env_id)
