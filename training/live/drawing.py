@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
 import trimesh
+import viser
 from mjviser.conversions import get_geom_texture_id, merge_geoms
 
 from viapoint.envs import Arm, Box, Capsule, HalfSpace, Shape, Sphere
@@ -21,9 +22,6 @@ from viapoint.envs.geometry.obstacles import add_to_model, pack
 from viapoint.training.live.arena import SAMPLES, Arena
 from viapoint.training.live.state import State
 from viapoint.training.planning.motion_plan import MotionPlan
-
-if TYPE_CHECKING:
-    import viser
 
 PLAN, PROPOSAL, DONE = 0.0050, 0.0028, 0.0032  # Radii of plan, proposals, executed path, [m]
 ROD = trimesh.creation.cylinder(1.0, 2.0, sections=8)  # Piece of a tube before it is scaled
