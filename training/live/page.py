@@ -45,18 +45,11 @@ class Tab:
 
     state: State
 
-    def __init__(
-        self,
-        client: viser.ClientHandle,
-        make: Callable[[], tuple[Arena, ArmDrawing]],
-        on_end: Callable[[], object],
-    ) -> None:
-        self.client, self._make, self._on_end = client, make, on_end
+    def __init__(self, client: viser.ClientHandle, make: Callable[[], tuple[Arena, ArmDrawing]]) -> None:
+        self.client, self._make = client, make
         self.latencies: deque[float] = deque(maxlen=200)  # from changes to messages with plans, [s]
-        self._jobs: dict[
-            Any, tuple[float, Callable[[], None]]
-        ] = {}  # with the times at which they are due, [s]
-        self._due = time.perf_counter()  # that of the present job
+        self._jobs: dict[Any, tuple[float, Callable[[], None]]] = {}  # functions, and when they are due, [s]
+        self._due = time.perf_counter()  # when the present one was due
         self._wake, self._busy, self._closed = threading.Condition(), True, False
         self._thread = threading.Thread(target=self._run, name=f"viapoint-{client.client_id}", daemon=True)
         self._thread.start()
@@ -106,7 +99,6 @@ class Tab:
                 traceback.print_exc(file=sys.stderr)
         finally:
             self.arena.close()
-            self._on_end()
 
     def _next(self) -> Callable[[], None]:
         """Wait for the job that is due first, and return it; nothing is done in a tab that is closed."""
@@ -155,6 +147,8 @@ class Tab:
         if "scene" in changes:
             state.results = ()
         state.movement, state.playing, state.before = None, False, state.plan
+        with self._wake:
+            self._jobs.pop(("propose",), None)  # those of the scene before
         proposal = decide(self.arena, state)
         state.proposals, state.picked, state.profile = (proposal,), 0, None
         self._say(describe_plan(proposal), proposal.motion.success)
@@ -418,12 +412,12 @@ class LivePage:
         return arena, ArmDrawing(arena.task.arm, arena.env("own").model, file)
 
     def _connect(self, client: viser.ClientHandle) -> None:
-        number = client.client_id
-        self._tabs[number] = Tab(client, self._make, lambda: self._tabs.pop(number, None))
+        self._tabs[client.client_id] = Tab(client, self._make)
 
     def _disconnect(self, client: viser.ClientHandle) -> None:
-        if client.client_id in self._tabs:
-            self._tabs[client.client_id].close()
+        tab = self._tabs.pop(client.client_id, None)
+        if tab is not None:
+            tab.close()
 
 
 def run(config: Any) -> None:
