@@ -145,7 +145,7 @@ class Arena:
     def scene_of(self, scenes: ve.Scenes, row: int = 0) -> Scene:
         """Return one of the scenes of an environment."""
         options = ve.scene_from_json(ve.scene_to_json(scenes, self.task.arm, self.task.space_name, scene=row))
-        arrays = {name: np.array(value) for name, value in options.items() if name != "obstacles"}
+        arrays: Any = {name: np.array(value) for name, value in options.items() if name != "obstacles"}
         return Scene(obstacles=tuple(options["obstacles"]), **arrays)
 
     def read(self, content: str | bytes) -> Scene:

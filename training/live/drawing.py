@@ -323,7 +323,7 @@ class View:
         point = eye + share * ray - self._grab
         if upright:
             point = np.array([*place[:2], max(point[2], self._floor)])
-        return np.clip(point, -FARTHEST, FARTHEST)
+        return np.asarray(np.clip(point, -FARTHEST, FARTHEST))
 
 
 def _rgb(colour: Any) -> tuple[int, int, int]:
