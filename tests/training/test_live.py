@@ -47,7 +47,7 @@ def untrained(env_id):
 def drawn(arena, number=0):
     """Return a random scene."""
     scenes = arena.scenes()["Random"]
-    return [next(scenes)[0] for _ in range(number + 1)][-1]
+    return [next(scenes) for _ in range(number + 1)][-1]
 
 
 def decided(arena, scene, method=SEARCH, **changes):
@@ -77,7 +77,7 @@ def test_every_environment_has_scenes_decisions_movements_and_a_drawing(env_id, 
     """Without an agent the geometry search decides; environments of an own arm have the Panda by default."""
     arena = arenas(env_id)
     for kind in arena.scenes().values():
-        scene, _ = next(kind)
+        scene = next(kind)
         assert_same(arena.read(scene.to_json(env_id)), scene, atol=1e-9)
     scene = drawn(arena)
     state = with_proposals(arena, decided(arena, scene))
@@ -193,6 +193,18 @@ def test_a_dragged_goal_is_reached_without_a_jump(arenas):
         assert np.abs(np.diff(velocity, axis=0)).max() < 0.1
         restarts = sum(len(b.rollout.time) < len(a.rollout.time) for a, b in itertools.pairwise(seen))
         assert restarts == int(late)
+
+
+def test_a_dragged_goal_jumps_no_more(arenas):
+    """Neither in the movement nor in the simulations of its proposals."""
+    arena = arenas(JUMPS)
+    scene = drawn(arena)
+    assert len(scene.jumps)
+    state = with_proposals(arena, decided(arena, scene.with_goal(scene.goal)))
+    assert state.plan.success
+    assert state.proposals[0].reward is not None
+    *_, movement = execute(arena, state)
+    assert not movement.scenes.jumps.any()
 
 
 @pytest.mark.parametrize("env_id", [PLANAR, PANDA])

@@ -26,6 +26,7 @@ from viapoint.training.scene_sets import load, shipped_set
 
 MOTION, AGENT, SEARCH = "motion planner", "agent", "geometry search"
 STRAIGHT, OMPL, HAND = "straight movement", "OMPL", "by hand"  # Names of methods
+SAMPLES = 80  # Points of a path
 MOST_OBSTACLES = 24  # Greatest number of obstacles of a scene
 SIMULATED = ("sphere", "capsule", "cylinder", "box", "half_space")  # In every scene
 BOX_SIZES = ("half-depth", "half-width", "half-height")  # Names of the half lengths of a box
@@ -115,8 +116,8 @@ class Arena:
 
     # Scenes
 
-    def scenes(self) -> dict[str, Iterator[tuple[Scene, str]]]:
-        """Return endless scenes and sentences on them, by the names of their buttons."""
+    def scenes(self) -> dict[str, Iterator[Scene]]:
+        """Return endless scenes by the names of their buttons."""
         task = self.task
         kinds = {"Random": self._random()}
         for name in ("test", "hard"):
@@ -127,24 +128,24 @@ class Arena:
             kinds["Lights 1985"] = self._lights()
         return kinds
 
-    def _random(self) -> Iterator[tuple[Scene, str]]:
+    def _random(self) -> Iterator[Scene]:
         generator = np.random.default_rng(self._seed)
         while True:
-            yield self.scene_of(self._sampler([generator])), ""
+            yield self.scene_of(self._sampler([generator]))
 
-    def _shipped(self, name: str, scenes: ve.Scenes) -> Iterator[tuple[Scene, str]]:
+    def _shipped(self, name: str, scenes: ve.Scenes) -> Iterator[Scene]:
         for row in itertools.cycle(range(len(scenes.start))):
-            yield self.scene_of(scenes, row), f"Scene {row} of the set {name}."
+            yield self.scene_of(scenes, row)._replace(origin=f"Scene {row} of the set {name}.")
 
-    def _lights(self) -> Iterator[tuple[Scene, str]]:
+    def _lights(self) -> Iterator[Scene]:
         for first, last, lights in itertools.cycle(rows_of_lights(half_height=self._sampler.room.height)):
-            sentence = f"From {first} to {last} past a row of lights, Flash & Hogan 1985."
-            yield Scene(TARGETS[first], TARGETS[last], (lights,)), sentence
+            origin = f"From {first} to {last} past a row of lights, Flash & Hogan 1985."
+            yield Scene(TARGETS[first], TARGETS[last], (lights,), origin=origin)
 
     def scene_of(self, scenes: ve.Scenes, row: int = 0) -> Scene:
         """Return one of the scenes of an environment."""
         options = ve.scene_from_json(ve.scene_to_json(scenes, self.task.arm, self.task.space_name, scene=row))
-        arrays = {name: np.array(value) for name, value in options.items() if name != "obstacles"}
+        arrays: Any = {name: np.array(value) for name, value in options.items() if name != "obstacles"}
         return Scene(obstacles=tuple(options["obstacles"]), **arrays)
 
     def read(self, content: str | bytes) -> Scene:
@@ -180,7 +181,7 @@ class Arena:
         level = np.full((*coordinates.shape[:-1], 1), arm.hand(arm.home)[2])
         return np.concatenate((coordinates, level), axis=-1)
 
-    def path(self, plan: ve.Plan, samples: int = 80) -> Float:
+    def path(self, plan: ve.Plan, samples: int = SAMPLES) -> Float:
         """Return places of the tool at evenly spaced times of plans, shape (..., samples, 3), [m]."""
         times = plan.duration[..., None] * np.linspace(0.0, 1.0, samples)
         return self.tool(np.asarray(plan.trajectory()(times)))

@@ -44,7 +44,7 @@ def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Propos
         return _planned(arena, state, time_limit)
     scene, (name, task, decide_) = state.scene, _chooser(arena, state)
     try:
-        observation, _ = arena.env(name).reset(options=scene.options())
+        observation = begin_episode(arena.env(name), scene)
     except ValueError:
         best = _planned(arena, state, time_limit)
         if best.motion.success:
@@ -111,10 +111,9 @@ def propose(arena: Arena, state: State) -> tuple[Proposal, ...]:
     if state.method in (MOTION, OMPL, STRAIGHT):
         return (first,)
     env = arena.env("whole")
+    now = state.scene._replace(jumps=(), turns=(), reaches=())  # later changes are not known
     try:
-        env.reset(
-            options=state.scene._replace(jumps=(), turns=(), reaches=()).options()
-        )  # later changes are not known
+        begin_episode(env, now)
     except ValueError:  # the scene is impossible
         return (first,)
     scenes = env.scenes
@@ -131,7 +130,7 @@ def _distinct(arena: Arena, state: State, first: Proposal) -> list[Proposal]:
     """Return a plan and the best candidates whose paths differ from it and from one another."""
     scene, (name, task, _) = state.scene, _chooser(arena, state)
     env, by_agent = arena.env(name), name == "own"
-    observation, _ = env.reset(options=scene.options())
+    observation = begin_episode(env, scene)
     if by_agent and not hasattr(getattr(arena.agent, "policy", None), "propose"):  # it proposes one action
         return [first]
     if by_agent:
@@ -184,7 +183,7 @@ def play(
     `plan` replaces the first decision; `goal_of` returns the present goal, shape (D,). When the arm has reached a goal
     that has been dragged away meanwhile, a new episode begins there.
     """
-    observation, _ = env.reset(options=scene.options())
+    observation = begin_episode(env, scene)
     decision = env.execute_actions(decide(observation)) if plan is None else env.execute_plan(_in_batch(plan))
     goal, reward = scene.goal, 0.0
     while True:
@@ -206,10 +205,17 @@ def play(
                 for shape, place in zip(scene.obstacles, places, strict=False)
             ]
             scene = Scene(here, goal, tuple(resting))
-            observation, _ = env.reset(options=scene.options())
+            observation = begin_episode(env, scene)
         elif moved:
             observation = env.move_goals(goal[None])
         decision = env.execute_actions(decide(observation))
+
+
+def begin_episode(env: ReachVectorEnv, scene: Scene) -> Observation:
+    """Begin an episode in a scene, and return the observation; a target without jumps gets none."""
+    jumps = {"jumps": ()} if env.task.n_jumps[1] else {}
+    observation, _ = env.reset(options={**jumps, **scene.options()})
+    return observation
 
 
 def _in_batch(plan: Plan) -> Plan:

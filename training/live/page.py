@@ -31,7 +31,7 @@ from viapoint.training.config.checks import DEFAULT_ENV, SHIPPED_IDS
 from viapoint.training.config.configs import env_of_arm
 from viapoint.training.live.arena import MOST_OBSTACLES, Arena
 from viapoint.training.live.decide import decide, describe_outcome, describe_plan, execute, profile, propose
-from viapoint.training.live.drawing import ArmDrawing, View
+from viapoint.training.live.drawing import ArmDrawing, View, set_first_view
 from viapoint.training.live.panels import RESET, Panels
 from viapoint.training.live.state import Scene, State
 
@@ -45,17 +45,11 @@ class Tab:
 
     state: State
 
-    def __init__(
-        self,
-        client: viser.ClientHandle,
-        make: Callable[[], tuple[Arena, ArmDrawing]],
-        on_end: Callable[[], object],
-    ) -> None:
-        self.client, self._make, self._on_end = client, make, on_end
+    def __init__(self, client: viser.ClientHandle, make: Callable[[], tuple[Arena, ArmDrawing]]) -> None:
+        self.client, self._make = client, make
         self.latencies: deque[float] = deque(maxlen=200)  # from changes to messages with plans, [s]
-        self._jobs: dict[Any, tuple[float, Callable[[], None]]] = {}
-        self._later: dict[str, Callable[[], None]] = {}
-        self._posted = time.perf_counter()
+        self._jobs: dict[Any, tuple[float, Callable[[], None]]] = {}  # functions, and when they are due, [s]
+        self._due = time.perf_counter()  # when the present one was due
         self._wake, self._busy, self._closed = threading.Condition(), True, False
         self._thread = threading.Thread(target=self._run, name=f"viapoint-{client.client_id}", daemon=True)
         self._thread.start()
@@ -64,18 +58,17 @@ class Tab:
     def idle(self) -> bool:
         """True if nothing waits to be done and nothing moves."""
         with self._wake:
-            return not (self._busy or self._jobs or self._later or self.state.playing)
+            return not (self._busy or self._jobs)
 
-    def act(self, name: str, *values: Any, **changes: Any) -> None:
-        """Call a method by its name, such as `drag`, in the thread of the tab; view and panels call it.
+    def act(self, name: str, *values: Any, delay: float = 0.0, **changes: Any) -> None:
+        """Call a method by its name, such as `drag`, in the thread of the tab, after a delay, [s].
 
         A waiting call of the same kind is replaced, so that a fast drag skips positions instead of lagging behind.
         """
         kind = name, *(value for value in values if isinstance(value, str)), *changes
         job = functools.partial(getattr(self, name), *values, **changes)
         with self._wake:
-            self._jobs.pop(kind, None)  # the new one goes to the end of the line
-            self._jobs[kind] = time.perf_counter(), job
+            self._jobs[kind] = time.perf_counter() + delay, job
             self._wake.notify()
 
     def close(self, timeout: float = 0.0) -> None:
@@ -96,8 +89,8 @@ class Tab:
             self._panels = Panels(self.client, self.arena, self._scenes, self.act)
             self._speed = 0.5 if self.arena.planar else 1.0  # movements in the plane are short
             self._view = View(self.client, self.arena, drawing, self.act)
-            scene, origin = next(next(iter(self._scenes.values())))
-            self.state = State(scene=scene, drawn=scene, origin=origin, method=self.arena.methods[0])
+            scene = next(self._scenes["Random"])
+            self.state = State(scene=scene, drawn=scene, method=self.arena.methods[0])
             self._guarded(self.change)
             while not self._closed:
                 self._guarded(self._next())
@@ -106,29 +99,20 @@ class Tab:
                 traceback.print_exc(file=sys.stderr)
         finally:
             self.arena.close()
-            self._on_end()
 
     def _next(self) -> Callable[[], None]:
-        """Return the next job; wait for one, but only for a moment while there is something else to do."""
+        """Wait for the job that is due first, and return it; nothing is done in a tab that is closed."""
         with self._wake:
             self._busy = False
-            playing = self.state.playing
-            patience = None
-            if playing:
-                patience = TICK
-            elif self._later:
-                patience = max(self._posted + PAUSE - time.perf_counter(), 0.0)
-            if not self._jobs and not self._closed:
+            while not self._closed:
+                kind = min(self._jobs, key=lambda each: self._jobs[each][0], default=None)
+                patience = None if kind is None else self._jobs[kind][0] - time.perf_counter()
+                if patience is not None and patience <= 0.0:
+                    self._busy = True
+                    self._due, job = self._jobs.pop(kind)
+                    return job
                 self._wake.wait(patience)
-            self._busy = True
-            if self._jobs:
-                self._posted, job = self._jobs.pop(next(iter(self._jobs)))  # the oldest one
-                return job
-            if playing:
-                return self._advance
-            if self._later and time.perf_counter() >= self._posted + PAUSE:
-                return self._later.pop(next(iter(self._later)))
-            return lambda: None
+        return lambda: None
 
     def _guarded(self, job: Callable[[], None]) -> None:
         """Do a job; an error is told in one sentence."""
@@ -161,19 +145,22 @@ class Tab:
         for name, value in changes.items():
             setattr(state, name, value)
         if "scene" in changes:
-            state.results, state.comparing = (), ""
-            state.origin = changes.get("origin", "")
-            self._later.pop("comparison", None)
+            state.results = ()
         state.movement, state.playing, state.before = None, False, state.plan
-        self._later.pop("proposals", None)  # those of the scene before
+        with self._wake:
+            self._jobs.pop(("propose",), None)  # those of the scene before
         proposal = decide(self.arena, state)
         state.proposals, state.picked, state.profile = (proposal,), 0, None
         self._say(describe_plan(proposal), proposal.motion.success)
         self.client.flush()
-        self.latencies.append(time.perf_counter() - self._posted)
-        self._later["proposals"] = self._propose
+        self.latencies.append(time.perf_counter() - self._due)
+        self.act("propose", delay=PAUSE)
 
-    def _propose(self) -> None:
+    def propose(self) -> None:
+        """Show what the plan is compared with, unless something moves."""
+        if self.state.playing:
+            self.act("propose", delay=PAUSE)
+            return
         self.state.proposals = propose(self.arena, self.state)
         self.pick(0)
 
@@ -190,14 +177,14 @@ class Tab:
 
     def go_to(self, kind: str) -> None:
         """Go to another scene of a kind, or undo all changes."""
-        self._take(*((self.state.drawn, "") if kind == RESET else next(self._scenes[kind])))
+        self._take(self.state.drawn if kind == RESET else next(self._scenes[kind]))
 
     def load(self, content: bytes) -> None:
         """Go to the scene of a JSON file; an impossible one is refused."""
-        self._take(self.arena.read(content), "")
+        self._take(self.arena.read(content))
 
-    def _take(self, scene: Scene, origin: str) -> None:
-        self.change(scene=scene, drawn=scene, origin=origin, by_hand=None, duration=None, selected=None)
+    def _take(self, scene: Scene) -> None:
+        self.change(scene=scene, drawn=scene, by_hand=None, duration=None, selected=None)
 
     def drag(self, kind: str, number: int, place: Float) -> None:
         """Move start, goal, an obstacle or a via-point to another place, shape (3,), [m]."""
@@ -259,16 +246,19 @@ class Tab:
     def execute(self) -> None:
         """Begin to play the simulated movement, or stop it."""
         state = self.state
+        state.playing = not state.playing
         if state.playing:
-            state.playing = False
+            self._movements = execute(self.arena, state, lambda: self.state.scene.goal)
+            state.movement = None
+            self.advance()
+        else:
             self._draw()
-            return
-        self._movements = execute(self.arena, state, lambda: self.state.scene.goal)
-        state.movement, state.playing = None, True
 
-    def _advance(self) -> None:
+    def advance(self) -> None:
         """Show the present instant of a movement; its next part is simulated when this one has been shown."""
         state, movement = self.state, self.state.movement
+        if not state.playing:
+            return
         if movement is None or state.instant == len(movement.rollout.time) - 1:
             following = next(self._movements, None)
             if following is None:
@@ -284,24 +274,23 @@ class Tab:
         now = int(np.searchsorted(times, (time.monotonic() - self._began) * self._speed))
         state.instant = min(max(now, state.instant + 1), len(times) - 1)
         self._draw()
+        self.act("advance", delay=TICK)
 
     def compare(self, done: tuple[Any, ...] = ()) -> None:
-        """Compare methods, one after the other in pauses; some are done."""
-        self.state.results, left = done, self.arena.methods[len(done) :]
-        self.state.comparing = left[0] if left else ""
+        """Compare the methods in the present scene, one after the other in pauses; some are done."""
+        state, methods = self.state, self.arena.methods
+        if state.playing:
+            self.act("compare", done, delay=PAUSE)
+            return
+        if done and done is not state.results:  # the scene has changed
+            return
+        trial = State(scene=state.scene, drawn=state.drawn, method=methods[len(done)], checks=state.checks)
+        trial.proposals = (decide(self.arena, trial, time_limit=1.0),)
+        *_, movement = execute(self.arena, trial)
+        state.results = (*done, (trial.method, trial.proposals[0].seconds, movement))
         self._draw()
-
-        def step() -> None:
-            state = dataclasses.replace(
-                self.state, method=left[0], n_via=None, by_hand=None, duration=None, before=None
-            )
-            state.proposals = (decide(self.arena, state, time_limit=1.0),)
-            state.picked = 0
-            *_, movement = execute(self.arena, state)
-            self.compare((*done, (left[0], state.proposals[0].seconds, movement)))
-
-        if left:
-            self._later["comparison"] = step
+        if len(state.results) < len(methods):
+            self.act("compare", state.results, delay=PAUSE)
 
     # Files
 
@@ -317,16 +306,9 @@ class Tab:
 
     def save_picture(self) -> None:
         """Save a picture of the present view, rendered by the browser, as a PNG file on white."""
-        picture = Image.fromarray(self.client.get_render(800, 1280, transport_format="png", timeout=20.0))
-        ground = Image.new("RGBA", picture.size, "white")
         file = io.BytesIO()
-        ground.alpha_composite(picture.convert("RGBA"))
-        ground.convert("RGB").save(file, "PNG")
+        Image.fromarray(self.client.get_render(800, 1280, timeout=20.0)).save(file, "PNG")
         self.client.send_file_download("viapoint.png", file.getvalue(), save_immediately=True)
-
-    def reset_view(self) -> None:
-        """Move the camera to its first view."""
-        self._view.look_at_everything()
 
 
 class LivePage:
@@ -377,12 +359,17 @@ class LivePage:
         own = {} if loaded is None else loaded.env_kwargs
         self._made = env, loaded, seed, {**(env_kwargs or own), **argument}
         self._model_file = model_file
-        self._warm_up()
+        arena, _ = self._make()
+        drawn = next(arena.scenes()["Random"])
+        for method in arena.methods[:2]:  # a first decision takes longer than others
+            decide(arena, State(scene=drawn, drawn=drawn, method=method))
+        arena.close()
         self._tabs: dict[int, Tab] = {}
         # A tab may be closed while its thread still draws.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         self._server = _serve(port)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        set_first_view(self._server.initial_camera, arena.planar)
         scene = self._server.scene  # lights in which pale colours are not white
         scene.configure_environment_map(None)
         scene.configure_default_lights(enabled=False)
@@ -419,26 +406,18 @@ class LivePage:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _warm_up(self) -> None:
-        """Decide once, so that the first decision takes no longer than others; the file of the arm is drawn."""
-        arena, _ = self._make()
-        self._model_file = self._model_file or arena.task.arm.file or None
-        scene, _ = next(arena.scenes()["Random"])
-        for method in arena.methods[:2]:
-            decide(arena, State(scene=scene, drawn=scene, method=method))
-        arena.close()
-
     def _make(self) -> tuple[Arena, ArmDrawing]:
         arena = Arena(*self._made)
-        return arena, ArmDrawing(arena.task.arm, arena.env("own").model, self._model_file)
+        file = self._model_file or arena.task.arm.file or None
+        return arena, ArmDrawing(arena.task.arm, arena.env("own").model, file)
 
     def _connect(self, client: viser.ClientHandle) -> None:
-        number = client.client_id
-        self._tabs[number] = Tab(client, self._make, lambda: self._tabs.pop(number, None))
+        self._tabs[client.client_id] = Tab(client, self._make)
 
     def _disconnect(self, client: viser.ClientHandle) -> None:
-        if client.client_id in self._tabs:
-            self._tabs[client.client_id].close()
+        tab = self._tabs.pop(client.client_id, None)
+        if tab is not None:
+            tab.close()
 
 
 def run(config: Any) -> None:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import functools
 import html
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import numpy as np
+import viser
 from matplotlib.colors import to_hex
 
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.palette import PALETTE
+from viapoint.envs.common.types import Float
 from viapoint.training.live.arena import AGENT, SIZES, Arena
-from viapoint.training.live.state import State
-
-if TYPE_CHECKING:
-    import viser
+from viapoint.training.live.state import Movement, State
 
 WIDTH = 330  # Width of a panel, [pixels]
 RESET = "Reset"  # Name of the button that undoes all changes of a scene
@@ -44,14 +43,13 @@ class Panels:
     ) -> None:
         self._gui, self._arena, self._act = client.gui, arena, act
         self._selection: Any = ()
-        self._plotted: Any = None
         self._plots: dict[str, Any] = {}
         self._build_results()
         self._build_controls(scene_kinds)
 
     def draw(self, state: State) -> None:
         """Show what was decided, and set the controls."""
-        remark = state.origin
+        remark = state.scene.origin if state.scene is state.drawn else ""
         limit = self._arena.limit(state.scene)
         plan = state.plan
         if limit and state.method == AGENT:
@@ -66,9 +64,9 @@ class Panels:
                 self._duration.value = float(np.clip(round(plan.duration, 2), low, high))
         self._draw_selection(state)
         self._draw_comparison(state)
-        if state.profile is not None:
+        if state.profile is not None and not state.playing:
             self._draw_proposals(state)
-            self._draw_plots(state)
+            self._draw_plots(state.profile, state.movement)
 
     def show_code(self, code: str) -> None:
         """Show Python code with a button that copies it."""
@@ -88,16 +86,10 @@ class Panels:
         note = f"{first.maker}, decided in {1e3 * first.seconds:.0f} ms"
         self._table.content = _table(names, rows, state.picked) + NOTE.format(note)
         self._pick.visible = len(rows) > 1
-        options = tuple(name for name, *_ in rows)
-        if tuple(self._pick.options) != options:
-            self._pick.options = options
+        self._pick.options = tuple(name for name, *_ in rows)
 
-    def _draw_plots(self, state: State) -> None:
-        """Plot the plan, and the executed movement when it has ended."""
-        profile, movement = state.profile, None if state.playing else state.movement
-        if profile is None or self._plotted == (id(profile), id(movement)):
-            return
-        self._plotted = id(profile), id(movement)
+    def _draw_plots(self, profile: Mapping[str, Float], movement: Movement | None) -> None:
+        """Plot the plan, and the executed movement if there is one."""
         time, executed = profile["time"], {}
         if movement is not None:
             rollout = movement.rollout
@@ -123,8 +115,8 @@ class Panels:
             rows.append((name, success, _number(movement.reward), clearance, jerk, f"{1e3 * seconds:.0f}"))
         names = "method", "success", "reward", "clearance [mm]", "jerk", "decided in [ms]"
         note = "Each row is simulated. Jerk is relative to the straight movement."
-        if state.comparing:
-            note = f"{state.comparing} ..."
+        if 0 < len(rows) < len(self._arena.methods):
+            note = f"{self._arena.methods[len(rows)]} ..."
         self._methods.content = (_table(names, rows) if rows else "") + NOTE.format(note)
 
     def _draw_selection(self, state: State) -> None:
@@ -196,7 +188,6 @@ class Panels:
             upload.on_upload(lambda event: act("load", event.target.value.content))
             self._button("Copy as Python", "show_code")
             self._button("Save picture (PNG)", "save_picture")
-        self._button("Reset the view", "reset_view")
         drag = "Drag start, goal, via-point and obstacles with the mouse."
         gui.add_html(NOTE.format(drag + ("" if arena.planar else " Hold Shift to move them up and down.")))
 

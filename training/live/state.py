@@ -13,7 +13,7 @@ import numpy as np
 from viapoint.envs import Plan, Scenes, Shape
 from viapoint.envs.common.types import Float
 from viapoint.envs.outcome import Rollout
-from viapoint.envs.scenes.options import FORMAT
+from viapoint.envs.scenes.options import FORMAT, OPTIONS
 from viapoint.training.planning.motion_plan import MotionPlan
 
 
@@ -26,10 +26,11 @@ class Scene(NamedTuple):
     jumps: Any = ()  # Jumps of the target: rows (time [s], target D)
     turns: Any = ()  # Changes of course: rows (time [s], velocity 3 [m/s]) by obstacle
     reaches: Any = ()  # Reaches: rows (begin [s], duration [s], way 3 [m]) by obstacle
+    origin: str = ""  # Sentence on where the scene comes from, before a user changes it
 
     def options(self) -> dict[str, Any]:
         """Return the options of `reset`; what does not change is left out."""
-        given = {name: value for name, value in self._asdict().items() if len(value)}
+        given = {name: value for name, value in self._asdict().items() if name in OPTIONS and len(value)}
         return {**given, "obstacles": list(self.obstacles)}
 
     def to_json(self, env_id: str) -> str:
@@ -101,7 +102,6 @@ class State:
 
     scene: Scene  # Present scene
     drawn: Scene  # Scene before the user changed it
-    origin: str = ""  # Sentence on where the scene comes from
     method: str  # Name of the method that decides
     n_via: int | None = None  # Number of via-points; None for that of the method
     checks: int = 0  # Proposals that the agent checks with computed geometry
@@ -118,7 +118,6 @@ class State:
     playing: bool = False  # True while the movement is played
     # Compared methods: name, time of the first decision, [s], and simulated movement
     results: tuple[tuple[str, float, Movement], ...] = ()
-    comparing: str = ""  # Name of the method whose result is to come
     message: str = "Getting ready."  # Sentence on the plan or the movement
     good: bool = True  # False for bad news
 

@@ -72,10 +72,9 @@ class Claim:
             name: getattr(self, name) for name in ("row", "claim", "figure", "paper", "unit")
         }
         for name, number in (("model", self.model), ("arm", self.arm)):
-            value, expected = number or (None, None)
-            record[name] = None if value is None else float(value)
-            record[f"{name}_expected"] = expected and [
-                float(end) if np.isfinite(end) else None for end in expected
+            record[name] = number and float(number[0])
+            record[f"{name}_expected"] = number and [
+                float(end) if np.isfinite(end) else None for end in number[1]
             ]
         record["deviation_mm"] = None if self.deviation is None else float(self.deviation)
         return {**record, "verdict": self.verdict}
