@@ -83,9 +83,9 @@ TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
 @pytest.mark.parametrize(
     ("lines", "told"),
     [
-        ([TABLE[0], *(f"{line},0.3" for line in TABLE[1:])], "4 values in line 2; its first line names 3"),
-        ([TABLE[0], *(f"{line}," for line in TABLE[1:])], "4 values in line 2"),
-        ([*TABLE[:3], "", "  ", "0.2,0.1"], "2 values in line 6"),
+        ([TABLE[0], *(f"{line},0.3" for line in TABLE[1:])], "Expected 3 fields in line 2, saw 4"),
+        ([TABLE[0], *(f"{line}," for line in TABLE[1:])], "Expected 3 fields in line 2, saw 4"),
+        ([*TABLE[:3], "", "  ", "0.2,0.1"], "line 6, column y: nothing"),
         ([*TABLE[:2], "", "0.1,far,0.2"], "line 4, column x: far"),
         (["y", "0.1"], "no column time"),
         (["time;x;y", "0.0;0.1;0.2"], "separate columns by commas"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import itertools
 import sys
@@ -20,15 +19,6 @@ from viapoint.training.plotting.plots import fitted_movements
 
 REQUIRED = ("time", "x", "y")  # Columns that a file of movements must have
 COORDINATES = ("x", "y", "z")  # Names of the coordinates; z may be left out
-UNNAMED = (
-    "",
-    "na",
-    "<na>",
-    "nan",
-    "n/a",
-    "none",
-    "null",
-)  # Entries of a column `movement` that name none, in any case
 TABLE, FIGURE = "fit.csv", "fit.png"  # Files that are written
 # Distances of samples, [s], and extents of movements, [m], above which the units are probably others
 SLOW, WIDE = 0.5, 5.0
@@ -76,15 +66,15 @@ def read_movements(path: Path) -> Movements:
     wrong = np.argwhere(~np.isfinite(numbers.to_numpy(dtype=float)))
     if len(wrong):
         row, column = wrong[0]
+        entry = table[names].fillna("nothing").iloc[row, column]
         raise BadFileError(
             path,
-            f"has no number in line {table.index[row]}, column {names[column]}: "
-            f"{table[names[column]].iloc[row] or 'nothing'}; leave out lines that were not measured",
+            f"has no number in line {table.index[row]}, column {names[column]}: {entry}; "
+            "leave out lines that were not measured",
         )
-    labels = table["movement"] if "movement" in table else pd.Series("1", index=table.index)
-    unnamed = labels.str.lower().isin(UNNAMED)
-    if unnamed.any():
-        raise BadFileError(path, f"names no movement in line {unnamed.idxmax()}")
+    labels = table["movement"].str.strip() if "movement" in table else pd.Series("1", index=table.index)
+    if labels.isna().any():
+        raise BadFileError(path, f"names no movement in line {labels.isna().idxmax()}")
     movements: Movements = {}
     for label, rows in numbers.groupby(labels, sort=False):
         values = rows.to_numpy(dtype=float)
@@ -105,35 +95,26 @@ def _warn(movements: Movements) -> None:
 
 
 def _read_table(path: Path) -> pd.DataFrame:
-    """Return the entries of a CSV file as texts; the index holds the numbers of their lines in the file.
-
-    Pandas would take the first value of lines with too many for an index, and does not number blank lines.
-    """
-    rows, lines = [], []
+    """Return the entries of a CSV file as texts; the index holds the numbers of their lines in the file."""
+    content = read_bytes(path)
     try:
-        text = read_bytes(path).decode("utf-8-sig")
-        reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
-        for values in reader:
-            entries = [value.strip() for value in values]
-            if entries not in ([], [""]):  # a blank line
-                rows.append(entries)
-                lines.append(reader.line_num)
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise BadFileError(path, f"cannot be read as CSV in UTF-8 ({error})") from None
-    if not rows:
-        raise BadFileError(path, "cannot be read as CSV (it is empty)")
-    head, *samples = rows
-    twice = [name for name in (*REQUIRED, *COORDINATES, "movement") if head.count(name) > 1]
+        text = content.decode("utf-8-sig")
+        begun = text.lstrip()
+        file = io.StringIO(begun)
+        table = pd.read_csv(file, header=None, dtype=str, skipinitialspace=True, skip_blank_lines=False)
+    except ValueError as error:
+        raise BadFileError(
+            path,
+            f"cannot be read as CSV in UTF-8 ({error}); commas separate columns, and decimals have points",
+        ) from None
+    blank_lines = text[: len(text) - len(begun)].count("\n")
+    table.index += 1 + blank_lines
+    head = table.iloc[0].str.strip()
+    twice = [name for name in ("time", *COORDINATES, "movement") if (head == name).sum() > 1]
     if twice:
         raise BadFileError(path, f"has several columns {twice[0]}")
-    for line, entries in zip(lines[1:], samples, strict=True):
-        if len(entries) != len(head):
-            raise BadFileError(
-                path,
-                f"has {len(entries)} values in line {line}; its first line names {len(head)} columns: "
-                f"{', '.join(head)}; commas separate columns, and decimals have points",
-            )
-    return pd.DataFrame(samples, columns=head, index=lines[1:], dtype=str)
+    samples = table.iloc[1:].dropna(how="all")  # without blank lines
+    return samples.set_axis(head, axis="columns")
 
 
 def _printed(fits: Fits) -> str:
