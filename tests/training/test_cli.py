@@ -209,7 +209,7 @@ def test_an_interrupted_demo_goes_on_and_what_is_done_is_not_done_again(quick, c
 
     def interrupted(self):
         begin(self)
-        self._stop = True
+        self.interrupted = True
 
     with monkeypatch.context() as patch:
         patch.setattr(RunCallback, "_on_training_start", interrupted)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import warnings
@@ -16,22 +15,21 @@ import numpy as np
 
 from viapoint.training.planning.baselines import Method, OpenLoopBaseline, PlannerMethod
 
-# Groups, name and version, as Minari allows them; and a version, which Minari does not always ask for
-DATASET_ID = re.compile(r"([-\w]+/)*[-\w]+-v\d+")
+# Groups, name and version, as Minari allows them; it does not always ask for a version
+DATASET_ID = re.compile(r"([-\w]{2,}/)*[-\w]+-v\d+")
 GROUP_FILE = "namespace_metadata.json"  # File of Minari in the folder of a group
 
 
 def dataset_folder(dataset_id: str) -> Path:
     """Return the folder of a dataset, in MINARI_DATASETS_PATH or, by default, in ~/.minari/datasets."""
-    from minari.dataset.minari_dataset import DATASET_ID_RE
+    from minari.storage import get_dataset_path
 
-    if not (DATASET_ID.fullmatch(dataset_id) and DATASET_ID_RE.fullmatch(dataset_id)):
+    if not DATASET_ID.fullmatch(dataset_id):
         raise ValueError(
             "dataset must be named like group/name-v0, of letters, digits, - and _, two or more in a group, got "
             f"{dataset_id!r}"
         )
-    root = os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets"
-    return Path(root) / dataset_id
+    return Path(get_dataset_path(dataset_id))
 
 
 def record_dataset(
@@ -55,14 +53,14 @@ def record_dataset(
     """
     import minari
 
-    folder = dataset_folder(dataset_id)
-    if folder.exists():
-        raise ValueError(f"dataset {dataset_id} exists in {folder}; name another one, or a new version")
     if isinstance(method, PlannerMethod | OpenLoopBaseline):
         raise ValueError(
             f"movements of {method.name} are no actions, which a dataset holds; those of an agent, random or "
             "search512 are"
         )
+    folder = dataset_folder(dataset_id)
+    if folder.exists():
+        raise ValueError(f"dataset {dataset_id} exists in {folder}; name another one, or a new version")
     with closing(gym.make(env_id, **env_kwargs)) as env:
         buffers = []
         for episode in range(episodes):

@@ -103,11 +103,7 @@ class SceneSimulation:
         number = len(scenes.start)
         for first in range(0, number, self._capacity):
             rows = np.arange(first, min(first + self._capacity, number))
-            sizes = [
-                1,
-                min(64, self._capacity),
-                self._capacity,
-            ]  # each has an environment, which is made once
+            sizes = [1, min(64, self._capacity), self._capacity]  # each has an environment, made once
             size = next(each for each in sizes if each >= len(rows))
             if size not in self._envs:
                 made: Any = gym.make_vec(self.env_id, num_envs=size, **self.kwargs)

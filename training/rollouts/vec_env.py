@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -36,15 +36,15 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
     Raises:
         ValueError: The environment is another one.
     """
-    inner = env.unwrapped if env is not None else None
-    if env is not None and env.observation_space != env.unwrapped.observation_space:
+    if env is None:
+        raise ValueError("the environment must be one of this package, made by its id, got none")
+    inner = env.unwrapped
+    if env.observation_space != inner.observation_space:
         raise ValueError(
             f"{type(env).__name__} changes observations: models know an environment by its id alone"
         )
     if isinstance(inner, ViaVecEnv):
         return inner.env_id, dict(inner.env_kwargs)
-    if inner is None:
-        raise ValueError("the environment must be one of this package, made by its id, got none")
     spec: Any = inner.get_attr("spec", [0])[0]
     if spec is None or not hasattr(inner.get_attr("unwrapped", [0])[0], "task"):
         raise ValueError(
@@ -110,22 +110,12 @@ class ViaVecEnv(VecEnv):
         >>> env.close()
     """
 
-    def __init__(
-        self,
-        env_id: str,
-        num_envs: int,
-        seed: int | None = None,
-        **kwargs: Any,
-    ) -> None:
+    def __init__(self, env_id: str, num_envs: int, seed: int | None = None, **kwargs: Any) -> None:
         check_registered(env_id)
-        extra: dict[str, Any] = {}
-        if gym.spec(env_id).vector_entry_point is None:
-            extra["vector_kwargs"] = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        self.venv: Any = gym.make_vec(env_id, num_envs=num_envs, **extra, **kwargs)
-        if self.venv.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
-            raise ValueError(
-                f"{env_id} must have autoreset mode SAME_STEP, not {self.venv.metadata.get('autoreset_mode')}"
-            )
+        self.venv: Any = gym.make_vec(env_id, num_envs=num_envs, **kwargs)
+        mode = self.venv.metadata.get("autoreset_mode")
+        if mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(f"{env_id} must have autoreset mode SAME_STEP, not {mode}")
         self.env_id, self.env_kwargs = env_id, dict(kwargs)
         spaces = self.venv.single_observation_space, self.venv.single_action_space
         VecEnv.__init__(self, num_envs, *spaces)
@@ -238,9 +228,6 @@ class ViaVecEnv(VecEnv):
         frames = self.venv.render()
         return [None] * self.num_envs if frames is None else list(frames)
 
-    def _rows(self, indices: Any) -> list[int]:
-        chosen: Iterable[int] = self._get_indices(indices)
-        rows = list(chosen)
-        if any(not -self.num_envs <= row < self.num_envs for row in rows):
-            raise IndexError(f"indices must be of {self.num_envs} copies, got {indices!r}")
-        return rows
+    def _rows(self, indices: Any) -> NDArray[np.int64]:
+        """Return the rows of copies; IndexError where there is none."""
+        return np.arange(self.num_envs)[list(self._get_indices(indices))]

@@ -7,7 +7,6 @@ is one file of `torch.save`, written whole or not at all, and read with `weights
 from __future__ import annotations
 
 import io
-import pickle
 import random
 import zipfile
 from collections import deque
@@ -38,8 +37,6 @@ COUNTERS = (
 )
 ARRAYS = ("_last_obs", "_last_episode_starts")
 DEQUES = ("ep_info_buffer", "ep_success_buffer")
-# Errors of content that is none of a checkpoint, or that does not fit the model
-UNFIT = (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OSError, EOFError)
 MAY_DIFFER = ("num_timesteps", "viapoint")  # Entries that do not tell models apart
 
 
@@ -88,7 +85,7 @@ def read_checkpoint(model: BaseAlgorithm, path: Path) -> dict[str, Any]:
     try:
         _restore(model, state, _mapped(state["arrays"], torch.Tensor, torch.Tensor.numpy))
         extra: dict[str, Any] = dict(state["extra"])
-    except UNFIT as error:
+    except Exception as error:  # of a library, for content that does not fit the model
         reason = f"{written_by} does not fit the model ({type(error).__name__}: {error})"
         raise BadFileError(path, reason) from None
     return extra
@@ -120,7 +117,7 @@ def read_state(path: Path) -> dict[str, Any]:
         state = torch.load(content, weights_only=True)
         if state["format"] != FORMAT or not isinstance(state["model"], dict):
             raise ValueError(f"format must be {FORMAT}")
-    except (zipfile.BadZipFile, pickle.UnpicklingError, *UNFIT) as error:
+    except Exception as error:  # of a library, for content that is none of a checkpoint
         raise BadFileError(path, f"is no whole checkpoint ({' '.join(str(error).split())[:200]})") from None
     return dict(state)
 

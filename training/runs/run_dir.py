@@ -210,19 +210,19 @@ class Run:
             BadFileError: Another process trains in the folder.
         """
         with _locked(self.folder):
-            for name in (".", "checkpoints", "evaluations"):
-                tidy(self.folder / name)
             yield
 
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder for this process."""
+    """Lock a folder for this process, and tidy up what a crash left in it."""
     try:
         held = FileLock(folder / "lock").acquire(timeout=PATIENCE)
     except Timeout:
         raise BadFileError(folder, "is in use by another process") from None
     with held:
+        for name in (".", "checkpoints", "evaluations"):
+            tidy(folder / name)
         yield
 
 
@@ -236,15 +236,6 @@ def check_free(folder: Path) -> None:
     if names - begun - {"versions.json", COPY, "lock"}:
         raise BadFileError(folder, "is not empty and is no run folder")
     check_ours(folder / "versions.json")
-
-
-def write_timesteps(run: Run) -> None:
-    """Write the number of decisions of a run that is extended.
-
-    All else stays as it was written: an arm is named by its file, also while its copy takes its place.
-    """
-    path = run.folder / "config.json"
-    write_json(path, {**read_json(path), "n_timesteps": run.config.n_timesteps})
 
 
 def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = None) -> None:
@@ -269,7 +260,7 @@ def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = N
 
 def _settings(config: TrainConfig) -> dict[str, Any]:
     """Return the settings that may not change, those in fields with several by their own names."""
-    values = json.loads(json.dumps(config.as_json()))  # with lists for tuples, as in the file
+    values = config.as_json()
     for name in MAY_CHANGE:
         del values[name]
     env_kwargs = values.pop("env_kwargs")

@@ -21,18 +21,14 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from viapoint.training.agents.model_io import build
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.evaluation.evaluator import MethodResult, evaluate, one_thread
-from viapoint.training.io.files import BadFileError, versions
+from viapoint.training.io.files import BadFileError, read_json, versions, write_json
 from viapoint.training.io.progress import progress_bar
 from viapoint.training.rollouts.vec_env import LOGGED, ViaVecEnv
-from viapoint.training.runs.run_dir import Run, check_free, check_unchanged, write_timesteps
+from viapoint.training.runs.run_dir import Run, check_free, check_unchanged
 from viapoint.training.scene_sets import FrozenScenes, scenes_for
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
 
-# Errors of libraries for networks or buffers that cannot be built
-UNFIT = (
-    ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError,
-)  # fmt: skip
 LOG_EVERY = 1_000  # Decisions between two entries of the log
 RATES = ("collision", "reachable")  # Metrics that are true or false
 # Metrics of a validation in the log and in the learning curve; medians in [m] and [s]
@@ -46,7 +42,7 @@ class TrainingStoppedError(Exception):
 
 
 class _TrainingEnds(Exception):  # noqa: N818 - it is no error
-    """Training ends before its limit: success does not rise any more, or a callback of the user asked for it."""
+    """Training ends before its limit: success does not rise any more, or Ctrl-C or a callback asked for it."""
 
 
 class TrainingFailedError(Exception):
@@ -161,16 +157,13 @@ def _warn(config: TrainConfig) -> None:
 @contextmanager
 def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
     """Build the untrained model of a resolved configuration with its own environments, and close them at the end."""
-    try:
-        env = ViaVecEnv(config.env, config.n_envs or config.preset.n_envs, **config.env_kwargs)
-    except TypeError as error:
-        raise ValueError(f"env_kwargs of {config.env}: {error}") from error
+    env = ViaVecEnv(config.env, config.n_envs or config.preset.n_envs, **config.env_kwargs)
     with closing(env):
         try:
             model = build(
                 config.algorithm, config.preset.policy, env, config.hyperparameters, seed=config.seed
             )
-        except UNFIT as error:
+        except Exception as error:  # of a library, for networks or buffers that cannot be built
             usual = config.preset.arguments()
             others = {name: each for name, each in config.hyperparameters.items() if usual.get(name) != each}
             raise ValueError(
@@ -182,11 +175,11 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
 def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> None:
     """Train from the last checkpoint of the run to its end."""
     folder = str(run.folder / "tensorboard")
-    given = _GivenCallbacks([callback] if isinstance(callback, BaseCallback) else list(callback or ()))
+    callbacks = [callback] if isinstance(callback, BaseCallback) else list(callback or ())
     try:
         with (
             closing(Logger(folder, [TensorBoardOutputFormat(folder)])) as logger,
-            RunCallback(run, given) as monitor,
+            RunCallback(run, callbacks) as monitor,
         ):
             model.set_logger(logger)
             restored = run.restore(model)
@@ -197,7 +190,10 @@ def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> N
             if remaining > 0 and not run.stalled:
                 _learn(model, remaining, monitor, fresh=restored is None)
             run.save("final", model)
-            monitor.check_stopped()
+            if monitor.interrupted:  # also after the last decision
+                raise TrainingStoppedError(
+                    f"stopped after {run.decisions} decisions, and all is saved; go on with: {_resume_command(run)}"
+                )
     except OSError as error:
         raise TrainingFailedError(
             f"training cannot go on: {error}; all up to decision {run.decisions} is saved; go on with: "
@@ -206,12 +202,12 @@ def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> N
 
 
 def _learn(model: BaseAlgorithm, steps: int, monitor: RunCallback, *, fresh: bool) -> None:
-    """Learn; a training that stalls, or that a callback stops, ends like any other."""
-    callbacks: list[BaseCallback] = [monitor, monitor.given]
+    """Learn; a training that stalls, or that is stopped, ends like any other."""
     try:
-        model.learn(steps, callbacks, None, reset_num_timesteps=fresh)  # type: ignore[arg-type]
+        model.learn(steps, monitor, None, reset_num_timesteps=fresh)  # type: ignore[arg-type]
     except _TrainingEnds:
-        monitor.given.on_training_end()  # `learn` has not told them that it ends
+        for each in monitor.callbacks:
+            each.on_training_end()  # `learn` has not told them that it ends
         if hasattr(model, "calibrate"):  # nor has it done this at its end
             model.calibrate()
 
@@ -227,7 +223,9 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
                 f"got {config.n_timesteps}",
             )
         run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
-        write_timesteps(run)
+        path = run.folder / "config.json"
+        # All else stays as it was written: an arm is named by its file, also while its copy takes its place.
+        write_json(path, {**read_json(path), "n_timesteps": config.n_timesteps})
     run.config = dataclasses.replace(run.config, progress=config.progress)
     began = run.versions
     others = [
@@ -242,41 +240,28 @@ def _resume_command(run: Run) -> str:
     return shlex.join(["viapoint", "train", "--resume", "--out", str(run.folder)])
 
 
-class _GivenCallbacks(CallbackList):
-    """Callbacks of the user, which stop a training between two rounds of experience only.
-
-    In the middle of a round Stable-Baselines3 drops the step that it has just made, and no run could go on from there
-    to the same result.
-    """
-
-    stopped = False
-    """True once a callback has asked for the end of the training."""
-
-    def _on_step(self) -> bool:
-        if not super()._on_step():
-            self.stopped = True
-        return True
-
-
-class RunCallback(BaseCallback):
+class RunCallback(CallbackList):
     """Callback that validates, keeps the best model, writes checkpoints and logs, and shows progress.
 
     It acts between two collections of experience, when the state of a run is complete. It draws no random numbers of
     the learner, so it does not change the result. Use it as a context around `learn`: inside, the first Ctrl-C saves
     and stops, the second stops at once.
+
+    It calls the callbacks of the user, which stop a training between two collections only: in the middle of one,
+    Stable-Baselines3 drops the step that it has just made, and no run could go on from there to the same result.
     """
 
-    def __init__(self, run: Run, given: _GivenCallbacks) -> None:
-        super().__init__()
+    def __init__(self, run: Run, callbacks: list[BaseCallback]) -> None:
+        super().__init__(callbacks)
         self.run, self.config = run, run.config
-        self.given = given
         self.curve: list[dict[str, Any]] = []  # one record for each evaluation so far
         self._seconds_before, self._began = 0.0, time.monotonic()
         self._before = 0  # Decisions when it was last decided what is due
         self._validation: FrozenScenes | None = None
         if self.config.evaluation_interval:
             self._validation = scenes_for("validation", self.config.task, self.config.eval_scenes)
-        self._stop = False
+        self.interrupted = False  # True once Ctrl-C was pressed
+        self.stopped = False  # True once a callback of the user has asked for the end of the training
 
     def restore(self, seconds: float, decisions: int) -> None:
         """Continue a training that took a time [s] for a number of decisions."""
@@ -308,39 +293,30 @@ class RunCallback(BaseCallback):
 
     def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)  # for the second Ctrl-C
-        self._stop = True
+        self.interrupted = True
         self._bar.write("saving and leaving; Ctrl-C again leaves at once", file=sys.stderr)
-
-    def check_stopped(self) -> None:
-        """Check that nobody pressed Ctrl-C; everything is saved already, also after the last decision."""
-        if self._stop:
-            raise TrainingStoppedError(
-                f"stopped after {self.run.decisions} decisions, and all is saved; go on with: "
-                f"{_resume_command(self.run)}"
-            )
 
     def _on_training_start(self) -> None:
         self._began = time.monotonic()
         self._show_progress()
+        super()._on_training_start()
 
     def _on_step(self) -> bool:
         self._show_progress()
+        if not super()._on_step():
+            self.stopped = True
         return True
 
     def _on_rollout_start(self) -> None:
-        self._run_due_actions(final=self.given.stopped)
-        if self._stop:
+        self._run_due_actions(final=self.stopped)
+        if self.interrupted or self.stopped or self.run.stalled:
             self.run.checkpoint(self.model, {"seconds": self.seconds})
-            self.run.save("final", self.model)
-            self.check_stopped()
-        stalled = self.run.stalled
-        if stalled:
-            self.run.checkpoint(self.model, {"seconds": self.seconds})
-        if stalled or self.given.stopped:
             raise _TrainingEnds
+        super()._on_rollout_start()
 
     def _on_training_end(self) -> None:
         self._run_due_actions(final=True)
+        super()._on_training_end()
 
     def _run_due_actions(self, *, final: bool) -> None:
         config = self.config
