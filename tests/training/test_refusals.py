@@ -40,7 +40,6 @@ from viapoint.training.config.configs import (
     LiveConfig,
     PaperConfig,
     PlayConfig,
-    StudyConfig,
     from_words,
 )
 from viapoint.training.evaluation import statistics
@@ -71,13 +70,8 @@ CONFIGURATIONS = [
     *((TrainConfig, {"stop_when_stalled": share}) for share in (0.0, 1.0, True, "0.3", math.nan)),
     (TrainConfig, STALLING),  # the preset has no more decisions than it must make
     (TrainConfig, {**STALLING, "n_timesteps": 10**5, "eval_every": 0}),
-    (EvaluateConfig, {}),
-    (EvaluateConfig, {"baselines": ("ompl", "ompl"), "env": ENV}),
     *((EvaluateConfig, {"env": ENV, "checks": checks}) for checks in ((8,), ())),
-    (EvaluateConfig, {"agent": ENV, "checks": (-1,)}),
     (EvaluateConfig, {"agent": "runs/x", "pretrained": ENV}),
-    (EvaluateConfig, {"pretrained": "nobody"}),
-    (PlayConfig, {}),
     (PlayConfig, {"agent": "a", "video": "film.gif"}),
     (LiveConfig, {"port": 70_000}),
     (LiveConfig, {"env": "nothing"}),
@@ -108,7 +102,6 @@ def test_words(words):
         (PlayConfig, "video", {"agent": "a"}),
         (PaperConfig, "out", {}),
         (DemoConfig, "out", {}),
-        (StudyConfig, "out", {"file": "study.yaml"}),
     ],
 )
 def test_places_that_cannot_be_written_to(kind, name, needed, tmp_path):
@@ -230,7 +223,7 @@ CALLS = [
     *(lambda given=given: evaluate(env=ENV, baselines=given) for given in (
         5, [3], [None], ["straight", "straight"], [Decides("a", ZERO), Decides("a", ZERO)],
     )),
-    *(lambda checks=checks: evaluate(ENV, checks=checks) for checks in ([4, 4], [0, 1.5])),
+    *(lambda checks=checks: evaluate(ENV, checks=checks) for checks in ([4, 4], [0, 1.5], [-1])),
     *(lambda scenes=scenes: evaluate(ENV, scenes=scenes) for scenes in (5, None, ["test"], "nowhere.npz")),
     *(lambda given=given: evaluate(env=ENV, baselines=[Decides("a", given)], n_scenes=2) for given in (
         None, "left", ZERO[0], ZERO[:1], ZERO[:, :2], ZERO + math.nan, ZERO.astype(object),
@@ -368,7 +361,11 @@ COMMANDS = [
     ("train --n-timesteps 1 --out full", "full"),
     ("train --resume --out full", "full"),
     ("evaluate", "--env"),
+    ("play", "--env"),
     ("evaluate nowhere", "nowhere"),
+    ("evaluate --pretrained nobody", "nobody"),
+    ("plan --position 0.4 0.3", "position must have shape (3,)"),
+    ("record", "name an agent"),
     ("evaluate --arm nowhere.xml", "nowhere.xml"),
     ("evaluate --scenes motionbenchmaker --baselines nothing", "plan_motion+ompl"),
     (f"evaluate --env {ENV} --baselines straight --scenes nowhere.npz", "nowhere.npz"),

@@ -13,7 +13,9 @@ import pandas as pd
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.config.configs import (
+    BENCHMARK,
     USUAL_BASELINES,
+    AgentConfig,
     EvaluateConfig,
     PlayConfig,
     RecordConfig,
@@ -43,13 +45,16 @@ def train(config: TrainConfig) -> None:
     print(training.train(config))
 
 
-def _named(config: EvaluateConfig | PlayConfig | RecordConfig) -> tuple[Agent | None, str, dict[str, Any]]:
-    """Return the agent of a configuration, if any, and the id and the arguments of the environment."""
-    agent = None if config.agent is None else load_agent(config.agent)
+def _named(config: AgentConfig, name: str | None) -> tuple[Agent | None, str, dict[str, Any]]:
+    """Return the agent of a name, if any, and the id and the arguments of the environment of a configuration."""
+    agent = None if name is None else load_agent(name)
     if agent is not None and config.env not in (None, agent.env_id):
         raise ValueError(f"env must be {agent.env_id}, on which the agent was trained, got {config.env!r}")
     env_id, argument = env_of_arm(config.arm, config.env if agent is None else agent.env_id)
-    assert env_id is not None
+    if env_id is None:
+        raise ValueError(
+            "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
+        )
     env_kwargs = {**({} if agent is None else agent.env_kwargs), **argument, **config.env_kwargs}
     task_with(env_id, env_kwargs)  # says what is wrong with an argument
     return agent, env_id, env_kwargs
@@ -57,10 +62,10 @@ def _named(config: EvaluateConfig | PlayConfig | RecordConfig) -> tuple[Agent | 
 
 def evaluate(config: EvaluateConfig) -> None:
     """Evaluate, print the table, and write the results."""
-    if config.of_planners:
+    if config.scenes == BENCHMARK:
         _measure_planners(config)
         return
-    agent, env, env_kwargs = _named(config)
+    agent, env, env_kwargs = _named(config, config.agent)
     with scene_progress() as progress:
         result = measure(
             agent,
@@ -98,11 +103,7 @@ def _notes(config: EvaluateConfig) -> TextIO:
 
 def _measure_planners(config: EvaluateConfig) -> None:
     """Measure planners on the problems of MotionBenchMaker, print the table, and write one line for each problem."""
-    faults = list[str]()
-    if config.problems is None:
-        problems = benchmark.benchmark_problems()
-    else:
-        problems, faults = benchmark.read_problems(config.problems)
+    problems = benchmark.benchmark_problems()
     problems = [problems[row] for row in evenly_spread(len(problems), config.n_scenes)]
     names = ("plan_motion",) if config.baselines == USUAL_BASELINES else config.baselines
     for name in names:
@@ -111,7 +112,7 @@ def _measure_planners(config: EvaluateConfig) -> None:
         lines = [benchmark.measure_planner(name, problems, progress=progress) for name in names]
     table = pd.concat(lines)
     refused = table[table.refused != ""].drop_duplicates(["set", "number"])
-    faults += [f"{each.set} {each.number}: {each.refused}" for each in refused.itertuples()]
+    faults = [f"{each.set} {each.number}: {each.refused}" for each in refused.itertuples()]
     if faults:
         told = [*faults[:MOST_FAULTS], "..."] if len(faults) > MOST_FAULTS else faults
         print(f"{len(faults)} problems are left out:", *told, sep="\n  ", file=sys.stderr)
@@ -130,7 +131,7 @@ def play(config: PlayConfig) -> None:
     """Record a video of the movements of an agent, or of the geometry search."""
     from viapoint.training.plotting.video import record_video
 
-    agent, env_id, env_kwargs = _named(config)
+    agent, env_id, env_kwargs = _named(config, config.agent)
     scenes = scenes_for(config.scenes, registered_task(env_id, **env_kwargs), config.n_scenes).scenes
     env = gym.make(env_id, render_mode="rgb_array_list", **env_kwargs)
     if agent is None:
@@ -146,17 +147,16 @@ def record(config: RecordConfig) -> None:
     """Record episodes of an agent or a baseline as a Minari dataset, and print how to load it."""
     name = str(config.agent)
     if name in SHIPPED_IDS or Path(name).expanduser().exists():
-        agent, env_id, env_kwargs = _named(config)
+        agent, env_id, env_kwargs = _named(config, name)
         if config.env_kwargs:
             raise ValueError("env_kwargs are for baselines; an agent has those of its training")
         method = agent_method("agent", agent)
     else:
-        env, argument = env_of_arm(config.arm, config.env)
-        if env is None:
+        if config.env is config.arm is None:
             raise ValueError(
-                f"there is no agent {name!r}; for a baseline, name an environment with --env or --arm"
+                f"there is no agent {name!r}; for a baseline, name an environment: --env or --arm"
             )
-        env_id, env_kwargs = env, {**config.env_kwargs, **argument}
+        _, env_id, env_kwargs = _named(config, None)
         if registered_task(env_id, **env_kwargs).stepwise and name != "random":
             raise ValueError(
                 f"baselines of {env_id}, which decides in every control step, are random, got {name!r}"

@@ -127,15 +127,9 @@ def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
 
 
 def _complaint(text: str, command: str, kind: type[Any]) -> str:
-    """Return the words in tyro's boxes in one line, and fields by their flags.
-
-    Where the output knows only ASCII, there is no frame, and a rule follows the title.
-    """
-    lines = [line.strip("│╭╮╰╯─ ") for line in text.splitlines() if not line.startswith(("╭", "╰"))]
-    if "╭" not in text:
-        rule = next((i for i, line in enumerate(lines) if line and not line.strip("-")), -1)
-        lines = lines[rule + 1 :]
-    said = " ".join(line for line in lines if line.strip("-")) or text
+    """Return what tyro says below a title, in a frame or in ASCII, as one line with the flags of fields."""
+    _, _, body = text.strip().partition("\n")
+    said = " ".join(re.sub("[│╰╯─]|-{3,}", " ", body).split())
     said = re.sub(
         rf"^Error parsing ({kind.__name__}: )?|( Argument helptext: .*)? For full helptext, .*", "", said
     )

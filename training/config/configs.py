@@ -128,28 +128,29 @@ ARM = tyro.conf.arg(metavar="ARM", help="Arm: panda, planar, or an MJCF or URDF 
 ARM_ENVS = {"planar": DEFAULT_ENV, "panda": "viapoint/PandaObstacles-v0"}
 
 
-def _plain(name: str, value: Any) -> Any:
-    """Return a value as JSON has it: NumPy's numbers and arrays as Python's, arms by name or file."""
+def _plain(name: str, values: Any) -> Any:
+    """Return values as JSON has them; a file of an arm is named by its whole path, as runs go on in other folders."""
+    try:
+        plain = json.loads(json.dumps(values, default=_as_json))
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name} must be numbers, texts, lists and dictionaries, as files hold them, or a registered arm: {error}"
+        ) from None
+    arm = plain.get("arm") if isinstance(plain, dict) else None
+    if isinstance(arm, str) and arm.endswith(ARM_FILES):
+        plain["arm"] = str(Path(arm).expanduser().resolve())
+    return plain
+
+
+def _as_json(value: Any) -> Any:
+    """Return numbers and arrays of NumPy as Python's, and arms by name or file, for the encoder of JSON."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if isinstance(value, Arm) and value.file:
         return value.file
     if isinstance(value, Arm) and value.name in arm_names() and arm_of(value.name) is value:
         return value.name
-    if isinstance(value, Mapping):
-        found = {f"{key}": _plain(f"{key} in {name}", each) for key, each in value.items()}
-        file = found.get("arm")
-        if isinstance(file, str) and file.endswith(ARM_FILES):
-            found["arm"] = str(Path(file).expanduser().resolve())  # runs go on in other folders, too
-        return found
-    if isinstance(value, list | tuple):
-        return [_plain(name, each) for each in value]
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    raise ValueError(
-        f"{name} must be numbers, texts, lists and dictionaries, which a file can hold, or a registered arm, "
-        f"got {value!r:.80}"
-    )
+    raise TypeError(f"got {value!r:.80}")
 
 
 def env_of_arm(arm: Arm | str | None, env: str | None) -> tuple[str | None, dict[str, Any]]:
@@ -177,7 +178,6 @@ def task_with(env_id: str, env_kwargs: Mapping[str, Any]) -> Task:
 Format = Literal["table", "md", "csv", "json"]  # Form of a table
 BENCHMARK = "motionbenchmaker"  # Name of the scene set that measures planners
 MOTION_FILES = (".csv", ".yaml", ".yml")  # Suffixes of files of movements
-UNNAMED = "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
 NOTHING_TO_CHECK = "checks and refine concern an agent, and none is given"
 USUAL_BASELINES = ("straight", "random", "search512")  # Baselines of an evaluation
 
@@ -259,7 +259,7 @@ class TrainConfig(Config):
         if self.arm is not None:
             env, argument = env_of_arm(self.arm, None if self.env == DEFAULT_ENV else self.env)
             object.__setattr__(self, "env", env)
-            object.__setattr__(self, "env_kwargs", {**self.env_kwargs, **argument})
+            object.__setattr__(self, "env_kwargs", {**self.env_kwargs, **_plain("arm", argument)})
             object.__setattr__(self, "arm", None)
         if self.algo is None:
             object.__setattr__(self, "algo", usual_algorithm(self.task))
@@ -353,11 +353,6 @@ class AgentConfig(Config):
     env_kwargs: NamedValues = field(default_factory=dict)
     """Arguments of the environment, values in YAML: sensor=hand_rays decide_at=[sight,clearance]."""
 
-    @property
-    def unnamed(self) -> bool:
-        """True if neither an agent nor an environment nor an arm is named."""
-        return self.agent is self.env is self.arm is None
-
     def _check(self) -> None:
         if self.env is not None:
             check_registered(self.env)
@@ -366,8 +361,6 @@ class AgentConfig(Config):
             return
         if self.agent not in (None, self.pretrained):
             raise ValueError(f"the agent is named twice: {self.agent} and pretrained={self.pretrained}")
-        if self.pretrained not in SHIPPED_IDS:
-            raise ValueError(unknown_name("pretrained", self.pretrained, SHIPPED_IDS))
         object.__setattr__(self, "agent", self.pretrained)
 
 
@@ -388,31 +381,18 @@ class EvaluateConfig(AgentConfig):
     scenes: str = "test"
     """Scene set: validation, test, hard, uniform, or a scene file; motionbenchmaker for the problems of that benchmark,
     on which planners are measured: straight, plan_motion, plan_motion+ompl, ompl, search512."""
-    problems: Path | None = None
-    """Folder of MotionBenchMaker's own files, in place of the problems that are shipped."""
     n_scenes: int | None = None  # Number of scenes, evenly spread over the set; all if not given.
     format: Format = "table"  # Form in which the table is printed: for the terminal, Markdown, CSV or JSON.
     json: Path | None = None  # JSON file for all results, scene by scene.
 
-    @property
-    def of_planners(self) -> bool:
-        """True if planners are measured on the problems of MotionBenchMaker."""
-        return self.problems is not None or self.scenes == BENCHMARK
-
     def _check(self) -> None:
         super()._check()
-        if len(set(self.baselines)) < len(self.baselines):
-            raise ValueError(f"baselines must differ, got {', '.join(self.baselines)}")
-        if self.of_planners and not self.unnamed:
-            raise ValueError("motionbenchmaker measures planners: name neither an agent nor an environment")
-        if self.unnamed and not self.of_planners:
-            raise ValueError(UNNAMED)
+        if self.scenes == BENCHMARK and not (self.agent is self.env is self.arm is None):
+            raise ValueError(
+                f"{BENCHMARK} measures planners: name neither an agent nor an environment nor an arm"
+            )
         if not self.checks:
             raise ValueError("checks must name at least one number, such as 0")
-        for number in self.checks:
-            check_whole("checks", number)
-        for number in self.refine:
-            check_whole("refine", number)
         if (any(self.checks) or self.refine) and self.agent is None:
             raise ValueError(NOTHING_TO_CHECK)
         check_file("json", self.json)
@@ -434,8 +414,6 @@ class PlayConfig(AgentConfig):
 
     def _check(self) -> None:
         super()._check()
-        if self.unnamed:
-            raise ValueError(UNNAMED)
         if self.agent is None and self.checks:
             raise ValueError(NOTHING_TO_CHECK)
         check_file("video", self.video, ".mp4")
@@ -455,8 +433,6 @@ class RecordConfig(AgentConfig):
     dataset: str | None = None
     """Name of the dataset; default: <environment>/<method>-v0, in the folder MINARI_DATASETS_PATH."""
     seed: int = 0  # Seed of the first episode; others follow.
-    env_kwargs: NamedValues = field(default_factory=dict)
-    """Arguments of the environment, values in YAML: n_via=2 n_obstacles=[1,8]; not with an agent."""
 
     def _check(self) -> None:
         super()._check()
@@ -505,10 +481,6 @@ class PlanConfig(Config):
             check_folder(f"out {self.out}", self.out.parent)
         if self.goal and self.position:
             raise ValueError("a goal is either --goal, joint positions, or --position; both are given")
-        for name, length in (("position", 3), ("quaternion", 4)):
-            given = len(getattr(self, name))
-            if given not in (0, length):
-                raise ValueError(f"{name} has {length} numbers, got {given}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -609,6 +581,3 @@ class StudyConfig(Config):
     """Address HOST:PORT of a Ray cluster; default: a Ray of its own on this machine."""
     workers: int | None = None
     """Number of trials at the same time on this machine; default: as many as the cores allow."""
-
-    def _check(self) -> None:
-        check_folder(f"out {self.out}", self.out)
