@@ -103,10 +103,8 @@ def _read_table(path: Path) -> pd.DataFrame:
         file = io.StringIO(begun)
         table = pd.read_csv(file, header=None, dtype=str, skipinitialspace=True, skip_blank_lines=False)
     except ValueError as error:
-        raise BadFileError(
-            path,
-            f"cannot be read as CSV in UTF-8 ({error}); commas separate columns, and decimals have points",
-        ) from None
+        reason = f"cannot be read as CSV in UTF-8 ({str(error).strip()})"
+        raise BadFileError(path, f"{reason}; commas separate columns, and decimals have points") from None
     blank_lines = text[: len(text) - len(begun)].count("\n")
     table.index += 1 + blank_lines
     head = table.iloc[0].str.strip()

@@ -20,7 +20,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.registry import ARM_FILES, arm_names, arm_of
 from viapoint.envs.common.validation import is_number
-from viapoint.envs.registration import ENV_IDS, check_registered
+from viapoint.envs.registration import ENV_IDS
 from viapoint.envs.task import Task
 from viapoint.primitives.fitting import MOST_VIA_POINTS, USUAL_RANGE
 from viapoint.training.config.checks import (
@@ -143,9 +143,11 @@ def _plain(name: str, values: Any) -> Any:
 
 
 def _as_json(value: Any) -> Any:
-    """Return numbers and arrays of NumPy as Python's, and arms by name or file, for the encoder of JSON."""
+    """Return what the encoder of JSON takes for NumPy's numbers and arrays, other mappings, and arms."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
+    if isinstance(value, Mapping):
+        return dict(value)
     if isinstance(value, Arm) and value.file:
         return value.file
     if isinstance(value, Arm) and value.name in arm_names() and arm_of(value.name) is value:
@@ -354,14 +356,11 @@ class AgentConfig(Config):
     """Arguments of the environment, values in YAML: sensor=hand_rays decide_at=[sight,clearance]."""
 
     def _check(self) -> None:
-        if self.env is not None:
-            check_registered(self.env)
         check_env_kwargs(self.env_kwargs)
-        if self.pretrained is None:
-            return
-        if self.agent not in (None, self.pretrained):
-            raise ValueError(f"the agent is named twice: {self.agent} and pretrained={self.pretrained}")
-        object.__setattr__(self, "agent", self.pretrained)
+        if self.pretrained is not None:
+            if self.agent not in (None, self.pretrained):
+                raise ValueError(f"the agent is named twice: {self.agent} and pretrained={self.pretrained}")
+            object.__setattr__(self, "agent", self.pretrained)
 
 
 @dataclass(frozen=True, kw_only=True)

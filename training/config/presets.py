@@ -29,10 +29,10 @@ class Preset:
         return copy.deepcopy(dict(self.hyperparameters))
 
 
-def _changed(preset: Preset, n_timesteps: int, **hyperparameters: Any) -> Preset:
-    """Return a preset with another number of decisions and some other hyperparameters."""
+def _changed(preset: Preset, hyperparameters: Mapping[str, Any], **fields: Any) -> Preset:
+    """Return a preset with some other hyperparameters and fields."""
     changed = {**preset.hyperparameters, **hyperparameters}
-    return dataclasses.replace(preset, n_timesteps=n_timesteps, hyperparameters=changed)
+    return dataclasses.replace(preset, hyperparameters=changed, **fields)
 
 
 def _falling(start: float, end: float) -> dict[str, Any]:
@@ -54,7 +54,6 @@ _OFF_POLICY: dict[str, Any] = {
     "gradient_steps": 16,
     "policy_kwargs": _NETWORK,
 }
-_STEP_WISE: dict[str, Any] = {**_OFF_POLICY, "learning_starts": 4096, "gamma": 0.98}
 _LITTLE_ENTROPY = {"ent_coef": "auto_0.02"}  # rewards are of order one, and the usual 1 outweighs them
 _NOISE = {"action_noise": {"kind": "normal", "sigma": 0.2}}
 _SELDOM: dict[str, Any] = {"eval_every": 10_000, "checkpoint_every": 50_000}
@@ -89,29 +88,24 @@ PRESETS: dict[str, Preset] = {
 }
 
 # Presets of tasks in which an action lasts one control step, which counts as a decision
+_STEP_WISE = {"learning_starts": 4096, "gamma": 0.98}
 STEP_PRESETS: dict[str, Preset] = {
-    "sac": Preset(n_timesteps=200_000, hyperparameters={**_STEP_WISE, **_LITTLE_ENTROPY}, **_SELDOM),
-    "td3": Preset(n_timesteps=200_000, hyperparameters={**_STEP_WISE, **_NOISE}, **_SELDOM),
-    "tqc": Preset(n_timesteps=200_000, hyperparameters={**_STEP_WISE, **_LITTLE_ENTROPY}, **_SELDOM),
-    "ppo": Preset(
+    "sac": _changed(PRESETS["sac"], _STEP_WISE, n_timesteps=200_000, **_SELDOM),
+    "td3": _changed(PRESETS["td3"], _STEP_WISE, n_timesteps=200_000, **_SELDOM),
+    "tqc": _changed(PRESETS["tqc"], _STEP_WISE, n_timesteps=200_000, **_SELDOM),
+    "ppo": _changed(
+        PRESETS["ppo"],
+        {"n_steps": 64, "batch_size": 512, "n_epochs": 5, "gamma": 0.98, "ent_coef": 0.0},
         n_timesteps=2_000_000,
         eval_every=50_000,
         checkpoint_every=200_000,
-        hyperparameters={
-            "learning_rate": _falling(1e-3, 1e-5),
-            "n_steps": 64,
-            "batch_size": 512,
-            "n_epochs": 5,
-            "gamma": 0.98,
-            "ent_coef": 0.0,
-            "policy_kwargs": _NETWORK,
-        },
     ),
 }
 
 # Presets of tasks without obstacles, which need fewer decisions
-REACH_PRESETS = {"viaq": _changed(PRESETS["viaq"], 8_000)}
-REPLANNING_PRESETS = {"viaq": _changed(PRESETS["viaq"], 24_000, gradient_steps=6, next_candidates=4)}
+REACH_PRESETS = {"viaq": _changed(PRESETS["viaq"], {}, n_timesteps=8_000)}
+_REVISING = {"gradient_steps": 6, "next_candidates": 4}
+REPLANNING_PRESETS = {"viaq": _changed(PRESETS["viaq"], _REVISING, n_timesteps=24_000)}
 """Presets of replanning tasks."""
 HAND_ROUNDS = {"refinements": 4}
 """Settings of the policy of viaq where plans of the hand are revised; twice the usual rounds solve a little more."""
@@ -141,9 +135,9 @@ def preset_of(task: Task, algo: Algorithm) -> Preset:
     elif not task.n_obstacles[1]:
         preset = REACH_PRESETS.get(algo, preset)
     if algo == "viaq" and not task.space.of_hand:
-        return _changed(preset, min(preset.n_timesteps, JOINT_DECISIONS))
+        return _changed(preset, {}, n_timesteps=min(preset.n_timesteps, JOINT_DECISIONS))
     if algo == "viaq" and task.replanning:
-        return _changed(preset, preset.n_timesteps, policy_kwargs=HAND_ROUNDS)
+        return _changed(preset, {"policy_kwargs": HAND_ROUNDS})
     if algo == "viarank" and not task.space.of_hand:
-        return _changed(preset, JOINT_DECISIONS, **JOINT_SIGHT)
+        return _changed(preset, JOINT_SIGHT, n_timesteps=JOINT_DECISIONS)
     return preset
