@@ -84,7 +84,7 @@ def write_problems(folder: Path) -> None:
 
 def write_table(problems: list[BenchmarkProblem]) -> None:
     """Measure all planners, print the table, and write it."""
-    lines = pd.concat([benchmark.measure_planner(name, problems) for name in PLANNERS])
+    lines = pd.concat([benchmark.measure_planner(name, problems, benchmark_panda()) for name in PLANNERS])
     print(benchmark.markdown(lines))
     found = benchmark.summary(lines)
     found.to_csv(TABLE, index=False, float_format="%.4g", lineterminator="\n")
@@ -161,12 +161,12 @@ def draw_curves(problems: list[BenchmarkProblem]) -> None:
         curves["plan_motion"].append((taken, len(solved) / len(plans), float(np.median(solved))))
         print(f"plan_motion {limit} ms", curves["plan_motion"][-1], file=sys.stderr)
     for checks in CHECKS:
-        lines = benchmark.measure_planner(f"search{checks}", problems, physics=False)
+        lines = benchmark.measure_planner(f"search{checks}", problems, benchmark_panda(), physics=False)
         curves["search"].append(
             (lines.milliseconds.median(), lines.solved.mean(), lines[lines.solved].jerk.median())
         )
     # A path is found or not: the curve is the share of those that took less than a time.
-    lines = benchmark.measure_planner("ompl", problems, physics=False)
+    lines = benchmark.measure_planner("ompl", problems, benchmark_panda(), physics=False)
     for limit in LIMITS:
         found = lines[lines.solved & (lines.milliseconds <= limit)]
         if len(found):

@@ -15,6 +15,7 @@ import pytest
 from tasks import PLANE as ENV
 from tasks import REACH
 
+from viapoint.envs import load_arm
 from viapoint.training import Run, TrainConfig, evaluate, load_agent
 from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
 from viapoint.training.cli import demo, doctor
@@ -296,6 +297,28 @@ def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch) -> None
     filmed = not_filmed(monkeypatch)
     run("play", *arm, "--n-scenes", 1, "--video", tmp_path / "b.mp4")
     assert filmed == [str(UR5E)]
+
+
+def test_planners_are_measured_on_problems_of_another_arm(tmp_path, capsys) -> None:
+    arm = load_arm(UR5E)
+    folder = tmp_path / "box_ur5e"
+    folder.mkdir()
+    places = [{"position": [0.5, 0.3, 0.2], "orientation": [0, 0, 0, 1]}]
+    box = {"primitives": [{"type": "box", "dimensions": [0.1, 0.1, 0.4]}], "primitive_poses": places}
+    goal = arm.home + 0.2
+    # Joints of a gripper and of a head are in the files, too; values of JSON are values of YAML.
+    state = {"name": ["head", *arm.joint_names], "position": [0.1, *arm.home]}
+    wanted = [{"joint_name": name, "position": q} for name, q in zip(arm.joint_names, goal, strict=True)]
+    request = {"start_state": {"joint_state": state}, "goal_constraints": [{"joint_constraints": wanted}]}
+    (folder / "scene0001.yaml").write_text(json.dumps({"world": {"collision_objects": [box]}}))
+    (folder / "request0001.yaml").write_text(json.dumps(request))
+    run("evaluate", "--problems", tmp_path, "--arm", UR5E, "--baselines", "plan_motion", "--format", "json")
+    [line] = json.loads(capsys.readouterr().out)
+    assert (line["set"], line["solved"], line["physics"]) == ("box_ur5e", True, True)
+    assert line["length"] == pytest.approx(0.2 * len(goal) ** 0.5, rel=1e-3)
+    with pytest.raises(SystemExit):
+        cli.main(["evaluate", "--problems", str(tmp_path)])
+    assert "panda_joint1" in capsys.readouterr().err
 
 
 GOOD, GONE = "print('fine')", "import no_such_module"

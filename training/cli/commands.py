@@ -10,10 +10,10 @@ from typing import Any, TextIO
 import gymnasium as gym
 import pandas as pd
 
+from viapoint.envs.arms.registry import arm_of
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.config.checks import SHIPPED_IDS
 from viapoint.training.config.configs import (
-    BENCHMARK,
     USUAL_BASELINES,
     AgentConfig,
     EvaluateConfig,
@@ -62,7 +62,7 @@ def _named(config: AgentConfig, name: str | None) -> tuple[Agent | None, str, di
 
 def evaluate(config: EvaluateConfig) -> None:
     """Evaluate, print the table, and write the results."""
-    if config.scenes == BENCHMARK:
+    if config.of_planners:
         _measure_planners(config)
         return
     agent, env, env_kwargs = _named(config, config.agent)
@@ -103,16 +103,22 @@ def _notes(config: EvaluateConfig) -> TextIO:
 
 def _measure_planners(config: EvaluateConfig) -> None:
     """Measure planners on the problems of MotionBenchMaker, print the table, and write one line for each problem."""
-    problems = benchmark.benchmark_problems()
+    arm = benchmark.benchmark_panda() if config.arm is None else arm_of(config.arm)
+    faults = list[str]()
+    if config.problems is None:
+        problems = benchmark.benchmark_problems()
+    else:
+        joints = benchmark.JOINTS if config.arm is None else arm.joint_names
+        problems, faults = benchmark.read_problems(config.problems, joints)
     problems = [problems[row] for row in evenly_spread(len(problems), config.n_scenes)]
     names = ("plan_motion",) if config.baselines == USUAL_BASELINES else config.baselines
     for name in names:
         benchmark.benchmark_planner(name)  # an unknown name is told before anything is measured
     with scene_progress() as progress:
-        lines = [benchmark.measure_planner(name, problems, progress=progress) for name in names]
+        lines = [benchmark.measure_planner(name, problems, arm, progress=progress) for name in names]
     table = pd.concat(lines)
     refused = table[table.refused != ""].drop_duplicates(["set", "number"])
-    faults = [f"{each.set} {each.number}: {each.refused}" for each in refused.itertuples()]
+    faults += [f"{each.set} {each.number}: {each.refused}" for each in refused.itertuples()]
     if faults:
         told = [*faults[:MOST_FAULTS], "..."] if len(faults) > MOST_FAULTS else faults
         print(f"{len(faults)} problems are left out:", *told, sep="\n  ", file=sys.stderr)

@@ -380,16 +380,24 @@ class EvaluateConfig(AgentConfig):
     scenes: str = "test"
     """Scene set: validation, test, hard, uniform, or a scene file; motionbenchmaker for the problems of that benchmark,
     on which planners are measured: straight, plan_motion, plan_motion+ompl, ompl, search512."""
+    problems: Path | None = None
+    """Folder of MotionBenchMaker's own files, in place of the problems that are shipped; with --arm, for the joints of
+    that arm, by their names."""
     n_scenes: int | None = None  # Number of scenes, evenly spread over the set; all if not given.
     format: Format = "table"  # Form in which the table is printed: for the terminal, Markdown, CSV or JSON.
     json: Path | None = None  # JSON file for all results, scene by scene.
 
+    @property
+    def of_planners(self) -> bool:
+        """True if planners are measured on the problems of MotionBenchMaker."""
+        return self.problems is not None or self.scenes == BENCHMARK
+
     def _check(self) -> None:
         super()._check()
-        if self.scenes == BENCHMARK and not (self.agent is self.env is self.arm is None):
-            raise ValueError(
-                f"{BENCHMARK} measures planners: name neither an agent nor an environment nor an arm"
-            )
+        if self.of_planners and not (self.agent is self.env is None):
+            raise ValueError(f"{BENCHMARK} measures planners: name neither an agent nor an environment")
+        if self.of_planners and self.arm is not None and self.problems is None:
+            raise ValueError("the problems that are shipped are for one arm; --arm needs --problems")
         if not self.checks:
             raise ValueError("checks must name at least one number, such as 0")
         if (any(self.checks) or self.refine) and self.agent is None:

@@ -83,8 +83,8 @@ class BenchmarkProblem(NamedTuple):
 
     set: str  # Name of its set
     number: int  # Number within the set, from 1
-    start: Float  # Joint positions, shape (7,), [rad]
-    goal: Float  # Joint positions, shape (7,), [rad]
+    start: Float  # Joint positions, shape (J,), [rad] or [m]
+    goal: Float  # Joint positions, shape (J,), [rad] or [m]
     obstacles: tuple[Shape, ...]  # Obstacles
 
     @property
@@ -150,11 +150,14 @@ def benchmark_problems() -> list[BenchmarkProblem]:
     return problems
 
 
-def read_problems(folder: str | Path) -> tuple[list[BenchmarkProblem], list[str]]:
+def read_problems(
+    folder: str | Path, joints: Sequence[str] = JOINTS
+) -> tuple[list[BenchmarkProblem], list[str]]:
     """Return the problems of a folder of MotionBenchMaker's files, in the order of their sets and numbers.
 
-    The files are `sceneNNNN.yaml` and `requestNNNN.yaml`, in folders named after their sets. The second result has a
-    line for each problem that cannot be read, which names its file.
+    The files are `sceneNNNN.yaml` and `requestNNNN.yaml`, in folders named after their sets; `joints` are the names of
+    the arm's joints in them, those of the Panda by default. The second result has a line for each problem that cannot
+    be read, which names its file.
 
     Raises:
         ValueError: There is no problem that can be read.
@@ -164,7 +167,7 @@ def read_problems(folder: str | Path) -> tuple[list[BenchmarkProblem], list[str]
     for scene in scenes:
         if re.fullmatch(r"scene\d+", scene.stem):
             try:
-                problems.append(_read(scene))
+                problems.append(_read(scene, joints))
             except ValueError as error:
                 faults.append(str(error))
     if not problems:
@@ -172,7 +175,7 @@ def read_problems(folder: str | Path) -> tuple[list[BenchmarkProblem], list[str]
     return problems, faults
 
 
-def _read(scene: Path) -> BenchmarkProblem:
+def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
     """Return the problem of a scene file and its request file."""
     request = scene.with_name(scene.name.replace("scene", "request"))
     try:
@@ -182,11 +185,15 @@ def _read(scene: Path) -> BenchmarkProblem:
         start = dict(zip(state["name"], state["position"], strict=True))
         wanted = asked["goal_constraints"][0]["joint_constraints"]
         goal = {each["joint_name"]: each["position"] for each in wanted}
-        begin = finite_array("start", [start[joint] for joint in JOINTS], (len(JOINTS),))
-        end = finite_array("goal", [goal[joint] for joint in JOINTS], (len(JOINTS),))
+        missing = [joint for joint in joints if joint not in start or joint not in goal]
+        if missing:
+            known = ", ".join(goal)
+            raise ValueError(f"joint {missing[0]!r} of the arm is not among those of the problem: {known}")
+        begin = finite_array("start", [start[joint] for joint in joints], (len(joints),))
+        end = finite_array("goal", [goal[joint] for joint in joints], (len(joints),))
         obstacles = tuple(_shapes_of(world["collision_objects"]))
     except (KeyError, TypeError, IndexError, OSError, yaml.YAMLError) as error:
-        raise ValueError(f"{scene}: no problem of MotionBenchMaker for the Panda ({error!r:.80})") from None
+        raise ValueError(f"{scene}: no problem of MotionBenchMaker ({error!r:.80})") from None
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from None
     number = int(scene.stem.removeprefix("scene"))
@@ -268,10 +275,15 @@ def _searched(arm: Arm, problem: BenchmarkProblem, checks: int) -> MotionPlan:
 
 
 def measure_planner(
-    name: str, problems: Sequence[BenchmarkProblem], *, physics: bool = True, progress: Progress | None = None
+    name: str,
+    problems: Sequence[BenchmarkProblem],
+    arm: Arm,
+    *,
+    physics: bool = True,
+    progress: Progress | None = None,
 ) -> pd.DataFrame:
     """Return one line for each problem: what a planner found, how long it took, and what MuJoCo says of it."""
-    arm, planner = benchmark_panda(), benchmark_planner(name)
+    planner = benchmark_planner(name)
     planner(arm, problems[0])  # compiles what is not compiled yet
     plans, lines = [], []
     for number, problem in enumerate(problems):
