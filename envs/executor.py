@@ -10,6 +10,7 @@ from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import (
     Placed,
+    bounds_memory,
     configuration_clearances,
     fastest,
     memory,
@@ -254,7 +255,8 @@ def _measure(
     episode has its own number of steps. At rest, the arm is within the tolerance of its goal, shape (n, D), and slower
     than `rest_speed`; the metrics in `state` are changed at `rows`.
     """
-    found, nothing = np.empty_like(steps), np.empty(0)
+    found = np.empty_like(steps)
+    bounds = bounds_memory(chain, spheres, False)
     for scene in range(len(rows)):
         row = rows[scene]
         executed = joints[scene]
@@ -302,13 +304,13 @@ def _measure(
         # Clearance of what was done, and of what was commanded
         body = chain, spheres, reach
         done = movement_clearance(
-            *body, executed[:end], obstacles, scene, timestep, timestep, placed, nothing, 0.0
+            *body, executed[:end], obstacles, scene, timestep, timestep, placed, bounds, 0.0
         )
         state.min_clearance[row] = min(state.min_clearance[row], done[0])
         state.self_clearance[row] = min(state.self_clearance[row], done[1])
         planned_path = path[scene, : steps[scene] + 1]
         command = movement_clearance(
-            *body, planned_path, obstacles, scene, 0.0, timestep, placed, nothing, 0.0
+            *body, planned_path, obstacles, scene, 0.0, timestep, placed, bounds, 0.0
         )
         state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
         found[scene] = end

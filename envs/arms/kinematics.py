@@ -385,7 +385,7 @@ def _all_tools(chain: Chain, joints: Float) -> tuple[Float, Float]:
 
 
 @compiled
-def _all_torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
+def motion_torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
     """Return the torques of N motions, see :func:`torques`."""
     torque = np.empty_like(q)
     for n in range(q.shape[0]):
@@ -418,7 +418,7 @@ def torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
     flat, batch = _flat("q", chain, q)
     rates, _ = _flat("v", chain, np.broadcast_to(v, np.shape(q)))
     accelerations, _ = _flat("a", chain, np.broadcast_to(a, np.shape(q)))
-    return _all_torques(chain, flat, rates, accelerations).reshape(*batch, flat.shape[1])
+    return motion_torques(chain, flat, rates, accelerations).reshape(*batch, flat.shape[1])
 
 
 def sphere_centres(chain: Chain, spheres: Spheres, joints: Float) -> Float:

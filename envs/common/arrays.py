@@ -59,12 +59,17 @@ def frozen(array: Any) -> Any:
 def frame_matrices(quaternion: Float) -> Float:
     """Return the axes of frames as columns, shape (..., 3, 3), from their quaternions, shape (..., 4)."""
     w, x, y, z = (quaternion[..., i] for i in range(4))
-    rows = (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    found = np.empty((*quaternion.shape[:-1], 3, 3))
+    found[..., 0, 0] = 1.0 - 2.0 * (y * y + z * z)
+    found[..., 0, 1] = 2.0 * (x * y - w * z)
+    found[..., 0, 2] = 2.0 * (x * z + w * y)
+    found[..., 1, 0] = 2.0 * (x * y + w * z)
+    found[..., 1, 1] = 1.0 - 2.0 * (x * x + z * z)
+    found[..., 1, 2] = 2.0 * (y * z - w * x)
+    found[..., 2, 0] = 2.0 * (x * z - w * y)
+    found[..., 2, 1] = 2.0 * (y * z + w * x)
+    found[..., 2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    return found
 
 
 def quaternion_to(direction: Any) -> Float:

@@ -35,14 +35,23 @@ class Placed(NamedTuple):
     ball: Float
     centre: Float  # Centres of the spheres of known groups, shape (S, 3), [m]
     known: Bool  # True for groups whose spheres are placed, shape (G,)
-    # Bound of the way of the spheres of links 0 to J since another configuration, shape (J + 1,), [m]
-    way: Float
-    bend: Float  # Bound of how much longer than its chord this way is, shape (J + 1,), [m]
-    group_way: Float  # Bound of the way of the spheres of groups, shape (G,), [m]
-    last_rotation: Float  # Axes of the links' frames in the configuration before, shape (J + 1, 3, 3)
-    last_ball: Float  # Centres of the bounding balls in the configuration before, shape (G, 3), [m]
-    apart: Float  # Lower bounds of the clearance of groups from obstacles in a movement, shape (G,), [m]
-    pair_apart: Float  # Lower bounds of the clearance of pairs of groups in a movement, shape (P,), [m]
+
+
+class Bounds(NamedTuple):
+    """Memory of :func:`movement_clearance`.
+
+    It is not a part of :class:`Placed`, which functions pass on that take less time than more numbers would.
+    """
+
+    apart: Float  # Lower bounds of the clearance of groups from obstacles, shape (G,), [m]
+    pair_apart: Float  # Lower bounds of the clearance of pairs of groups, shape (P,), [m]
+    way: Float  # Bounds of the way of the spheres of links 0 to J since another configuration, shape (J + 1,), [m]
+    bend: Float  # Bounds of how much longer than its chord this way is, shape (J + 1,), [m]
+    group_way: Float  # Bounds of the way of the spheres of groups, shape (G,), [m]
+    rotation: Float  # Axes of the links' frames in the configuration before, shape (J + 1, 3, 3)
+    ball: Float  # Centres of the bounding balls in the configuration before, shape (G, 3), [m]
+    # Joints between two configurations, shape (J,); empty if nothing counts between them
+    between: Float
 
 
 @compiled
@@ -56,13 +65,23 @@ def memory(chain: Chain, spheres: Spheres) -> Placed:
         np.empty((len(spheres.ball_radius), 3)),
         np.empty((len(spheres.radius), 3)),
         np.empty(groups, np.bool_),
+    )
+
+
+@compiled
+def bounds_memory(chain: Chain, spheres: Spheres, between: bool) -> Bounds:
+    """Return memory for the clearance of movements, also `between` their configurations or at these alone."""
+    joints = len(chain.mass)
+    groups = len(spheres.link)
+    return Bounds(
+        np.empty(groups),
+        np.empty(len(spheres.pairs)),
         np.empty(joints + 1),
         np.empty(joints + 1),
         np.empty(groups),
         np.empty((joints + 1, 3, 3)),
         np.empty((groups, 3)),
-        np.empty(groups),
-        np.empty(len(spheres.pairs)),
+        np.empty(joints if between else 0),
     )
 
 
@@ -327,7 +346,7 @@ def movement_clearance(
     begin: float,
     step: float,
     placed: Placed,
-    between: Float,
+    bounds: Bounds,
     floor: float,
 ) -> tuple[float, float]:
     """Return the least clearance of T configurations from obstacles and from the arm itself, at most FAR each, [m].
@@ -336,42 +355,43 @@ def movement_clearance(
     spheres, none of them is nearer than the least so far before they, and the obstacles, have moved by the difference.
     The path begins at the time `begin` and takes `step` from one configuration to the next, [s].
 
-    With memory `between`, shape (J,), the lesser value also counts between the configurations, where joints and
-    obstacles move straight. It may be too great by ROUGHLY, but not so that it is `floor` or more in place of less than
-    that by RESOLUTION or more. The memory is empty, shape (0,), where this does not matter.
+    With memory for joints between two configurations, the lesser value also counts between the configurations, where
+    joints and obstacles move straight. It may be too great by ROUGHLY, but not so that it is `floor` or more in place
+    of less than that by RESOLUTION or more.
     """
     least, least_self = FAR, FAR
+    between = bounds.between
     drift = step * fastest(obstacles, scene)  # the way of obstacles in one step
     # A coarse look comes first: with a small clearance from the start, the second one skips most configurations.
     for stride in (COARSE, 1):
-        _forget(placed)
+        _forget(bounds)
         last = -1  # the configuration of which the last places are
         for k in range(0, len(path), stride):
-            _set_ways(reach, path[max(k - stride, 0)], path[k], spheres, placed)
+            _set_ways(reach, path[max(k - stride, 0)], path[k], spheres, bounds)
             is_placed = False
-            if len(between) > 0 and stride == 1 and k > 0 and _matters(spheres, placed, drift, least):
+            if len(between) > 0 and stride == 1 and k > 0 and _matters(spheres, bounds, drift, least):
                 if last != k - 1:
                     place(chain, spheres, path[k - 1], placed)
-                    _keep_places(placed)
+                    _keep_places(placed, bounds)
                 place(chain, spheres, path[k], placed)
-                _shorten_ways(spheres, placed)
-                _keep_places(placed)
+                _shorten_ways(spheres, placed, bounds)
+                _keep_places(placed, bounds)
                 is_placed, last = True, k
-            _move(stride * drift, spheres, placed)
+            _move(stride * drift, spheres, bounds)
             for group in range(len(spheres.link)):
-                if spheres.link[group] == 0 or placed.apart[group] >= least:
+                if spheres.link[group] == 0 or bounds.apart[group] >= least:
                     continue
                 if not is_placed:
                     place(chain, spheres, path[k], placed)
                     is_placed = True
                 time, most = begin + k * step, least + WINDOW
-                bound = placed.apart[group]
+                bound = bounds.apart[group]
                 apart = nearest_obstacle(spheres, placed, group, obstacles, scene, time, most, -FAR)
-                placed.apart[group] = apart
+                bounds.apart[group] = apart
                 least = min(least, apart)
                 if len(between) == 0 or stride > 1 or k == 0:
                     continue
-                way = placed.group_way[group] + drift
+                way = bounds.group_way[group] + drift
                 low = min(least, least_self)
                 if way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
                     continue
@@ -384,18 +404,18 @@ def movement_clearance(
                     share += _until_next(apart, way, min(least, least_self), floor)
                 is_placed = False
             for pair in range(len(spheres.pairs)):
-                if placed.pair_apart[pair] >= least_self:
+                if bounds.pair_apart[pair] >= least_self:
                     continue
                 if not is_placed:
                     place(chain, spheres, path[k], placed)
                     is_placed = True
-                bound = placed.pair_apart[pair]
+                bound = bounds.pair_apart[pair]
                 apart, _, _ = nearest_spheres(spheres, placed, pair, least_self + WINDOW, -FAR)
-                placed.pair_apart[pair] = apart
+                bounds.pair_apart[pair] = apart
                 least_self = min(least_self, apart)
                 if len(between) == 0 or stride > 1 or k == 0:
                     continue
-                way = _way_of_pair(spheres, placed, pair)
+                way = _way_of_pair(spheres, bounds, pair)
                 low = min(least, least_self)
                 if way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
                     continue
@@ -436,30 +456,30 @@ def _place_between(
 
 
 @inlined
-def _way_of_pair(spheres: Spheres, placed: Placed, pair: int) -> float:
+def _way_of_pair(spheres: Spheres, bounds: Bounds, pair: int) -> float:
     """Return how much a pair of groups may have moved, seen from one another, [m].
 
     That is by the joints between both alone, and not by more than both have moved.
     """
     one = spheres.pairs[pair, 0]
     other = spheres.pairs[pair, 1]
-    between = abs(placed.way[spheres.link[other]] - placed.way[spheres.link[one]])
-    return float(min(between, placed.group_way[one] + placed.group_way[other]))
+    between = abs(bounds.way[spheres.link[other]] - bounds.way[spheres.link[one]])
+    return float(min(between, bounds.group_way[one] + bounds.group_way[other]))
 
 
 @inlined
-def _forget(placed: Placed) -> None:
+def _forget(bounds: Bounds) -> None:
     """Set all lower bounds of clearance so low that they tell nothing."""
-    for group in range(len(placed.apart)):
-        placed.apart[group] = -FAR
-    for pair in range(len(placed.pair_apart)):
-        placed.pair_apart[pair] = -FAR
+    for group in range(len(bounds.apart)):
+        bounds.apart[group] = -FAR
+    for pair in range(len(bounds.pair_apart)):
+        bounds.pair_apart[pair] = -FAR
 
 
 @inlined
-def _set_ways(reach: Float, first: Float, second: Float, spheres: Spheres, placed: Placed) -> None:
+def _set_ways(reach: Float, first: Float, second: Float, spheres: Spheres, bounds: Bounds) -> None:
     """Set bounds of the ways of links and groups between two configurations, with straight movements of the joints."""
-    way, bend = placed.way, placed.bend
+    way, bend = bounds.way, bounds.bend
     way[0] = 0.0
     bend[0] = 0.0
     turned = 0.0
@@ -469,57 +489,57 @@ def _set_ways(reach: Float, first: Float, second: Float, spheres: Spheres, place
         # Half of a bound of the second derivative of the way, in which each pair of joints counts twice.
         bend[joint + 1] = bend[joint] + 0.5 * reach[joint] * turn * (turn + 2.0 * turned)
         turned += turn
-    for group in range(len(placed.group_way)):
-        placed.group_way[group] = way[spheres.link[group]]
+    for group in range(len(bounds.group_way)):
+        bounds.group_way[group] = way[spheres.link[group]]
 
 
 @inlined
-def _matters(spheres: Spheres, placed: Placed, drift: float, least: float) -> bool:
+def _matters(spheres: Spheres, bounds: Bounds, drift: float, least: float) -> bool:
     """Return True if the ways of the groups must be known better, because one may now be nearer than the least."""
-    for group in range(len(placed.apart)):
-        if spheres.link[group] > 0 and placed.apart[group] - placed.group_way[group] - drift < least:
+    for group in range(len(bounds.apart)):
+        if spheres.link[group] > 0 and bounds.apart[group] - bounds.group_way[group] - drift < least:
             return True
     return False
 
 
 @inlined
-def _keep_places(placed: Placed) -> None:
+def _keep_places(placed: Placed, bounds: Bounds) -> None:
     """Keep the places of links and balls as those of the configuration before."""
-    for link in range(len(placed.way)):
+    for link in range(len(bounds.way)):
         for row in range(3):
             for column in range(3):
-                placed.last_rotation[link, row, column] = placed.rotation[link, row, column]
-    for group in range(len(placed.apart)):
+                bounds.rotation[link, row, column] = placed.rotation[link, row, column]
+    for group in range(len(bounds.apart)):
         for axis in range(3):
-            placed.last_ball[group, axis] = placed.ball[group, axis]
+            bounds.ball[group, axis] = placed.ball[group, axis]
 
 
 @inlined
-def _shorten_ways(spheres: Spheres, placed: Placed) -> None:
+def _shorten_ways(spheres: Spheres, placed: Placed, bounds: Bounds) -> None:
     """Lower the bounds of the ways of groups to what follows from where they are now and were before.
 
     No sphere of a group has a longer chord than that of the group's ball and of a point at its edge. The chord is the
     mean of the velocity, from which the velocity differs by half of its greatest derivative at most.
     """
-    for group in range(len(placed.apart)):
+    for group in range(len(bounds.apart)):
         link = spheres.link[group]
         turn = 0.0
         for row in range(3):
             for column in range(3):
-                change = placed.rotation[link, row, column] - placed.last_rotation[link, row, column]
+                change = placed.rotation[link, row, column] - bounds.rotation[link, row, column]
                 turn += 0.5 * change * change
-        chord = math.sqrt(_square(placed.ball, group, placed.last_ball, group))
-        bound = chord + spheres.ball_radius[group] * math.sqrt(turn) + placed.bend[link]
-        placed.group_way[group] = min(placed.group_way[group], bound)
+        chord = math.sqrt(_square(placed.ball, group, bounds.ball, group))
+        bound = chord + spheres.ball_radius[group] * math.sqrt(turn) + bounds.bend[link]
+        bounds.group_way[group] = min(bounds.group_way[group], bound)
 
 
 @inlined
-def _move(drift: float, spheres: Spheres, placed: Placed) -> None:
+def _move(drift: float, spheres: Spheres, bounds: Bounds) -> None:
     """Lower the bounds of clearance by the ways of the spheres, and the one of the obstacles, `drift`, [m]."""
-    for group in range(len(placed.apart)):
-        placed.apart[group] -= placed.group_way[group] + drift
-    for pair in range(len(placed.pair_apart)):
-        placed.pair_apart[pair] -= _way_of_pair(spheres, placed, pair)
+    for group in range(len(bounds.apart)):
+        bounds.apart[group] -= bounds.group_way[group] + drift
+    for pair in range(len(bounds.pair_apart)):
+        bounds.pair_apart[pair] -= _way_of_pair(spheres, bounds, pair)
 
 
 @compiled

@@ -46,6 +46,9 @@ EXTENT = 1.0  # Half length of the cube that stands for a half-space in observat
 BOXES = np.array([shape.box for shape in SHAPES], np.float64)
 GEOMS = np.array([shape.geom for shape in SHAPES])  # MuJoCo's geoms by kind
 
+NO_MESHES = join_meshes([])
+NO_CLOUDS = join_clouds([])
+
 Table = TypeVar("Table", Meshes, Clouds)
 
 
@@ -134,11 +137,12 @@ class Obstacles(NamedTuple):
 def no_obstacles(n_scenes: int, n_rows: int = 0) -> Obstacles:
     """Return scenes without obstacles, with rows for some."""
     shape = (n_scenes, n_rows)
-    rotation = np.tile(np.eye(3), (*shape, 1, 1))
+    rotation = np.empty((*shape, 3, 3))
+    rotation[:] = np.eye(3)
     vectors = [np.zeros((*shape, 3)) for _ in range(3)]
     centre, size, velocity = vectors
     kind = np.full(shape, ABSENT, np.int64)
-    return Obstacles(kind, centre, rotation, size, velocity, join_meshes([]), join_clouds([]))
+    return Obstacles(kind, centre, rotation, size, velocity, NO_MESHES, NO_CLOUDS)
 
 
 def pack(scenes: Sequence[Iterable[Shape | Mapping[str, Any]]], rows: int | None = None) -> Obstacles:

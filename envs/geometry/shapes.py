@@ -268,8 +268,13 @@ class Shape:
     @property
     def packed_size(self) -> Float:
         """Sizes in MuJoCo's convention, shape (3,), [m]; missing ones are 0, see also :class:`Obstacles`."""
-        given = [value for name in self.sizes for value in np.ravel(getattr(self, name))]
-        return np.array([*given, 0.0, 0.0, 0.0][:3])
+        packed = np.zeros(3)
+        first = 0
+        for name, shape in self.sizes.items():
+            after = first + (shape[0] if shape else 1)
+            packed[first:after] = getattr(self, name)
+            first = after
+        return packed
 
     def to_dict(self) -> dict[str, Any]:
         """Return the parameters as plain numbers and lists, with the kind as `shape`."""

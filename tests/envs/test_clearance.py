@@ -13,6 +13,7 @@ from viapoint.envs.geometry.clearance import (
     FAR,
     RESOLUTION,
     ROUGHLY,
+    bounds_memory,
     configuration_clearances,
     memory,
     movement_clearance,
@@ -63,13 +64,14 @@ def test_clearance_of_a_movement_is_that_of_its_nearest_configuration(name, numb
     rng, arm = np.random.default_rng(1), arm_of(name)
     share = np.linspace(0.0, 1.0, 400)[:, None]
     step, placed = 0.004, memory(arm.chain, arm.spheres)
+    bounds = bounds_memory(arm.chain, arm.spheres, False)
     for _ in range(50):
         obstacles = pack([some_shapes(rng, number)]).with_rows(5)
         start, goal, bend = some_joints(rng, arm, 3)
         path = start + share * (goal - start) + 0.3 * np.sin(3.0 * np.pi * share) * (bend - start)
         path = np.clip(path, *arm.joint_range.T)
         found = movement_clearance(
-            arm.chain, arm.spheres, arm.reach, path, obstacles, 0, 0.0, step, placed, np.empty(0), 0.0
+            arm.chain, arm.spheres, arm.reach, path, obstacles, 0, 0.0, step, placed, bounds, 0.0
         )
         scenes = obstacles.take(np.zeros(len(path), int))
         each = configuration_clearances(arm.chain, arm.spheres, path, scenes, step * np.arange(len(path)))
@@ -80,7 +82,8 @@ def test_clearance_of_a_movement_is_that_of_its_nearest_configuration(name, numb
 def test_clearance_between_configurations_is_that_of_many_more(name, number):
     """Of a path with few of them, among obstacles that move."""
     rng, arm = np.random.default_rng(1), arm_of(name)
-    placed, between = memory(arm.chain, arm.spheres), np.empty(len(arm.home))
+    placed = memory(arm.chain, arm.spheres)
+    all_times, these_times = (bounds_memory(arm.chain, arm.spheres, between) for between in (True, False))
     corners, few, many = (np.linspace(0.0, 1.0, each) for each in (9, number, 4001))
     duration = 0.5
     deeper = 0
@@ -93,9 +96,9 @@ def test_clearance_between_configurations_is_that_of_many_more(name, number):
         dense = np.stack([np.interp(many, corners, joint) for joint in turns], axis=-1)
         body = arm.chain, arm.spheres, arm.reach
         least = []
-        for joints, memory_of_it in ((path, between), (dense, np.empty(0)), (path, np.empty(0))):
+        for joints, bounds in ((path, all_times), (dense, these_times), (path, these_times)):
             step = duration / (len(joints) - 1)
-            found = movement_clearance(*body, joints, pack([shapes]), 0, 0.0, step, placed, memory_of_it, 0.0)
+            found = movement_clearance(*body, joints, pack([shapes]), 0, 0.0, step, placed, bounds, 0.0)
             least.append(max(min(found), -FAR))
         # Many configurations may miss something, too.
         assert least[1] - 3e-3 <= least[0] <= least[1] + ROUGHLY

@@ -17,7 +17,7 @@ import numpy as np
 from viapoint import primitives
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import UnreachableError, inverse_kinematics
-from viapoint.envs.arms.kinematics import slowdown, torques
+from viapoint.envs.arms.kinematics import motion_torques, slowdown, torques
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least, whole_number
@@ -666,7 +666,7 @@ def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple
         factor = max(factor, shortest / duration)
     rate = motion.velocity / factor
     change = motion.acceleration / factor**2
-    torque = torques(arm.chain, motion.position, rate, change)
+    torque = motion_torques(arm.chain, motion.position, rate, change)
     shares = np.stack((np.abs(rate) / arm.velocity_limit, np.abs(torque) / arm.torque_limit)).max(axis=1)
     limits = Limits(float(shares[0].max()), float(shares[1].max()))
     kind = "velocity" if limits.velocity > limits.torque else "torque"

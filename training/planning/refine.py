@@ -19,6 +19,7 @@ from viapoint.envs.common.types import Float, Int
 from viapoint.envs.geometry.clearance import (
     WINDOW,
     Placed,
+    bounds_memory,
     fastest,
     group_clearance,
     memory,
@@ -581,6 +582,6 @@ def exact_clearance(
     step = movement.duration / (number - 1)
     apart, own = movement_clearance(
         setting.chain, setting.spheres, setting.reach, path, obstacles, scene, 0.0, step, placed,
-        np.empty(path.shape[1]), margin,
+        bounds_memory(setting.chain, setting.spheres, True), margin,
     )  # fmt: skip
     return min(apart, own)
