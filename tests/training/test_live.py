@@ -20,7 +20,8 @@ import viapoint.envs as ve
 from viapoint.envs import ENV_IDS
 from viapoint.training import LivePage, ViaQ, ViaVecEnv
 from viapoint.training.agents.agent import SAC
-from viapoint.training.live import drawing
+from viapoint.training.config.configs import LiveConfig
+from viapoint.training.live import drawing, page
 from viapoint.training.live.arena import AGENT, HAND, MOTION, SEARCH, STRAIGHT, Arena
 from viapoint.training.live.decide import APART, decide, describe_plan, execute, profile, propose
 from viapoint.training.live.state import Scene, State
@@ -360,3 +361,10 @@ def test_the_page_is_private():
     with LivePage(env=PLANAR, port=0) as page:
         assert page.url.startswith("http://127.0.0.1:")
         assert page._server.request_share_url() is None
+
+
+def test_the_command_passes_arguments_of_the_environment_on(monkeypatch):
+    seen = []
+    monkeypatch.setattr(page.LivePage, "wait", lambda served: seen.append(served._make()[0].task.n_via))
+    page.run(LiveConfig(env=PLANAR, env_kwargs={"n_via": 2}, port=0))
+    assert seen == [2]

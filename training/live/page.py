@@ -423,7 +423,9 @@ class LivePage:
 def run(config: Any) -> None:
     """Serve the live page until Ctrl-C; see :class:`LivePage`."""
     torch.set_num_threads(1)  # decisions are small, and the page has threads of its own
-    given = {"env": config.env, "arm": config.arm, "port": config.port, "seed": config.seed}
+    given = {**config.env_kwargs, "env": config.env, "port": config.port, "seed": config.seed}
+    if config.arm is not None:
+        given["arm"] = config.arm
     with LivePage(config.agent, **given) as page:
         print(f"live page: {page.url} (Ctrl-C ends it)", flush=True)
         page.wait()
