@@ -34,8 +34,8 @@ States: TypeAlias = list[list[Any]]
 Nodes: TypeAlias = dict[tuple[int, int], int]  # Row of each unknown states[k][i] in Eq. 1, by (k, i).
 
 # Power of the machine epsilon that is the least ratio of two durations of a movement for the normal equations. Their
-# relative error is about epsilon times the square of the inverse ratio: below 1e-9, in single precision 1e-4.
-_DIGITS = 0.2
+# relative error is about epsilon times the square of the inverse ratio: below 1e-10, in single precision 1e-4.
+_DIGITS = 0.15
 # Greatest distance by which a movement may miss a waypoint because of rounding, relative to its extent.
 _MISS = 1e-9
 # Least relative change of the cost for which the tolerance of waypoints counts.

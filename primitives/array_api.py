@@ -114,6 +114,8 @@ def _numpy_floats(named: dict[str, Any]) -> list[Any]:
             arrays.append(value)
             continue
         try:
+            if isinstance(value, np.ma.MaskedArray):
+                raise TypeError("leave out what is masked")
             array = np.asarray(value)
             if array.dtype.kind not in "fiu":
                 raise TypeError(f"dtype {array.dtype}")

@@ -141,8 +141,10 @@ class Trajectory:
         Raises:
             ValueError: time is not finite or does not broadcast; nu is not a whole number of at least 0.
         """
-        if isinstance(time, int | float | np.generic):
+        if isinstance(time, int | float):
             return self.sample([time], (nu,))[0][..., 0, :]
+        if getattr(time, "ndim", 1) == 0:
+            return self.sample(time.reshape(1), (nu,))[0][..., 0, :]
         return self.sample(time, (nu,))[0]
 
     def sample(

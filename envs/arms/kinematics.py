@@ -318,7 +318,7 @@ def slowdown(
     for k in range(len(position)):
         for j in range(joints):
             least = max(least, abs(velocity[k, j]) / (LIMIT_SHARE * velocity_limit[j]))
-        if k % TORQUE_STRIDE:  # torques change slowly
+        if k % TORQUE_STRIDE and k < len(position) - 1:  # torques change slowly
             continue
         inverse_dynamics(chain, position[k], rest, rest, heavy)
         inverse_dynamics(chain, position[k], velocity[k], acceleration[k], whole)

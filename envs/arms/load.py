@@ -200,8 +200,13 @@ def _load(
     chosen = choose_tool(whole, given["tool"], base)
     notes.insert(0, f"tool: {chosen.name!r}")
     names = given["joints"]
+    if base is not None and whole.body(base).id not in (chosen.body, *ancestors(whole, chosen.body)):
+        raise ValueError(f"the tool {chosen.name!r} is not carried by base={base!r}; name one of both")
     if names is None:
-        names = _joint_names(arm_joints(whole, chain_joints(whole, chosen.body, base), notes))
+        chain = chain_joints(whole, chosen.body, base)
+        if not chain:
+            raise ValueError(f"no joint moves the tool {chosen.name!r}; name another one with tool=")
+        names = _joint_names(arm_joints(whole, chain, notes))
         notes.append(f"joints: {', '.join(names)}")
     there = [whole.joint(index).name for index in range(whole.njnt)]
     missing = [each for each in names if each not in there]

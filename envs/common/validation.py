@@ -123,6 +123,8 @@ def masked_rows(mask: Any, num_envs: int, running: bool) -> Int:
 
 def as_real_array(values: Any) -> NDArray[Any] | None:
     """Return real numbers as an array, or None for anything else."""
+    if isinstance(values, np.ma.MaskedArray):
+        return None  # what is masked is missing
     try:
         array = np.asarray(values)
     except (TypeError, ValueError, RuntimeError):

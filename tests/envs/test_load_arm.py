@@ -495,6 +495,8 @@ def test_of_two_arms_one_is_named():
     left = load_arm(TWO, base="left")
     assert left.joint_names[0] == "left_shoulder_pan"
     assert load_arm(TWO, tool="hand").joint_names == JOINTS
+    with pytest.raises(ValueError):
+        load_arm(TWO, tool="hand", base="left")  # which carries another one
 
 
 def parts_of(arm):

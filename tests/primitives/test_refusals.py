@@ -18,7 +18,12 @@ MISSING = np.where(np.arange(20)[:, None] == 3, np.nan, SEEN)
 TWICE = np.where(np.arange(20) == 3, TIME[2], TIME)
 
 NO_NUMBERS = ["ab", 1j, {}, object(), [[1.0], [1.0, 2.0]], [torch.ones(1, requires_grad=True)]]
-NOT_FINITE = [np.nan, [0.0, np.inf], torch.tensor([np.nan, 0.0])]
+NOT_FINITE = [
+    np.nan,
+    [0.0, np.inf],
+    torch.tensor([np.nan, 0.0]),
+    np.ma.masked_array([0.0, 1.0], mask=[False, True]),
+]
 BAD_ARRAYS = [FREE, *NO_NUMBERS, *NOT_FINITE]
 BAD_NU = [[1], -1, 1.5, None, "1", True, np.array(1), FREE]
 

@@ -5,6 +5,7 @@ from itertools import pairwise
 import hypothesis
 import numpy as np
 import pytest
+import torch
 from hypothesis.extra import numpy as hnp
 from scipy.integrate import quad
 from scipy.interpolate import make_interp_spline
@@ -115,6 +116,15 @@ def test_knots_are_stretched_with_their_movements(own_durations, pace, rng):
     expected = plain.knots * (pace / plain.duration)[:, None]
     np.testing.assert_allclose(slow.knots, expected, rtol=1e-14)
     np.testing.assert_allclose(slow(slow.knots), waypoints, atol=1e-12)
+
+
+def test_a_single_time_may_be_an_array_of_its_own_library(rng):
+    movement = through(rng.normal(size=(4, 2)), np.full(3, 0.3))
+    end = movement(float(movement.duration))
+    for time in (movement.duration, np.float64(movement.duration)):
+        np.testing.assert_array_equal(movement(time), end)
+    in_torch = through(torch.tensor(rng.normal(size=(3, 2))), torch.full((2,), 0.3))
+    assert in_torch(in_torch.duration, 1).shape == (2,)
 
 
 def test_outside_the_movement_the_end_points_are_held_at_rest(rng):

@@ -393,6 +393,18 @@ def test_first_problems_of_the_benchmark() -> None:
     assert outcome.is_success.all()
 
 
+def test_limits_are_those_of_a_dense_movement() -> None:
+    # Also at the very end, where the torque of a quick movement changes most.
+    arm, rng = load_arm(UR5E), np.random.default_rng(0)
+    for _ in range(60):
+        start, goal = rng.uniform(-2.0, 2.0, (2, 6))
+        plan = plan_motion(arm, start, goal, time_limit=0.0)
+        motion = plan.joints(2000, force=True)
+        velocity = (np.abs(motion.velocity) / arm.velocity_limit).max()
+        torque = (np.abs(motion.torque) / arm.torque_limit).max()
+        assert np.allclose(plan.limits, (velocity, torque), atol=3e-3)
+
+
 @pytest.mark.parametrize("file", ["plan.csv", "plan.yaml"])
 def test_files_hold_the_movement(tmp_path, file) -> None:
     written = write_motion(plan_motion(PANDA, PANDA.home, GOAL, [POST]), tmp_path / file, rate=250)
@@ -476,6 +488,10 @@ world:
     assert np.allclose(box.position, (0.5, 0.1, 0.2))  # turned by a quarter of a turn about z
     assert np.allclose(box.size, (0.1, 0.2, 0.3))
     assert (can.radius, can.half_length) == (0.05, 0.15)
+    scene = folder / "scene0007.yaml"
+    scene.write_text(scene.read_text() + "      meshes: [{vertices: []}]\n")
+    with pytest.raises(ValueError, match=r"shelf.*meshes"):  # not left out without a word
+        read_problems(tmp_path)
     (folder / "request0007.yaml").write_text("start_state: {}\n")
     for bad in (tmp_path, tmp_path / "nothing"):
         with pytest.raises(ValueError):

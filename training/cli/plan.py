@@ -65,6 +65,11 @@ def _check_replaceable(path: Path) -> None:
 def _arm_for(config: PlanConfig) -> Arm:
     """Return the arm of a name or of a file."""
     if config.arm in arm_names():
+        for flag in ("tool", "joints", "base", "packages", "velocity_limit"):
+            if getattr(config, flag):
+                raise ValueError(
+                    f"--{flag.replace('_', '-')} is for an arm of a file, got --arm {config.arm}"
+                )
         return arm_of(config.arm)
     if not Path(config.arm).expanduser().is_file():
         raise ValueError(f"there is no arm or file {config.arm!r}; arms are {', '.join(arm_names())}")

@@ -488,6 +488,8 @@ class PlanConfig(Config):
             check_folder(f"out {self.out}", self.out.parent)
         if self.goal and self.position:
             raise ValueError("a goal is either --goal, joint positions, or --position; both are given")
+        if self.quaternion and not self.position:
+            raise ValueError("--quaternion belongs to --position, the place of the tool at the goal")
 
 
 @dataclass(frozen=True, kw_only=True)

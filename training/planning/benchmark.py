@@ -178,6 +178,8 @@ def read_problems(
 def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
     """Return the problem of a scene file and its request file."""
     request = scene.with_name(scene.name.replace("scene", "request"))
+    if not request.is_file():
+        raise ValueError(f"{request}: there is no such file beside {scene.name}")
     try:
         world = yaml.load(scene.read_text(encoding="utf-8"), yaml.CSafeLoader)["world"]
         asked = yaml.load(request.read_text(encoding="utf-8"), yaml.CSafeLoader)
@@ -185,14 +187,16 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
         start = dict(zip(state["name"], state["position"], strict=True))
         wanted = asked["goal_constraints"][0]["joint_constraints"]
         goal = {each["joint_name"]: each["position"] for each in wanted}
-        missing = [joint for joint in joints if joint not in start or joint not in goal]
-        if missing:
-            known = ", ".join(goal)
-            raise ValueError(f"joint {missing[0]!r} of the arm is not among those of the problem: {known}")
+        for end, there in (("start", start), ("goal", goal)):
+            missing = [joint for joint in joints if joint not in there]
+            if missing:
+                raise ValueError(
+                    f"joint {missing[0]!r} of the arm is not among those of the {end}: {', '.join(there)}"
+                )
         begin = finite_array("start", [start[joint] for joint in joints], (len(joints),))
         end = finite_array("goal", [goal[joint] for joint in joints], (len(joints),))
         obstacles = tuple(_shapes_of(world["collision_objects"]))
-    except (KeyError, TypeError, IndexError, OSError, yaml.YAMLError) as error:
+    except (KeyError, TypeError, IndexError, AttributeError, OSError, yaml.YAMLError) as error:
         raise ValueError(f"{scene}: no problem of MotionBenchMaker ({error!r:.80})") from None
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from None
@@ -203,6 +207,11 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
 def _shapes_of(objects: list[Mapping[str, Any]]) -> Iterator[Shape]:
     """Yield the shapes of collision objects."""
     for each in objects:
+        unread = [name for name in ("mesh", "meshes", "planes") if each.get(name)]
+        if unread:
+            raise ValueError(
+                f"object {each.get('id')!r} has {unread[0]}; boxes, cylinders and spheres are read"
+            )
         outer = _matrix(each.get("pose"))
         for primitive, pose in zip(each["primitives"], each["primitive_poses"], strict=True):
             place = outer @ _matrix(pose)

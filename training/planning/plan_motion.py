@@ -62,7 +62,8 @@ LONGEST_SEARCH = 1.0  # Default of the time limit, [s]
 RANGE_TOLERANCE = 1e-6  # Way beyond a joint limit that counts as rounding, [rad]
 # Shortest durations that are chosen: servos come to rest in time after them; for arms without velocity limits, [s]
 SHORTEST, UNLIMITED = 0.25, 0.85
-LIMIT_STRIDE = 4  # Step between the instants at which limits are looked at
+# Instants of FINE_INSTANTS at which limits are looked at: every second one, and the last
+LIMIT_INSTANTS = np.append(np.arange(0, FINE_INSTANTS - 1, 2), FINE_INSTANTS - 1)
 ROUNDS = 6  # Greatest number of times that a movement is planned again because it must take longer
 # Duration relative to that of the straight movement with which planning among moving obstacles begins
 LONGER = 1.3
@@ -655,9 +656,9 @@ def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple
     """
     arm, duration = problem.arm, movement.duration
     offsets = problem.offsets(movement.vias, duration)
-    position = problem.start + movement.table.basis[movement.times, ::LIMIT_STRIDE] @ offsets
-    velocity = movement.table.rate[movement.times, ::LIMIT_STRIDE] @ offsets / duration
-    acceleration = movement.table.bend[movement.times, ::LIMIT_STRIDE] @ offsets / duration**2
+    position = problem.start + movement.table.basis[movement.times, LIMIT_INSTANTS] @ offsets
+    velocity = movement.table.rate[movement.times, LIMIT_INSTANTS] @ offsets / duration
+    acceleration = movement.table.bend[movement.times, LIMIT_INSTANTS] @ offsets / duration**2
     motion = joint_motion(problem.space, position, velocity, acceleration)
     needed = slowdown(arm.chain, arm.velocity_limit, arm.torque_limit, *motion)
     factor = 1.0 if least is None else max(needed, least)
