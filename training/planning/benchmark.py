@@ -187,11 +187,11 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
         start = dict(zip(state["name"], state["position"], strict=True))
         wanted = asked["goal_constraints"][0]["joint_constraints"]
         goal = {each["joint_name"]: each["position"] for each in wanted}
-        for end, there in (("start", start), ("goal", goal)):
+        for name, there in (("start", start), ("goal", goal)):
             missing = [joint for joint in joints if joint not in there]
             if missing:
                 raise ValueError(
-                    f"joint {missing[0]!r} of the arm is not among those of the {end}: {', '.join(there)}"
+                    f"joint {missing[0]!r} of the arm is not among those of the {name}: {', '.join(there)}"
                 )
         begin = finite_array("start", [start[joint] for joint in joints], (len(joints),))
         end = finite_array("goal", [goal[joint] for joint in joints], (len(joints),))
