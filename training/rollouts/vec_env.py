@@ -112,7 +112,10 @@ class ViaVecEnv(VecEnv):
 
     def __init__(self, env_id: str, num_envs: int, seed: int | None = None, **kwargs: Any) -> None:
         check_registered(env_id)
-        self.venv: Any = gym.make_vec(env_id, num_envs=num_envs, **kwargs)
+        extra: dict[str, Any] = {}
+        if gym.spec(env_id).vector_entry_point is None:  # copies of the single environment
+            extra["vector_kwargs"] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.venv: Any = gym.make_vec(env_id, num_envs=num_envs, **extra, **kwargs)
         mode = self.venv.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(f"{env_id} must have autoreset mode SAME_STEP, not {mode}")
