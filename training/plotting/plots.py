@@ -156,10 +156,15 @@ def style_axes(ax: Any) -> None:
 
 
 def _bar_style(name: str, names: Sequence[str]) -> dict[str, Any]:
-    """Return the colour of a method; a variant, such as an agent with checks, has the hatched colour of its method."""
-    method = name.rstrip("0123456789")
+    """Return the colour of a method; a variant, such as an agent with checks, has the hatched colour of its method.
+
+    Of searches with different numbers of checks, the first ones are paler.
+    """
+    digits = "0123456789"
+    method = name.rstrip(digits)
     if method in METHOD_COLOURS:
-        return {"color": METHOD_COLOURS[method]}
+        same = [each for each in names if each.rstrip(digits) == method]
+        return {"color": METHOD_COLOURS[method], "alpha": (1 + same.index(name)) / len(same)}
     for known, colour in METHOD_COLOURS.items():
         if name.startswith(known):
             return {"color": colour, "hatch": "///", "edgecolor": "white"}
