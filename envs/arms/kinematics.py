@@ -386,7 +386,7 @@ def _all_tools(chain: Chain, joints: Float) -> tuple[Float, Float]:
 
 @compiled
 def motion_torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
-    """Return the torques of N motions, see :func:`torques`."""
+    """Return the torques of N motions of shape (N, J) each; :func:`torques` checks its arguments, this one does not."""
     torque = np.empty_like(q)
     for n in range(q.shape[0]):
         inverse_dynamics(chain, q[n], v[n], a[n], torque[n])

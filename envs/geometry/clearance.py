@@ -40,7 +40,7 @@ class Placed(NamedTuple):
 class Bounds(NamedTuple):
     """Memory of :func:`movement_clearance`.
 
-    It is not a part of :class:`Placed`, which functions pass on that take less time than more numbers would.
+    It is not a part of :class:`Placed`: compiled functions that pass a record on take longer the more arrays it has.
     """
 
     apart: Float  # Lower bounds of the clearance of groups from obstacles, shape (G,), [m]
@@ -365,7 +365,7 @@ def movement_clearance(
     # A coarse look comes first: with a small clearance from the start, the second one skips most configurations.
     for stride in (COARSE, 1):
         _forget(bounds)
-        last = -1  # the configuration of which the last places are
+        last = -1  # the configuration whose places are kept
         for k in range(0, len(path), stride):
             _set_ways(reach, path[max(k - stride, 0)], path[k], spheres, bounds)
             is_placed = False

@@ -133,8 +133,9 @@ def _check_replaceable(path: Path, names: set[str]) -> None:
     for each in there:
         if each.name not in names or not each.is_file():
             raise BadFileError(path, f"holds {each.name}, which is not written here; name a new folder")
-    marked = [each for each in there if each.suffix == ".json" and JSON_MARK in each.read_bytes()]
-    if there and not marked:
+        if each.suffix == ".json":
+            check_ours(each)
+    if there and not any(each.suffix == ".json" for each in there):
         raise BadFileError(path, f"holds {there[0].name}, not written by viapoint; name a new folder")
 
 

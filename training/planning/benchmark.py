@@ -156,8 +156,9 @@ def read_problems(
     """Return the problems of a folder of MotionBenchMaker's files, in the order of their sets and numbers.
 
     The files are `sceneNNNN.yaml` and `requestNNNN.yaml`, in folders named after their sets; `joints` are the names of
-    the arm's joints in them, those of the Panda by default. The second result has a line for each problem that cannot
-    be read, which names its file.
+    the arm's joints in them, those of the Panda by default. Values of other joints, objects that are attached to the
+    arm, and goals after the first are not looked at. The second result has a line for each problem that cannot be
+    read, which names its file.
 
     Raises:
         ValueError: There is no problem that can be read.
