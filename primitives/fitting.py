@@ -110,15 +110,17 @@ class ViaPointFit:
         return self.end - self.onset
 
     def __call__(self, time: Array, nu: int = 0) -> Array:
-        """Return the nu-th derivative of the fitted movement at times (T,) or (..., T) of the measurement.
+        """Return the nu-th derivative of the fitted movement at times (T,) or (..., T) of the measurement, or at one.
 
         Returns:
-            (..., T, D) [m/s^nu]. Before the onset and after the end the movement rests.
+            (..., T, D), or (..., D) for one time [m/s^nu]. Before the onset and after the end the movement rests.
 
         Raises:
             ValueError: time is not finite or does not broadcast; nu is not a whole number of at least 0.
         """
         (time,) = self.trajectory.floats(time=time)
+        if time.ndim == 0:
+            return self(time[None], nu)[..., 0, :]
         return self.trajectory(time - self.onset[..., None], nu)
 
 

@@ -63,7 +63,8 @@ def cover(
         spheres = _spheres(names, links, capsules, excess, pairs)
         close = spheres.pairs[overlapping(chain, spheres, home[None], False)[0]]
         if not len(close):
-            return names, spheres, left_out, max(excess.values())
+            beyond = [_along(each, excess[each.body])[1] - each.radius for each in capsules]
+            return names, spheres, left_out, max(beyond)
         for group in np.unique(close):
             excess[names[group]] *= SHRUNK  # smaller spheres, and more of them
     first, second = close[0]

@@ -142,6 +142,7 @@ def test_a_batch_holds_the_fits_of_its_movements(rng):
     starts = 5 * np.arange(4)  # movements of a list may have different lengths
     parts = [(own[0][start:], own[1][start:]) for own, start in zip(several, starts, strict=True)]
     listed = fit_via_points([own_time for own_time, _ in parts], [own_position for _, own_position in parts])
+    np.testing.assert_array_equal(batch(0.3, 1), batch([0.3], 1)[..., 0, :])
     assert batch.via_points.shape == (2, 2, 2, 2)
     assert listed.via_points.shape == (4, 2, 2)
     for i in range(4):

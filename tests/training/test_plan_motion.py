@@ -315,8 +315,9 @@ def test_numbers_of_other_types_compile_nothing_anew() -> None:
     assert np.array_equal(plan.waypoints, expected.waypoints)
 
 
-def test_a_start_faster_than_the_limits_is_told_at_once() -> None:
-    plan = plan_motion(PANDA, PANDA.home, GOAL, velocity=[3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+@pytest.mark.parametrize("state", ["velocity", "acceleration"])
+def test_a_start_beyond_the_limits_is_told_at_once(state: str) -> None:
+    plan = plan_motion(PANDA, PANDA.home, GOAL, **{state: [300.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]})
     assert (plan.success, plan.seeds) == (False, 0)
     assert "'joint1'" in plan.reason
 
@@ -489,7 +490,11 @@ world:
     assert np.allclose(box.size, (0.1, 0.2, 0.3))
     assert (can.radius, can.half_length) == (0.05, 0.15)
     scene = folder / "scene0007.yaml"
-    scene.write_text(scene.read_text() + "      meshes: [{vertices: []}]\n")
+    whole = scene.read_text()
+    scene.write_text(whole + "robot_state: {attached_collision_objects: [{link_name: hand}]}\n")
+    with pytest.raises(ValueError):
+        read_problems(tmp_path)
+    scene.write_text(whole + "      meshes: [{vertices: []}]\n")
     with pytest.raises(ValueError, match=r"shelf.*meshes"):  # not left out without a word
         read_problems(tmp_path)
     (folder / "request0007.yaml").write_text("start_state: {}\n")

@@ -156,9 +156,9 @@ def read_problems(
     """Return the problems of a folder of MotionBenchMaker's files, in the order of their sets and numbers.
 
     The files are `sceneNNNN.yaml` and `requestNNNN.yaml`, in folders named after their sets; `joints` are the names of
-    the arm's joints in them, those of the Panda by default. Values of other joints, objects that are attached to the
-    arm, and goals after the first are not looked at. The second result has a line for each problem that cannot be
-    read, which names its file.
+    the arm's joints in them, those of the Panda by default. Values of other joints, frames of objects, and goals after
+    the first are not looked at. The second result has a line for each problem that cannot be read, which names its
+    file; meshes, planes and objects that are attached to the arm cannot be read.
 
     Raises:
         ValueError: There is no problem that can be read.
@@ -182,7 +182,7 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
     if not request.is_file():
         raise ValueError(f"{request}: there is no such file beside {scene.name}")
     try:
-        world = yaml.load(scene.read_text(encoding="utf-8"), yaml.CSafeLoader)["world"]
+        read = yaml.load(scene.read_text(encoding="utf-8"), yaml.CSafeLoader)
         asked = yaml.load(request.read_text(encoding="utf-8"), yaml.CSafeLoader)
         state = asked["start_state"]["joint_state"]
         start = dict(zip(state["name"], state["position"], strict=True))
@@ -196,7 +196,10 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
                 )
         begin = finite_array("start", [start[joint] for joint in joints], (len(joints),))
         end = finite_array("goal", [goal[joint] for joint in joints], (len(joints),))
-        obstacles = tuple(_shapes_of(world["collision_objects"]))
+        for held in (read.get("robot_state"), asked["start_state"]):
+            if held and held.get("attached_collision_objects"):
+                raise ValueError("an object is attached to the arm; plan for an arm whose model holds it")
+        obstacles = tuple(_shapes_of(read["world"]["collision_objects"]))
     except (KeyError, TypeError, IndexError, AttributeError, OSError, yaml.YAMLError) as error:
         raise ValueError(f"{scene}: no problem of MotionBenchMaker ({error!r:.80})") from None
     except ValueError as error:

@@ -505,12 +505,17 @@ def _fault(problem: _Problem) -> tuple[str, float]:
             row = int(near.argmax())
             where = "in contact with" if rows[end, row] < 0.0 else "nearer than the margin to"
             return f"the {name} is {where} obstacle {row}, clearance {1e3 * rows[end, row]:.1f} mm", most
-    if problem.velocity.any():
+    if problem.velocity.any() or problem.acceleration.any():
         moving = joint_motion(space, ends[:1], problem.velocity[None], problem.acceleration[None])
-        share = np.abs(moving.velocity[0]) / arm.velocity_limit
-        if share.max() > 1.0:
-            fastest = arm.joint_names[int(share.argmax())]
-            return f"the start has {share.max():.2f} times the velocity limit of joint {fastest!r}", most
+        torque = motion_torques(arm.chain, *moving)
+        for kind, values, limit in (
+            ("velocity", moving.velocity, arm.velocity_limit),
+            ("torque", torque, arm.torque_limit),
+        ):
+            share = np.abs(values[0]) / limit
+            if share.max() > 1.0:
+                joint = arm.joint_names[int(share.argmax())]
+                return f"the start has {share.max():.2f} times the {kind} limit of joint {joint!r}", most
     counted = both.present & (resting | np.array([[True], [False]]))
     nearest = min(float(own.min()), float(rows.min(where=counted, initial=most)))
     return "", max(problem.margin, min(most, nearest - ROUNDING))
