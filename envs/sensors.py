@@ -249,7 +249,9 @@ class Sensor:
 
     def _disturbed(self, ranges: Float, seen: Int) -> Float:
         """Return distances with noise and dropped rays, which are functions of the distances and the rays' numbers."""
-        bits = ranges.view(np.uint64) + np.arange(1, self.n_rays + 1, dtype=np.uint64) * np.uint64(GOLDEN)
+        # Distances of one scene differ in their last bits where its numbers were written and read.
+        numbers = np.arange(1, self.n_rays + 1, dtype=np.uint64)
+        bits = np.rint(ranges / GRAIN).astype(np.uint64) + numbers * np.uint64(GOLDEN)
         first, second, third = (_uniform(bits + np.uint64(k)) for k in range(3))
         # Two uniform numbers give a normal one (G. E. P. Box and M. E. Muller, 1958).
         normal = np.sqrt(-2.0 * np.log(1.0 - first)) * np.cos(2.0 * np.pi * second)
@@ -297,6 +299,7 @@ def named_sensor(name: str, arm: Arm, foot: tuple[float, float, float], scale: f
     raise ValueError(f"sensor must be one of {', '.join(NAMED)}, got {name!r}")
 
 
+GRAIN = 1e-9  # Distance below which readings count as equal for the random numbers of their noise, [m]
 GOLDEN = 0x9E3779B97F4A7C15  # Odd number near 2^64 divided by the golden ratio, the step of SplitMix64
 
 

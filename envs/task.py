@@ -49,6 +49,7 @@ JOINT_MOVEMENT = 5.0  # Time that a movement in joint space is given where time 
 HAND_SPEED, HAND_BANDWIDTH = 1.5, 25.0
 # Top speed of the joints where they are steered, as a share of their limits, and bandwidth, [rad/s]
 JOINT_SPEED_SHARE, JOINT_BANDWIDTH = 0.5, 12.0
+UNLIMITED_SPEED = 4.0  # Speed that counts as the limit of joints without one in durations of actions, [rad/s]
 # Default duration range by space: seconds, and multiples of the shortest movement that the limits allow
 DURATIONS: dict[str, tuple[float, float]] = {"hand": (0.6, 1.2), "joints": (1.1, 2.5)}
 
@@ -205,7 +206,8 @@ class Task:
         in_hand = self.space_name == "hand"
         width = self.arm.joint_range[:, 1] - self.arm.joint_range[:, 0]
         offsets = np.minimum(RANGE_SHARE * width, LARGEST_OFFSET)
-        limits = np.minimum(self.arm.velocity_limit, 1e6)  # infinite for arms without limits
+        limits = self.arm.velocity_limit
+        limits = np.where(np.isfinite(limits), limits, UNLIMITED_SPEED)
         return ActionLayout(
             space=self.space_name,
             names_of_axes=("along", "across") if in_hand else self.arm.joint_names,
@@ -297,8 +299,8 @@ def _checked_decisions(decide_at: Any) -> str | tuple[Trigger, ...]:
     if isinstance(decide_at, str):
         if decide_at in (END, STEPS):
             return decide_at
-    elif isinstance(decide_at, Sequence) and all(each in TRIGGERS for each in decide_at):
+    elif isinstance(decide_at, Sequence) and decide_at and all(each in TRIGGERS for each in decide_at):
         return tuple(decide_at)
     raise ValueError(
-        f"decide_at must be {END!r}, {STEPS!r} or a list with some of {', '.join(TRIGGERS)}, got {decide_at!r}"
+        f"decide_at must be {END!r}, {STEPS!r} or a list with one or more of {', '.join(TRIGGERS)}, got {decide_at!r}"
     )

@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from viapoint.envs.arms.arm import Arm
+from viapoint.envs.common.arrays import as_dict, from_dict
 from viapoint.envs.common.types import Bool, Float, Int, Observation
 from viapoint.envs.common.validation import (
     as_given,
@@ -357,18 +358,33 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state of environments of the same task, number and number of threads."""
+        """Continue from a state of environments of the same task and number, whatever its number of threads was."""
         if not self.generators:
             self.generators = [np.random.default_rng() for _ in range(self.num_envs)]
             self._np_random = self.generators[0]
-        for generator, saved in zip(self.generators, state["generators"], strict=True):
-            generator.bit_generator.state = saved
-        for each, part in zip(self._episodes, state["episodes"], strict=True):
+        for generator, place in zip(self.generators, state["generators"], strict=True):
+            generator.bit_generator.state = place
+        saved = state["episodes"]
+        if len(saved) != len(self._episodes):
+            saved = self._shared_out(saved)
+        for each, part in zip(self._episodes, saved, strict=True):
             each.restore(part)
         self._over[:] = state["over"]
         self._decisions[:] = state["decisions"]
         self.terminated, self.truncated = np.array(state["ended"])
         self._running = True
+
+    def _shared_out(self, states: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Return states of the episodes of each thread from those with another number of threads."""
+        like = self._episodes[0].scenes
+        scenes = Scenes.together([from_dict(like, part["scenes"]) for part in states])
+        every = _joined([{**part, "scenes": None} for part in states])
+        parts = []
+        for share in self._shares:
+            parts.append({**_taken(every, share), "scenes": as_dict(scenes.take(share))})
+        for part in parts[1:]:
+            part["physics_steps"] = 0  # the first one has those of all
+        return parts
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a pickle holds: the arguments, and the running episodes."""
@@ -510,3 +526,24 @@ def _together(parts: Sequence[Any]) -> Any:
     if isinstance(parts[0], dict):
         return {name: _together([part[name] for part in parts]) for name in parts[0]}
     return np.concatenate(parts)
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """Return the states of all episodes, nested values and arrays, from those of each thread; numbers are added."""
+    first = parts[0]
+    if isinstance(first, Mapping):
+        return {name: _joined([part[name] for part in parts]) for name in first}
+    if isinstance(first, list):
+        return [_joined(column) for column in zip(*parts, strict=True)]
+    if isinstance(first, int):
+        return sum(parts)
+    return None if first is None else np.concatenate(parts)
+
+
+def _taken(state: Any, rows: Int) -> Any:
+    """Return the states of some episodes from those of all; numbers stay."""
+    if isinstance(state, Mapping):
+        return {name: _taken(each, rows) for name, each in state.items()}
+    if isinstance(state, list):
+        return [_taken(each, rows) for each in state]
+    return state[rows] if isinstance(state, np.ndarray) else state

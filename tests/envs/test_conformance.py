@@ -109,6 +109,20 @@ def test_a_pickled_environment_goes_on_as_the_original(env_id):
                 np.testing.assert_allclose(part[len(part) - len(last) + 1 :], last[1:], atol=1e-9)
 
 
+@pytest.mark.parametrize("env_id", ["viapoint/PandaMovingObstacles-v0", "viapoint/PlanarSensed-v0"])
+def test_episodes_go_on_with_another_number_of_threads(env_id):
+    first, second = (gym.make_vec(env_id, num_envs=9, threads=threads) for threads in (1, 2))
+    first.reset(seed=4)
+    action = np.tile(actions_for(first, 1)[0], (9, 1))
+    first.step(action)
+    for source, target in ((first, second), (second, first)):
+        target.unwrapped.restore(source.unwrapped.state())
+        assert target.unwrapped.physics_steps == source.unwrapped.physics_steps
+    expected, found = (each.step(action) for each in (first, second))
+    same(expected[0], found[0])
+    np.testing.assert_array_equal(expected[1], found[1])
+
+
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
 @pytest.mark.parametrize("limit", [1, 2])
 def test_a_limit_of_decisions_is_that_of_gymnasium(env_id, mode, limit):

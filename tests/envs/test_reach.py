@@ -123,6 +123,19 @@ def scenes_with(env, kind, rng):
     return resting(scenes.start, scenes.goal, pack(shapes, 1))
 
 
+@pytest.mark.parametrize("arm", ["planar", "panda"])
+def test_a_longer_duration_is_a_longer_movement_in_joint_space(arm):
+    """Also where joints have no velocity limit."""
+    envs = gym.make_vec("viapoint/Reach-v0", num_envs=3, arm=arm, space="joints").unwrapped
+    envs.reset(seed=[0, 0, 0])
+    actions = np.zeros(envs.action_space.shape, np.float32)
+    actions[:, envs.action_names.index("duration")] = (-1.0, 0.0, 1.0)
+    _, reward, _, _, info = envs.step(actions)
+    duration = info["final_info"]["duration"]
+    assert (np.diff(duration) > 0.1 * duration[0]).all()
+    assert (reward > -2.0).all()
+
+
 def test_the_rollout_is_the_movement_that_info_tells_of():
     env, _ = given(obstacles=[WALL])
     *_, info = env.step(through(env, np.array([-0.1, 0.54])))

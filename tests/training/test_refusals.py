@@ -263,9 +263,11 @@ CALLS = [
     *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, SENSED)),
     lambda: ViaQ("ViaQPolicy", make_vec_env("Pendulum-v1")),
     *(lambda wrapper=wrapper: ViaQ("ViaQPolicy", make_vec_env(ENV, 2, wrapper_class=wrapper))
-      for wrapper in (FlattenObservation, lambda env: RescaleAction(env, -2.0, 2.0))),
+      for wrapper in (FlattenObservation, lambda env: RescaleAction(env, np.float32(-2.0), np.float32(2.0)))),
     lambda: sensed(ranges=np.full((2, 192), 50.0)),
     lambda: evaluate(load_agent(SENSED), scenes="validation", n_scenes=2, env_kwargs={"sensor": shorter()}),
+    *(lambda changes=changes: evaluate(ENV, scenes="validation", n_scenes=2, env_kwargs=changes)
+      for changes in ({"shapes": ["box", "cylinder"]}, {"duration_range": (0.3, 0.6)}, {"n_obstacles": 8})),
     lambda: ViaQ("ViaQPolicy", VecNormalize(ViaVecEnv(ENV, 2))),
     lambda: ViaRank("ViaRankPolicy", ViaVecEnv(ENV, 1)),
     *(lambda labels=labels: ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1), labels=labels)

@@ -8,7 +8,8 @@ from stable_baselines3.common.monitor import Monitor
 from tasks import PLANE, STEP
 
 from viapoint.envs import scene_from_json, scene_to_json
-from viapoint.training import TrainConfig, ViaVecEnv, evaluate, train
+from viapoint.training import TrainConfig, ViaVecEnv, evaluate, load_agent, train
+from viapoint.training.io.files import BadFileError
 
 
 def actions(env, seed=0):
@@ -51,9 +52,9 @@ def test_it_is_the_vector_environment(env_id, steps):
     env.close()
 
 
-def register(monkeypatch, **kwargs):
+def register(monkeypatch, *, control_step=0.04, **kwargs):
     """Register an id of one's own for the test alone."""
-    usual = {"arm": "planar", "decide_at": "steps"}
+    usual = {"arm": "planar", "decide_at": "steps", "control_step": control_step}
     spec = EnvSpec("me/Own-v0", "viapoint.envs.env:ReachEnv", kwargs=usual, **kwargs)
     monkeypatch.setitem(gym.registry, spec.id, spec)
     return spec.id
@@ -75,6 +76,9 @@ def test_an_own_id_has_the_limit_of_decisions_of_gymnasium(tmp_path, monkeypatch
         again = evaluate(run.best, scenes="validation", n_scenes=4)
     for each in (result, again):
         assert (each.results[0].outcomes["decisions"] == 3).all()
+    register(monkeypatch, vector_entry_point=vector, control_step=0.08)  # nor another task by this id
+    with pytest.raises(BadFileError):
+        load_agent(run.folder)
 
 
 def test_an_own_id_needs_a_vector_environment(monkeypatch):

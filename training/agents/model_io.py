@@ -39,7 +39,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.stored import keep_arm, with_kept_arm
 from viapoint.envs.common.validation import is_number
 from viapoint.envs.plans import MOST_VIAS
-from viapoint.envs.task import MOST_OBSTACLES
+from viapoint.envs.task import MOST_OBSTACLES, Task
 from viapoint.training.agents.extractors import SceneExtractor
 from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
 from viapoint.training.planning.candidates import MOST_CANDIDATES, MOST_ROUNDS
@@ -139,14 +139,14 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
         hyperparameters = dict(record["hyperparameters"])
         policy = hyperparameters.get("policy_kwargs", {})
         if isinstance(policy, dict) and isinstance(policy.get("task"), dict):  # ViaQ's networks know the task
-            task = with_kept_arm(policy["task"], folder)
-            hyperparameters["policy_kwargs"] = {**policy, "task": task}
+            hyperparameters["policy_kwargs"] = {**policy, "task": with_kept_arm(policy["task"], folder)}
         with warnings.catch_warnings(), _parameter_budget(arrays):
             warnings.simplefilter("ignore", UserWarning)  # PPO's batches do not fill one environment
             own = _own_environment(record["env"], folder)
             if env is None:
                 hyperparameters = _to_decide(hyperparameters)
             else:
+                check_same_task(*(each.get_attr("task", [0])[0] for each in (own, env)))
                 check_for_correct_spaces(env, own.observation_space, own.action_space)
             model = build(record["algorithm"], record["policy"], env or own, hyperparameters)
         model.num_timesteps = int(record["num_timesteps"])
@@ -162,6 +162,42 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
     if record.get("weights_sha256", "") not in ("", _digest(tensors)):
         raise BadFileError(tensors, "is damaged: its hash is not the one that model.json states")
     return model
+
+
+def check_same_task(mine: Task, theirs: Task) -> None:
+    """Check that observations and actions mean the same in two tasks, so that an agent of one can decide in the other.
+
+    Scenes, rewards, and noise of a sensor may differ.
+
+    Raises:
+        ValueError: They do not; the message names the parts that differ.
+    """
+    before, after = _meaning(mine), _meaning(theirs)
+    if mine.arm.xml == theirs.arm.xml:  # one arm may be in several files
+        after["arm"] = before["arm"]
+    others = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+    if others:
+        raise ValueError(
+            f"the environment must have the same {', '.join(others)} as the agent: "
+            f"{ {name: before.get(name) for name in others} }, got { {name: after.get(name) for name in others} }"
+        )
+
+
+def _meaning(task: Task) -> dict[str, Any]:
+    """Return the parts of a task on which the meaning of observations and actions depends."""
+    record = task.as_dict()
+    parts = {name: record[name] for name in ("arm", "space")}
+    parts["decide_at"] = "events" if task.replanning else task.decide_at
+    if task.stepwise:
+        parts["control_step"] = task.control_step
+    else:
+        parts |= {name: record[name] for name in ("n_via", "timing", "duration_range")}
+    if task.sensor is None:
+        parts["shapes"] = record["shapes"]
+        parts["greatest n_obstacles"] = task.n_obstacles[1]
+    else:
+        parts["sensor"] = {**record["sensor"], "noise": 0.0, "dropped": 0.0}
+    return parts
 
 
 def build(
@@ -337,6 +373,7 @@ def _own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
 
     Raises:
         ValueError: There is neither, or an argument is not one that files may give.
+        BadFileError: The id stands for another task here.
     """
     env_id, kwargs = record["id"], record["kwargs"]
     if env_id not in gym.registry:  # never lets Gymnasium import a module named in a file
@@ -353,7 +390,17 @@ def _own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
         for each in value if isinstance(value, list | tuple) else (value,):
             if isinstance(each, int | float) and each > most:
                 raise ValueError(f"{name} may be at most {most} in a file, got {each}")
-    return ViaVecEnv(env_id, 1, **kwargs)
+    env = ViaVecEnv(env_id, 1, **kwargs)
+    if "task" in record:
+        try:
+            check_same_task(
+                Task.from_dict(with_kept_arm(record["task"], folder)), env.get_attr("task", [0])[0]
+            )
+        except ValueError as error:
+            raise BadFileError(
+                folder, f"holds an agent for another {env_id} than is registered: {error}"
+            ) from None
+    return env
 
 
 @contextmanager

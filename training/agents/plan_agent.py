@@ -19,7 +19,7 @@ from torch import Tensor
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
-from viapoint.training.agents.model_io import check_arguments
+from viapoint.training.agents.model_io import check_arguments, check_same_task
 from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
 from viapoint.training.rollouts.vec_env import check_unwrapped
 
@@ -223,10 +223,6 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
     def _task_of(self, env: VecEnv) -> Task:
         """Return the task of an environment, if the algorithm is made for it; ValueError otherwise."""
 
-    @abstractmethod
-    def _check_task(self, mine: Task, theirs: Task) -> None:
-        """Check that the policy, which was made for one task, can decide in another; ValueError if not."""
-
     def _check_env(self, env: VecEnv) -> None:
         normalized = unwrap_vec_normalize(env)
         if normalized is not None and normalized.norm_obs:
@@ -234,11 +230,7 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
                 f"{type(self).__name__} computes with metres: VecNormalize must be made with norm_obs=False"
             )
         check_unwrapped(env)
-        self.check_task(self._task_of(env))
-
-    def check_task(self, task: Task) -> None:
-        """Check that the agent can decide in another task than that of its training; ValueError if not."""
-        self._check_task(Task.from_dict(self.policy_kwargs["task"]), task)
+        check_same_task(Task.from_dict(self.policy_kwargs["task"]), self._task_of(env))
 
     def _setup_model(self) -> None:
         if self.env is not None:

@@ -28,8 +28,6 @@ from viapoint.training.agents.viaq_policy import KEEP, ViaQPolicy
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.problem import Problem
 
-# Parts of the task that agent and environment must share, because the policy plans with them
-FIXED_PARTS = ("arm", "space", "n_via", "timing", "duration_range", "shapes")
 # Unit of errors of the clearance term, as a share of the weight of the term: 2 cm
 CLEARANCE_SCALE = 0.4
 # Share of the weight of the clearance term by which the obstacles must be nearer than the arm itself: 1 mm
@@ -138,15 +136,6 @@ class ViaQ(PlanAlgorithm):
                 "viaq needs the obstacles; where a sensor sees them, viarank learns to place via-points"
             )
         return task
-
-    def _check_task(self, mine: Task, theirs: Task) -> None:
-        before, after = mine.as_dict(), theirs.as_dict()
-        others = [name for name in FIXED_PARTS if before[name] != after[name]]
-        if others:
-            raise ValueError(
-                f"the environment must have the same {', '.join(others)} as the agent: "
-                f"{ {name: before[name] for name in others} }, got { {name: after[name] for name in others} }"
-            )
 
     def _sampled_losses(self, batch_size: int) -> dict[str, Tensor]:
         assert self.replay_buffer is not None

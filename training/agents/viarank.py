@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -289,13 +288,6 @@ class ViaRank(PlanAlgorithm):
                 f"such as viapoint/PlanarSensed-v0; got {got}"
             )
         return task
-
-    def _check_task(self, mine: Task, theirs: Task) -> None:
-        ideal = [each.sensor and replace(each.sensor, noise=0.0, dropped=0.0) for each in (mine, theirs)]
-        if ideal[0] != ideal[1]:  # noise and dropped rays may differ
-            raise ValueError(
-                f"the environment must have the sensor of the agent, {mine.sensor}, got {theirs.sensor}"
-            )
 
     def _candidates(self, number: int) -> NDArray[np.float32]:
         """Return random candidates of some scenes, shape (number, H, m), of as many as a decision compares."""

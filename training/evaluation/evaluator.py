@@ -20,7 +20,7 @@ from viapoint.envs.common.validation import finite_array
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.scenes.scene import NEVER, Scenes
 from viapoint.training.agents.agent import load_agent
-from viapoint.training.agents.model_io import untrained
+from viapoint.training.agents.model_io import check_same_task, untrained
 from viapoint.training.config.checks import check_whole
 from viapoint.training.evaluation import report
 from viapoint.training.evaluation.statistics import mcnemar, success_weighted_path_length, wilson
@@ -227,9 +227,6 @@ def evaluate(
         agent = load_agent(agent)
     env_id, kwargs = _environment_of(agent, env, env_kwargs)
     task = registered_task(env_id, **kwargs)
-    check_task = getattr(agent, "check_task", None)
-    if task.sensor is not None and check_task is not None:
-        check_task(task)
     methods = _rows_of(agent, settings)
     for each in baselines:
         if not isinstance(each, str):
@@ -260,6 +257,9 @@ def _environment_of(
     mine, kwargs = env_arguments(agent.get_env())
     if env not in (None, mine):
         raise ValueError(f"env must be {mine}, on which the agent was trained, or be left out, got {env!r}")
+    if env_kwargs is not None:
+        trained = agent.get_env().get_attr("task", [0])[0]  # type: ignore[union-attr]
+        check_same_task(trained, registered_task(mine, **env_kwargs))
     return mine, whole_task(mine, kwargs if env_kwargs is None else env_kwargs)
 
 
