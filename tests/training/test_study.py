@@ -1,4 +1,4 @@
-"""Studies: what a file means, what is refused, and that a study which was killed or runs on two nodes ends alike."""
+"""Studies: what a file means, what is refused, and that a study which was killed ends alike."""
 
 import doctest
 import json
@@ -55,7 +55,7 @@ def of_viaq(results):
 def ray():
     """One Ray for all studies of this process, as each start takes seconds."""
     ray, _ = _import_libraries()
-    with _connected(None, 2):
+    with _connected(2):
         yield ray
 
 
@@ -120,27 +120,6 @@ def test_a_killed_study_goes_on_to_the_same_results(whole, tmp_path):
     run_study(Study.from_dict(ONE_AGENT), out=folder, told=lines.append)
     assert len(lines) == 3 - complete
     assert results_in(folder) == of_viaq(whole[3])
-
-
-def test_two_nodes_have_the_same_results(whole, tmp_path):
-    """Two nodes of one core each that listen on 127.0.0.1; a process of its own, as Ray reads settings once."""
-    script = tmp_path / "nodes.py"
-    script.write_text(
-        "import os, sys\n"
-        'os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"\n'
-        "import yaml\n"
-        "from ray.cluster_utils import Cluster\n"
-        "from viapoint.training import Study, run_study\n"
-        'node = {"num_cpus": 1, "include_dashboard": False, "node_ip_address": "127.0.0.1"}\n'
-        "cluster = Cluster(initialize_head=True, head_node_args=node)\n"
-        'cluster.add_node(num_cpus=1, node_ip_address="127.0.0.1")\n'
-        "run_study(Study.from_yaml(sys.argv[1]), out=sys.argv[2], address=cluster.address)\n"
-        "cluster.shutdown()\n"
-    )
-    (tmp_path / "study.yaml").write_text(yaml.safe_dump(ONE_AGENT))
-    words = [sys.executable, script, tmp_path / "study.yaml", tmp_path / "out"]
-    subprocess.run(words, check=True, timeout=300, capture_output=True)
-    assert results_in(tmp_path / "out") == of_viaq(whole[3])
 
 
 def test_a_search_writes_its_best_settings_and_a_command_for_them(ray, tmp_path):

@@ -586,7 +586,5 @@ class StudyConfig(Config):
     file: tyro.conf.Positional[Path]  # YAML file that describes the study (docs/studies.md).
     out: Path | None = None
     """Folder of runs and results; default: the one in the file, or runs/<name of the file>."""
-    address: str | None = None
-    """Address HOST:PORT of a Ray cluster; default: a Ray of its own on this machine."""
     workers: int | None = None
     """Number of trials at the same time on this machine; default: as many as the cores allow."""

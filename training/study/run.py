@@ -6,7 +6,6 @@ import dataclasses
 import json
 import os
 import signal
-import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -60,7 +59,7 @@ class StudyFailedError(Exception):
 def run(config: StudyConfig) -> None:
     """Run a study from its file, and print where its tables are."""
     study = Study.from_yaml(config.file)
-    table = run_study(study, out=config.out, address=config.address, workers=config.workers, told=print)
+    table = run_study(study, out=config.out, workers=config.workers, told=print)
     if len(table):
         print(markdown(table, study.name))
     print(f"tables and figures: {config.out or study.out}")
@@ -70,19 +69,18 @@ def run_study(
     study: Study,
     *,
     out: str | Path | None = None,
-    address: str | None = None,
     workers: int | None = None,
     told: Told = lambda line: None,
 ) -> pd.DataFrame:
     """Run what a study has not run yet, and write its tables.
 
-    Ray places the trials. The same call continues a study that was stopped or killed: complete trials are kept,
-    and interrupted trainings go on from their last checkpoints.
+    Ray places the trials: the one that the process is connected to, or one of this machine. The same call continues a
+    study that was stopped or killed: complete trials are kept, and interrupted trainings go on from their last
+    checkpoints.
 
     Args:
         study: Environments, agents, baselines and searches.
         out: Folder of runs and results; that of the study if not given.
-        address: Address HOST:PORT of a Ray cluster whose nodes see the folder; a Ray of this machine if not given.
         workers: Number of trials at the same time on this machine; as many as the cores allow if not given.
         told: Function of one line for each trial that ends.
 
@@ -91,7 +89,7 @@ def run_study(
 
     Raises:
         ImportError: Ray, or for a search Optuna, is not installed.
-        ValueError: A trial cannot be made, the folder holds something else, or there is no such cluster.
+        ValueError: A trial cannot be made, or the folder holds something else.
         StudyFailedError: Some trials failed.
 
     Example:
@@ -116,7 +114,7 @@ def run_study(
         told(
             f"{len(missing)} trials and {len(searches)} searches to do; Ctrl-C stops, the same command goes on"
         )
-        with _connected(address, workers):
+        with _connected(workers):
             failed += _run_trials(missing, folder, told)
             for search in searches:
                 failed += _search(search, folder, workers, told)
@@ -270,28 +268,25 @@ def _import_libraries() -> tuple[Any, Any]:
 
 
 @contextmanager
-def _connected(address: str | None, workers: int | None) -> Iterator[None]:
-    """Connect to a cluster, or start a Ray of this machine that listens on 127.0.0.1 alone and ends with the study."""
-    loopback = address is None or address.startswith(("127.0.0.1:", "localhost:"))
-    if loopback:  # otherwise Ray replaces 127.0.0.1 by another address of the machine
-        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+def _connected(workers: int | None) -> Iterator[None]:
+    """Start a Ray of this machine that listens on 127.0.0.1 alone and ends with the study, if there is none."""
+    # Otherwise Ray replaces 127.0.0.1 by another address of the machine.
+    os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     ray, _ = _import_libraries()
     if ray.is_initialized():
         yield
         return
-    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-    if address is None:
-        settings |= {"num_cpus": workers, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
     try:
-        if address is not None:  # Ray itself tries for minutes
-            host, _, port = address.rpartition(":")
-            socket.create_connection((host, int(port)), timeout=10.0).close()
-        ray.init(address=address or "local", **settings)
+        ray.init(
+            address="local",
+            num_cpus=workers,
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level="ERROR",
+            _node_ip_address="127.0.0.1",
+        )
     except (OSError, RuntimeError, ValueError) as error:
-        if address is None:
-            raise ValueError(f"Ray cannot be started: {_one_line(error)}") from None
-        advice = "`ray start --head` starts one, and one that has a token needs RAY_AUTH_MODE=token"
-        raise ValueError(f"no Ray cluster at {address} ({_one_line(error)}); {advice}") from None
+        raise ValueError(f"Ray cannot be started: {_one_line(error)}") from None
     try:
         yield
     finally:
