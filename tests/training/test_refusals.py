@@ -65,6 +65,8 @@ CONFIGURATIONS = [
     *((TrainConfig, {"n_envs": number}) for number in (0, True, 10**9)),
     *((TrainConfig, {name: 0}) for name in ("n_timesteps", "checkpoint_every", "eval_scenes")),
     (TrainConfig, {"env_kwargs": ("n_via",)}),
+    (TrainConfig, {"env_kwargs": {"sensor": object()}}),
+    (TrainConfig, {"env_kwargs": {"arm": dataclasses.replace(arm_of("panda"), home=np.zeros(7))}}),
     *((TrainConfig, {"env_kwargs": {name: 1}}) for name in ELSEWHERE),
     (TrainConfig, {"hyperparameters": 5}),
     *((TrainConfig, {"stop_when_stalled": share}) for share in (0.0, 1.0, True, "0.3", math.nan)),

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import viapoint.envs
 from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import TERMS as TERMS
+from viapoint.training.io.files import as_plain
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
@@ -51,12 +52,11 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
             f"the environment must be one of this package, made by its id, got {inner if spec is None else spec.id}"
         )
     check_unwrapped(inner)
-    usual = gym.spec(spec.id).kwargs
-    return spec.id, {
-        name: value
-        for name, value in spec.kwargs.items()
-        if name not in ("render_mode", "threads") and (name not in usual or usual[name] != value)
-    }
+    registered = gym.spec(spec.id)
+    given = {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
+    usual = {**registered.kwargs, "max_episode_steps": registered.max_episode_steps}
+    others = [name for name in given if name not in usual or as_plain(given[name]) != as_plain(usual[name])]
+    return spec.id, {name: given[name] for name in others if name not in ("render_mode", "threads")}
 
 
 def check_unwrapped(env: VecEnv) -> None:
