@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import math
 from pathlib import Path
 
@@ -134,13 +135,16 @@ UNTRAINABLE = [
     *({"algo": algo, "hyperparameters": values} for algo, values in HYPERPARAMETERS),
     {"env_kwargs": {"colour": 1}},
     {"env_kwargs": {"n_via": -1}},
+    *({"callback": given} for given in (5, "stop", [print])),
 ]
 
 
 @pytest.mark.parametrize("changes", UNTRAINABLE)
 def test_what_cannot_be_trained_leaves_no_folder(changes, tmp_path):
+    callback = changes.get("callback")
+    settings = {name: value for name, value in changes.items() if name != "callback"}
     with pytest.raises(ValueError):
-        train(TrainConfig(out=tmp_path / "runs" / "run", n_timesteps=1, n_envs=2, **changes))
+        train(TrainConfig(out=tmp_path / "runs" / "run", n_timesteps=1, n_envs=2, **settings), callback)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -341,7 +345,10 @@ def test_folders_that_are_no_runs(tmp_path):
             call()
     with pytest.raises(BadFileError, match="--resume"):
         Run.create(TrainConfig(out=run.folder))
-    for content in ('{"env": "viapoint/Nothing-v0"}', '{"colour": "red"}', "{"):
+    written = json.loads((run.folder / "config.json").read_text())
+    others = [{**written, "env": "viapoint/Nothing-v0"}, {**written, "colour": "red"}, {}]
+    del written["algo"]
+    for content in (*map(json.dumps, [*others, written]), "{"):
         (run.folder / "config.json").write_text(content)
         with pytest.raises(BadFileError):
             Run(run.folder)

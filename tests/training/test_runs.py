@@ -319,6 +319,30 @@ def test_a_training_leaves_foreign_files_in_its_folder_alone(tmp_path):
     assert all((folder / name).read_bytes() == NOTES for name in foreign)
 
 
+def test_a_run_that_has_lost_files_does_not_go_on(tmp_path, capsys):
+    folder = tmp_path / "run"
+    train(tiny(folder, n_timesteps=32, eval_every=16, eval_scenes=4))
+    curve, before = folder / "learning_curve.jsonl", (folder / "config.json").read_bytes()
+    whole = curve.read_bytes()
+
+    def longer():
+        return train(TrainConfig(out=folder, resume=True, n_timesteps=48, progress=False))
+
+    for content in (b"[]", b"{}", whole[:-9], b"\xff", b'{"decisions": 0, "success": 1}'):
+        curve.write_bytes(content)
+        for refused in (lambda: repr(Run(folder)), longer):
+            with pytest.raises(BadFileError, match=r"learning_curve\.jsonl"):
+                refused()
+    curve.write_bytes(whole)
+    (folder / "checkpoints").rename(tmp_path / "away")
+    with pytest.raises(BadFileError, match="no checkpoint"):
+        longer()
+    assert (folder / "config.json").read_bytes() == before
+    (folder / "final").rename(tmp_path / "final")  # as if it had been killed before the first checkpoint
+    assert longer().decisions == 48
+    assert "begins anew" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["final/notes.txt", "final/thesis/a.tex", "final/model.json", "final"])
 def test_a_training_keeps_a_model_with_foreign_files_and_goes_on(name, tmp_path):
     folder = tmp_path / "run"
