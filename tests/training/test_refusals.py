@@ -13,7 +13,7 @@ from gymnasium.wrappers import FlattenObservation, NormalizeObservation, Rescale
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecExtractDictObs, VecNormalize
+from stable_baselines3.common.vec_env import VecExtractDictObs, VecFrameStack, VecNormalize
 from tasks import JUMPS, MOVING, PANDA, REACH, SENSED, STEP
 from tasks import PLANE as ENV
 
@@ -211,7 +211,7 @@ class Decides:
 ZERO = np.zeros((2, 3))
 CALLS = [
     *(lambda name=name: make_method(name, ENV) for name in ("magic", "search", "search3", "sobol0", "unrevised")),
-    *(lambda name=name: make_method(name, MOVING) for name in ("constant", "random16", "ompl")),
+    *(lambda name=name: make_method(name, MOVING) for name in ("constant", "rest:ompl", "ompl")),
     lambda: SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2, replay_buffer_class=HerReplayBuffer),
     lambda: benchmark_planner("search99999999999"),
     *(lambda more=more: GeometrySearch(ENV, **more) for more in (
@@ -269,10 +269,11 @@ CALLS = [
     *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, SENSED)),
     lambda: ViaQ("ViaQPolicy", make_vec_env("Pendulum-v1")),
     *(lambda wrapper=wrapper: ViaQ("ViaQPolicy", make_vec_env(ENV, 2, wrapper_class=wrapper))
-      for wrapper in (FlattenObservation, lambda env: RescaleAction(env, -2.0, 2.0))),
+      for wrapper in (FlattenObservation, lambda env: RescaleAction(env, np.float32(-2), np.float32(2)))),
     lambda: sensed(ranges=np.full((2, 192), 50.0)),
     lambda: evaluate(load_agent(SENSED), scenes="validation", n_scenes=2, env_kwargs={"sensor": shorter()}),
-    lambda: ViaQ("ViaQPolicy", VecNormalize(ViaVecEnv(ENV, 2))),
+    *(lambda wrapped=wrapped: ViaQ("ViaQPolicy", wrapped)
+      for wrapped in (VecNormalize(ViaVecEnv(ENV, 2)), VecFrameStack(ViaVecEnv(ENV, 2), 2))),
     lambda: ViaRank("ViaRankPolicy", ViaVecEnv(ENV, 1)),
     *(lambda labels=labels: ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1), labels=labels)
       for labels in (100, "all")),
@@ -330,6 +331,11 @@ def test_what_copies_of_an_environment_cannot_share(call, error, env):
     env.reset()
 
 
+def test_an_environment_of_another_task_is_named():
+    with pytest.raises(ValueError, match=f"{ENV}, .*{PANDA} {{'n_via': 2}}"):
+        load_agent(ENV, env=ViaVecEnv(PANDA, 1, n_via=2))
+
+
 def test_folders_that_are_no_runs(tmp_path):
     run = Run.create(TrainConfig(out=tmp_path / "run"))
     for call in (
@@ -383,6 +389,11 @@ COMMANDS = [
     (f"evaluate --env {SENSED} --baselines search16 --env-kwargs sensor=nose", "hand_rays"),
     (f"evaluate --env {ENV} --json /proc/x", "--json /proc/x cannot be written"),
     (f"evaluate {REACH} --baselines unrevised", "unrevised"),
+    (f"evaluate --env {ENV} --baselines untrained", "untrained needs an agent"),
+    *(
+        (f"evaluate --env {ENV} --baselines {name}", f"{name} needs a task with a sensor")
+        for name in ("points:search16", "cautious16")
+    ),
     *((f"fit nothing.csv --n-via {numbers}", "--n-via must be") for numbers in ("2 1", "0 1 2", "9", "-1")),
     ("fit nothing.csv", "nothing.csv"),
     (f"paper --agent {find_model('viapoint/PlanarReach-v0')}", "PlanarReach"),

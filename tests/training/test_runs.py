@@ -326,7 +326,7 @@ def test_a_run_that_has_lost_files_does_not_go_on(tmp_path, capsys):
     whole = curve.read_bytes()
 
     def longer():
-        return train(TrainConfig(out=folder, resume=True, n_timesteps=48, progress=False))
+        return train(TrainConfig(out=folder, resume=True, n_timesteps=40, progress=False))
 
     for content in (b"[]", b"{}", whole[:-9], b"\xff", b'{"decisions": 0, "success": 1}'):
         curve.write_bytes(content)
@@ -339,7 +339,7 @@ def test_a_run_that_has_lost_files_does_not_go_on(tmp_path, capsys):
         longer()
     assert (folder / "config.json").read_bytes() == before
     (folder / "final").rename(tmp_path / "final")  # as if it had been killed before the first checkpoint
-    assert longer().decisions == 48
+    assert "48 of 48 decisions" in repr(longer())  # rounds are whole
     assert "begins anew" in capsys.readouterr().err
 
 

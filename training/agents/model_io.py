@@ -25,12 +25,7 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.utils import (
-    ConstantSchedule,
-    FloatSchedule,
-    LinearSchedule,
-    check_for_correct_spaces,
-)
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn.modules.module import register_module_parameter_registration_hook
 from typeguard import TypeCheckError, check_type
@@ -49,7 +44,7 @@ from viapoint.training.io.files import (
     write_json,
 )
 from viapoint.training.planning.candidates import MOST_CANDIDATES, MOST_ROUNDS
-from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments
+from viapoint.training.rollouts.vec_env import ViaVecEnv, check_spaces, env_arguments
 
 ACTIVATIONS = (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
 # Classes that model files name, by kind and name
@@ -153,7 +148,7 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
             if env is None:
                 hyperparameters = _to_decide(hyperparameters)
             else:
-                check_for_correct_spaces(env, own.observation_space, own.action_space)
+                check_spaces(own, env)
             model = build(record["algorithm"], record["policy"], env or own, hyperparameters)
         model.num_timesteps = int(record["num_timesteps"])
     except BadFileError:

@@ -219,7 +219,7 @@ class TrainConfig(Config):
     seed: int = 0
     """Seed of all random numbers."""
     n_timesteps: int | None = None
-    """Decisions; default: the preset's."""
+    """Decisions, in whole rounds of all environments; default: the preset's."""
     stop_when_stalled: float | None = None
     """Stop if success stalls for this share of decisions."""
     n_envs: int | None = None
@@ -360,7 +360,7 @@ class EvaluateConfig(AgentConfig):
     """
 
     baselines: tuple[str, ...] = USUAL_BASELINES
-    """Some of straight, random, random16, random80, ompl, search512 or another number (the best of that many computed
+    """Some of straight, random, ompl, search512 or another number (the best of that many computed
     plans), sobol512 (of fixed plans); with an agent, untrained (its network before training); in tasks with replanning,
     unrevised (the first plan alone)."""
     checks: tuple[int, ...] = (0,)

@@ -94,7 +94,7 @@ class Run:
         rate = f", success {100.0 * curve[-1]['success']['rate']:.1f} % on validation scenes" if curve else ""
         return (
             f"Run({str(self.folder)!r}: {config.algo} on {config.env}, seed {config.seed}, "
-            f"{self.decisions} of {config.total_timesteps} decisions{stalled}{rate})"
+            f"{self.decisions} of {max(self.decisions, config.total_timesteps)} decisions{stalled}{rate})"
         )
 
     @classmethod

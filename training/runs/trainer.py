@@ -355,8 +355,9 @@ class RunCallback(CallbackList):
         self.run.write_curve(self.curve)
         if self.config.progress and self._bar.disable:
             rate = 100.0 * record["success"]["rate"]
+            total = max(self.num_timesteps, self.config.total_timesteps)  # rounds are whole
             print(
-                f"{self.num_timesteps} of {self.config.total_timesteps} decisions: success {rate:.1f} % in validation",
+                f"{self.num_timesteps} of {total} decisions: success {rate:.1f} % in validation",
                 file=sys.stderr,
                 flush=True,
             )
