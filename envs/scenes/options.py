@@ -130,6 +130,8 @@ def _shapes(value: Any, sampler: SceneSampler, number: int) -> list[list[Shape]]
     """Return the given obstacles of N scenes."""
     if isinstance(value, str):
         value = obstacles_from_json(value)
+    elif isinstance(value, Sequence):
+        value = [obstacles_from_json(each) if isinstance(each, str) else each for each in value]
     several = (
         isinstance(value, Sequence) and bool(value) and all(isinstance(each, list | tuple) for each in value)
     )

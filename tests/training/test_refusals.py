@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import math
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from gymnasium.wrappers import FlattenObservation, NormalizeObservation, Rescale
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecExtractDictObs, VecNormalize
+from stable_baselines3.common.vec_env import VecExtractDictObs, VecFrameStack, VecNormalize
 from tasks import JUMPS, MOVING, PANDA, REACH, SENSED, STEP
 from tasks import PLANE as ENV
 
@@ -65,6 +66,8 @@ CONFIGURATIONS = [
     *((TrainConfig, {"n_envs": number}) for number in (0, True, 10**9)),
     *((TrainConfig, {name: 0}) for name in ("n_timesteps", "checkpoint_every", "eval_scenes")),
     (TrainConfig, {"env_kwargs": ("n_via",)}),
+    (TrainConfig, {"env_kwargs": {"sensor": object()}}),
+    (TrainConfig, {"env_kwargs": {"arm": dataclasses.replace(arm_of("panda"), home=np.zeros(7))}}),
     *((TrainConfig, {"env_kwargs": {name: 1}}) for name in ELSEWHERE),
     (TrainConfig, {"hyperparameters": 5}),
     *((TrainConfig, {"stop_when_stalled": share}) for share in (0.0, 1.0, True, "0.3", math.nan)),
@@ -132,13 +135,16 @@ UNTRAINABLE = [
     *({"algo": algo, "hyperparameters": values} for algo, values in HYPERPARAMETERS),
     {"env_kwargs": {"colour": 1}},
     {"env_kwargs": {"n_via": -1}},
+    *({"callback": given} for given in (5, "stop", [print])),
 ]
 
 
 @pytest.mark.parametrize("changes", UNTRAINABLE)
 def test_what_cannot_be_trained_leaves_no_folder(changes, tmp_path):
+    callback = changes.get("callback")
+    settings = {name: value for name, value in changes.items() if name != "callback"}
     with pytest.raises(ValueError):
-        train(TrainConfig(out=tmp_path / "runs" / "run", n_timesteps=1, n_envs=2, **changes))
+        train(TrainConfig(out=tmp_path / "runs" / "run", n_timesteps=1, n_envs=2, **settings), callback)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -205,7 +211,7 @@ class Decides:
 ZERO = np.zeros((2, 3))
 CALLS = [
     *(lambda name=name: make_method(name, ENV) for name in ("magic", "search", "search3", "sobol0", "unrevised")),
-    *(lambda name=name: make_method(name, MOVING) for name in ("constant", "random16", "ompl")),
+    *(lambda name=name: make_method(name, MOVING) for name in ("constant", "rest:ompl", "ompl")),
     lambda: SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2, replay_buffer_class=HerReplayBuffer),
     lambda: benchmark_planner("search99999999999"),
     *(lambda more=more: GeometrySearch(ENV, **more) for more in (
@@ -263,12 +269,13 @@ CALLS = [
     *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, SENSED)),
     lambda: ViaQ("ViaQPolicy", make_vec_env("Pendulum-v1")),
     *(lambda wrapper=wrapper: ViaQ("ViaQPolicy", make_vec_env(ENV, 2, wrapper_class=wrapper))
-      for wrapper in (FlattenObservation, lambda env: RescaleAction(env, np.float32(-2.0), np.float32(2.0)))),
+      for wrapper in (FlattenObservation, lambda env: RescaleAction(env, np.float32(-2), np.float32(2)))),
     lambda: sensed(ranges=np.full((2, 192), 50.0)),
     lambda: evaluate(load_agent(SENSED), scenes="validation", n_scenes=2, env_kwargs={"sensor": shorter()}),
     *(lambda changes=changes: evaluate(ENV, scenes="validation", n_scenes=2, env_kwargs=changes)
       for changes in ({"shapes": ["box", "cylinder"]}, {"duration_range": (0.3, 0.6)}, {"n_obstacles": 8})),
-    lambda: ViaQ("ViaQPolicy", VecNormalize(ViaVecEnv(ENV, 2))),
+    *(lambda wrapped=wrapped: ViaQ("ViaQPolicy", wrapped)
+      for wrapped in (VecNormalize(ViaVecEnv(ENV, 2)), VecFrameStack(ViaVecEnv(ENV, 2), 2))),
     lambda: ViaRank("ViaRankPolicy", ViaVecEnv(ENV, 1)),
     *(lambda labels=labels: ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1), labels=labels)
       for labels in (100, "all")),
@@ -326,6 +333,11 @@ def test_what_copies_of_an_environment_cannot_share(call, error, env):
     env.reset()
 
 
+def test_an_environment_of_another_task_is_named():
+    with pytest.raises(ValueError, match=f"{ENV}, .*{PANDA} {{'n_via': 2}}"):
+        load_agent(ENV, env=ViaVecEnv(PANDA, 1, n_via=2))
+
+
 def test_folders_that_are_no_runs(tmp_path):
     run = Run.create(TrainConfig(out=tmp_path / "run"))
     for call in (
@@ -341,7 +353,10 @@ def test_folders_that_are_no_runs(tmp_path):
             call()
     with pytest.raises(BadFileError, match="--resume"):
         Run.create(TrainConfig(out=run.folder))
-    for content in ('{"env": "viapoint/Nothing-v0"}', '{"colour": "red"}', "{"):
+    written = json.loads((run.folder / "config.json").read_text())
+    others = [{**written, "env": "viapoint/Nothing-v0"}, {**written, "colour": "red"}, {}]
+    del written["algo"]
+    for content in (*map(json.dumps, [*others, written]), "{"):
         (run.folder / "config.json").write_text(content)
         with pytest.raises(BadFileError):
             Run(run.folder)
@@ -376,6 +391,11 @@ COMMANDS = [
     (f"evaluate --env {SENSED} --baselines search16 --env-kwargs sensor=nose", "hand_rays"),
     (f"evaluate --env {ENV} --json /proc/x", "--json /proc/x cannot be written"),
     (f"evaluate {REACH} --baselines unrevised", "unrevised"),
+    (f"evaluate --env {ENV} --baselines untrained", "untrained needs an agent"),
+    *(
+        (f"evaluate --env {ENV} --baselines {name}", f"{name} needs a task with a sensor")
+        for name in ("points:search16", "cautious16")
+    ),
     *((f"fit nothing.csv --n-via {numbers}", "--n-via must be") for numbers in ("2 1", "0 1 2", "9", "-1")),
     ("fit nothing.csv", "nothing.csv"),
     (f"paper --agent {find_model('viapoint/PlanarReach-v0')}", "PlanarReach"),

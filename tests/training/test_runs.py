@@ -10,9 +10,10 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3.common.env_util import make_vec_env
 from tasks import PLANE, REACH
 
-from viapoint.envs import arm_of, register_arm
+from viapoint.envs import RewardWeights, Sensor, arm_of, register_arm
 from viapoint.envs.arms import registry
 from viapoint.training import Run, TrainConfig, ViaVecEnv, load_agent, train
 from viapoint.training.agents.agent import find_model
@@ -55,6 +56,27 @@ def test_a_model_decides_the_same_after_a_round_trip(algo, env, tmp_path):
     written = json.loads((tmp_path / "model.json").read_text())
     assert written.pop("weights_sha256")
     assert describe(load_model(tmp_path, env)) == written
+
+
+OBJECTS = [
+    {"sensor": Sensor(columns=16)},
+    {"reward_weights": RewardWeights(success=2.0)},
+    {"duration_range": np.array([0.6, 1.0]), "n_obstacles": np.array([1, 3]), "max_episode_steps": 2},
+    {"arm": arm_of("planar")},
+]
+
+
+@pytest.mark.parametrize("make", [ViaVecEnv, lambda *args, **kwargs: make_vec_env(*args, env_kwargs=kwargs)])
+@pytest.mark.parametrize("kwargs", OBJECTS)
+def test_arguments_of_an_environment_may_be_objects(make, kwargs, tmp_path):
+    agent = new("sac", make("viapoint/Obstacles-v0", 1, **{"arm": "planar", **kwargs}))
+    agent.save(tmp_path / "model")
+    (task,), loaded = agent.get_env().get_attr("task"), load_agent(tmp_path / "model")
+    assert loaded.get_env().get_attr("task")[0].as_dict() == task.as_dict()
+    assert loaded.env_kwargs.get("max_episode_steps") == kwargs.get("max_episode_steps")
+    config = TrainConfig(env=agent.env_id, env_kwargs={"arm": "planar", **kwargs})
+    assert config.env_kwargs == loaded.env_kwargs
+    assert config.task.as_dict() == task.as_dict()
 
 
 def test_an_agent_of_ones_own_arm_is_loaded_by_whoever_makes_the_arm_known(tmp_path, monkeypatch):
@@ -295,6 +317,30 @@ def test_a_training_leaves_foreign_files_in_its_folder_alone(tmp_path):
     run = train(TrainConfig(out=folder, resume=True, n_timesteps=128, progress=False))
     assert [int(path.stem) for path in run.checkpoints()] == [112, 128]
     assert all((folder / name).read_bytes() == NOTES for name in foreign)
+
+
+def test_a_run_that_has_lost_files_does_not_go_on(tmp_path, capsys):
+    folder = tmp_path / "run"
+    train(tiny(folder, n_timesteps=32, eval_every=16, eval_scenes=4))
+    curve, before = folder / "learning_curve.jsonl", (folder / "config.json").read_bytes()
+    whole = curve.read_bytes()
+
+    def longer():
+        return train(TrainConfig(out=folder, resume=True, n_timesteps=40, progress=False))
+
+    for content in (b"[]", b"{}", whole[:-9], b"\xff", b'{"decisions": 0, "success": 1}'):
+        curve.write_bytes(content)
+        for refused in (lambda: repr(Run(folder)), longer):
+            with pytest.raises(BadFileError, match=r"learning_curve\.jsonl"):
+                refused()
+    curve.write_bytes(whole)
+    (folder / "checkpoints").rename(tmp_path / "away")
+    with pytest.raises(BadFileError, match="no checkpoint"):
+        longer()
+    assert (folder / "config.json").read_bytes() == before
+    (folder / "final").rename(tmp_path / "final")  # as if it had been killed before the first checkpoint
+    assert "48 of 48 decisions" in repr(longer())  # rounds are whole
+    assert "begins anew" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["final/notes.txt", "final/thesis/a.tex", "final/model.json", "final"])

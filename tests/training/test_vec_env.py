@@ -7,7 +7,7 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.monitor import Monitor
 from tasks import PLANE, STEP
 
-from viapoint.envs import scene_from_json, scene_to_json
+from viapoint.envs import obstacles_to_json, scene_from_json, scene_to_json
 from viapoint.training import TrainConfig, ViaVecEnv, evaluate, load_agent, train
 from viapoint.training.io.files import BadFileError
 
@@ -102,9 +102,14 @@ def test_seeds_options_and_attributes(env):
     ]
     env.set_options(scenes[0])
     assert np.ptp(env.reset()["goal"], axis=0).max() == 0.0
-    env.set_options(scenes)
-    for name, part in env.reset().items():
-        np.testing.assert_allclose(part, first[name], atol=1e-6)
+    texts = [{**scene, "obstacles": obstacles_to_json(scene["obstacles"])} for scene in scenes]
+    for options in (scenes, texts):
+        env.set_options(options)
+        for name, part in env.reset().items():
+            np.testing.assert_allclose(part, first[name], atol=1e-6)
+    env.set_options({**texts[0], "reset_mask": np.arange(6) > 3})
+    some = env.reset()["obstacles"]
+    np.testing.assert_allclose(some, first["obstacles"][[0, 1, 2, 3, 0, 0]], atol=1e-6)
     assert env.get_attr("num_envs", [-1, 5]) == [6, 6]
     env.set_attr("mark", 1)
     assert env.get_attr("mark", indices=[2, 3]) == [1, 1]

@@ -25,25 +25,26 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.utils import (
-    ConstantSchedule,
-    FloatSchedule,
-    LinearSchedule,
-    check_for_correct_spaces,
-)
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn.modules.module import register_module_parameter_registration_hook
 from typeguard import TypeCheckError, check_type
 
-from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.stored import keep_arm, with_kept_arm
 from viapoint.envs.common.validation import is_number
 from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES, Task
 from viapoint.training.agents.extractors import SceneExtractor
-from viapoint.training.io.files import BadFileError, read_arrays, read_json, write_arrays, write_json
+from viapoint.training.io.files import (
+    BadFileError,
+    as_plain,
+    read_arrays,
+    read_json,
+    write_arrays,
+    write_json,
+)
 from viapoint.training.planning.candidates import MOST_CANDIDATES, MOST_ROUNDS
-from viapoint.training.rollouts.vec_env import ViaVecEnv, env_arguments
+from viapoint.training.rollouts.vec_env import ViaVecEnv, check_spaces, env_arguments
 
 ACTIVATIONS = (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
 # Classes that model files name, by kind and name
@@ -147,7 +148,7 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
                 hyperparameters = _to_decide(hyperparameters)
             else:
                 check_same_task(*(each.get_attr("task", [0])[0] for each in (own, env)))
-                check_for_correct_spaces(env, own.observation_space, own.action_space)
+                check_spaces(own, env)
             model = build(record["algorithm"], record["policy"], env or own, hyperparameters)
         model.num_timesteps = int(record["num_timesteps"])
     except BadFileError:
@@ -457,13 +458,7 @@ def _encode(value: Any) -> Any:
         return [value.frequency, value.unit.value]
     if isinstance(value, list | tuple):
         return [_encode(each) for each in value]
-    if isinstance(value, np.generic):
-        return value.item()
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, Arm):
-        return value.name  # of an arm; whoever loads the model makes it known first
-    raise ValueError(f"a {type(value).__name__} cannot be written as JSON: {value!r}")
+    return as_plain(value)  # an arm of one's own by its name; whoever loads the model makes it known first
 
 
 def _decode(value: Any, size: int) -> Any:

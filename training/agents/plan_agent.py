@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.utils import check_for_correct_spaces, is_vectorized_observation
+from stable_baselines3.common.utils import is_vectorized_observation
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
@@ -21,7 +21,7 @@ from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
 from viapoint.training.agents.model_io import check_arguments, check_same_task
 from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
-from viapoint.training.rollouts.vec_env import check_unwrapped
+from viapoint.training.rollouts.vec_env import check_spaces, check_unwrapped
 
 N_ELITES = 8  # Number of candidates around which each round of refinement samples
 # Standard deviation of the first round of refinement, in the action space; each round halves it
@@ -245,7 +245,8 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
             ValueError: Spaces, or parts of the task that the policy needs, differ from those of the agent.
         """
         wrapped = self._wrap_env(env, self.verbose)
-        check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
+        if self.env is not None:
+            check_spaces(self.env, wrapped)
         self._check_env(wrapped)
         super().set_env(wrapped, force_reset)
 

@@ -13,12 +13,11 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args
 
-import numpy as np
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.registry import ARM_FILES, arm_names, arm_of
+from viapoint.envs.arms.registry import ARM_FILES, arm_of
 from viapoint.envs.common.validation import is_number
 from viapoint.envs.registration import ENV_IDS
 from viapoint.envs.task import Task
@@ -35,7 +34,7 @@ from viapoint.training.config.checks import (
     unknown_name,
 )
 from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of, usual_algorithm
-from viapoint.training.io.files import parse_yaml
+from viapoint.training.io.files import as_plain, parse_yaml
 from viapoint.training.planning.search import registered_task
 
 REGISTRY = ConstructorRegistry()  # Ways in which the command line reads numbers and paths
@@ -131,28 +130,18 @@ ARM_ENVS = {"planar": DEFAULT_ENV, "panda": "viapoint/PandaObstacles-v0"}
 def _plain(name: str, values: Any) -> Any:
     """Return values as JSON has them; a file of an arm is named by its whole path, as runs go on in other folders."""
     try:
-        plain = json.loads(json.dumps(values, default=_as_json))
+        plain = as_plain(values)
     except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"{name} must be numbers, texts, lists and dictionaries, as files hold them, or a registered arm: {error}"
-        ) from None
+        raise ValueError(f"{name}: {error}") from None
     arm = plain.get("arm") if isinstance(plain, dict) else None
+    given = values["arm"] if isinstance(arm, str) else None
+    if isinstance(given, Arm) and not given.file and arm_of(arm) is not given:
+        raise ValueError(
+            f"{name}: register_arm makes arm {arm!r} known by its name, which is that of another one"
+        )
     if isinstance(arm, str) and arm.endswith(ARM_FILES):
         plain["arm"] = str(Path(arm).expanduser().resolve())
     return plain
-
-
-def _as_json(value: Any) -> Any:
-    """Return what the encoder of JSON takes for NumPy's numbers and arrays, other mappings, and arms."""
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return dict(value)
-    if isinstance(value, Arm) and value.file:
-        return value.file
-    if isinstance(value, Arm) and value.name in arm_names() and arm_of(value.name) is value:
-        return value.name
-    raise TypeError(f"got {value!r:.80}")
 
 
 def env_of_arm(arm: Arm | str | None, env: str | None) -> tuple[str | None, dict[str, Any]]:
@@ -230,7 +219,7 @@ class TrainConfig(Config):
     seed: int = 0
     """Seed of all random numbers."""
     n_timesteps: int | None = None
-    """Decisions; default: the preset's."""
+    """Decisions, in whole rounds of all environments; default: the preset's."""
     stop_when_stalled: float | None = None
     """Stop if success stalls for this share of decisions."""
     n_envs: int | None = None
@@ -371,7 +360,7 @@ class EvaluateConfig(AgentConfig):
     """
 
     baselines: tuple[str, ...] = USUAL_BASELINES
-    """Some of straight, random, random16, random80, ompl, search512 or another number (the best of that many computed
+    """Some of straight, random, ompl, search512 or another number (the best of that many computed
     plans), sobol512 (of fixed plans); with an agent, untrained (its network before training); in tasks with replanning,
     unrevised (the first plan alone)."""
     checks: tuple[int, ...] = (0,)

@@ -191,7 +191,7 @@ def evaluate(
             agent's own setting if not given.
         refine: Number of proposals that the planner refines, or several numbers, one further row each.
         baselines: Names, or objects with `name` and `decide`. Names are `untrained` (the agent's network before
-            training), `straight`, `random`, `random16`, `random80`, `plan_motion`, `ompl`, `searchN` and `sobolN` (N
+            training), `straight`, `random`, `plan_motion`, `ompl`, `searchN` and `sobolN` (N
             checked plans), in tasks with replanning `unrevised` (the first plan alone), and in tasks with a sensor
             `cautiousN` and BELIEF:METHOD, such as `thick:search512`. Where obstacles move, also PREDICTION:searchN,
             such as `reach:search512`.
@@ -238,6 +238,7 @@ def evaluate(
             methods.append(OpenLoopBaseline(first, SceneSimulation(env_id, 250, **kwargs)))
         else:
             methods.append(make_method(each, env_id, **kwargs))
+    _check_methods(methods)
     chosen = scenes_for(scenes, task, n_scenes)
     if n_scenes is not None and n_scenes > len(chosen.share):
         print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
@@ -283,8 +284,6 @@ def evaluate_methods(
     progress: Progress | None = None,
 ) -> EvaluationResult:
     """Evaluate one or more methods in the same scenes, `batch` at a time; the rest is as for :func:`evaluate`."""
-    if not methods:
-        raise ValueError("there is nothing to evaluate: give an agent or baselines")
     _check_methods(methods)
     results: list[MethodResult] = []
     opened = SceneSimulation(env_id, min(batch, len(frozen.share)), **(env_kwargs or {}))
@@ -301,7 +300,9 @@ def evaluate_methods(
 
 
 def _check_methods(methods: Sequence[Any]) -> None:
-    """Check that objects are methods, with names that tell them apart in the results."""
+    """Check that there are methods, with names that tell them apart in the results."""
+    if not methods:
+        raise ValueError("there is nothing to evaluate: give an agent or baselines")
     for each in methods:
         if not isinstance(getattr(each, "name", None), str) or not callable(getattr(each, "decide", None)):
             raise ValueError(f"methods must be names, or objects with `name` and `decide`, got {each!r}")

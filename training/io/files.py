@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.metadata
 import io
 import itertools
@@ -23,6 +24,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
+
+from viapoint.envs.arms.arm import Arm
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -156,6 +159,28 @@ def write_figure(path: Path, figure: Any, **options: Any) -> Path:
     figure.savefig(content, format=path.suffix[1:], metadata=metadata, **options)
     write_bytes(path, content.getvalue())
     return path
+
+
+def as_plain(value: Any) -> Any:
+    """Return the numbers, texts, lists and dictionaries that stand for a value in JSON; an arm is its file or name."""
+    return json.loads(json.dumps(value, default=_as_json))
+
+
+def _as_json(value: Any) -> Any:
+    """Return what the encoder of JSON takes for an object, such as an array or a sensor."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, Arm):
+        return value.file or value.name
+    if isinstance(value, Path):
+        return str(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    raise ValueError(
+        f"values must be numbers, texts, lists and dictionaries, as files hold them, got {value!r:.80}"
+    )
 
 
 def write_json(path: Path, value: Any) -> None:

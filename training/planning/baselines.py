@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
@@ -62,29 +61,17 @@ class Straight:
 
 
 class RandomVias:
-    """Best of some random actions by simulated reward; a single one is not simulated."""
+    """Uniformly random actions."""
 
-    def __init__(self, simulation: SceneSimulation, count: int) -> None:
-        self._simulation, self._count = simulation, count
+    name = "random"
+
+    def __init__(self, simulation: SceneSimulation) -> None:
+        self._size = len(simulation.task.action_names)
         self._generator = np.random.default_rng(0)  # the same actions in every evaluation
-        self.name = "random" if count == 1 else f"random{count}"
-
-    @functools.cached_property
-    def _for_one_scene(self) -> SceneSimulation:
-        """Simulation of as many actions as there are: a larger one would simulate more movements."""
-        return SceneSimulation(self._simulation.env_id, self._count, **self._simulation.kwargs)
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """Return the best of the random actions, see :class:`Method`."""
-        number = len(scenes.start)
-        size = len(self._simulation.task.action_names)
-        actions = self._generator.uniform(-1.0, 1.0, (number, self._count, size))
-        if self._count == 1:
-            return actions[:, 0]
-        every = scenes.take(np.repeat(np.arange(number), self._count))  # each scene with each action
-        simulation = self._for_one_scene if number == 1 else self._simulation
-        reward = simulation(every, actions.reshape(-1, size)).reward.reshape(number, self._count)
-        return np.asarray(actions[np.arange(number), reward.argmax(axis=-1)])
+        """Return random actions, see :class:`Method`."""
+        return self._generator.uniform(-1.0, 1.0, (len(scenes.start), self._size))
 
 
 class PlannerMethod:
@@ -262,16 +249,14 @@ PLANNERS: dict[str, Callable[[SceneSimulation], PlannerMethod]] = {
 # Factories of baselines by their names on the command line
 METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "straight": Straight,
-    "random": lambda simulation: RandomVias(simulation, 1),
-    "random16": lambda simulation: RandomVias(simulation, 16),
-    "random80": lambda simulation: RandomVias(simulation, 80),
+    "random": RandomVias,
     **PLANNERS,
 }
 
 # Factories of baselines for replanning tasks
 REPLANNING_METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
     "straight": Straight,
-    "random": lambda simulation: RandomVias(simulation, 1),
+    "random": RandomVias,
     "unrevised": lambda simulation: OpenLoopBaseline(Straight(simulation), simulation),
 }
 
@@ -308,6 +293,10 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
     found = _counted(name, counted)
     if found is not None:
         return found
+    if name == "untrained":
+        raise ValueError("untrained needs an agent, whose network it is before training")
+    if not sensed and (belief in BELIEFS or _counted(name, SENSED)):
+        raise ValueError(f"{name} needs a task with a sensor: it plans with what is seen")
     names = [*known, *(f"{each}N" for each in counted), "untrained"]  # N plans are checked
     names += [f"{each}:METHOD" for each in BELIEFS] if sensed else []
     names += [f"{each}:searchN" for each in PREDICTIONS] if task.replanning and task.moving_obstacles else []

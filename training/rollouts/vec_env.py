@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import viapoint.envs
 from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import TERMS as TERMS
+from viapoint.training.io.files import as_plain
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
 
@@ -38,11 +39,8 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
     """
     if env is None:
         raise ValueError("the environment must be one of this package, made by its id, got none")
+    check_unwrapped(env)
     inner = env.unwrapped
-    if env.observation_space != inner.observation_space:
-        raise ValueError(
-            f"{type(env).__name__} changes observations: models know an environment by its id alone"
-        )
     if isinstance(inner, ViaVecEnv):
         return inner.env_id, dict(inner.env_kwargs)
     spec: Any = inner.get_attr("spec", [0])[0]
@@ -50,23 +48,34 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
         raise ValueError(
             f"the environment must be one of this package, made by its id, got {inner if spec is None else spec.id}"
         )
-    check_unwrapped(inner)
-    usual = gym.spec(spec.id).kwargs
-    return spec.id, {
-        name: value
-        for name, value in spec.kwargs.items()
-        if name not in ("render_mode", "threads") and (name not in usual or usual[name] != value)
-    }
+    registered = gym.spec(spec.id)
+    given = {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
+    usual = {**registered.kwargs, "max_episode_steps": registered.max_episode_steps}
+    others = [name for name in given if name not in usual or as_plain(given[name]) != as_plain(usual[name])]
+    return spec.id, {name: given[name] for name in others if name not in ("render_mode", "threads")}
 
 
 def check_unwrapped(env: VecEnv) -> None:
-    """Check that no wrapper changes observations or actions of single environments; ValueError otherwise."""
+    """Check that no wrapper changes observations, or actions of single environments; ValueError otherwise."""
+    if env.observation_space != env.unwrapped.observation_space:
+        raise ValueError(
+            f"{type(env).__name__} changes observations: models know an environment by its id alone"
+        )
     for wrapper in (gym.ObservationWrapper, gym.ActionWrapper):
         if not isinstance(env.unwrapped, ViaVecEnv) and any(env.env_is_wrapped(wrapper, [0])):
             raise ValueError(
                 f"the environment must have no {wrapper.__name__}, such as FlattenObservation or RescaleAction: models "
                 "know it by its id alone"
             )
+
+
+def check_spaces(own: VecEnv, env: VecEnv) -> None:
+    """Check that an environment has the observations and actions of an agent's own one; ValueError otherwise."""
+    if (env.observation_space, env.action_space) != (own.observation_space, own.action_space):
+        trained, given = (" ".join(map(str, filter(None, env_arguments(each)))) for each in (own, env))
+        raise ValueError(
+            f"the agent decides in {trained}, whose observations or actions are others than in {given}"
+        )
 
 
 def predicted_actions(model: BaseAlgorithm, observation: Any) -> NDArray[Any]:
@@ -142,10 +151,13 @@ class ViaVecEnv(VecEnv):
         whole = isinstance(given, Sequence) and len(given) == self.num_envs
         if not whole or not all(isinstance(each, Mapping) and set(each) == set(given[0]) for each in given):
             raise ValueError(f"options must be a mapping, or a list of {self.num_envs} alike, got {given!r}")
-        options = {name: [each[name] for each in given] for name in given[0]}
+        options = dict(given[0])  # for all copies, as SB3 repeats a mapping
+        if any(each is not given[0] for each in given):
+            options = {name: [each[name] for each in given] for name in options}
         observation, _ = self.venv.reset(seed=seeds, options=options or None)
         self._reset_seeds()  # a later reset goes on with the generators
-        self._returns[:], self._lengths[:] = 0.0, 0
+        begun = options.get("reset_mask", slice(None))
+        self._returns[begun], self._lengths[begun] = 0.0, 0
         started: Observation = observation
         return started
 

@@ -27,9 +27,11 @@ from viapoint.training.agents.model_io import save_model
 from viapoint.training.config.checks import check_folder
 from viapoint.training.config.configs import TrainConfig
 from viapoint.training.io.files import (
+    LARGEST_JSON,
     UNFINISHED,
     BadFileError,
     check_ours,
+    read_bytes,
     read_json,
     tidy,
     versions,
@@ -75,6 +77,9 @@ class Run:
         self.folder = folder
         record = read_json(folder / "config.json")
         try:
+            for name in ("env", "algo", "seed", "n_timesteps"):
+                if name not in record:
+                    raise ValueError(f"{name} is missing")
             if isinstance(record.get("env_kwargs"), dict):
                 record["env_kwargs"] = with_kept_arm(record["env_kwargs"], folder)
             self.config: TrainConfig = TrainConfig(**record)
@@ -89,7 +94,7 @@ class Run:
         rate = f", success {100.0 * curve[-1]['success']['rate']:.1f} % on validation scenes" if curve else ""
         return (
             f"Run({str(self.folder)!r}: {config.algo} on {config.env}, seed {config.seed}, "
-            f"{self.decisions} of {config.total_timesteps} decisions{stalled}{rate})"
+            f"{self.decisions} of {max(self.decisions, config.total_timesteps)} decisions{stalled}{rate})"
         )
 
     @classmethod
@@ -120,10 +125,16 @@ class Run:
 
     @property
     def curve(self) -> list[dict[str, Any]]:
-        """Learning curve: one record for each evaluation."""
+        """Learning curve: one record for each evaluation; a damaged one raises BadFileError."""
         path = self.folder / "learning_curve.jsonl"
-        lines = path.read_text().splitlines() if path.exists() else []
-        return [json.loads(line) for line in lines]
+        lines = read_bytes(path, LARGEST_JSON).splitlines() if path.exists() else []
+        try:
+            records: list[dict[str, Any]] = [json.loads(line) for line in lines]
+            for record in records:
+                int(record["decisions"]), float(record["success"]["rate"]), float(record["jerk_ratio"] or 0.0)
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise BadFileError(path, f"is no learning curve ({type(error).__name__}: {error})") from None
+        return records
 
     def write_curve(self, records: list[dict[str, Any]]) -> None:
         """Replace the learning curve."""
@@ -172,7 +183,8 @@ class Run:
             Content of `extra`; None without any checkpoint.
 
         Raises:
-            BadFileError: There are checkpoints, but none is whole; the message is about the newest.
+            BadFileError: There are checkpoints, but none is whole; the message is about the newest. Or those of a
+                training that has ended are gone.
         """
         newest = None
         for path in reversed(self.checkpoints()):
@@ -183,6 +195,10 @@ class Run:
                 newest = newest or error
         if newest is not None:
             raise newest
+        if self.final.exists():
+            raise BadFileError(self.folder / "checkpoints", "holds no checkpoint to go on from")
+        if self.curve:
+            print(f"{self.folder} holds no checkpoint: the training begins anew", file=sys.stderr)
         return None
 
     @property

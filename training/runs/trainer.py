@@ -86,13 +86,17 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
         >>> run.best.name, run.final.name
         ('best', 'final')
     """
+    given = () if callback is None else callback
+    callbacks = list(given) if isinstance(given, Sequence) else [given]
+    if not all(isinstance(each, BaseCallback) for each in callbacks):
+        raise ValueError(f"callback must be one of Stable-Baselines3, or a list of them, got {callback!r}")
     with one_thread():
         if config.resume:
             run = Run(config.folder)
             with run.locked():
                 _restore_settings(run, config)
                 with _untrained_model(run.config) as model:
-                    _continue_training(run, model, callback)
+                    _continue_training(run, model, callbacks)
             return run
         check_free(config.folder)
         begun = resolved(config)
@@ -100,7 +104,7 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
         with _untrained_model(begun) as model:  # before there is a folder: what cannot be built leaves none
             run = Run.create(begun)
             with run.locked():
-                _continue_training(run, model, callback)
+                _continue_training(run, model, callbacks)
         return run
 
 
@@ -172,10 +176,9 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
         yield model
 
 
-def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> None:
+def _continue_training(run: Run, model: BaseAlgorithm, callbacks: list[BaseCallback]) -> None:
     """Train from the last checkpoint of the run to its end."""
     folder = str(run.folder / "tensorboard")
-    callbacks = [callback] if isinstance(callback, BaseCallback) else list(callback or ())
     try:
         with (
             closing(Logger(folder, [TensorBoardOutputFormat(folder)])) as logger,
@@ -186,6 +189,9 @@ def _continue_training(run: Run, model: BaseAlgorithm, callback: Callbacks) -> N
             if restored is not None:
                 monitor.restore(float(restored["seconds"]), model.num_timesteps)
             run.write_curve(monitor.curve)  # without validations after the checkpoint
+            # All else stays as it was written: an arm is named by its file, also while its copy takes its place.
+            path = run.folder / "config.json"
+            write_json(path, {**read_json(path), "n_timesteps": run.config.total_timesteps})
             remaining = run.config.total_timesteps - model.num_timesteps
             if remaining > 0 and not run.stalled:
                 _learn(model, remaining, monitor, fresh=restored is None)
@@ -223,9 +229,6 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
                 f"got {config.n_timesteps}",
             )
         run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
-        path = run.folder / "config.json"
-        # All else stays as it was written: an arm is named by its file, also while its copy takes its place.
-        write_json(path, {**read_json(path), "n_timesteps": config.n_timesteps})
     run.config = dataclasses.replace(run.config, progress=config.progress)
     began = run.versions
     others = [
@@ -352,8 +355,9 @@ class RunCallback(CallbackList):
         self.run.write_curve(self.curve)
         if self.config.progress and self._bar.disable:
             rate = 100.0 * record["success"]["rate"]
+            total = max(self.num_timesteps, self.config.total_timesteps)  # rounds are whole
             print(
-                f"{self.num_timesteps} of {self.config.total_timesteps} decisions: success {rate:.1f} % in validation",
+                f"{self.num_timesteps} of {total} decisions: success {rate:.1f} % in validation",
                 file=sys.stderr,
                 flush=True,
             )
