@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 
 from viapoint.envs.common.types import Bool, Float
-from viapoint.envs.registration import ENV_IDS, TASKS, twin_of
+from viapoint.envs.registration import TASKS
 from viapoint.envs.scenes.families_registry import scene_families
 from viapoint.envs.scenes.sampler import is_planar
 from viapoint.envs.scenes.scene import Scenes, check_scenes
@@ -230,11 +230,11 @@ def make_sets(env: tuple[str, ...] = (), sets: tuple[str, ...] = SETS, check: bo
         check: Make the sets that ship again, and compare them; the exit code is 1 if one differs by more than CLOSE.
     """
     different = 0
-    first: dict[
-        str, str
-    ] = {}  # ids of environments whose scenes differ; a set fits every task with the same scenes
-    for env_id in map(twin_of, ENV_IDS):
-        first.setdefault(str(TASKS[env_id]), env_id)
+    # Ids of environments whose scenes differ; a set fits every task with the same scenes
+    first: dict[str, str] = {}
+    for env_id, kwargs in TASKS.items():
+        if kwargs.get("decide_at") != "steps":  # tasks of control steps have the scenes of those of movements
+            first.setdefault(str(kwargs), env_id)
     for env_id in env or first.values():
         maker = Maker(env_id)
         for name in [each for each in sets if each in maker.numbers()]:

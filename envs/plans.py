@@ -222,16 +222,6 @@ class ActionLayout:
         return (*vias, "duration", *splits)
 
     @functools.cached_property
-    def units(self) -> tuple[str, ...]:
-        """Value of an action of 1 in each component."""
-        unit = "m" if self.space == "hand" else "rad"
-        low, high = self.duration_range
-        middle = f"{self.centre:.4g} s" if self.space == "hand" else f"{self.centre:.4g} times the shortest"
-        vias = [f"{scale:g} {unit}" for scale in self.via_scale] * self.n_via
-        splits = ["factor 4 between the segments before and after"] * (self.size - len(vias) - 1)
-        return (*vias, f"factor {(high / low) ** 0.5:.4g} on {middle}", *splits)
-
-    @functools.cached_property
     def centre(self) -> float:
         """Duration of the zero action, [s] in hand space, relative in joint space."""
         low, high = self.duration_range

@@ -70,13 +70,3 @@ def check_registered(env_id: str) -> None:
         raise ValueError(
             f"there is no environment {env_id!r} ({error}); `import viapoint.envs` registers {', '.join(ENV_IDS)}"
         ) from None
-
-
-def twin_of(env_id: str) -> str:
-    """Return the id of the same task with one decision for a movement; for most ids, the id itself.
-
-    Example:
-        >>> twin_of("viapoint/PlanarObstaclesStep-v0")
-        'viapoint/PlanarObstacles-v0'
-    """
-    return env_id.replace("Step-v", "-v") if env_id in TASKS else env_id

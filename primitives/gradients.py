@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import perm, prod
 from typing import Any
 
-from ._passage.cost import duration_gradient
+from ._passage_newton import duration_gradient
 from .array_api import Array
 from .trajectory import Trajectory, require_trajectory
 

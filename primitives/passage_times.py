@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 
 from ._boundary import check_durations, chosen_items, read_arguments, unit_time_ends, waypoint_shapes
-from ._passage.cost import PassageCost
-from ._passage.moving_ends import fractions_moving
-from ._passage.newton import attach_gradient, fractions_by_newton
-from ._passage.rest_to_rest import fractions_at_rest
+from ._passage_newton import PassageCost, attach_gradient, fractions_by_newton
+from ._passage_one_via import fractions_at_rest, fractions_moving
 from ._polynomial import differentiate, evaluate
 from ._weighted_solver import rounding_slack
 from .array_api import (

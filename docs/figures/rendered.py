@@ -19,7 +19,7 @@ from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Frame
 from viapoint.envs.geometry.obstacles import add_to_model, unpack
 from viapoint.envs.rendering.gl import Canvas
-from viapoint.envs.rendering.scene_view import GLOWING, PLAN, ShapeWriter
+from viapoint.envs.rendering.renderer import GLOWING, PLAN, ShapeWriter
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training import GeometrySearch, load_agent, plan_motion
 from viapoint.training.config.checks import SHIPPED_IDS

@@ -20,8 +20,7 @@ from viapoint.envs.episodes import Recorded
 from viapoint.envs.geometry.obstacles import unpack
 from viapoint.envs.outcome import Rollout
 from viapoint.envs.plans import Plan
-from viapoint.envs.rendering.renderer import picture_of
-from viapoint.envs.rendering.scene_view import FADED, Picture
+from viapoint.envs.rendering.renderer import FADED, Picture, picture_of
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollouts.rollout import Decide
 

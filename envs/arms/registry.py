@@ -15,8 +15,6 @@ from viapoint.envs.arms.load import load_arm
 from viapoint.envs.arms.stored import read_arm
 
 ARM_FILES = (".xml", ".mjcf", ".urdf")  # Suffixes of files of arms
-# Joint positions at home, [rad]: Franka's ready pose
-PANDA_HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
 
 
 @functools.cache
@@ -43,7 +41,7 @@ def panda() -> Arm:
         asset("panda.xml"),
         joints=tuple(f"joint{number}" for number in range(1, 8)),
         tool="hand",
-        home=PANDA_HOME,
+        home=(0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785),  # Franka's ready pose
         velocity_limit=(2.175,) * 4 + (2.61,) * 3,
         torque_limit=(87.0,) * 4 + (12.0,) * 3,
         # Capsules of wrist and flange are always within 2 cm, though the links never touch: the 59 spheres of VAMP's

@@ -291,30 +291,44 @@ def scene_to_json(
         >>> sorted(scene_from_json(text))
         ['goal', 'obstacles', 'start']
     """
+    return options_to_json(scene_options(scenes, arm, space, scene), env_id)
+
+
+def scene_options(scenes: Scenes, arm: Arm, space: SpaceName | None = None, scene: int = 0) -> dict[str, Any]:
+    """Return a scene as options of `reset`, arrays and a list of shapes, see :func:`scene_to_json`."""
     of_hand = (arm.space if space is None else space) == "hand"
 
-    def coordinates(joints: Float) -> list[Any]:
-        return (arm.hand(joints)[..., :2] if of_hand else joints).tolist()  # type: ignore[no-any-return]
+    def coordinates(joints: Float) -> Float:
+        return np.array(arm.hand(joints)[..., :2] if of_hand else joints)
 
-    record: dict[str, Any] = {"format": FORMAT}
-    if env_id:
-        record["env"] = env_id
-    record["start"] = coordinates(scenes.start[scene])
-    record["goal"] = coordinates(scenes.goal[scene])
-    record["obstacles"] = [shape.to_dict() for shape in unpack(scenes.obstacles, scene)]
+    options: dict[str, Any] = {
+        "start": coordinates(scenes.start[scene]),
+        "goal": coordinates(scenes.goal[scene]),
+        "obstacles": unpack(scenes.obstacles, scene),
+    }
     times = scenes.jump_times[scene]
     jumps = scenes.jumps[scene][times < NEVER]
     if len(jumps):
-        record["jumps"] = [[float(row[0]), *coordinates(row[1:])] for row in jumps]
+        options["jumps"] = np.column_stack((jumps[:, 0], coordinates(jumps[:, 1:])))
     present = scenes.obstacles.present[scene]
     turn_time = scenes.turn_time[scene][present]
     if (turn_time < NEVER).any():
         turns = np.column_stack((turn_time, scenes.turn_velocity[scene][present]))
-        record["turns"] = np.where(turn_time[:, None] < NEVER, turns, 0.0).tolist()
+        options["turns"] = np.where(turn_time[:, None] < NEVER, turns, 0.0)
     reaches = scenes.reach[scene][present]
     if reaches.any():
-        record["reaches"] = reaches.tolist()
-    return json.dumps(record, indent=1) + "\n"
+        options["reaches"] = reaches
+    return options
+
+
+def options_to_json(options: Mapping[str, Any], env_id: str = "") -> str:
+    """Return options of `reset`, arrays and shapes, as JSON, see :func:`scene_to_json`."""
+
+    def plain(value: Any) -> Any:
+        return value.to_dict() if isinstance(value, Shape) else value.tolist()
+
+    env = {"env": env_id} if env_id else {}
+    return json.dumps({"format": FORMAT, **env, **options}, indent=1, default=plain) + "\n"
 
 
 def scene_from_json(text: str | bytes) -> dict[str, Any]:

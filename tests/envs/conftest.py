@@ -7,7 +7,7 @@ import gymnasium as gym
 import pytest
 
 from viapoint.envs.rendering import renderer
-from viapoint.envs.rendering.renderer import GLUnavailableError
+from viapoint.envs.rendering.gl import GLUnavailableError
 from viapoint.envs.scenes import families_registry
 
 sys.path.append(str(Path(__file__).parent))

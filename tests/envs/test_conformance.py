@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
 from viapoint.envs.outcome import Outcome
-from viapoint.envs.registration import TASKS, twin_of
+from viapoint.envs.registration import TASKS
 from viapoint.envs.rewards import TERMS
 
 INFO = {*Outcome._fields, *TERMS, "elapsed", "time", "event"}
@@ -159,8 +159,8 @@ def test_a_failed_reset_changes_nothing(env_id, begun):
 
 
 def test_scenes_are_those_of_the_twin(env_id):
-    assert twin_of(twin_of(env_id)) == twin_of(env_id)
-    mine, theirs = (gym.make_vec(each, num_envs=3).reset(seed=3)[0] for each in (env_id, twin_of(env_id)))
+    twin = env_id.replace("Step-v", "-v")
+    mine, theirs = (gym.make_vec(each, num_envs=3).reset(seed=3)[0] for each in (env_id, twin))
     same({name: mine[name] for name in theirs if name in mine}, {n: theirs[n] for n in theirs if n in mine})
 
 

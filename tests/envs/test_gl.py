@@ -14,7 +14,7 @@ import pytest
 from episodes import OBSTACLES
 
 from viapoint.envs.rendering import gl
-from viapoint.envs.rendering.renderer import GLUnavailableError
+from viapoint.envs.rendering.gl import GLUnavailableError
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
 

@@ -14,7 +14,7 @@ from tasks import MOVING, PANDA, PLANE, REACH, SENSED, WHOLE, problem_of, scenes
 
 from viapoint.training import ViaQ, ViaVecEnv, load_agent
 from viapoint.training.agents.agent import SAC
-from viapoint.training.agents.outcome_buffer import Outcomes, outcome_of
+from viapoint.training.agents.viaq import Outcomes, outcome_of
 from viapoint.training.agents.viaq_policy import ViaQPolicy
 from viapoint.training.io.files import BadFileError
 from viapoint.training.planning.baselines import agent_method

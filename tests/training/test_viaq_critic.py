@@ -15,8 +15,8 @@ from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import BOX, bounding_boxes, no_obstacles
 from viapoint.training import ViaQ
 from viapoint.training.agents import viaq_policy
-from viapoint.training.agents.outcome_buffer import OutcomeReplayBuffer, Outcomes
 from viapoint.training.agents.pairs import CLEAR, NO_OBSTACLE, pairs_of
+from viapoint.training.agents.viaq import OutcomeReplayBuffer, Outcomes
 from viapoint.training.agents.viaq_critic import Values, _Saturated
 from viapoint.training.planning.candidates import best_duration, candidate_actions, sobol_actions
 from viapoint.training.planning.movements import INSTANTS

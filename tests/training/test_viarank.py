@@ -9,7 +9,7 @@ from tasks import SENSED as ENV
 
 from viapoint.training import ViaRank, ViaVecEnv, evaluate
 from viapoint.training.planning.beliefs import Sight
-from viapoint.training.planning.places import places_of
+from viapoint.training.planning.cautious import places_of
 from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import plan_clearances, registered_task
 from viapoint.training.rollouts.rollout import SceneSimulation

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from viapoint.envs.rendering.renderer import GLUnavailableError
+from viapoint.envs.rendering.gl import GLUnavailableError
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.agents.model_io import untrained
 from viapoint.training.config.configs import DemoConfig, TrainConfig

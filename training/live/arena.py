@@ -17,6 +17,7 @@ from viapoint.envs.arms.kinematics import forward
 from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import KINDS, pack, quaternions_of
+from viapoint.envs.scenes.options import scene_options
 from viapoint.training.agents.agent import Agent
 from viapoint.training.live.state import Scene, State
 from viapoint.training.paper.movements import TARGETS, rows_of_lights
@@ -144,9 +145,8 @@ class Arena:
 
     def scene_of(self, scenes: ve.Scenes, row: int = 0) -> Scene:
         """Return one of the scenes of an environment."""
-        options = ve.scene_from_json(ve.scene_to_json(scenes, self.task.arm, self.task.space_name, scene=row))
-        arrays: Any = {name: np.array(value) for name, value in options.items() if name != "obstacles"}
-        return Scene(obstacles=tuple(options["obstacles"]), **arrays)
+        options = scene_options(scenes, self.task.arm, self.task.space_name, row)
+        return Scene(**{**options, "obstacles": tuple(options["obstacles"])})
 
     def read(self, content: str | bytes) -> Scene:
         """Return the scene of a JSON file; missing parts are drawn, and an impossible one raises ValueError."""

@@ -13,7 +13,7 @@ import numpy as np
 from viapoint.envs import Plan, Scenes, Shape
 from viapoint.envs.common.types import Float
 from viapoint.envs.outcome import Rollout
-from viapoint.envs.scenes.options import FORMAT, OPTIONS
+from viapoint.envs.scenes.options import OPTIONS, options_to_json
 from viapoint.training.planning.motion_plan import MotionPlan
 
 
@@ -35,12 +35,7 @@ class Scene(NamedTuple):
 
     def to_json(self, env_id: str) -> str:
         """Return the scene as the text of a JSON file, with the names of its obstacles."""
-
-        def plain(value: Any) -> Any:
-            return value.to_dict() if isinstance(value, Shape) else value.tolist()
-
-        record = {"format": FORMAT, "env": env_id, **self.options()}
-        return json.dumps(record, indent=1, default=plain) + "\n"
+        return options_to_json(self.options(), env_id)
 
     def to_python(self, env_id: str, arguments: Mapping[str, Any]) -> str:
         """Return Python code that makes an environment with arguments and sets the scene up."""

@@ -7,23 +7,21 @@ microseconds via vectorized sampling-based planning, ICRA 2024. Both are numeric
 
 from __future__ import annotations
 
-import csv
 import functools
 import itertools
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from importlib.resources import files
+from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 import pandas as pd
 import yaml
 
-from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
-from viapoint.envs.arms.registry import PANDA_HOME
+from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.stored import read_arm
 from viapoint.envs.common.arrays import frame_matrices
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array, whole_number
@@ -40,6 +38,7 @@ from viapoint.training.planning.plan_motion import checked_motion, ompl_motion, 
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import GeometrySearch
 
+DATA = files("viapoint.training.planning") / "data"
 # Names of the sets
 SETS = (
     "bookshelf_small",
@@ -52,23 +51,6 @@ SETS = (
 )
 KINDS: dict[type[Shape], int] = {Box: 0, Cylinder: 1}  # Numbers of shapes in the numeric file
 JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))  # Names of the joints in the files
-LOWEST = (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671)
-# Ranges of the joints in the published description, [rad]
-HIGHEST = (2.9671, 1.8326, 2.9671, 0.0873, 2.9671, 3.8223, 2.9671)
-# Bodies of the fingers, and the directions in which they open along y
-FINGERS = {"leftfinger": 1.0, "rightfinger": -1.0}
-# Opening of a finger, and height of the fingers' frames over that of the hand, [m]
-OPEN, FINGER_HEIGHT = 0.065, 0.0584
-# Pairs of bodies, besides consecutive moving ones, that the published description does not compare (panda.srdf)
-NEVER_TOUCH = {
-    "link0": ("link1", "link2", "link3", "link4"),
-    "link1": ("link3", "link4"),
-    "link2": ("link4", "link6"),
-    "link3": ("link5", "link6", "link7", "gripper", "leftfinger", "rightfinger"),
-    "link4": ("link6", "link7", "gripper", "leftfinger", "rightfinger"),
-    "link6": ("gripper", "leftfinger", "rightfinger"),
-    "link7": ("leftfinger", "rightfinger"),
-}
 TOGETHER = 20  # Number of plans that are simulated together
 PATH_INSTANTS = 200  # Instants between which the length of a movement is measured
 NOTES = (
@@ -96,40 +78,15 @@ class BenchmarkProblem(NamedTuple):
 @functools.cache
 def benchmark_panda() -> Arm:
     """Return the Panda of the benchmark: 59 spheres, the fingers open by 6.5 cm each, dynamics of the built-in one."""
-    spec = mujoco.MjSpec.from_string(asset("panda.xml"))
-    for body in spec.bodies:
-        for geom in list(body.geoms):
-            if geom.name != "table":
-                spec.delete(geom)
-    for joint, low, high in zip(spec.joints, LOWEST, HIGHEST, strict=True):
-        joint.range = low, high
-    gripper = spec.body("gripper")
-    for name, side in FINGERS.items():
-        gripper.add_body(name=name, pos=(0.0, side * OPEN, FINGER_HEIGHT))
-    with (files("viapoint.training.planning") / "data" / "panda_spheres.csv").open(encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            place = [float(row[axis]) for axis in "xyz"]
-            size = (float(row["radius"]), 0.0, 0.0)
-            spec.body(row["body"]).add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=place, size=size)
-    return arm_from_xml(
-        "panda_spheres",
-        spec.to_xml(),
-        joints=tuple(f"joint{number}" for number in range(1, 8)),
-        tool="hand",
-        home=PANDA_HOME,
-        velocity_limit=(2.175,) * 4 + (2.61,) * 3,
-        torque_limit=(87.0,) * 4 + (12.0,) * 3,
-        exclude={
-            frozenset((first, second)): "never in contact"
-            for first, others in NEVER_TOUCH.items()
-            for second in others
-        },
-    )
+    with as_file(DATA / "panda_spheres.xml") as path:
+        arm = read_arm(path)
+    assert arm is not None
+    return arm
 
 
 def benchmark_problems() -> list[BenchmarkProblem]:
     """Return the 700 problems, of which one, `table_pick 41`, has a goal in contact."""
-    with (files("viapoint.training.planning") / "data" / "motionbenchmaker.npz").open("rb") as file:
+    with (DATA / "motionbenchmaker.npz").open("rb") as file:
         parts = dict(np.load(file))
     problems, first = [], 0
     for k, count in enumerate(parts["count"]):

@@ -1,1 +1,0 @@
-"""Solvers for free passage times: closed forms for one via-point, Newton iterations for several."""
