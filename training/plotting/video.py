@@ -138,7 +138,7 @@ def describe_outcome(info: dict[str, Any]) -> tuple[str, Colour]:
         return "out of reach", PALETTE.contact
     if info["collision"]:
         return f"collision at {info['first_contact_time']:.2f} s", PALETTE.contact
-    return f"missed by {1e3 * info['goal_error']:.0f} mm", PALETTE.contact
+    return "missed the goal", PALETTE.contact  # the error is in m or in rad
 
 
 def play(env: gym.Env[Any, Any], scene: Scenes, decide: Decide) -> dict[str, Any]:
