@@ -147,8 +147,8 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
             if env is None:
                 hyperparameters = _to_decide(hyperparameters)
             else:
-                check_same_task(*(each.get_attr("task", [0])[0] for each in (own, env)))
                 check_spaces(own, env)
+                check_same_task(*(each.get_attr("task", [0])[0] for each in (own, env)))
             model = build(record["algorithm"], record["policy"], env or own, hyperparameters)
         model.num_timesteps = int(record["num_timesteps"])
     except BadFileError:
