@@ -188,7 +188,7 @@ def _lowest(cost: PassageCost, candidates: list[Floats]) -> Floats:
     return chosen
 
 
-def log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, Floats, Floats]:
+def _log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, Floats, Floats]:
     """Return log(J + reference), its gradient and its Hessian with respect to z.
 
     The Hessian consists of difference quotients of the gradient, all computed at once, central ones for many
@@ -228,7 +228,7 @@ def _minimise(cost: PassageCost, start: Floats) -> tuple[Floats, Floats, Any]:
     """Return local minima of log(J + reference) from durations (S, N): z (S, N), value and convergence (N,)."""
     z, reference = np.log(start), cost.reference()
     active = np.arange(z.shape[1])
-    value, gradient, hessian = log_cost(cost, z, reference)
+    value, gradient, hessian = _log_cost(cost, z, reference)
     converged = np.zeros(z.shape[1], dtype=bool)
     result = value.copy()
     for _ in range(_ITERATIONS):
@@ -281,7 +281,7 @@ def _search(
     length = 1.0
     for _ in range(_HALVINGS):
         trial = origin[:, waiting] + length * step[:, waiting]
-        found = log_cost(cost.chosen(waiting), trial, reference[waiting])
+        found = _log_cost(cost.chosen(waiting), trial, reference[waiting])
         falls = found[0] <= first[waiting] + 1e-4 * length * slope[waiting] + _NOISE
         accepted = waiting[falls]
         z[:, accepted] = trial[:, falls]
@@ -296,13 +296,13 @@ def _search(
 
 def _descent_step(gradient: Floats, hessian: Floats) -> Floats:
     """Return the modified Newton step -H^-1 g, shortened so that no component is longer than 1.5."""
-    step = -solve_positive(hessian, gradient[:, None])[:, 0]
+    step = -_solve_positive(hessian, gradient[:, None])[:, 0]
     longest = np.abs(step).max(axis=0)
     shortened: Floats = step * (_LONGEST_STEP / np.maximum(longest, _LONGEST_STEP))
     return shortened
 
 
-def solve_positive(matrix: Floats, right: Floats) -> Floats:
+def _solve_positive(matrix: Floats, right: Floats) -> Floats:
     """Solve H x = b for symmetric matrices (n, n, N) and right sides (n, m, N).
 
     Where H is not positive definite its eigenvalues are replaced by their absolute values (Nocedal & Wright 2006,
@@ -357,7 +357,7 @@ def attach_gradient(
 
 def _inverse_hessian(cost: PassageCost, h: Floats) -> Floats:
     """Return (S, S, N) inverse Hessian of the log-cost with respect to log-durations, divided by the cost."""
-    value, _, hessian = log_cost(cost, np.log(h), cost.reference())
+    value, _, hessian = _log_cost(cost, np.log(h), cost.reference())
     identity = np.repeat(np.eye(len(h))[:, :, None], h.shape[1], axis=2)
-    inverse: Floats = np.clip(solve_positive(hessian, identity), -_LARGEST, _LARGEST) / np.exp(value)
+    inverse: Floats = np.clip(_solve_positive(hessian, identity), -_LARGEST, _LARGEST) / np.exp(value)
     return inverse

@@ -297,7 +297,7 @@ class ShapeWriter:
 
     def line(self, points: Float, radius: float, colour: Colour) -> None:
         """Add a tube along a polyline, shape (n, 3), [m], without a shadow."""
-        for first, second in itertools.pairwise(resampled(points, SPACING)):
+        for first, second in itertools.pairwise(_resampled(points, SPACING)):
             geom = self._geom(mujoco.mjtGeom.mjGEOM_CAPSULE, (radius,) * 3, first, colour, GLOWING)
             if geom is not None:
                 mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, radius, first, second)
@@ -317,7 +317,7 @@ class ShapeWriter:
         return geom
 
 
-def resampled(points: Float, spacing: float) -> Float:
+def _resampled(points: Float, spacing: float) -> Float:
     """Return points about `spacing` [m] apart along a polyline through `points` (n, 3) [m], with both ends."""
     length = np.concatenate(([0.0], np.cumsum(norm(np.diff(points, axis=0)))))
     count = max(int(np.ceil(length[-1] / spacing)), 1) + 1

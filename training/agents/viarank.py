@@ -208,7 +208,7 @@ class ViaRankPolicy(PlanPolicy):
             )
 
 
-class NoBuffer(ReplayBuffer):
+class _NoBuffer(ReplayBuffer):
     """Replay buffer that keeps nothing: scenes to learn from are drawn anew for each update."""
 
     def __init__(
@@ -281,7 +281,7 @@ class ViaRank(PlanAlgorithm):
             batch_size=batch_size,
             gamma=1.0,
             gradient_steps=gradient_steps,
-            replay_buffer_class=NoBuffer,
+            replay_buffer_class=_NoBuffer,
             policy_kwargs=policy_kwargs,
             train_freq=train_freq,
             _init_setup_model=_init_setup_model,
