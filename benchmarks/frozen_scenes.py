@@ -34,7 +34,7 @@ from viapoint.training.planning.search import (
     plan_clearances,
     registered_task,
 )
-from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import (
     BANDS,
     DRAWN,

@@ -19,7 +19,7 @@ from viapoint.envs.geometry.obstacles import pack
 from viapoint.training.planning import benchmark
 from viapoint.training.planning.benchmark import BenchmarkProblem, benchmark_panda, benchmark_problems
 from viapoint.training.planning.plan_motion import plan_motion
-from viapoint.training.plotting.plots import METHOD_COLOURS
+from viapoint.training.plots import METHOD_COLOURS
 
 DOCS = Path(__file__).parents[1] / "docs"
 TABLE = DOCS / "planning.csv"

@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from viapoint.training.config.configs import TrainConfig
-from viapoint.training.io.files import UNFINISHED, read_arrays
-from viapoint.training.runs.checkpoints import read_state
-from viapoint.training.runs.run_dir import Run
+from viapoint.training.checkpoints import read_state
+from viapoint.training.configs import TrainConfig
+from viapoint.training.files import UNFINISHED, read_arrays
+from viapoint.training.runs import Run
 
 ENV = "viapoint/PlanarObstacles-v0"
 OFF_POLICY: dict[str, Any] = {
@@ -66,7 +66,7 @@ def start(folder: Path, algo: str, log: Path) -> int:
         with log.open("a") as file:
             os.dup2(file.fileno(), 1)
             os.dup2(file.fileno(), 2)
-        from viapoint.training.runs.trainer import train
+        from viapoint.training.trainer import train
 
         train(config(folder, algo, resume=(folder / "config.json").exists()))
         code = 0
@@ -156,7 +156,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    import viapoint.training.runs.trainer  # noqa: F401 - once, and not in every process
+    import viapoint.training.trainer  # noqa: F401 - once, and not in every process
 
     generator, results = np.random.default_rng(arguments.seed), {}
     with tempfile.TemporaryDirectory() as base:

@@ -22,9 +22,9 @@ import tyro
 from matplotlib.figure import Figure
 
 from viapoint.training import Run, evaluate, load_agent
-from viapoint.training.config.checks import SHIPPED_IDS
+from viapoint.training.checks import SHIPPED_IDS
 from viapoint.training.planning.search import registered_task
-from viapoint.training.plotting.plots import METHOD_COLOURS, style_axes
+from viapoint.training.plots import METHOD_COLOURS, style_axes
 from viapoint.training.scene_sets import SETS, shipped_set
 
 BASELINES = ("untrained", "straight", "sobol64", "search512", "plan_motion", "ompl")

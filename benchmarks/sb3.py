@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from stable_baselines3.common.callbacks import BaseCallback
 
 from viapoint.training import TrainConfig, train
-from viapoint.training.plotting.plots import METHOD_COLOURS, style_axes
+from viapoint.training.plots import METHOD_COLOURS, style_axes
 
 TASKS = (
     "PlanarObstacles",

@@ -24,7 +24,7 @@ from viapoint.envs.geometry.obstacles import pack
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import GeometrySearch, plan_clearances, registered_task
-from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.vec_env import ViaVecEnv
 
 REPEATS = 7
 CANDIDATES = 256

@@ -47,7 +47,7 @@ def test_what_training_imports_is_declared():
     [
         ("viapoint.primitives", {"torch", "mujoco", "gymnasium", "scipy", "matplotlib"}),
         ("viapoint.envs", {"torch", "stable_baselines3", "matplotlib", "scipy", "viapoint.training"}),
-        ("viapoint.training.config.configs", {"torch", "stable_baselines3", "matplotlib"}),
+        ("viapoint.training.configs", {"torch", "stable_baselines3", "matplotlib"}),
         ("viapoint.training.planning.plan_motion", {"torch", "stable_baselines3", "matplotlib", "pandas"}),
     ],
 )

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from viapoint.training import configs
 from viapoint.training.cli import entry as cli
-from viapoint.training.config import configs
 
 ROOT = Path(__file__).parents[1]
 WRITTEN = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/environments/*-v0.md")]

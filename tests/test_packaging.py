@@ -31,7 +31,7 @@ assert load_agent("viapoint/PlanarObstacles-v0").env_id == "viapoint/PlanarObsta
 """
 ALL = """
 import viapoint.training.live.page, minari, ray.tune, ompl
-from viapoint.training.study.run import run_study
+from viapoint.training.study import run_study
 """
 OF_TRAINING = ("torch", "stable_baselines3", "matplotlib", "pandas", "tyro")
 OF_OTHERS = ("ray", "optuna", "viser", "mjviser", "ompl", "minari", "gymnasium_robotics", "furo")

@@ -12,18 +12,17 @@ if TYPE_CHECKING:
     from viapoint.training.agents.extractors import SceneExtractor
     from viapoint.training.agents.viaq import ViaQ
     from viapoint.training.agents.viarank import ViaRank
-    from viapoint.training.config.configs import TrainConfig
-    from viapoint.training.evaluation.evaluator import EvaluationResult, evaluate
+    from viapoint.training.configs import TrainConfig
+    from viapoint.training.evaluation import EvaluationResult, evaluate
     from viapoint.training.live.page import LivePage
     from viapoint.training.planning.export import read_motion, write_motion
     from viapoint.training.planning.motion_plan import MotionPlan, UnsafePlanError
     from viapoint.training.planning.plan_motion import plan_motion, plan_motions
     from viapoint.training.planning.search import GeometrySearch
-    from viapoint.training.rollouts.vec_env import ViaVecEnv
-    from viapoint.training.runs.run_dir import Run
-    from viapoint.training.runs.trainer import train
-    from viapoint.training.study.config import Study
-    from viapoint.training.study.run import run_study
+    from viapoint.training.runs import Run
+    from viapoint.training.study import Study, run_study
+    from viapoint.training.trainer import train
+    from viapoint.training.vec_env import ViaVecEnv
 else:
     _get, __dir__ = lazy_imports(__name__)
 

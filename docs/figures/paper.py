@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from viapoint.training.evaluation.evaluator import one_thread
+from viapoint.training.evaluation import one_thread
 from viapoint.training.paper.run import reproduce
 
 FOLDER = Path(__file__).parents[1] / "images"

@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 
 from viapoint.envs.common.palette import PALETTE
 from viapoint.primitives import curvature, passage_durations, point_to_point, speed, speed_valleys, through
-from viapoint.training.plotting.plots import style_axes
+from viapoint.training.plots import style_axes
 
 FOLDER = Path(__file__).parents[1] / "images"
 COLOURS = plt.get_cmap("viridis")

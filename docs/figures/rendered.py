@@ -22,12 +22,12 @@ from viapoint.envs.rendering.gl import Canvas
 from viapoint.envs.rendering.renderer import GLOWING, PLAN, ShapeWriter
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training import GeometrySearch, load_agent, plan_motion
-from viapoint.training.config.checks import SHIPPED_IDS
+from viapoint.training.checks import SHIPPED_IDS
 from viapoint.training.planning.baselines import Method, Straight, agent_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.plotting.video import play
-from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import scenes_for
+from viapoint.training.video import play
 
 ROOT = Path(__file__).parents[2]
 IN_PLANE, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"

@@ -20,7 +20,7 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training import load_agent
-from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import scenes_for
 
 ENV_ID, SCENES = "viapoint/PlanarSensed-v0", (300, 420, 450)

@@ -22,7 +22,7 @@ from viapoint.envs.outcome import Rollout
 from viapoint.envs.plans import Plan
 from viapoint.envs.rendering.renderer import FADED, Picture, picture_of
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.rollouts.rollout import Decide
+from viapoint.training.rollout import Decide
 
 View = tuple[tuple[float, float], tuple[float, float]]
 """Limits of x and y, [m]."""

@@ -10,7 +10,7 @@ import torch
 
 from viapoint.training import ViaVecEnv, scene_sets
 from viapoint.training.cli import entry
-from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import FrozenScenes
 
 sys.path.append(str(Path(__file__).parent))

@@ -20,9 +20,9 @@ from viapoint.training import Run, TrainConfig, evaluate, load_agent
 from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
 from viapoint.training.cli import demo, doctor
 from viapoint.training.cli import entry as cli
-from viapoint.training.config.configs import DemoConfig, EvaluateConfig, from_words, to_words
-from viapoint.training.config.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
-from viapoint.training.runs.trainer import RunCallback, TrainingStoppedError
+from viapoint.training.configs import DemoConfig, EvaluateConfig, from_words, to_words
+from viapoint.training.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
+from viapoint.training.trainer import RunCallback, TrainingStoppedError
 
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 
@@ -239,7 +239,7 @@ def not_filmed(monkeypatch) -> list[str]:
         decide({name: value[None] for name, value in observation.items()}, scenes)
         filmed.append(env.unwrapped.task.arm.file)
 
-    monkeypatch.setattr("viapoint.training.plotting.video.record_video", record)
+    monkeypatch.setattr("viapoint.training.video.record_video", record)
     return filmed
 
 

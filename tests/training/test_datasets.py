@@ -9,8 +9,8 @@ import pytest
 from tasks import JUMPS, MOVING, PLANE, SENSED, STEP
 
 from viapoint.training.cli import entry as cli
+from viapoint.training.datasets import record_dataset
 from viapoint.training.planning.baselines import make_method
-from viapoint.training.rollouts.datasets import record_dataset
 
 minari = pytest.importorskip("minari")
 

@@ -14,14 +14,12 @@ from stable_baselines3.common.vec_env import VecNormalize
 from tasks import MOVING, REACH
 from tasks import PLANE as ENV
 
-from viapoint.training import ViaVecEnv, evaluate
+from viapoint.training import ViaVecEnv, evaluate, plots, report, statistics
 from viapoint.training.agents.agent import PPO
-from viapoint.training.evaluation import report, statistics
-from viapoint.training.evaluation.evaluator import SLOW_DECISION, MethodResult, evaluate_methods
+from viapoint.training.evaluation import SLOW_DECISION, MethodResult, evaluate_methods
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.plotting import plots
-from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import BANDS, drawn
 
 ZEROS = np.zeros((40, 3))
@@ -181,7 +179,7 @@ def test_an_interrupted_evaluation_keeps_what_is_done(small_scenes):
 
 
 def test_decisions_are_timed_one_by_one_and_slow_ones_by_the_batch(small_scenes, monkeypatch):
-    import viapoint.training.evaluation.evaluator as module
+    import viapoint.training.evaluation as module
 
     class Timed(Given):
         cost = 0.001

@@ -14,7 +14,7 @@ from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training import scene_sets
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import BANDS, SETS, drawn, load, scenes_for, shipped_path, shipped_set
 
 SHIPPED = sorted(shipped_path("test", ENV).parent.glob("*.npz"))

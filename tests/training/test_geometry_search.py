@@ -19,7 +19,7 @@ from viapoint.training.planning.search import (
     plan_clearances,
     refined_actions,
 )
-from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import scenes_for
 
 AMONG_OBSTACLES = (PLANE, WHOLE, PANDA)

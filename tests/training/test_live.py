@@ -20,7 +20,7 @@ import viapoint.envs as ve
 from viapoint.envs import ENV_IDS
 from viapoint.training import LivePage, ViaQ, ViaVecEnv
 from viapoint.training.agents.agent import SAC
-from viapoint.training.config.configs import LiveConfig
+from viapoint.training.configs import LiveConfig
 from viapoint.training.live import drawing, page
 from viapoint.training.live.arena import AGENT, HAND, MOTION, SEARCH, STRAIGHT, Arena
 from viapoint.training.live.decide import APART, decide, describe_plan, execute, profile, propose

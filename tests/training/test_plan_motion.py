@@ -29,7 +29,7 @@ from viapoint.envs.geometry.obstacles import pack
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training import UnsafePlanError, plan_motion, plan_motions, read_motion, write_motion
 from viapoint.training.cli.entry import main
-from viapoint.training.evaluation.evaluator import evaluate_methods
+from viapoint.training.evaluation import evaluate_methods
 from viapoint.training.planning import ompl_paths, refine
 from viapoint.training.planning import plan_motion as module
 from viapoint.training.planning.baselines import make_method
@@ -38,7 +38,7 @@ from viapoint.training.planning.motion_plan import execute_plans
 from viapoint.training.planning.movements import OUTSIDE, Movement, movement_table
 from viapoint.training.planning.ompl_paths import points_on
 from viapoint.training.planning.search import registered_task
-from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import BANDS, load, scenes_for, shipped_path
 
 UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"

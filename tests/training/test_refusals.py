@@ -30,12 +30,14 @@ from viapoint.training import (
     load_agent,
     plan_motion,
     plan_motions,
+    plots,
+    statistics,
     train,
 )
 from viapoint.training.agents.agent import SAC, find_model
 from viapoint.training.agents.model_io import ALGORITHMS
-from viapoint.training.config.checks import ELSEWHERE
-from viapoint.training.config.configs import (
+from viapoint.training.checks import ELSEWHERE
+from viapoint.training.configs import (
     DemoConfig,
     EvaluateConfig,
     LiveConfig,
@@ -43,16 +45,14 @@ from viapoint.training.config.configs import (
     PlayConfig,
     from_words,
 )
-from viapoint.training.evaluation import statistics
-from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.io.files import BadFileError
+from viapoint.training.evaluation import evaluate_methods
+from viapoint.training.files import BadFileError
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.benchmark import benchmark_planner
 from viapoint.training.planning.search import registered_task
-from viapoint.training.plotting import plots
-from viapoint.training.plotting.video import record_video
-from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import load, scenes_for, shipped_path
+from viapoint.training.video import record_video
 
 CHANGING = MOVING, JUMPS
 STALLING = {"stop_when_stalled": 0.3}

@@ -8,11 +8,11 @@ from tasks import JUMPS, MOVING, STEP, scenes_of
 from viapoint.envs import scene_from_json, scene_to_json
 from viapoint.training import ViaVecEnv, evaluate
 from viapoint.training.agents.model_io import build
-from viapoint.training.config.presets import STEP_PRESETS
-from viapoint.training.evaluation.evaluator import evaluate_methods
+from viapoint.training.evaluation import evaluate_methods
 from viapoint.training.planning.baselines import StepAgentMethod, Straight, agent_method, make_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.rollouts.rollout import SceneSimulation, whole_task
+from viapoint.training.presets import STEP_PRESETS
+from viapoint.training.rollout import SceneSimulation, whole_task
 from viapoint.training.scene_sets import drawn
 
 MOVING_STEP = "viapoint/PlanarMovingObstaclesStep-v0"

@@ -15,18 +15,16 @@ from tasks import PLANE, REACH
 
 from viapoint.envs import RewardWeights, Sensor, arm_of, register_arm
 from viapoint.envs.arms import registry
-from viapoint.training import Run, TrainConfig, ViaVecEnv, load_agent, train
+from viapoint.training import Run, TrainConfig, ViaVecEnv, files, load_agent, runs, train
 from viapoint.training.agents.agent import find_model
 from viapoint.training.agents.model_io import build, describe, load_model, save_model, weights
 from viapoint.training.cli import demo
 from viapoint.training.cli import entry as cli
-from viapoint.training.config.configs import DemoConfig, PaperConfig
-from viapoint.training.config.presets import PRESETS
-from viapoint.training.io import files
-from viapoint.training.io.files import BadFileError
+from viapoint.training.configs import DemoConfig, PaperConfig
+from viapoint.training.files import BadFileError
 from viapoint.training.paper import run as paper
-from viapoint.training.plotting.video import record_video
-from viapoint.training.runs import run_dir
+from viapoint.training.presets import PRESETS
+from viapoint.training.video import record_video
 
 
 def new(algo, env, **hyperparameters):
@@ -114,9 +112,9 @@ def run(tmp_path):
 
 
 def test_a_folder_in_use_is_refused_and_a_dead_process_holds_nothing(run, monkeypatch):
-    monkeypatch.setattr(run_dir, "PATIENCE", 0.0)
+    monkeypatch.setattr(runs, "PATIENCE", 0.0)
     script = (
-        "import sys; from pathlib import Path; from viapoint.training.runs.run_dir import Run\n"
+        "import sys; from pathlib import Path; from viapoint.training.runs import Run\n"
         f"with Run(Path({str(run.folder)!r})).locked():\n    print('in', flush=True); sys.stdin.read()"
     )
     other = subprocess.Popen(
@@ -133,14 +131,14 @@ def test_a_folder_in_use_is_refused_and_a_dead_process_holds_nothing(run, monkey
 
 def test_two_that_begin_at_the_same_time_do_not_mix(tmp_path, monkeypatch):
     """The second finds a free folder, but the first is faster."""
-    folder, check = tmp_path / "run", run_dir.check_free
+    folder, check = tmp_path / "run", runs.check_free
 
     def slow(path):
         check(path)
-        monkeypatch.setattr(run_dir, "check_free", check)
+        monkeypatch.setattr(runs, "check_free", check)
         Run.create(TrainConfig(out=path, seed=1))
 
-    monkeypatch.setattr(run_dir, "check_free", slow)
+    monkeypatch.setattr(runs, "check_free", slow)
     with pytest.raises(BadFileError):
         Run.create(TrainConfig(out=folder, seed=2))
     assert Run(folder).config.seed == 1

@@ -16,7 +16,7 @@ import yaml
 from tasks import PLANE as ENV
 
 from viapoint.training import Study, run_study
-from viapoint.training.study.run import COLUMNS, StudyFailedError, _connected, _import_libraries
+from viapoint.training.study import COLUMNS, StudyFailedError, _connected, _import_libraries
 
 FEW = {"learning_starts": 64, "gradient_steps": 1}
 TRAINING = {

@@ -17,17 +17,16 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tasks import MOVING, PLANE, STEP
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from viapoint.training import Run, TrainConfig, ViaVecEnv, train
+from viapoint.training import Run, TrainConfig, ViaVecEnv, train, trainer
 from viapoint.training.agents.model_io import load_model
+from viapoint.training.checkpoints import read_state
 from viapoint.training.cli import entry as cli
-from viapoint.training.config.presets import PRESETS
-from viapoint.training.evaluation.evaluator import evaluate_methods
-from viapoint.training.io.files import BadFileError, read_arrays
+from viapoint.training.evaluation import evaluate_methods
+from viapoint.training.files import BadFileError, read_arrays
 from viapoint.training.planning.baselines import agent_method
-from viapoint.training.runs import trainer
-from viapoint.training.runs.checkpoints import read_state
-from viapoint.training.runs.trainer import TrainingFailedError, TrainingStoppedError
+from viapoint.training.presets import PRESETS
 from viapoint.training.scene_sets import scenes_for
+from viapoint.training.trainer import TrainingFailedError, TrainingStoppedError
 
 OFF_POLICY = {"learning_starts": 32, "gradient_steps": 2, "batch_size": 16}
 TINY = {

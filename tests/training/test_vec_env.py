@@ -9,7 +9,7 @@ from tasks import PLANE, STEP
 
 from viapoint.envs import obstacles_to_json, scene_from_json, scene_to_json
 from viapoint.training import TrainConfig, ViaVecEnv, evaluate, load_agent, train
-from viapoint.training.io.files import BadFileError
+from viapoint.training.files import BadFileError
 
 
 def actions(env, seed=0):

@@ -16,12 +16,12 @@ from viapoint.training import ViaQ, ViaVecEnv, load_agent
 from viapoint.training.agents.agent import SAC
 from viapoint.training.agents.viaq import Outcomes, outcome_of
 from viapoint.training.agents.viaq_policy import ViaQPolicy
-from viapoint.training.io.files import BadFileError
+from viapoint.training.files import BadFileError
 from viapoint.training.planning.baselines import agent_method
 from viapoint.training.planning.candidates import sobol_actions
 from viapoint.training.planning.search import registered_task
-from viapoint.training.rollouts.rollout import SceneSimulation
-from viapoint.training.rollouts.vec_env import TERMS
+from viapoint.training.rollout import SceneSimulation
+from viapoint.training.vec_env import TERMS
 
 FEW = {"width": 8, "instants": 8, "candidates": 32, "refinements": 1, "per_refinement": 16}
 SMALL = {

@@ -22,7 +22,7 @@ from viapoint.training.planning.candidates import best_duration, candidate_actio
 from viapoint.training.planning.movements import INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import INFEASIBLE, plan_clearances, registered_task
-from viapoint.training.rollouts.vec_env import TERMS
+from viapoint.training.vec_env import TERMS
 
 KNOW_OBSTACLES = (
     viapoint.envs.geometry.clearance,

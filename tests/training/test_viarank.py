@@ -12,7 +12,7 @@ from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.cautious import places_of
 from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import plan_clearances, registered_task
-from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import scenes_for
 
 

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from viapoint.training import GeometrySearch
-from viapoint.training.plotting.video import gallery, record_video
+from viapoint.training.video import gallery, record_video
 
 TASKS = "viapoint/PlanarObstacles-v0", "viapoint/PlanarMovingObstacles-v0"
 

@@ -16,11 +16,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training.agents.model_io import ALGORITHMS, load_model, save_model
-from viapoint.training.config.checks import SHIPPED, SHIPPED_IDS
-from viapoint.training.io.files import BadFileError, write_folder
+from viapoint.training.checks import SHIPPED, SHIPPED_IDS
+from viapoint.training.files import BadFileError, write_folder
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.plan_motion import checked_motion
-from viapoint.training.rollouts.vec_env import env_arguments, predicted_actions
+from viapoint.training.vec_env import env_arguments, predicted_actions
 
 
 class Agent(BaseAlgorithm):

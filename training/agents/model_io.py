@@ -35,7 +35,7 @@ from viapoint.envs.common.validation import is_number
 from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES, Task
 from viapoint.training.agents.extractors import SceneExtractor
-from viapoint.training.io.files import (
+from viapoint.training.files import (
     BadFileError,
     as_plain,
     read_arrays,
@@ -44,7 +44,7 @@ from viapoint.training.io.files import (
     write_json,
 )
 from viapoint.training.planning.candidates import MOST_CANDIDATES, MOST_ROUNDS
-from viapoint.training.rollouts.vec_env import ViaVecEnv, check_spaces, env_arguments
+from viapoint.training.vec_env import ViaVecEnv, check_spaces, env_arguments
 
 ACTIVATIONS = (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
 # Classes that model files name, by kind and name

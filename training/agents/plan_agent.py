@@ -21,7 +21,7 @@ from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
 from viapoint.training.agents.model_io import check_arguments, check_same_task
 from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
-from viapoint.training.rollouts.vec_env import check_spaces, check_unwrapped
+from viapoint.training.vec_env import check_spaces, check_unwrapped
 
 N_ELITES = 8  # Number of candidates around which each round of refinement samples
 # Standard deviation of the first round of refinement, in the action space; each round halves it

@@ -30,7 +30,7 @@ from viapoint.training.agents.viaq_critic import Values
 from viapoint.training.agents.viaq_policy import KEEP, ViaQPolicy
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.problem import Problem
-from viapoint.training.rollouts.vec_env import ELAPSED, TERMS
+from viapoint.training.vec_env import ELAPSED, TERMS
 
 # Unit of errors of the clearance term, as a share of the weight of the term: 2 cm
 CLEARANCE_SCALE = 0.4

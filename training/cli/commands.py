@@ -11,9 +11,11 @@ import gymnasium as gym
 import pandas as pd
 
 from viapoint.envs.arms.registry import arm_of
+from viapoint.training import report
+from viapoint.training import trainer as training
 from viapoint.training.agents.agent import Agent, load_agent
-from viapoint.training.config.checks import SHIPPED_IDS
-from viapoint.training.config.configs import (
+from viapoint.training.checks import SHIPPED_IDS
+from viapoint.training.configs import (
     USUAL_BASELINES,
     AgentConfig,
     EvaluateConfig,
@@ -23,16 +25,14 @@ from viapoint.training.config.configs import (
     env_of_arm,
     task_with,
 )
-from viapoint.training.evaluation import report
-from viapoint.training.evaluation.evaluator import evaluate as measure
-from viapoint.training.io.files import read_json, write_json
-from viapoint.training.io.progress import scene_progress
+from viapoint.training.datasets import dataset_folder, record_dataset
+from viapoint.training.evaluation import evaluate as measure
+from viapoint.training.files import read_json, write_json
 from viapoint.training.planning import benchmark
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.rollouts.datasets import dataset_folder, record_dataset
-from viapoint.training.runs import trainer as training
-from viapoint.training.runs.run_dir import Run
+from viapoint.training.progress import scene_progress
+from viapoint.training.runs import Run
 from viapoint.training.scene_sets import evenly_spread, scenes_for
 
 MOST_FAULTS = 10  # Greatest number of problems that are named with what is wrong
@@ -135,7 +135,7 @@ def _measure_planners(config: EvaluateConfig) -> None:
 
 def play(config: PlayConfig) -> None:
     """Record a video of the movements of an agent, or of the geometry search."""
-    from viapoint.training.plotting.video import record_video
+    from viapoint.training.video import record_video
 
     agent, env_id, env_kwargs = _named(config, config.agent)
     scenes = scenes_for(config.scenes, registered_task(env_id, **env_kwargs), config.n_scenes).scenes

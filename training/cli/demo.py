@@ -11,20 +11,19 @@ import gymnasium as gym
 import numpy as np
 
 from viapoint.envs.rendering.gl import GLUnavailableError
+from viapoint.training import plots, report
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.agents.model_io import untrained
-from viapoint.training.config.configs import DemoConfig, TrainConfig
-from viapoint.training.evaluation import report
-from viapoint.training.evaluation.evaluator import evaluate
-from viapoint.training.io.files import check_ours, read_json
-from viapoint.training.io.progress import scene_progress
+from viapoint.training.configs import DemoConfig, TrainConfig
+from viapoint.training.evaluation import evaluate
+from viapoint.training.files import check_ours, read_json
 from viapoint.training.planning.baselines import agent_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.plotting import plots
-from viapoint.training.plotting.video import gallery, record_video
-from viapoint.training.runs.run_dir import Run
-from viapoint.training.runs.trainer import train_or_resume
+from viapoint.training.progress import scene_progress
+from viapoint.training.runs import Run
 from viapoint.training.scene_sets import BANDS, FrozenScenes, scenes_for
+from viapoint.training.trainer import train_or_resume
+from viapoint.training.video import gallery, record_video
 
 CHECKS = 16  # Proposals that the agent checks in the second row of the table
 BASELINES = ("search16", "search512", "straight", "random")

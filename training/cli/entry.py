@@ -16,7 +16,7 @@ from viapoint.training.cli import doctor
 from viapoint.training.extras import explain_import_error
 
 if TYPE_CHECKING:
-    from viapoint.training.config.configs import TrainConfig
+    from viapoint.training.configs import TrainConfig
 
 
 class UsageError(ValueError):
@@ -33,7 +33,7 @@ COMMANDS = {
     "fit": "cli.fit:run",
     "paper": "paper.run:run",
     "demo": "cli.demo:run",
-    "study": "study.run:run",
+    "study": "study:run",
     "live": "live.page:run",
     "doctor": "cli.doctor:run",
 }
@@ -91,7 +91,7 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
     """
     import tyro
 
-    from viapoint.training.config import checks, configs
+    from viapoint.training import checks, configs
 
     kinds = {name: getattr(configs, f"{name.capitalize()}Config") for name in COMMANDS}
     if words and words[0] in ("-h", "--help"):
@@ -119,7 +119,7 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
 
 def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
     """Check that flags equal those of the run to resume, including flags with default values."""
-    from viapoint.training.runs.run_dir import Run, check_unchanged
+    from viapoint.training.runs import Run, check_unchanged
 
     run = Run(config.folder)
     usual = dataclasses.replace(run.config, out=config.out, resume=True)

@@ -13,9 +13,9 @@ import pandas as pd
 
 from viapoint.envs.common.types import Float
 from viapoint.primitives import ViaPointFit, fit_via_points
-from viapoint.training.config.configs import FitConfig
-from viapoint.training.io.files import BadFileError, check_ours, read_bytes, write_bytes
-from viapoint.training.plotting.plots import fitted_movements
+from viapoint.training.configs import FitConfig
+from viapoint.training.files import BadFileError, check_ours, read_bytes, write_bytes
+from viapoint.training.plots import fitted_movements
 
 REQUIRED = ("time", "x", "y")  # Columns that a file of movements must have
 COORDINATES = ("x", "y", "z")  # Names of the coordinates; z may be left out

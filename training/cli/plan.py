@@ -12,8 +12,8 @@ from viapoint.envs.arms.load import load_arm
 from viapoint.envs.arms.registry import arm_names, arm_of
 from viapoint.envs.geometry.shapes import obstacles_from_json
 from viapoint.envs.scenes.options import Pose, scene_from_json
-from viapoint.training.config.configs import PlanConfig
-from viapoint.training.io.files import LARGEST_JSON, BadFileError, read_bytes
+from viapoint.training.configs import PlanConfig
+from viapoint.training.files import LARGEST_JSON, BadFileError, read_bytes
 from viapoint.training.planning.export import read_motion, write_motion
 from viapoint.training.planning.plan_motion import plan_motion
 
@@ -45,7 +45,7 @@ def run(config: PlanConfig) -> None:
         motion = write_motion(plan, config.out, config.rate, force=config.force)
         print(f"{len(motion.time)} instants at {config.rate:g} Hz: {config.out}")
     if config.video is not None:
-        from viapoint.training.plotting.video import record_plan
+        from viapoint.training.video import record_plan
 
         print(f"{record_plan(config.video, plan)} frames: {config.video}")
 

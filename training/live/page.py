@@ -27,8 +27,8 @@ from viapoint.envs import Arm
 from viapoint.envs.common.types import Float
 from viapoint.envs.registration import check_registered
 from viapoint.training.agents.agent import Agent, load_agent
-from viapoint.training.config.checks import DEFAULT_ENV, SHIPPED_IDS
-from viapoint.training.config.configs import env_of_arm
+from viapoint.training.checks import DEFAULT_ENV, SHIPPED_IDS
+from viapoint.training.configs import env_of_arm
 from viapoint.training.live.arena import MOST_OBSTACLES, Arena
 from viapoint.training.live.decide import decide, describe_outcome, describe_plan, execute, profile, propose
 from viapoint.training.live.drawing import ArmDrawing, View, set_first_view

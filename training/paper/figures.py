@@ -16,7 +16,7 @@ from viapoint import primitives
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import unpack
-from viapoint.training.io.files import write_figure
+from viapoint.training.files import write_figure
 from viapoint.training.paper import double_step, movements, one_via, point_to_point
 from viapoint.training.paper.movements import TARGETS, Profile, curved, passage_share, simulate, straight
 from viapoint.training.paper.obstacles import ObstacleMovements, features

@@ -15,13 +15,13 @@ from viapoint.envs.geometry.obstacles import pack
 from viapoint.envs.scenes.scene import check_scenes, resting
 from viapoint.primitives import speed_valleys
 from viapoint.training import GeometrySearch, load_agent
-from viapoint.training.config.checks import DEFAULT_ENV
+from viapoint.training.checks import DEFAULT_ENV
 from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, Range, at_least, at_most, near
 from viapoint.training.paper.movements import PLANE, TARGETS, Profile, SimulatedMovements, simulate
 from viapoint.training.paper.one_via import slow_and_fast
 from viapoint.training.planning.baselines import Method, agent_method
-from viapoint.training.rollouts.rollout import SceneSimulation
+from viapoint.training.rollout import SceneSimulation
 
 LENGTHS = (0.15, 0.2, 0.25)  # Lengths of the rows of lights, [m]; the paper's were up to 25 cm
 RADII = (0.008, 0.02)  # Half widths of the rows of lights, [m]

@@ -14,13 +14,13 @@ import pandas as pd
 from jinja2 import Environment, StrictUndefined
 from matplotlib.figure import Figure
 
-from viapoint.training.config.configs import PaperConfig
-from viapoint.training.evaluation.evaluator import one_thread
-from viapoint.training.io.files import MARK, check_ours, versions, write_bytes, write_json
-from viapoint.training.io.progress import progress_bar
+from viapoint.training.configs import PaperConfig
+from viapoint.training.evaluation import one_thread
+from viapoint.training.files import MARK, check_ours, versions, write_bytes, write_json
 from viapoint.training.paper import double_step, figures, obstacles, one_via, point_to_point
 from viapoint.training.paper.claim import Claim, Number
 from viapoint.training.paper.one_via import ENDS, FAST, SLOW, THREE_POINTS
+from viapoint.training.progress import progress_bar
 
 # Titles and functions of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991
 ROWS: dict[int, tuple[str, Callable[..., list[Claim]]]] = {

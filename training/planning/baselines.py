@@ -14,7 +14,7 @@ from viapoint.envs.common.validation import whole_number
 from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
-from viapoint.training.config.checks import unknown_name
+from viapoint.training.checks import unknown_name
 from viapoint.training.planning.candidates import MOST_CANDIDATES
 from viapoint.training.planning.cautious import (
     BELIEFS,
@@ -28,15 +28,15 @@ from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl
 from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
 from viapoint.training.planning.predictions import PREDICTIONS, PredictedSearch
 from viapoint.training.planning.search import GeometrySearch, registered_task
-from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
-from viapoint.training.rollouts.vec_env import env_arguments, predicted_actions
+from viapoint.training.rollout import SceneSimulation, SimulationResults
+from viapoint.training.vec_env import env_arguments, predicted_actions
 
 
 class Method(Protocol):
     """Decision maker that chooses a movement in each of N scenes.
 
     A method whose movements are no actions of the environment has `execute(scenes, decisions)` as well, which simulates
-    them and returns :class:`~viapoint.training.rollouts.rollout.SimulationResults`.
+    them and returns :class:`~viapoint.training.rollout.SimulationResults`.
     """
 
     @property

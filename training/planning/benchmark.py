@@ -30,7 +30,7 @@ from viapoint.envs.geometry.shapes import Box, Cylinder, Shape, as_obstacle
 from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import resting
 from viapoint.envs.task import Task
-from viapoint.training.config.checks import unknown_name
+from viapoint.training.checks import unknown_name
 from viapoint.training.planning.candidates import MOST_CANDIDATES
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
 from viapoint.training.planning.ompl_paths import import_ompl

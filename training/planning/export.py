@@ -12,7 +12,7 @@ import yaml
 
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import finite_array
-from viapoint.training.io.files import write_bytes
+from viapoint.training.files import write_bytes
 from viapoint.training.planning.motion_plan import JointMotion, MotionPlan
 
 # Quantities of a table, each of which has a column for each joint

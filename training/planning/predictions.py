@@ -19,7 +19,7 @@ from viapoint.envs.scenes.motions import REACH_LENGTH, REACH_TIME
 from viapoint.envs.scenes.scene import CHORD, Scenes, reached
 from viapoint.envs.task import Task
 from viapoint.training.planning.problem import Problem
-from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults
+from viapoint.training.rollout import SceneSimulation, SimulationResults
 
 HORIZON = 40  # Number of intervals of a prediction; obstacles keep the last velocity
 MOVING = 1e-3  # Speed above which an obstacle moves, [m/s]

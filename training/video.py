@@ -22,10 +22,10 @@ from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.types import Frame
 from viapoint.envs.rendering.renderer import EpisodeRenderer
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.config.checks import check_file
-from viapoint.training.io.files import MARK, write_figure
+from viapoint.training.checks import check_file
+from viapoint.training.files import MARK, write_figure
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
-from viapoint.training.rollouts.rollout import Decide
+from viapoint.training.rollout import Decide
 
 CAPTION = 48  # Height of the caption below the picture, [pixels]
 BLOCK = 16  # Encoders need sides that are multiples of this, [pixels]

@@ -19,12 +19,11 @@ from viapoint.envs.common.types import Float, Observation
 from viapoint.envs.common.validation import finite_array
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.scenes.scene import NEVER, Scenes
+from viapoint.training import report
 from viapoint.training.agents.agent import load_agent
 from viapoint.training.agents.model_io import check_same_task, untrained
-from viapoint.training.config.checks import check_whole
-from viapoint.training.evaluation import report
-from viapoint.training.evaluation.statistics import mcnemar, success_weighted_path_length, wilson
-from viapoint.training.io.files import versions
+from viapoint.training.checks import check_whole
+from viapoint.training.files import versions
 from viapoint.training.planning.baselines import (
     Method,
     OpenLoopBaseline,
@@ -32,9 +31,10 @@ from viapoint.training.planning.baselines import (
     make_method,
 )
 from viapoint.training.planning.search import registered_task
-from viapoint.training.rollouts.rollout import SceneSimulation, SimulationResults, whole_task
-from viapoint.training.rollouts.vec_env import env_arguments
+from viapoint.training.rollout import SceneSimulation, SimulationResults, whole_task
 from viapoint.training.scene_sets import BANDS, DRAWN, SETS, FrozenScenes, scenes_for
+from viapoint.training.statistics import mcnemar, success_weighted_path_length, wilson
+from viapoint.training.vec_env import env_arguments
 
 Progress = Callable[[str, int, int], None]  # Method's name, scenes done, all scenes
 

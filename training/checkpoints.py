@@ -22,8 +22,8 @@ from stable_baselines3.common.save_util import recursive_getattr, recursive_seta
 from viapoint.envs.arms.registry import ARM_FILES
 from viapoint.envs.arms.stored import COPY
 from viapoint.training.agents.model_io import describe
-from viapoint.training.io.files import BadFileError, read_bytes, write_bytes
-from viapoint.training.rollouts.vec_env import ViaVecEnv
+from viapoint.training.files import BadFileError, read_bytes, write_bytes
+from viapoint.training.vec_env import ViaVecEnv
 
 FORMAT = 3
 # Counters of Stable-Baselines3's algorithms

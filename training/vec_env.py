@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import viapoint.envs
 from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import TERMS as TERMS
-from viapoint.training.io.files import as_plain
+from viapoint.training.files import as_plain
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
 

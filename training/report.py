@@ -10,8 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-from viapoint.training.config.configs import Format
-from viapoint.training.io.files import MARK, write_bytes, write_json
+from viapoint.training.configs import Format
+from viapoint.training.files import MARK, write_bytes, write_json
 from viapoint.training.scene_sets import BANDS
 
 Record = Mapping[str, Any]  # Result of `EvaluationResult.to_dict`, or the content of its file

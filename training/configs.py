@@ -22,7 +22,7 @@ from viapoint.envs.common.validation import is_number
 from viapoint.envs.registration import ENV_IDS
 from viapoint.envs.task import Task
 from viapoint.primitives.fitting import MOST_VIA_POINTS, USUAL_RANGE
-from viapoint.training.config.checks import (
+from viapoint.training.checks import (
     DEFAULT_ENV,
     RANGES,
     SHIPPED_IDS,
@@ -33,9 +33,9 @@ from viapoint.training.config.checks import (
     named_path,
     unknown_name,
 )
-from viapoint.training.config.presets import STEP_PRESETS, Algorithm, Preset, preset_of, usual_algorithm
-from viapoint.training.io.files import as_plain, parse_yaml
+from viapoint.training.files import as_plain, parse_yaml
 from viapoint.training.planning.search import registered_task
+from viapoint.training.presets import STEP_PRESETS, Algorithm, Preset, preset_of, usual_algorithm
 
 REGISTRY = ConstructorRegistry()  # Ways in which the command line reads numbers and paths
 # Name in helps and in errors of the types of values.

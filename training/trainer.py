@@ -19,13 +19,13 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
 from viapoint.training.agents.model_io import build
-from viapoint.training.config.configs import TrainConfig
-from viapoint.training.evaluation.evaluator import MethodResult, evaluate, one_thread
-from viapoint.training.io.files import BadFileError, read_json, versions, write_json
-from viapoint.training.io.progress import progress_bar
-from viapoint.training.rollouts.vec_env import LOGGED, ViaVecEnv
-from viapoint.training.runs.run_dir import Run, check_free, check_unchanged
+from viapoint.training.configs import TrainConfig
+from viapoint.training.evaluation import MethodResult, evaluate, one_thread
+from viapoint.training.files import BadFileError, read_json, versions, write_json
+from viapoint.training.progress import progress_bar
+from viapoint.training.runs import Run, check_free, check_unchanged
 from viapoint.training.scene_sets import FrozenScenes, scenes_for
+from viapoint.training.vec_env import LOGGED, ViaVecEnv
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
 from viapoint.primitives import ViaPointFit
-from viapoint.training.io.files import write_figure
+from viapoint.training.files import write_figure
 from viapoint.training.scene_sets import BANDS
 
 BLUE = "#1f5fa8"

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from viapoint.envs.common.validation import whole_number
-from viapoint.training.io.files import check_ours
+from viapoint.training.files import check_ours
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
 SHIPPED = Path(str(files("viapoint.training") / "pretrained"))  # Agents of the package

@@ -24,9 +24,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from viapoint.envs.arms.stored import COPY, keep_arm, with_kept_arm
 from viapoint.training.agents.agent import best_model
 from viapoint.training.agents.model_io import save_model
-from viapoint.training.config.checks import check_folder
-from viapoint.training.config.configs import TrainConfig
-from viapoint.training.io.files import (
+from viapoint.training.checkpoints import read_checkpoint, write_checkpoint
+from viapoint.training.checks import check_folder
+from viapoint.training.configs import TrainConfig
+from viapoint.training.files import (
     LARGEST_JSON,
     UNFINISHED,
     BadFileError,
@@ -39,7 +40,6 @@ from viapoint.training.io.files import (
     write_folder,
     write_json,
 )
-from viapoint.training.runs.checkpoints import read_checkpoint, write_checkpoint
 
 KEPT_CHECKPOINTS = 2
 PATIENCE = 10.0  # [s]; workers of a study that was killed end within seconds

@@ -1,1 +1,0 @@
-"""Evaluation of methods and its statistics."""

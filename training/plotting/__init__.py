@@ -1,1 +1,0 @@
-"""Plots, pictures and films of results."""

@@ -1,1 +1,0 @@
-"""Rollouts of agents and methods in environments."""

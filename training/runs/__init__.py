@@ -1,1 +1,0 @@
-"""Training runs: folders, checkpoints and models."""

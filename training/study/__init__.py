@@ -1,1 +1,0 @@
-"""Studies: many trainings, baselines and searches for hyperparameters from one file."""
