@@ -42,8 +42,9 @@ from viapoint.training.scene_sets import (
     OWN,
     SETS,
     FrozenScenes,
-    load,
+    save_sets,
     shipped_path,
+    shipped_sets,
 )
 
 SEEDS = {"validation": 11, "test": 12, "hard": 13, "uniform": 14}  # First part of seeds
@@ -236,22 +237,22 @@ def make_sets(env: tuple[str, ...] = (), sets: tuple[str, ...] = SETS, check: bo
         if kwargs.get("decide_at") != "steps":  # tasks of control steps have the scenes of those of movements
             first.setdefault(str(kwargs), env_id)
     for env_id in env or first.values():
-        maker = Maker(env_id)
+        maker, path = Maker(env_id), shipped_path(env_id)
+        there = shipped_sets(path) if path.is_file() else {}
         for name in [each for each in sets if each in maker.numbers()]:
-            path = shipped_path(name, env_id)
-            if path.is_file() and not check:
+            if name in there and not check:
                 continue
             made = maker.make(name)
             counts = np.bincount(made.band, minlength=len(BANDS))
             told = ", ".join(f"{band}: {count}" for band, count in zip(BANDS, counts, strict=True))
             if check:
-                same = path.is_file() and are_close(load(path), made)
+                same = name in there and are_close(there[name], made)
                 different += not same
-                print(f"{path.name}: {'as it ships' if same else 'DIFFERENT'} ({told})", flush=True)
+                print(f"{path.stem} {name}: {'as it ships' if same else 'DIFFERENT'} ({told})", flush=True)
             else:
-                path.parent.mkdir(exist_ok=True)
-                made.save(path)
-                print(f"{path.name}: {len(made.share)} scenes ({told})", flush=True)
+                there[name] = made
+                save_sets(path, there)
+                print(f"{path.stem} {name}: {len(made.share)} scenes ({told})", flush=True)
     sys.exit(bool(different))
 
 

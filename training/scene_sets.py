@@ -90,11 +90,7 @@ class FrozenScenes:
 
     def save(self, path: Path) -> None:
         """Write the set with its hash; numbers that single precision represents take half the place."""
-        if (self.scenes.obstacles.kind >= MESH).any():
-            raise ValueError(f"frozen scenes must have obstacles of the kinds {', '.join(KINDS[:MESH])} only")
-        arrays = {name: _smallest(array) for name, array in self.arrays().items()}
-        about = {"task": np.array(json.dumps(self.task)), "sha256": np.array(self.sha256)}
-        np.savez_compressed(path, **about, **arrays)  # type: ignore[arg-type]
+        save_sets(path, {"": self})
 
     def take(self, rows: Any) -> FrozenScenes:
         """Return the scenes at `rows`, an index array, slice or mask."""
@@ -113,22 +109,50 @@ def evenly_spread(number: int, count: int | None) -> Int:
     return np.linspace(0, number - 1, kept).round().astype(np.int64)
 
 
-def shipped_path(name: str, env_id: str) -> Path:
-    """Return the path of a shipped set of an environment."""
-    task = env_id.removeprefix("viapoint/").partition("-")[0]
-    stem = "".join(f"_{c.lower()}" if c.isupper() else c for c in task).lstrip("_")
-    return Path(str(files("viapoint.training") / "scenes" / f"{stem}_{name}.npz"))
+def save_sets(path: Path, sets: Mapping[str, FrozenScenes]) -> None:
+    """Write sets by their names into one file; the arrays of a set are in a folder of its name."""
+    arrays: dict[str, Any] = {}
+    for name, frozen in sets.items():
+        if (frozen.scenes.obstacles.kind >= MESH).any():
+            raise ValueError(f"frozen scenes must have obstacles of the kinds {', '.join(KINDS[:MESH])} only")
+        arrays |= {_place(name, part): _smallest(array) for part, array in frozen.arrays().items()}
+        arrays[_place(name, "task")] = np.array(json.dumps(frozen.task))
+        arrays[_place(name, "sha256")] = np.array(frozen.sha256)
+    np.savez_compressed(path, **arrays)
 
 
-def shipped_set(name: str, task: Task) -> Path | None:
-    """Return the path of the shipped set whose scenes are those of a task, or None if there is none."""
-    folder = Path(str(files("viapoint.training") / "scenes"))
-    for path in sorted(folder.glob(f"*_{name}.npz")):
+def _place(name: str, part: str) -> str:
+    """Return the name that an array of a set has in a file."""
+    return f"{name}/{part}" if name else part
+
+
+def shipped_path(env_id: str) -> Path:
+    """Return the path of the file that holds the shipped sets of an environment."""
+    return _shipped() / f"{env_id.removeprefix('viapoint/')}.npz"
+
+
+def _shipped() -> Path:
+    return Path(str(files("viapoint.training") / "scenes"))
+
+
+def shipped_sets(path: Path) -> dict[str, FrozenScenes]:
+    """Return the sets of a shipped file by their names."""
+    with np.load(path, allow_pickle=False) as archive:
+        names = [name for name in SETS if _place(name, "task") in archive]
+    return {name: load(path, name) for name in names}
+
+
+def shipped_set(name: str, task: Task) -> FrozenScenes | None:
+    """Return the shipped set whose scenes are those of a task, or None if there is none."""
+    for path in sorted(_shipped().glob("*.npz")):
         with np.load(path, allow_pickle=False) as archive:
-            frozen = json.loads(str(archive["task"]))
+            text = archive.get(_place(name, "task"))
+        if text is None:
+            continue
+        frozen = json.loads(str(text))
         same_eye = _eyes_agree(Sensor.of(frozen.get("sensor")), task.sensor)
         if same_eye and _scene_key(frozen) == _scene_key(task.as_dict()):
-            return path
+            return load(path, name)
     return None
 
 
@@ -150,10 +174,14 @@ def _eyes_agree(frozen: Sensor | None, wanted: Sensor | None) -> bool:
 
 
 def load(path: Path, name: str = "") -> FrozenScenes:
-    """Load a set of scenes and check its hash; a file of something else, or a damaged one, raises ValueError."""
+    """Load a set of scenes, the one with a name in a file of several, and check its hash.
+
+    Raises:
+        ValueError: The file is one of something else, or is damaged.
+    """
     if not path.is_file():
         raise ValueError(f"there is no file of scenes {path}")
-    content: dict[str, Any] = _read(path)
+    content: dict[str, Any] = _read(path, name)
     obstacles = no_obstacles(*content["kind"].shape)
     obstacles = obstacles._replace(**{part: content[part] for part in ("kind", *MOVING)})
     frozen = FrozenScenes(
@@ -177,20 +205,20 @@ def _smallest(array: NDArray[Any]) -> NDArray[Any]:
     return array.astype(np.int8) if array.dtype.kind == "i" else array
 
 
-def _read(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a file, whose shapes are consistent."""
+def _read(path: Path, name: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a set, whose shapes are consistent."""
     try:
         with zipfile.ZipFile(path) as packed:
             size = sum(part.file_size for part in packed.infolist())
         if size > LARGEST:
             raise ValueError(f"its arrays would take {size} bytes, more than {LARGEST}")
         with np.load(path, allow_pickle=False) as archive:
-            content = {name: archive[name] for name in (*CONTENT, "task", "sha256")}
+            content = {part: archive[_place(name, part)] for part in (*CONTENT, "task", "sha256")}
             no_reach = np.zeros((*content["kind"].shape, 5))
-            content[REACH] = archive.get(REACH, no_reach)
-        for name in (*CONTENT, REACH):
-            if content[name].dtype.kind == "f":
-                content[name] = content[name].astype(np.float64)
+            content[REACH] = archive.get(_place(name, REACH), no_reach)
+        for part in (*CONTENT, REACH):
+            if content[part].dtype.kind == "f":
+                content[part] = content[part].astype(np.float64)
         content["kind"] = content["kind"].astype(np.int64)
         _check_content(content)
     except Exception as error:  # an archive can be broken in any of its layers
@@ -233,14 +261,14 @@ def scenes_for(given: str | Path | FrozenScenes, task: Task, number: int | None 
     that cannot be those of the task, raise ValueError.
     """
     if isinstance(given, FrozenScenes) or str(given) not in SETS:
-        frozen = given if isinstance(given, FrozenScenes) else load(Path(given).expanduser())
-        _check_fit(frozen, task)
-        scenes = frozen.scenes.with_rows(task.observation.n_rows)
-        return dataclasses.replace(frozen, scenes=scenes).spread(number)
+        own = given if isinstance(given, FrozenScenes) else load(Path(given).expanduser())
+        _check_fit(own, task)
+        scenes = own.scenes.with_rows(task.observation.n_rows)
+        return dataclasses.replace(own, scenes=scenes).spread(number)
     name = str(given)
-    path = shipped_set(name, task)
-    if path is not None:
-        return load(path, name).spread(number)
+    frozen = shipped_set(name, task)
+    if frozen is not None:
+        return frozen.spread(number)
     if name not in SEEDS:
         raise ValueError(
             f"no {name} scenes are shipped for this task; scenes must be {', '.join(SEEDS)}, which are drawn for it, "

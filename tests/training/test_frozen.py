@@ -15,9 +15,19 @@ from viapoint.training import scene_sets
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
-from viapoint.training.scene_sets import BANDS, SETS, drawn, load, scenes_for, shipped_path, shipped_set
+from viapoint.training.scene_sets import (
+    BANDS,
+    SETS,
+    drawn,
+    load,
+    scenes_for,
+    shipped_path,
+    shipped_set,
+    shipped_sets,
+)
 
-SHIPPED = sorted(shipped_path("test", ENV).parent.glob("*.npz"))
+FILES = sorted(shipped_path(ENV).parent.glob("*.npz"))
+SHIPPED = {f"{path.stem} {name}": frozen for path in FILES for name, frozen in shipped_sets(path).items()}
 
 
 @pytest.fixture(scope="module")
@@ -29,14 +39,13 @@ def simulation():
 
 @pytest.fixture
 def some():
-    return load(shipped_path("test", ENV)).take(slice(0, 5))
+    return load(shipped_path(ENV), "test").take(slice(0, 5))
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_shipped_sets_are_whole_possible_and_of_the_kind_that_they_promise(path):
-    frozen = load(path)
+@pytest.mark.parametrize("frozen", SHIPPED.values(), ids=SHIPPED)
+def test_shipped_sets_are_whole_possible_and_of_the_kind_that_they_promise(frozen):
     check_scenes(frozen.scenes, Task.from_dict(frozen.task).arm)
-    name = path.stem.rpartition("_")[2]
+    name = frozen.name
     changing = frozen.task["moving_obstacles"] or not frozen.task["n_obstacles"][1]
     wanted = (make.FEWER if changing else make.NUMBERS)[name]
     assert 0.95 * wanted <= len(frozen.share) <= wanted
@@ -55,13 +64,14 @@ def test_every_task_has_the_sets_of_its_scenes():
         task = registered_task(env_id)
         own = shipped_set("test", task)
         if env_id not in ("viapoint/Reach-v0", "viapoint/Obstacles-v0"):  # those of the Panda
-            assert own == shipped_path("test", env_id.replace("Step-v", "-v"))
-        assert load(own).task["arm"] == task.arm.name
+            path = shipped_path(env_id.replace("Step-v", "-v"))
+            assert own.sha256 == load(path, "test").sha256
+        assert own.task["arm"] == task.arm.name
 
 
 def test_sets_made_again_are_the_same():
     made = make.Maker(REACH).make("validation")
-    assert made.sha256 == load(shipped_path("validation", REACH)).sha256
+    assert made.sha256 == load(shipped_path(REACH), "validation").sha256
 
 
 def test_scenes_are_of_the_kind_asked_for_and_can_be_solved(simulation, monkeypatch):
@@ -81,7 +91,7 @@ def test_scenes_are_of_the_kind_asked_for_and_can_be_solved(simulation, monkeypa
 
 def test_the_stated_share_is_what_one_measures(simulation):
     """Other random actions give the same shares in physics, within what chance and the least clearance allow."""
-    frozen = load(shipped_path("validation", ENV))
+    frozen = load(shipped_path(ENV), "validation")
     few = frozen.take(np.flatnonzero(frozen.share > 0.1)[:12])
     draws = np.random.default_rng(123).uniform(-1.0, 1.0, (200, 3))
     rows = np.repeat(np.arange(12), 200)
@@ -101,7 +111,7 @@ def test_bands_by_their_edges(some):
 def test_frozen_scenes_are_met_where_they_fit(kwargs, capsys):
     task = registered_task(ENV, **kwargs)
     for name in SETS:
-        assert scenes_for(name, task).sha256 == load(shipped_path(name, ENV)).sha256
+        assert scenes_for(name, task).sha256 == load(shipped_path(ENV), name).sha256
     assert capsys.readouterr().err == ""
 
 
@@ -188,8 +198,8 @@ def test_arrays_that_do_not_fit_together_are_refused(some, tmp_path, name, forge
     refused(path)
 
 
-@pytest.mark.parametrize("task", sorted({path.stem.rpartition("_")[0] for path in SHIPPED}))
-def test_no_scene_is_in_two_sets(task):
-    sets = [load(path) for path in SHIPPED if path.stem.rpartition("_")[0] == task]
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_no_scene_is_in_two_sets(path):
+    sets = shipped_sets(path).values()
     ends = np.concatenate([np.hstack((each.scenes.start, each.scenes.goal)) for each in sets])
     assert len(np.unique(ends, axis=0)) == len(ends)

@@ -536,7 +536,7 @@ def test_without_the_library_its_extra_is_named(monkeypatch):
 
 def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
     pytest.importorskip("ompl")
-    frozen = load(shipped_path("validation", PLANE))
+    frozen = load(shipped_path(PLANE), "validation")
     frozen = frozen.take(np.concatenate([np.flatnonzero(frozen.band == band)[:3] for band in range(4)]))
     result = evaluate_methods(
         [make_method("ompl", PLANE)], frozen, PLANE, batch=20, time_decisions=False
@@ -568,7 +568,7 @@ def test_where_there_is_no_way_it_gives_up(monkeypatch):
 @pytest.mark.parametrize("env_id", [PLANE, WHOLE, PANDA_TASK])
 def test_plans_are_as_clear_as_they_are_said_to_be(env_id):
     pytest.importorskip("ompl")
-    scenes = load(shipped_path("validation", env_id)).scenes.take(np.arange(0, 240, 20))
+    scenes = load(shipped_path(env_id), "validation").scenes.take(np.arange(0, 240, 20))
     method = make_method("ompl", env_id)
     plans = [method.plan(scenes.take([row])) for row in range(12)]
     for plan in plans:

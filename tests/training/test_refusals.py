@@ -222,7 +222,7 @@ CALLS = [
     )),
     lambda: setattr(load_agent(SENSED).policy, "belief", "magic"),
     lambda: agent_method("agent", SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2), 8),
-    lambda: evaluate_methods([], load(shipped_path("test", ENV)), ENV),
+    lambda: evaluate_methods([], load(shipped_path(ENV), "test"), ENV),
     lambda: evaluate(ENV, env=REACH),
     lambda: evaluate(5, env=ENV),
     *(lambda given=given: evaluate(env=ENV, baselines=given) for given in (
@@ -296,8 +296,8 @@ CALLS = [
     lambda: plan_motions(PANDA_ARM, [PANDA_ARM.home], [PANDA_ARM.home], [[]], threads=2.5),
     lambda: moved(obstacles=[many_points()]).execute(force=True),
     lambda: scenes_for("tests", Task.of()),
-    *(lambda env_id=env_id: scenes_for(shipped_path("validation", env_id), Task.of()) for env_id in CHANGING),
-    *(lambda name=name: evaluate(env=ENV, baselines=["straight"], scenes=load(shipped_path("test", name)))
+    *(lambda env_id=env_id: scenes_for(load(shipped_path(env_id), "validation"), Task.of()) for env_id in CHANGING),
+    *(lambda name=name: evaluate(env=ENV, baselines=["straight"], scenes=load(shipped_path(name), "test"))
       for name in (PANDA, *CHANGING)),
     *(lambda changes=changes: film(**changes)
       for changes in ({"path": "film.gif"}, {"mode": None}, {"number": 0})),

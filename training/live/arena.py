@@ -23,7 +23,7 @@ from viapoint.training.live.state import Scene, State
 from viapoint.training.paper.movements import TARGETS, rows_of_lights
 from viapoint.training.planning.baselines import AgentMethod
 from viapoint.training.planning.search import registered_task
-from viapoint.training.scene_sets import load, shipped_set
+from viapoint.training.scene_sets import shipped_set
 
 MOTION, AGENT, SEARCH = "motion planner", "agent", "geometry search"
 STRAIGHT, OMPL, HAND = "straight movement", "OMPL", "by hand"  # Names of methods
@@ -122,9 +122,9 @@ class Arena:
         task = self.task
         kinds = {"Random": self._random()}
         for name in ("test", "hard"):
-            path = shipped_set(name, task)
-            if path is not None:
-                kinds[name.capitalize()] = self._shipped(name, load(path).scenes)
+            frozen = shipped_set(name, task)
+            if frozen is not None:
+                kinds[name.capitalize()] = self._shipped(name, frozen.scenes)
         if task.space.of_hand and task.n_obstacles[1] and not (task.whole_arm or task.replanning):
             kinds["Lights 1985"] = self._lights()
         return kinds
