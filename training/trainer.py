@@ -222,11 +222,11 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
     """Take over a run's own configuration, except for fields that may change."""
     check_unchanged(run, config, TrainConfig())
     if config.n_timesteps is not None and config.n_timesteps != run.config.total_timesteps:
-        if config.n_timesteps < run.decisions:
+        if config.n_timesteps < run.config.total_timesteps:
             raise BadFileError(
                 run.folder,
-                f"holds a run of {run.decisions} decisions already; n_timesteps must be as many or more, "
-                f"got {config.n_timesteps}",
+                f"holds a run of {run.config.total_timesteps} decisions, whose settings change in its course; "
+                f"n_timesteps must be as many or more, got {config.n_timesteps}",
             )
         run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
     run.config = dataclasses.replace(run.config, progress=config.progress)

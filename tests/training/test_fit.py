@@ -77,6 +77,14 @@ def test_other_units_than_seconds_and_metres_are_told(column, tmp_path, capsys):
     assert ("seconds" if column == "time" else "metres") in capsys.readouterr().err
 
 
+def test_the_most_via_points_are_told(tmp_path, capsys):
+    recorded("time", "x", "y").to_csv(tmp_path / "one.csv", index=False)
+    run(tmp_path / "one.csv", "--out", tmp_path, "--n-via", 0, 1)
+    assert "the most allowed" in capsys.readouterr().err
+    run(tmp_path / "one.csv", "--out", tmp_path, "--n-via", 0, 2)
+    assert capsys.readouterr().err == ""
+
+
 TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
 
 
@@ -89,7 +97,10 @@ TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
         ([*TABLE[:2], "", "0.1,far,0.2"], "line 4, column x: far"),
         (["y", "0.1"], "no column time"),
         (["time;x;y", "0.0;0.1;0.2"], "separate columns by commas"),
-        ([TABLE[0], *(f"{-time},0.1,0.2" for time in range(12))], "time must ascend"),
+        ([TABLE[0], *(f"{-time},0.1,0.2" for time in range(12))], "goes back in time in line 3"),
+        ([*TABLE, *TABLE[1:]], "add a column `movement`"),
+        (["time,x,y", "s,m,m", *TABLE[1:]], "leave out lines of units"),
+        (["# arm 1", *TABLE], "first line must name the columns"),
         (TABLE[:1], "holds no samples"),
         (["", *TABLE[:3], "0.1,,0.2"], "line 5, column x: nothing"),
         (["time,x,y,x", "0.0,0.1,0.2,0.1"], "several columns x"),
@@ -109,7 +120,7 @@ def test_foreign_files_stay(file, tmp_path, failed):
     assert "not written by viapoint" in failed("fit", file, "--out", tmp_path)
     assert (tmp_path / "fit.csv").read_text() == "mine"
     (tmp_path / "empty.csv").touch()
-    assert "cannot be read as CSV" in failed("fit", tmp_path / "empty.csv", "--out", tmp_path / "fit")
+    assert "is empty" in failed("fit", tmp_path / "empty.csv", "--out", tmp_path / "fit")
 
 
 def test_a_full_disk_leaves_no_half_of_a_figure(file, tmp_path, failed, monkeypatch):

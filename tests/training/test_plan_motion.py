@@ -450,6 +450,8 @@ def test_command_line_plans_and_measures(tmp_path, capsys, failed) -> None:
         f'{{"format": "viapoint-scene", "obstacles": {obstacles_to_json([POST])}, "reaches": [[0, 1, 0.1, 0, 0]]}}'
     )
     assert "has reaches" in failed(*words)
+    scene.write_text('{"format": "viapoint-scene", "env": "viapoint/PlanarReach-v0", "start": [0.1, 0.4]}')
+    assert "of the arm planar" in failed(*words)
     main(["evaluate", "--scenes", "motionbenchmaker", "--n-scenes", "3"])
     assert "| plan_motion | all" in capsys.readouterr().out
 

@@ -13,6 +13,7 @@ import pandas as pd
 
 from viapoint.envs.common.types import Float
 from viapoint.primitives import ViaPointFit, fit_via_points
+from viapoint.primitives.fitting import USUAL_RANGE
 from viapoint.training.configs import FitConfig
 from viapoint.training.files import BadFileError, check_ours, read_bytes, write_bytes
 from viapoint.training.plots import fitted_movements
@@ -43,7 +44,7 @@ def run(config: FitConfig) -> None:
             fits[name] = fit_via_points(time, position, config.numbers, free_ends=config.free_ends)
         except ValueError as error:
             raise BadFileError(config.file, f"movement {name}: {error}") from None
-    _warn(movements)
+    _warn(movements, fits, config)
     print(_printed(fits))
     fitted_movements(figure, dict(itertools.islice(movements.items(), DRAWN)), fits)
     write_bytes(table, _written(fits).to_csv(index=False).encode())
@@ -57,9 +58,10 @@ def read_movements(path: Path) -> Movements:
     missing = [name for name in REQUIRED if name not in table]
     if missing:
         found = ", ".join(map(str, table.columns))
-        advice = "; separate columns by commas" if len(table.columns) == 1 else ""
+        advice = "separate columns by commas" if len(table.columns) == 1 else "names must be the same"
         raise BadFileError(
-            path, f"has no column {', '.join(missing)}; its first line names the columns {found}{advice}"
+            path,
+            f"has no column {', '.join(missing)}; its first line names the columns {found}; {advice}",
         )
     names = [name for name in ("time", *COORDINATES) if name in table]
     numbers = table[names].apply(pd.to_numeric, errors="coerce")
@@ -70,7 +72,7 @@ def read_movements(path: Path) -> Movements:
         raise BadFileError(
             path,
             f"has no number in line {table.index[row]}, column {names[column]}: {entry}; "
-            "leave out lines that were not measured",
+            "leave out lines of units, and those that were not measured",
         )
     labels = table["movement"].str.strip() if "movement" in table else pd.Series("1", index=table.index)
     if labels.isna().any():
@@ -78,25 +80,38 @@ def read_movements(path: Path) -> Movements:
     movements: Movements = {}
     for label, rows in numbers.groupby(labels, sort=False):
         values = rows.to_numpy(dtype=float)
+        back = np.flatnonzero(np.diff(values[:, 0]) < 0.0)
+        if back.size:
+            raise BadFileError(
+                path,
+                f"goes back in time in line {rows.index[back[0] + 1]}; if another movement begins there, "
+                "add a column `movement` with the name of the movement of each line, otherwise sort the lines",
+            )
         movements[str(label)] = values[:, 0], values[:, 1:]
     if not movements:
         raise BadFileError(path, "holds no samples")
     return movements
 
 
-def _warn(movements: Movements) -> None:
-    """Print what looks like other units than seconds and metres."""
+def _warn(movements: Movements, fits: Fits, config: FitConfig) -> None:
+    """Print what looks like other units than seconds and metres, or like several movements in one."""
+    fewest, most = config.numbers or USUAL_RANGE
     for name, (time, position) in movements.items():
         gap, extent = float(np.ptp(time)) / len(time), float(np.ptp(position, axis=0).max())
         if gap > SLOW:
             print(f"movement {name}: samples are {gap:g} s apart; `time` is in seconds", file=sys.stderr)
         if extent > WIDE:
             print(f"movement {name}: the hand moves {extent:g} m; positions are in metres", file=sys.stderr)
+        if fewest < most == fits[name].n_via:
+            told = "allow more by --n-via, or cut a recording of several movements"
+            print(f"movement {name}: {most} via-points, the most allowed, fit best; {told}", file=sys.stderr)
 
 
 def _read_table(path: Path) -> pd.DataFrame:
     """Return the entries of a CSV file as texts; the index holds the numbers of their lines in the file."""
     content = read_bytes(path)
+    if not content.strip():
+        raise BadFileError(path, "is empty")
     try:
         text = content.decode("utf-8-sig")
         begun = text.lstrip()
@@ -104,7 +119,8 @@ def _read_table(path: Path) -> pd.DataFrame:
         table = pd.read_csv(file, header=None, dtype=str, skipinitialspace=True, skip_blank_lines=False)
     except ValueError as error:
         reason = f"cannot be read as CSV in UTF-8 ({str(error).strip()})"
-        raise BadFileError(path, f"{reason}; commas separate columns, and decimals have points") from None
+        advice = "its first line must name the columns, commas separate them, and decimals have points"
+        raise BadFileError(path, f"{reason}; {advice}") from None
     blank_lines = text[: len(text) - len(begun)].count("\n")
     table.index += 1 + blank_lines
     head = table.iloc[0].str.strip()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from viapoint.training.configs import PlanConfig
 from viapoint.training.files import LARGEST_JSON, BadFileError, read_bytes
 from viapoint.training.planning.export import read_motion, write_motion
 from viapoint.training.planning.plan_motion import plan_motion
+from viapoint.training.planning.search import registered_task
 
 
 def run(config: PlanConfig) -> None:
@@ -23,7 +25,7 @@ def run(config: PlanConfig) -> None:
     if config.out is not None:
         _check_replaceable(config.out)
     arm = _arm_for(config)
-    scene = _scene(config.scene)
+    scene = _scene(config.scene, arm)
     start = config.start or scene.get("start")
     if start is None:
         start = arm.hand(arm.home)[:2] if arm.space == "hand" else arm.home
@@ -83,14 +85,19 @@ def _arm_for(config: PlanConfig) -> Arm:
     )
 
 
-def _scene(path: Path | None) -> dict[str, Any]:
-    """Return start, goal and obstacles of a scene file, or of a list of obstacles."""
+def _scene(path: Path | None, arm: Arm) -> dict[str, Any]:
+    """Return start, goal and obstacles of a scene file, or of a list of obstacles; ends of another arm are refused."""
     if path is None:
         return {}
     text = read_bytes(path, LARGEST_JSON).decode("utf-8-sig")
     if text.lstrip().startswith("["):
         return {"obstacles": obstacles_from_json(text)}
     scene = scene_from_json(text)
+    env_id = json.loads(text).get("env")
+    if env_id and {"start", "goal"} & scene.keys():
+        other = registered_task(env_id).arm
+        if other.name != arm.name:
+            raise ValueError(f"{path} has ends of the arm {other.name} ({env_id}), not of {arm.name}")
     changes = [name for name in ("jumps", "turns", "reaches") if scene.get(name)]
     if changes:
         raise ValueError(f"{path} has {', '.join(changes)}: a plan is for one goal and constant velocities")
