@@ -68,7 +68,7 @@ def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
         ax.bar(x, rate, width=0.9 * width, label=name, **_bar_style(name, list(summaries)))
         ax.errorbar(x, rate, yerr=(rate - low, high - rate), fmt="none", ecolor="0.25", elinewidth=1.0)
     ax.set_xticks(range(len(BANDS)), BANDS)
-    ax.set_xlabel("solution share: random actions that solve the scene (easy to hard)")
+    ax.set_xlabel("solution share: random actions whose plan is clear (easy to hard)")
     ax.set_ylabel("success [%]")
     ax.set_ylim(0.0, 102.0)
     ax.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))

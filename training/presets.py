@@ -107,8 +107,6 @@ REACH_PRESETS = {"viaq": _changed(PRESETS["viaq"], {}, n_timesteps=8_000)}
 _REVISING = {"gradient_steps": 6, "next_candidates": 4}
 REPLANNING_PRESETS = {"viaq": _changed(PRESETS["viaq"], _REVISING, n_timesteps=24_000)}
 """Presets of replanning tasks."""
-HAND_ROUNDS = {"refinements": 4}
-"""Settings of the policy of viaq where plans of the hand are revised; twice the usual rounds solve a little more."""
 JOINT_DECISIONS = 16_000  # Decisions in joint space, where one costs several times as much
 # Settings of viarank in joint space, where the arm has many more places in a movement
 JOINT_SIGHT: dict[str, Any] = {
@@ -136,8 +134,6 @@ def preset_of(task: Task, algo: Algorithm) -> Preset:
         preset = REACH_PRESETS.get(algo, preset)
     if algo == "viaq" and not task.space.of_hand:
         return _changed(preset, {}, n_timesteps=min(preset.n_timesteps, JOINT_DECISIONS))
-    if algo == "viaq" and task.replanning:
-        return _changed(preset, {"policy_kwargs": HAND_ROUNDS})
     if algo == "viarank" and not task.space.of_hand:
         return _changed(preset, JOINT_SIGHT, n_timesteps=JOINT_DECISIONS)
     return preset

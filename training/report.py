@@ -29,7 +29,7 @@ NUMBERS = {
 NOTES = (
     "Success: arrived at rest within 1 cm, no contact at any physics step, joint limits kept; with its 95 % "
     "Wilson interval. Share: success among scenes of that solution share, the fraction of random actions "
-    "that solve a scene; in hard sets also among scenes of each family. Clearance and goal error are medians "
+    "whose plan is clear; in hard sets also among scenes of each family. Clearance and goal error are medians "
     "of all scenes, jerk ratio (to the straight movement) and duration of the successes. SPL: success weighted "
     "by straight distance over path length. Decision: median wall time of single decisions, and their 98th "
     "percentile; where that is missing, the mean in a batch."

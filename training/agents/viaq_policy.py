@@ -49,8 +49,8 @@ class ViaQPolicy(PlanPolicy):
         refinements: Rounds of candidates around the best ones.
         per_refinement: Candidates of each round.
         checks: Greatest number of plans that exact geometry checks, the best candidates first; 0 for none.
-        refine: Number of best candidates that the planner refines by the gradient of clearance, of which the best one
-            is taken after an exact check; 0 for none. Only for tasks whose actions are whole movements.
+        refine: Number of best candidates, some distance apart, that the planner refines by the gradient of clearance;
+            the best one is taken after an exact check. 0 for none. Only for tasks whose actions are whole movements.
     """
 
     OWN = "width", "instants", "candidates", "refinements", "per_refinement", "checks", "refine"
@@ -65,7 +65,7 @@ class ViaQPolicy(PlanPolicy):
         width: int = 32,
         instants: int = 32,
         candidates: int = 256,
-        refinements: int = 2,
+        refinements: int = 4,
         per_refinement: int = 64,
         checks: int = 0,
         refine: int = 0,
@@ -161,10 +161,9 @@ class ViaQPolicy(PlanPolicy):
         local = max(count - PROPOSALS, 0) if self.checks else 0
         promising = self._promising(values, count - local)
         checked = np.take_along_axis(actions, promising[..., None], axis=1)
-        if self.refine:  # Sobol points differ more from each other than the candidates of later rounds
-            top = np.argsort(-values[:, : self.candidates], axis=1, kind="stable")[:, : self.refine]
-            seeds = np.take_along_axis(actions, top[..., None], axis=1)
-            checked = np.concatenate((checked, refined_actions(self.task, problem, seeds)), axis=1)
+        if self.refine:
+            refined = refined_actions(self.task, problem, self.best_apart(actions, values, self.refine))
+            checked = np.concatenate((checked, refined), axis=1)
         worth = merits(self.task, problem, checked)
         unsolved = np.flatnonzero(worth.max(axis=1) < 0.5 * INFEASIBLE)
         best = best_of(self.task, problem, checked, worth)
