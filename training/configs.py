@@ -361,8 +361,7 @@ class EvaluateConfig(AgentConfig):
 
     baselines: tuple[str, ...] = USUAL_BASELINES
     """Some of straight, random, ompl, search512 or another number (the best of that many computed
-    plans), sobol512 (of fixed plans); with an agent, untrained (its network before training); in tasks with replanning,
-    unrevised (the first plan alone)."""
+    plans), sobol512 (of fixed plans); with an agent, untrained (its network before training)."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
     refine: tuple[int, ...] = ()  # Numbers of proposals that the planner refines, one further row each.

@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from viapoint.training.planning.baselines import Method, OpenLoopBaseline, PlannerMethod
+from viapoint.training.planning.baselines import Method, PlannerMethod
 
 # Groups, name and version, as Minari allows them; it does not always ask for a version
 DATASET_ID = re.compile(r"([-\w]{2,}/)*[-\w]+-v\d+")
@@ -53,7 +53,7 @@ def record_dataset(
     """
     import minari
 
-    if isinstance(method, PlannerMethod | OpenLoopBaseline):
+    if isinstance(method, PlannerMethod):
         raise ValueError(
             f"movements of {method.name} are no actions, which a dataset holds; those of an agent, random or "
             "search512 are"

@@ -26,7 +26,6 @@ from viapoint.training.checks import check_whole
 from viapoint.training.files import versions
 from viapoint.training.planning.baselines import (
     Method,
-    OpenLoopBaseline,
     agent_method,
     make_method,
 )
@@ -191,10 +190,9 @@ def evaluate(
             agent's own setting if not given.
         refine: Number of proposals that the planner refines, or several numbers, one further row each.
         baselines: Names, or objects with `name` and `decide`. Names are `untrained` (the agent's network before
-            training), `straight`, `random`, `plan_motion`, `ompl`, `searchN` and `sobolN` (N
-            checked plans), in tasks with replanning `unrevised` (the first plan alone), and in tasks with a sensor
-            `cautiousN` and BELIEF:METHOD, such as `thick:search512`. Where obstacles move, also PREDICTION:searchN,
-            such as `reach:search512`.
+            training), `straight`, `random`, `plan_motion`, `ompl`, `searchN` and `sobolN` (N checked plans), in
+            tasks with a sensor also `cautiousN` and BELIEF:METHOD, such as `thick:search512`, and where obstacles move
+            PREDICTION:searchN, such as `reach:search512`.
         time_decisions: Measure the wall time of single decisions.
         progress: Function of the method's name, the number of finished scenes and the number of all scenes.
 
@@ -233,9 +231,6 @@ def evaluate(
             methods.append(each)
         elif each == "untrained" and isinstance(agent, BaseAlgorithm):
             methods += _rows_of(untrained(agent), settings, each)
-        elif each == "unrevised" and isinstance(agent, BaseAlgorithm) and task.replanning:
-            first = agent_method("agent", agent, checks=0 if settings[0] else None)
-            methods.append(OpenLoopBaseline(first, SceneSimulation(env_id, 250, **kwargs)))
         else:
             methods.append(make_method(each, env_id, **kwargs))
     _check_methods(methods)

@@ -70,14 +70,12 @@ class SceneSimulation:
             return results
         return self.episodes(scenes, decisions, method.decide)
 
-    def episodes(
-        self, scenes: Scenes, actions: Float, decide: Decide | None, *, single_decision: bool = False
-    ) -> SimulationResults:
+    def episodes(self, scenes: Scenes, actions: Float, decide: Decide | None) -> SimulationResults:
         """Simulate one episode in each of N scenes, from first actions (N, m); later ones are decided, or zero."""
         pieces = []
         for rows, _, env, _ in self._begun(scenes):
             some = scenes.take(rows)
-            pieces.append(_episodes(env, some, actions[rows], decide, single_decision))
+            pieces.append(_episodes(env, some, actions[rows], decide))
         return SimulationResults.concatenate(pieces)
 
     def execute_plan(self, scenes: Scenes, plan: Plan) -> SimulationResults:
@@ -118,9 +116,7 @@ def _joined(pieces: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[A
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
-def _episodes(
-    env: ReachVectorEnv, scenes: Scenes, first: Float, decide: Decide | None, single_decision: bool
-) -> SimulationResults:
+def _episodes(env: ReachVectorEnv, scenes: Scenes, first: Float, decide: Decide | None) -> SimulationResults:
     """Play one episode in each scene; environments beyond them do not take part."""
     number, size = len(first), env.num_envs
     actions = np.zeros((size, first.shape[1]))
@@ -135,7 +131,7 @@ def _episodes(
         decisions += now
         for name, values in decision.info.items():
             last[name] = np.where(now, values[:number], last.get(name, values[:number]))
-        running &= ~(decision.terminated | decision.truncated | single_decision)  # which must not go on
+        running &= ~(decision.terminated | decision.truncated)  # which must not go on
         actions[:] = 0.0  # which keeps the plan under way
         rows = np.flatnonzero(running)
         if decide is not None and rows.size:

@@ -210,7 +210,7 @@ class Decides:
 
 ZERO = np.zeros((2, 3))
 CALLS = [
-    *(lambda name=name: make_method(name, ENV) for name in ("magic", "search", "search3", "sobol0", "unrevised")),
+    *(lambda name=name: make_method(name, ENV) for name in ("magic", "search", "search3", "sobol0")),
     *(lambda name=name: make_method(name, MOVING) for name in ("constant", "rest:ompl", "ompl")),
     lambda: SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2, replay_buffer_class=HerReplayBuffer),
     lambda: benchmark_planner("search99999999999"),
@@ -390,7 +390,6 @@ COMMANDS = [
     (f"evaluate --env {ENV} --baselines straight --scenes nowhere.npz", "nowhere.npz"),
     (f"evaluate --env {SENSED} --baselines search16 --env-kwargs sensor=nose", "hand_rays"),
     (f"evaluate --env {ENV} --json /proc/x", "--json /proc/x cannot be written"),
-    (f"evaluate {REACH} --baselines unrevised", "unrevised"),
     (f"evaluate --env {ENV} --baselines untrained", "untrained needs an agent"),
     *(
         (f"evaluate --env {ENV} --baselines {name}", f"{name} needs a task with a sensor")

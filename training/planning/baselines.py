@@ -135,22 +135,6 @@ def _ompl_method(simulation: SceneSimulation) -> PlannerMethod:
     return PlannerMethod(simulation, "ompl", ompl_motion)
 
 
-class OpenLoopBaseline:
-    """First decision of a method, which is never revised."""
-
-    def __init__(self, method: Method, simulation: SceneSimulation) -> None:
-        self.name, self._method = "unrevised", method
-        self._simulation = SceneSimulation(simulation.env_id, 250, **{**simulation.kwargs, "decide_at": ()})
-
-    def decide(self, observation: Observation, scenes: Scenes) -> Float:
-        """Return the decision of the method, see :class:`Method`."""
-        return self._method.decide(observation, scenes)
-
-    def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
-        """Simulate one movement in each scene; it fails where the target has changed by its end."""
-        return self._simulation.episodes(scenes, decisions, None, single_decision=True)
-
-
 class AgentMethod:
     """Trained agent, which checks and refines some of its proposals in each decision.
 
@@ -246,19 +230,8 @@ PLANNERS: dict[str, Callable[[SceneSimulation], PlannerMethod]] = {
     "ompl": _ompl_method,
 }
 
-# Factories of baselines by their names on the command line
-METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
-    "straight": Straight,
-    "random": RandomVias,
-    **PLANNERS,
-}
-
-# Factories of baselines for replanning tasks
-REPLANNING_METHODS: dict[str, Callable[[SceneSimulation], Method]] = {
-    "straight": Straight,
-    "random": RandomVias,
-    "unrevised": lambda simulation: OpenLoopBaseline(Straight(simulation), simulation),
-}
+# Factories of baselines for all tasks; those with one decision for a movement have PLANNERS, too
+METHODS: dict[str, Callable[[SceneSimulation], Method]] = {"straight": Straight, "random": RandomVias}
 
 
 def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
@@ -273,7 +246,7 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
     Raises:
         ValueError: There is no such baseline, or it would check too many plans.
     """
-    known = REPLANNING_METHODS if task.replanning else METHODS
+    known = METHODS if task.replanning else {**METHODS, **PLANNERS}
     sensed = task.sensor is not None
     unsensed = [each for each in COUNTED if each not in SENSED]  # which plan with any belief, too
     belief, _, planner = name.rpartition(":")
