@@ -38,8 +38,8 @@ from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import (
     BANDS,
     DRAWN,
-    MOVING,
-    OWN,
+    OBSTACLE_PARTS,
+    SCENE_PARTS,
     SETS,
     FrozenScenes,
     save_sets,
@@ -183,8 +183,8 @@ class Maker:
 
 def rounded(scenes: Scenes) -> Scenes:
     """Return scenes whose numbers single precision represents."""
-    obstacles = scenes.obstacles._replace(**_single(scenes.obstacles, MOVING))
-    return scenes._replace(obstacles=obstacles, **_single(scenes, OWN))
+    obstacles = scenes.obstacles._replace(**_single(scenes.obstacles, OBSTACLE_PARTS))
+    return scenes._replace(obstacles=obstacles, **_single(scenes, SCENE_PARTS))
 
 
 def _single(record: Any, names: Sequence[str]) -> dict[str, Any]:
@@ -218,8 +218,8 @@ def are_close(first: FrozenScenes, second: FrozenScenes) -> bool:
 
 def numbers_of(scenes: FrozenScenes) -> list[Float]:
     """Return all numbers of a set."""
-    obstacles = [getattr(scenes.scenes.obstacles, name) for name in ("kind", *MOVING)]
-    return [*obstacles, *(getattr(scenes.scenes, name) for name in OWN), scenes.share]
+    obstacles = [getattr(scenes.scenes.obstacles, name) for name in ("kind", *OBSTACLE_PARTS)]
+    return [*obstacles, *(getattr(scenes.scenes, name) for name in SCENE_PARTS), scenes.share]
 
 
 def make_sets(env: tuple[str, ...] = (), sets: tuple[str, ...] = SETS, check: bool = False) -> None:

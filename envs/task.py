@@ -125,19 +125,19 @@ class Task:
             raise ValueError(f"courses must be one of {', '.join(COURSES)}, got {courses!r}")
         if courses != COURSES[0] and not moving_obstacles:
             raise ValueError(f"courses={courses!r} needs moving_obstacles=True")
-        numbers = fewest_and_most("n_obstacles", n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
+        n_obstacles = fewest_and_most("n_obstacles", n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
         plane = is_planar(arm)
         shapes = (PLANE_SHAPES if plane else SPACE_SHAPES) if shapes is None else shapes
         kinds = check_kinds(names_of("shapes", shapes))
-        families = default_families(plane, kinds, numbers[1]) if families is None else families
+        families = default_families(plane, kinds, n_obstacles[1]) if families is None else families
         names = names_of("families", families)
         if isinstance(sensor, str):
-            room = room_of(arm, kinds, numbers, tall=False)
+            room = room_of(arm, kinds, n_obstacles, tall=False)
             sensor = named_sensor(sensor, arm, room.foot, room.scale)
             if decide_at == END:  # only one look at the beginning
                 sensor = dataclasses.replace(sensor, looks=1)
         sensor = Sensor.of(sensor)
-        if sensor is not None and not numbers[1]:
+        if sensor is not None and not n_obstacles[1]:
             raise ValueError("sensor needs n_obstacles of 1 or more: there is nothing to see")
         task = cls(
             arm=arm,
@@ -145,9 +145,9 @@ class Task:
             n_via=whole_number("n_via", n_via, 0),
             timing=timing,
             duration_range=DURATIONS[space] if duration_range is None else duration_range,
-            n_obstacles=numbers,
+            n_obstacles=n_obstacles,
             shapes=kinds,
-            families=check_families(names, plane, kinds, numbers[1]),
+            families=check_families(names, plane, kinds, n_obstacles[1]),
             whole_arm=bool(whole_arm),
             moving_obstacles=bool(moving_obstacles),
             courses=courses,
@@ -171,8 +171,9 @@ class Task:
             raise ValueError(
                 "obstacles that move and targets that jump need decide_at with events of a movement"
             )
+        # Making the layout of actions checks the control step and the durations, and makes plain n_obstacles of these.
         if task.stepwise:
-            task.steering  # noqa: B018 - checks the control step
+            task.steering  # noqa: B018
         return dataclasses.replace(task, duration_range=task.action.duration_range)
 
     @functools.cached_property
@@ -271,7 +272,7 @@ class Task:
         return SceneSampler(self)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the task as plain values for JSON; the arm by its name."""
+        """Return the task as plain values for JSON; the arm by its name, or the path of its file."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         values["arm"] = self.arm.file or self.arm.name
         values["space"] = values.pop("space_name")
@@ -286,10 +287,10 @@ class Task:
 
     @classmethod
     def from_dict(cls, record: Mapping[str, Any]) -> Task:
-        """Return the task of a record of :meth:`as_dict`; its arm must be registered.
+        """Return the task of a record of :meth:`as_dict`; its arm must be registered, or its file be there.
 
         Raises:
-            ValueError: The arm is not registered, or a value is not allowed.
+            ValueError: There is no such arm, or a value is not allowed.
         """
         return cls.of(**record)
 

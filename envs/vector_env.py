@@ -129,9 +129,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self._limit = math.inf
         if max_episode_steps is not None:
             self._limit = whole_number("max_episode_steps", max_episode_steps, 1)
-        number = whole_number("threads", threads, 0) or os.cpu_count() or 1
-        number = max(min(number, self.num_envs // LEAST_SHARE), 1)
-        self._shares = np.array_split(np.arange(self.num_envs), number)
+        n_threads = whole_number("threads", threads, 0) or os.cpu_count() or 1
+        n_threads = max(min(n_threads, self.num_envs // LEAST_SHARE), 1)
+        self._shares = np.array_split(np.arange(self.num_envs), n_threads)
         self._episodes = [Episodes(self.task, len(share)) for share in self._shares]
         self._renderers = [
             EpisodeRenderer(episodes, row, render_mode, width, height, SINGLE_METADATA["render_fps"])
@@ -140,13 +140,13 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         ]
         self._samplers = [self.task.sampler() for _ in self._shares]
         self._pool: ThreadPoolExecutor | None = None
-        self._process = os.getpid()
+        self._process = os.getpid()  # of the pool, whose threads do not survive a fork
         self.generators: list[np.random.Generator] = []
         """Random generators of the environments' scenes; empty before the first reset."""
         self._running = False
         self._over = np.zeros(self.num_envs, bool)
         self._decisions = np.zeros(self.num_envs, np.int64)  # of the running episodes
-        self.terminated = np.ones(self.num_envs, bool)
+        self.terminated = np.zeros(self.num_envs, bool)
         """True where the last step terminated the episode, shape (num_envs,)."""
         self.truncated = np.zeros(self.num_envs, bool)
         """True where the last step truncated the episode, shape (num_envs,)."""

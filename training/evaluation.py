@@ -55,9 +55,8 @@ class MethodResult:
     family: NDArray[np.str_]  # Scene family of each scene, '' for the training distribution, shape (n,)
     distance: Float
     """Distance from start to goal, shape (n,), [m]; NaN if the target jumps, as the shortest path is unknown."""
-    interrupted: bool
-    """Mark of an evaluation that Ctrl-C ended; decision times, and scenes if it is partial, are missing."""
-    partial: bool  # Mark of an evaluation that was interrupted before the last scene
+    interrupted: bool  # True if Ctrl-C ended it; then decision times may be missing
+    partial: bool  # True if it ended before the last scene
 
     @property
     def success(self) -> NDArray[np.bool_]:

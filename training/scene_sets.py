@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.types import Float, Int
-from viapoint.envs.geometry.obstacles import KINDS, MESH, no_obstacles
+from viapoint.envs.geometry.obstacles import ABSENT, KINDS, no_obstacles
+from viapoint.envs.geometry.shapes import IN_TABLES, PLAIN_KINDS
 from viapoint.envs.scenes.scene import NEVER, Scenes, check_scenes, resting
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import COURSES, Task
@@ -29,10 +30,10 @@ DRAWN = ""  # Family of the scenes that are drawn as in training
 SEEDS = {"validation": 1_000_003, "test": 2_000_003}  # Far from training seeds
 NUMBERS = {"validation": 500, "test": 1_000}  # Number of scenes of such a set
 LARGEST = 1 << 30  # Limit of a file's arrays, [bytes]: small archives can claim any size
-OWN = ("start", "goal", "jumps", "turn_time", "turn_velocity", "reach")  # Arrays of `Scenes`
-MOVING = ("centre", "rotation", "size", "velocity")  # Arrays of `Obstacles` beside kind
+SCENE_PARTS = ("start", "goal", "jumps", "turn_time", "turn_velocity", "reach")  # Arrays of `Scenes`
+OBSTACLE_PARTS = ("centre", "rotation", "size", "velocity")  # Arrays of `Obstacles` beside kind
 # Arrays of a file, with one entry for each scene
-CONTENT = ("start", "goal", "kind", *MOVING, "jumps", "turn_time", "turn_velocity", "share", "family")
+CONTENT = ("start", "goal", "kind", *OBSTACLE_PARTS, "jumps", "turn_time", "turn_velocity", "share", "family")
 REACH = "reach"  # Array of a file where obstacles are on reaches
 # Fields of a task that say which scenes are scenes of it, besides kinds and families of obstacles
 SCENE_FIELDS = ("arm", "n_obstacles", "whole_arm", "moving_obstacles", "n_jumps")
@@ -56,7 +57,7 @@ class FrozenScenes:
     @property
     def band(self) -> NDArray[np.int64]:
         """Index into BANDS, shape (N,); -1 where the share is unknown."""
-        band = np.searchsorted(-np.array(BAND_EDGES), -self.share, side="right")
+        band = (self.share[:, None] <= np.array(BAND_EDGES)).sum(axis=1)
         return np.where(np.isnan(self.share), -1, band).astype(np.int64)
 
     @property
@@ -113,8 +114,8 @@ def save_sets(path: Path, sets: Mapping[str, FrozenScenes]) -> None:
     """Write sets by their names into one file; the arrays of a set are in a folder of its name."""
     arrays: dict[str, Any] = {}
     for name, frozen in sets.items():
-        if (frozen.scenes.obstacles.kind >= MESH).any():
-            raise ValueError(f"frozen scenes must have obstacles of the kinds {', '.join(KINDS[:MESH])} only")
+        if np.isin(frozen.scenes.obstacles.kind, IN_TABLES).any():
+            raise ValueError(f"frozen scenes must have obstacles of the kinds {', '.join(PLAIN_KINDS)} only")
         arrays |= {_place(name, part): _smallest(array) for part, array in frozen.arrays().items()}
         arrays[_place(name, "task")] = np.array(json.dumps(frozen.task))
         arrays[_place(name, "sha256")] = np.array(frozen.sha256)
@@ -183,11 +184,11 @@ def load(path: Path, name: str = "") -> FrozenScenes:
         raise ValueError(f"there is no file of scenes {path}")
     content: dict[str, Any] = _read(path, name)
     obstacles = no_obstacles(*content["kind"].shape)
-    obstacles = obstacles._replace(**{part: content[part] for part in ("kind", *MOVING)})
+    obstacles = obstacles._replace(**{part: content[part] for part in ("kind", *OBSTACLE_PARTS)})
     frozen = FrozenScenes(
         name=name or str(path),
         task=json.loads(str(content["task"])),
-        scenes=Scenes(obstacles=obstacles, **{part: content[part] for part in OWN}),
+        scenes=Scenes(obstacles=obstacles, **{part: content[part] for part in SCENE_PARTS}),
         share=content["share"],
         family=content["family"],
     )
@@ -241,7 +242,8 @@ def _check_content(content: Mapping[str, NDArray[Any]]) -> None:
             raise ValueError(f"{name} of {number} scenes is {found.dtype} of shape {found.shape}")
         if name not in ("share", "family") and not np.isfinite(found).all():
             raise ValueError(f"{name} is not finite")
-    if not ((content["kind"] >= -1) & (content["kind"] < MESH)).all():
+    plain = [number for number in range(len(KINDS)) if number not in IN_TABLES]
+    if not np.isin(content["kind"], [ABSENT, *plain]).all():
         raise ValueError("an obstacle has an unknown kind")
     if (content["share"] < 0.0).any() or (content["share"] > 1.0).any():
         raise ValueError("a solution share is not between 0 and 1")

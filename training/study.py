@@ -46,7 +46,11 @@ Values = Mapping[str, Any]
 # Fields of a training that an agent may set
 TRAINING_FIELDS = {each.name for each in dataclasses.fields(TrainConfig)}
 TRAINING_FIELDS -= {"env", "seed", "out", "resume", "progress"}
-MEASURED = ("test", "hard", "uniform")  # by default; models are selected on `validation`
+MEASURED = (
+    "test",
+    "hard",
+    "uniform",
+)  # Sets that are measured by default; models are selected on `validation`
 
 RETRIES = 2  # Number of times that a trial whose worker died is begun again
 # Environment variables of Ray, which reads them when it is imported
@@ -89,10 +93,10 @@ class Trial:
         """Return the folder of the trial."""
         return out / self.environment.rpartition("/")[2] / self.row / f"seed-{self.seed}"
 
-    def config(self, out: Path) -> TrainConfig:
-        """Return the configuration of the training; `policy_kwargs` are merged with those of the preset."""
+    def config(self, folder: Path) -> TrainConfig:
+        """Return the configuration of a training in a folder; `policy_kwargs` are merged with those of the preset."""
         given = {**self.training, "env_kwargs": {**self.env_kwargs, **self.training.get("env_kwargs", {})}}
-        config = TrainConfig(env=self.env_id, seed=self.seed, out=self.folder(out), progress=False, **given)
+        config = TrainConfig(env=self.env_id, seed=self.seed, out=folder, progress=False, **given)
         own = config.hyperparameters.get("policy_kwargs")
         if own is None:
             return config
@@ -103,7 +107,7 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class Search(Trial):
-    """Search for hyperparameters of one algorithm in one environment; the fields of the trial are what all share."""
+    """Search for hyperparameters of one algorithm in one environment; fields of Trial hold for every training."""
 
     parameters: Values  # range or list of values by the path of a field
     trials: int = 20
@@ -111,8 +115,7 @@ class Search(Trial):
 
     def with_parameters(self, values: Values, folder: Path) -> TrainConfig:
         """Return the configuration of a training with these parameters."""
-        trial = dataclasses.replace(self, training=_with(self.training, values))
-        return dataclasses.replace(trial.config(folder), out=folder)
+        return dataclasses.replace(self, training=_with(self.training, values)).config(folder)
 
     @property
     def key(self) -> str:
@@ -178,7 +181,7 @@ class Study:
 
 
 def _made(where: str, make: Callable[..., Any], fields: Any, *args: Any) -> Any:
-    """Return the result of a function of fields of a file; an error begins with the place in the file."""
+    """Call `make` with fields of a file; errors begin with `where`, the place in the file."""
     if not isinstance(fields, Mapping):
         raise ValueError(f"{where} must be values by name, got {fields!r}")
     parameters = inspect.signature(make).parameters
@@ -476,7 +479,7 @@ def _run_trial(trial: Trial, out: Path) -> Record:
     if trial.method:
         methods[trial.row] = make_method(trial.method, trial.env_id, **env_kwargs, threads=1)
     else:
-        config = trial.config(out)
+        config = trial.config(trial.folder(out))
         run = train_or_resume(config)
         models: dict[str, Any] = {trial.row: load_model(run.best)}
         if trial.untrained:

@@ -22,7 +22,8 @@ from torch import Tensor, nn
 from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, place_group, self_clearance
 from viapoint.envs.geometry.compiled import compiled, inner, kernel
-from viapoint.envs.geometry.obstacles import ABSENT, KINDS, MESH, Obstacles, bounding_boxes
+from viapoint.envs.geometry.obstacles import ABSENT, KINDS, Obstacles, bounding_boxes
+from viapoint.envs.geometry.shapes import IN_TABLES
 from viapoint.envs.task import Task
 from viapoint.training.planning.movements import INSTANTS, Setting, memory_of
 from viapoint.training.planning.problem import Moves, Problem, place_at, setting_of
@@ -300,7 +301,7 @@ def _gather(
                 for axis in range(3):
                     there = work.places[1, axis]
                     # Kinds without a table of vertices or points look the same when an axis is reversed.
-                    features[b, h, pair, axis] = abs(there) if kind < MESH else there
+                    features[b, h, pair, axis] = there if kind in IN_TABLES else abs(there)
                     features[b, h, pair, 3 + axis] = half[axis]
                 features[b, h, pair, 6] = spheres.radius[sphere]
                 features[b, h, pair, LENGTHS + columns[kind]] = 1.0

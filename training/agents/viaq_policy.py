@@ -31,6 +31,7 @@ PROPOSALS = 32
 # together: where the best is out of reach, so are many of the next.
 REACHED = 64
 LOCAL_ROUNDS = 4  # Rounds of checks around the best checked plans
+SPARE = 0.2  # Greatest time that is left after a movement, or missing for it, at the input of the critic, [s]
 BLOCK = 64  # Scenes that are decided together
 MOTION_SCALES = (1.0, 0.1)  # Scales of velocity and acceleration at the input of the critic
 
@@ -113,7 +114,7 @@ class ViaQPolicy(PlanPolicy):
         moves = moves_of(self.task, problem, actions)
         spare = np.zeros_like(moves.duration)
         if problem.time_left is not None:
-            spare = np.clip(problem.time_left[:, None] - moves.duration - SETTLING, -0.2, 0.2)
+            spare = np.clip(problem.time_left[:, None] - moves.duration - SETTLING, -SPARE, SPARE)
         effort = np.stack((moves.rough, moves.relative, np.log(moves.relative), spare), axis=-1)
         instants = np.linspace(0, INSTANTS - 1, min(self.instants, INSTANTS)).round().astype(np.int64)
         pairs = pairs_of(self.task, problem, moves, instants, until)
@@ -143,8 +144,8 @@ class ViaQPolicy(PlanPolicy):
         return self.proposals(len(problem.start), lambda actions: self.values(problem, actions))
 
     def decide(self, observation: Observation) -> Numbers:
-        """Return the chosen actions, shape (B, m), for parts of B observations."""
-        self._check_refine()  # it may have been set since
+        """Return the chosen actions, shape (B, m), for B observations, arrays by name."""
+        self._check_refine()  # it may have been set after construction
         number = len(observation["joints"])
         pieces = []
         for first in range(0, number, BLOCK):
@@ -165,11 +166,11 @@ class ViaQPolicy(PlanPolicy):
             refined = refined_actions(self.task, problem, self.best_apart(actions, values, self.refine))
             checked = np.concatenate((checked, refined), axis=1)
         worth = merits(self.task, problem, checked)
-        unsolved = np.flatnonzero(worth.max(axis=1) < 0.5 * INFEASIBLE)
         best = best_of(self.task, problem, checked, worth)
-        some = np.arange(len(actions)) if self.replanning else unsolved
-        if local and len(some):
-            best[some] = self._improved(problem.take(some), checked[some], worth[some], local)
+        # Plans that are not clear have a merit near INFEASIBLE.
+        rows = np.flatnonzero(self.replanning | (worth.max(axis=1) < 0.5 * INFEASIBLE))
+        if local and rows.size:
+            best[rows] = self._improved(problem.take(rows), checked[rows], worth[rows], local)
         return best
 
     def _best_within_reach(self, problem: Problem, actions: Numbers, values: Numbers) -> Numbers:
@@ -180,13 +181,13 @@ class ViaQPolicy(PlanPolicy):
         """
         best = values.argmax(axis=1)
         rows = np.arange(0 if self.replanning else len(best))
-        for _ in range(REACHED if rows.size else 0):
+        for _ in range(REACHED):
+            if not rows.size:
+                break
             alone = problem.take(rows)._replace(obstacles=no_obstacles(len(rows)))
             moves = moves_of(self.task, alone, actions[rows, best[rows]][:, None], exact=True)
             pairs = pairs_of(self.task, alone, moves, np.arange(FINE_INSTANTS), exact=True)
             rows = rows[~(pairs.inside & (pairs.self_clearance > 0.0)).numpy()[:, 0]]
-            if not rows.size:
-                break
             values[rows, best[rows]] = -np.inf
             best[rows] = values[rows].argmax(axis=1)
         return np.asarray(actions[np.arange(len(best)), best])

@@ -16,9 +16,10 @@ from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.episodes import Episodes
-from viapoint.envs.geometry.obstacles import KINDS, MESH, Obstacles, mesh_names, no_obstacles, pack, unpack
+from viapoint.envs.geometry.obstacles import Obstacles, mesh_names, no_obstacles, pack, unpack
 from viapoint.envs.geometry.shapes import (
     IN_TABLES,
+    PLAIN_KINDS,
     ConvexMesh,
     PointCloud,
     Shape,
@@ -245,6 +246,6 @@ def _episodes(
     arm: Arm, space: SpaceName, n_via: int, rows: int, number: int, meshes: tuple[str, ...]
 ) -> Episodes:
     """Return simulations of an arm among up to some obstacles, which may be some registered meshes."""
-    shapes = (*KINDS[:MESH], *meshes)
+    shapes = (*PLAIN_KINDS, *meshes)
     task = Task.of(arm=arm, space=space, n_via=n_via, n_obstacles=(0, rows), shapes=shapes)
     return Episodes(task, number)

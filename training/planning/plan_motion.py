@@ -60,8 +60,8 @@ SEEDS = 256  # Greatest number of random seeds
 CHUNKS = 1, 1, 2, 4  # Numbers of seeds between two looks at the clock; the last one repeats
 LONGEST_SEARCH = 1.0  # Default of the time limit, [s]
 RANGE_TOLERANCE = 1e-6  # Way beyond a joint limit that counts as rounding, [rad]
-# Shortest durations that are chosen: servos come to rest in time after them; for arms without velocity limits, [s]
-SHORTEST, UNLIMITED = 0.25, 0.85
+SHORTEST = 0.25  # Shortest duration that is chosen, after which servos come to rest in time, [s]
+UNLIMITED = 0.85  # The same for arms without velocity limits, [s]
 # Instants of FINE_INSTANTS at which limits are looked at: every second one, and the last
 LIMIT_INSTANTS = np.append(np.arange(0, FINE_INSTANTS - 1, 2), FINE_INSTANTS - 1)
 ROUNDS = 6  # Greatest number of times that a movement is planned again because it must take longer
@@ -72,7 +72,7 @@ ROUNDING = 1e-6  # Rounding error of clearances, [m]
 # Required clearances of a path of OMPL in each attempt, until one can be made smooth, [m]
 OMPL_MARGINS = (0.010, 0.004, 0.001, 0.001)
 OMPL_PATIENCE = 1.0  # Time limit for each path of OMPL as a baseline, [s]
-TURN = 2.0 * np.pi  # [rad]
+TURN = 2.0 * np.pi  # Full turn, [rad]
 GOALS = 8  # Greatest number of configurations that are tried for a pose
 
 
@@ -158,7 +158,7 @@ def plan_motion(
     """Plan a minimum-jerk movement through via-points from a start to a goal around obstacles.
 
     The straight movement is taken if it is free. Otherwise via-points are refined by the gradient of clearance and jerk
-    (see `training.planning.refine`), from the straight line first, and then from random seeds, until
+    (see :mod:`viapoint.training.planning.refine`), from the straight line first, and then from random seeds, until
     `enough` free movements are found. Each is checked at 256 instants and polished; the one with the least jerk is
     taken. The duration is the shortest that keeps 97 % of the velocity and torque limits, 0.25 s or more, if none is
     given.
@@ -170,8 +170,8 @@ def plan_motion(
             poses of the tool, :class:`~viapoint.envs.scenes.options.Pose`.
         obstacles: Shapes or dictionaries at time 0, with their velocities, or packed obstacles of one scene.
         n_via: Number of via-points, 1 to 3.
-        seeds: Greatest number of random seeds, for all goals together; or via-points that are tried before them, shape
-            (S, n_via, D).
+        seeds: Greatest number of random seeds, for all goals together; or via-points, shape (S, n_via, D), that are
+            tried first, before up to 256 random ones.
         enough: Number of free movements among which the one with the least jerk is chosen.
         time_limit: Time after which no further seed is tried, [s]; with 0, only the straight movement is looked at.
             Inverse kinematics of poses, some 20 ms, comes before.
@@ -182,7 +182,7 @@ def plan_motion(
         acceleration: Initial acceleration, shape (D,); 0 by default.
         ompl: True to follow a path of OMPL's RRT-Connect where no seed becomes free, if the extra `planning` is
             installed.
-        rng: Random generator of the seeds, or its seed.
+        rng: Random generator of the seeds, or its seed; 0 by default.
 
     Returns:
         The best movement found. `success` tells whether it is free and keeps all limits, and `reason` why not.
@@ -235,15 +235,14 @@ def plan_motion(
         number = whole_number("seeds", seeds, 0)
     else:
         given = finite_array("seeds", seeds, (None, n_via, where.dimension))
-    number = -(-number // len(goals))
-    if rng is None or isinstance(rng, int | np.integer):
-        rng = np.random.default_rng(whole_number("rng", 0 if rng is None else rng, 0))
+    number = -(-number // len(goals))  # rounded up
     if not isinstance(rng, np.random.Generator):
-        raise TypeError(f"rng must be a generator of numpy.random, or a seed, got {rng!r:.60}")
-    generator = rng
+        rng = np.random.default_rng(whole_number("rng", 0 if rng is None else rng, 0))
     until = time.perf_counter() + time_limit
     # Straight movements are cheap, and the first goal that is reached bounds what others may cost.
-    little = _Effort(n_via, given[:0], 0, enough, 0.0, generator, False)
+    little = _Effort(
+        n_via=n_via, given=given[:0], seeds=0, enough=enough, until=0.0, generator=rng, ompl=False
+    )
     straight = []
     if len(goals) > 1:
         straight = [_plan(problem._replace(goal=each), little) for each in goals]
@@ -257,7 +256,7 @@ def plan_motion(
         share = now + (until - now) / (len(goals) - rank)
         few = number if np.isinf(least) else min(number, NARROW)
         tree = ompl and bool(np.isinf(least))
-        effort = _Effort(n_via, given, few, enough, share, generator, tree)
+        effort = little._replace(given=given, seeds=few, until=share, ompl=tree)
         plans.append(_plan(problem._replace(goal=each), effort))
     best = max(plans, key=_worth)
     return dataclasses.replace(best, milliseconds=1e3 * (time.perf_counter() - began))
