@@ -154,7 +154,7 @@ def test_grids_and_checks_make_rows():
     assert [trial.row for trial in trials] == [
         f"sac-batch_size={size}-n_via={number}" for size in (64, 128) for number in (1, 2)
     ]
-    config = trials[-1].config(Path("out"))
+    config = trials[-1].config(trials[-1].folder(Path("out")))
     assert config.folder == Path("out/PlanarObstacles-v0/sac-batch_size=128-n_via=2/seed-3")
     assert config.hyperparameters == {"batch_size": 128}
     assert config.env_kwargs == {"n_via": 2}
