@@ -140,17 +140,19 @@ class Tab:
     # Decisions
 
     def change(self, **changes: Any) -> None:
-        """Decide anew after changes of the state, and show the plan; the rest follows in a pause."""
-        state = self.state
-        for name, value in changes.items():
-            setattr(state, name, value)
+        """Decide anew after changes of the state, and show the plan; the rest follows in a pause.
+
+        Where no decision is possible, nothing changes.
+        """
+        before = self.state.plan
+        state = dataclasses.replace(self.state, movement=None, playing=False, before=before, **changes)
         if "scene" in changes:
             state.results = ()
-        state.movement, state.playing, state.before = None, False, state.plan
+        proposal = decide(self.arena, state)
         with self._wake:
             self._jobs.pop(("propose",), None)  # those of the scene before
-        proposal = decide(self.arena, state)
         state.proposals, state.picked, state.profile = (proposal,), 0, None
+        self.state = state
         self._say(describe_plan(proposal), proposal.motion.success)
         self.client.flush()
         self.latencies.append(time.perf_counter() - self._due)

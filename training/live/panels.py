@@ -175,7 +175,7 @@ class Panels:
             for name, (least, most) in SIZES.items():
                 label = f"{name.capitalize()} [m]"
                 self._sizes[name] = gui.add_slider(label, least, most, 0.001, least, visible=False)
-                self._sizes[name].on_update(_by_user(functools.partial(act, "resize", name)))
+                _on_slide(self._sizes[name], functools.partial(act, "resize", name))
             shapes = gui.add_button_group("Add", tuple(arena.new_shapes()))
             shapes.on_click(lambda event: act("add", event.target.value))
             self._remove = self._button("Remove the selected one", "remove", disabled=True)
@@ -196,12 +196,12 @@ class Panels:
         anew: dict[str, Any] = {"by_hand": None, "duration": None, "n_via": None}
         low, high = action.duration_range if arena.task.space.of_hand else (0.3, 12.0)
         self._duration = gui.add_slider("Duration [s]", low, high, 0.01, (low * high) ** 0.5)
-        self._duration.on_update(_by_user(lambda value: act("change", duration=value)))
+        _on_slide(self._duration, lambda value: act("change", duration=value))
         methods = gui.add_dropdown("Method", arena.methods, hint="Decides after each change of the scene")
-        methods.on_update(_by_user(lambda name: act("change", method=name, **anew)))
+        methods.on_update(lambda event: act("change", method=event.target.value, **anew))
         most = action.n_via if arena.task.replanning else max(3, action.n_via)
         self._vias = gui.add_slider("Via-points", 0, most, 1, action.n_via, disabled=most == action.n_via)
-        self._vias.on_update(_by_user(lambda value: act("change", n_via=value, by_hand=None)))
+        _on_slide(self._vias, lambda value: act("change", n_via=value, by_hand=None))
         if hasattr(getattr(arena.agent, "policy", None), "checks"):
             hint = "Proposals whose clearance is computed"
             checks = gui.add_dropdown("Exact checks", tuple(CHECKS), hint=hint)
@@ -215,9 +215,14 @@ class Panels:
         return button
 
 
-def _by_user(function: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Return a callback that ignores changes made by the page itself."""
-    return lambda event: function(event.target.value) if event.client is not None else None
+def _on_slide(slider: Any, function: Callable[[Any], None]) -> None:
+    """Call a function with the values that a user gives a slider; a number that is typed may lie outside."""
+
+    def call(event: Any) -> None:
+        if event.client is not None:  # otherwise the page itself has set it
+            function(min(max(slider.value, slider.min), slider.max))
+
+    slider.on_update(call)
 
 
 def _table(names: Iterable[str], rows: Iterable[Iterable[str]], bold: int = -1) -> str:
