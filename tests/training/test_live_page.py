@@ -125,6 +125,10 @@ def test_what_a_user_does_changes_the_plan(opened):
 
     tab.press("button", "Execute")
     wait_for(lambda: "Success" in tab.text(MESSAGE) or "Failure" in tab.text(MESSAGE))
+    times, jerk, _ = session._panels._plots["jerk"].data
+    rests = times > session.state.plan.duration
+    assert rests.any()
+    assert not jerk[rests].any()
 
     tab.press("[role=tab]", "Methods")
     tab.press("button", "Compare in this scene")

@@ -97,7 +97,8 @@ class Panels:
             executed["speed"] = norm(np.gradient(rollout.hand, time, axis=0))
             executed["clearance"] = rollout.clearance
         for name, plot in self._plots.items():
-            planned = np.interp(time, profile["time"], profile[name])
+            beyond = 0.0 if name == "jerk" else None  # the arm rests after the plan
+            planned = np.interp(time, profile["time"], profile[name], right=beyond)
             other = np.full(len(time), np.nan)
             other[0] = planned[0]  # a line without numbers would leave the plot empty
             lines = [planned, executed.get(name, other)]
