@@ -22,7 +22,7 @@ from viapoint.training import LivePage, ViaQ, ViaVecEnv
 from viapoint.training.agents.agent import SAC
 from viapoint.training.configs import LiveConfig
 from viapoint.training.live import drawing, page
-from viapoint.training.live.arena import AGENT, HAND, MOTION, SEARCH, STRAIGHT, Arena
+from viapoint.training.live.arena import AGENT, HAND, MOTION, OMPL, SEARCH, STRAIGHT, Arena
 from viapoint.training.live.decide import APART, decide, describe_plan, execute, profile, propose
 from viapoint.training.live.state import Scene, State
 
@@ -171,6 +171,21 @@ def test_a_plan_by_hand_is_valued_as_the_same_decision(env_id, arenas):
     longer = decided(arena, state.scene, duration=chosen.motion.duration + 0.3)
     assert longer.plan.duration == pytest.approx(chosen.motion.duration + 0.3)
     np.testing.assert_allclose(longer.plan.waypoints, chosen.motion.waypoints)
+
+
+@pytest.mark.parametrize("method", [MOTION, OMPL, SEARCH])
+def test_every_method_keeps_a_duration_that_the_limits_allow(method, arenas):
+    """A shorter one becomes the shortest one, which is not a failure."""
+    if method == OMPL:
+        pytest.importorskip("ompl", reason="the extra `planning` is not installed")
+    arena = arenas(PANDA)
+    scene = drawn(arena, 1)
+    assert decided(arena, scene, method, duration=9.0).plan.duration == pytest.approx(9.0)
+    state = decided(arena, scene, method, duration=0.3)
+    assert state.plan.success
+    assert max(state.plan.limits) == pytest.approx(0.97, abs=0.01)
+    assert "the shortest time" in describe_plan(state.proposals[0], 0.3)
+    assert "the shortest time" not in describe_plan(state.proposals[0], state.plan.duration)
 
 
 def test_a_dragged_goal_is_reached_without_a_jump(arenas):

@@ -153,7 +153,7 @@ class Tab:
             self._jobs.pop(("propose",), None)  # those of the scene before
         state.proposals, state.picked, state.profile = (proposal,), 0, None
         self.state = state
-        self._say(describe_plan(proposal), proposal.motion.success)
+        self._say(describe_plan(proposal, state.duration), proposal.motion.success)
         self.client.flush()
         self.latencies.append(time.perf_counter() - self._due)
         self.act("propose", delay=PAUSE)
@@ -173,7 +173,8 @@ class Tab:
             state.picked, state.movement, state.playing, state.before = index, None, False, None
             proposal = state.proposals[index]
             state.profile = profile(self.arena, state.scene, proposal.motion.plan)
-            self._say(describe_plan(proposal), proposal.motion.success)
+            wanted = None if index else state.duration  # the others have durations of their own
+            self._say(describe_plan(proposal, wanted), proposal.motion.success)
 
     # Scenes
 
