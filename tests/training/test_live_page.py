@@ -17,6 +17,7 @@ from viser import transforms
 
 from viapoint.envs import Cylinder
 from viapoint.training import LivePage
+from viapoint.training.live.arena import SEARCH
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine")
 
@@ -163,9 +164,13 @@ def test_numbers_beyond_a_slider_are_its_ends(text, opened):
     assert duration == pytest.approx(session.state.duration)
     assert session.state.duration in (low, high)
     number = type_into(tab, session, 1, text)
-    assert session.state.n_via == number
-    assert session.state.n_via in (0, 1, 3)
-    assert "The plan takes" in tab.text(MESSAGE)
+    assert number == session.state.n_via == (1 if text == "-1" else 3)
+    assert "must be" not in tab.text(MESSAGE)
+    vias = session._panels._vias
+    assert (vias.visible, vias.min) == (True, 1)
+    session.act("change", method=SEARCH, n_via=None)
+    settled(session)
+    assert (vias.visible, vias.min, vias.value) == (True, 0, session.arena.task.n_via)
 
 
 def test_a_scene_without_a_decision_is_not_shown(opened):

@@ -14,7 +14,7 @@ from matplotlib.colors import to_hex
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
-from viapoint.training.live.arena import AGENT, SIZES, Arena
+from viapoint.training.live.arena import AGENT, MOTION, OMPL, SIZES, Arena
 from viapoint.training.live.state import Movement, State
 
 WIDTH = 330  # Width of a panel, [pixels]
@@ -57,11 +57,12 @@ class Panels:
         message = MESSAGE.format("#1b7f4b" if state.good else "#c4202b", html.escape(state.message))
         self._message.content = message + NOTE.format(html.escape(remark))
         self._execute.label = "Stop" if state.playing else "Execute"
-        if plan is not None:
-            self._vias.value = len(plan.durations) - 1
-            if state.duration is None:
-                low, high = self._duration.min, self._duration.max
-                self._duration.value = float(np.clip(round(plan.duration, 2), low, high))
+        self._vias.visible = state.method != OMPL  # which takes as many as its path needs
+        self._vias.min = int(state.method == MOTION)
+        self._vias.value = self._arena.n_via(state)
+        if plan is not None and state.duration is None:
+            low, high = self._duration.min, self._duration.max
+            self._duration.value = float(np.clip(round(plan.duration, 2), low, high))
         self._draw_selection(state)
         self._draw_comparison(state)
         if state.profile is not None and not state.playing:
