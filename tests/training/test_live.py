@@ -6,6 +6,7 @@ import json
 import socket
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -198,7 +199,7 @@ def test_a_dragged_goal_is_reached_without_a_jump(arenas):
 
         def goal(late=late, seen=seen):
             arrived = any(each.info["is_success"][0] for each in seen)
-            return aside if (arrived if late else len(seen) > 2) else scene.goal
+            return aside if (arrived if late else len(seen) > 1) else scene.goal
 
         state = decided(arena, scene)
         for movement in execute(arena, state, goal):
@@ -209,6 +210,24 @@ def test_a_dragged_goal_is_reached_without_a_jump(arenas):
         assert np.abs(np.diff(velocity, axis=0)).max() < 0.1
         restarts = sum(len(b.rollout.time) < len(a.rollout.time) for a, b in itertools.pairwise(seen))
         assert restarts == int(late)
+
+
+@pytest.mark.parametrize("env_id", [MOVING, JUMPS])
+def test_a_method_is_rewarded_as_in_the_environment(env_id):
+    agent = untrained(env_id)
+    arena = Arena(env_id, agent, 4, {})
+    env = gym.make_vec(env_id, num_envs=1)
+    for number in range(3):
+        scene = drawn(arena, number)
+        *_, movement = execute(arena, decided(arena, scene, AGENT))
+        observation, _ = env.reset(options=scene.options())
+        reward, ended = 0.0, False
+        while not ended:
+            action, _ = agent.predict(observation, deterministic=True)
+            observation, rewards, terminated, truncated, _ = env.step(action)
+            reward += float(rewards[0])
+            ended = bool(terminated[0] or truncated[0])
+        assert movement.reward == pytest.approx(reward, abs=1e-6)
 
 
 def test_a_dragged_goal_jumps_no_more(arenas):
