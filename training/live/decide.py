@@ -98,10 +98,7 @@ def _planned(arena: Arena, state: State, time_limit: float) -> Proposal:
 
 
 def _retimed(motion: MotionPlan, duration: float) -> MotionPlan:
-    """Return a movement in another duration, [s], or in the shortest one that the limits of the arm allow.
-
-    Where that is not free, it stays as it is.
-    """
+    """Return a movement in another duration, [s], or the shortest that the limits allow; as it is if that fails."""
     plan = Plan(motion.waypoints, motion.durations * (duration / motion.duration))
     other = checked_motion(motion.arm, motion.space, plan, motion.obstacles, motion.source)
     return other if other.success else motion

@@ -140,12 +140,9 @@ class Tab:
     # Decisions
 
     def change(self, **changes: Any) -> None:
-        """Decide anew after changes of the state, and show the plan; the rest follows in a pause.
-
-        Where no decision is possible, nothing changes.
-        """
-        before = self.state.plan
-        state = dataclasses.replace(self.state, movement=None, playing=False, before=before, **changes)
+        """Decide anew after changes, and show the plan, the rest in a pause; without a decision nothing changes."""
+        state = dataclasses.replace(self.state, movement=None, playing=False, **changes)
+        state.before = state.plan
         if "scene" in changes:
             state.results = ()
         proposal = decide(self.arena, state)
