@@ -49,7 +49,7 @@ def opened(browser):
         tabs.append(browser.tab(page.url))
         (session,) = wait_for(lambda: set(page.tabs) - before)
         wait_for(lambda: session.idle and session.state.plan is not None)
-        wait_for(lambda: "plan" in tabs[-1].text(MESSAGE))
+        wait_for(lambda: tabs[-1].text(MESSAGE) not in ("", "Getting ready."))
         # The library's notice on software rendering would hide a part of the scene.
         tabs[-1].run("document.querySelector('.mantine-Notification-closeButton')?.click()")
         wait_for(lambda: steady(tabs[-1]))
