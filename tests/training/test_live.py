@@ -6,6 +6,7 @@ import json
 import socket
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -22,7 +23,7 @@ from viapoint.training import LivePage, ViaQ, ViaVecEnv
 from viapoint.training.agents.agent import SAC
 from viapoint.training.configs import LiveConfig
 from viapoint.training.live import drawing, page
-from viapoint.training.live.arena import AGENT, HAND, MOTION, SEARCH, STRAIGHT, Arena
+from viapoint.training.live.arena import AGENT, HAND, MOTION, OMPL, SEARCH, STRAIGHT, Arena
 from viapoint.training.live.decide import APART, decide, describe_plan, execute, profile, propose
 from viapoint.training.live.state import Scene, State
 
@@ -173,6 +174,21 @@ def test_a_plan_by_hand_is_valued_as_the_same_decision(env_id, arenas):
     np.testing.assert_allclose(longer.plan.waypoints, chosen.motion.waypoints)
 
 
+@pytest.mark.parametrize("method", [MOTION, OMPL, SEARCH])
+def test_every_method_keeps_a_duration_that_the_limits_allow(method, arenas):
+    """A shorter one becomes the shortest one, which is not a failure."""
+    if method == OMPL:
+        pytest.importorskip("ompl", reason="the extra `planning` is not installed")
+    arena = arenas(PANDA)
+    scene = drawn(arena, 1)
+    assert decided(arena, scene, method, duration=9.0).plan.duration == pytest.approx(9.0)
+    state = decided(arena, scene, method, duration=0.3)
+    assert state.plan.success
+    assert max(state.plan.limits) == pytest.approx(0.97, abs=0.01)
+    assert "the shortest time" in describe_plan(state.proposals[0], 0.3)
+    assert "the shortest time" not in describe_plan(state.proposals[0], state.plan.duration)
+
+
 def test_a_dragged_goal_is_reached_without_a_jump(arenas):
     """A goal that is dragged after the arrival is reached by a second movement."""
     arena = arenas(MOVING)
@@ -183,7 +199,7 @@ def test_a_dragged_goal_is_reached_without_a_jump(arenas):
 
         def goal(late=late, seen=seen):
             arrived = any(each.info["is_success"][0] for each in seen)
-            return aside if (arrived if late else len(seen) > 2) else scene.goal
+            return aside if (arrived if late else len(seen) > 1) else scene.goal
 
         state = decided(arena, scene)
         for movement in execute(arena, state, goal):
@@ -194,6 +210,24 @@ def test_a_dragged_goal_is_reached_without_a_jump(arenas):
         assert np.abs(np.diff(velocity, axis=0)).max() < 0.1
         restarts = sum(len(b.rollout.time) < len(a.rollout.time) for a, b in itertools.pairwise(seen))
         assert restarts == int(late)
+
+
+@pytest.mark.parametrize("env_id", [MOVING, JUMPS])
+def test_a_method_is_rewarded_as_in_the_environment(env_id):
+    agent = untrained(env_id)
+    arena = Arena(env_id, agent, 4, {})
+    env = gym.make_vec(env_id, num_envs=1)
+    for number in range(3):
+        scene = drawn(arena, number)
+        *_, movement = execute(arena, decided(arena, scene, AGENT))
+        observation, _ = env.reset(options=scene.options())
+        reward, ended = 0.0, False
+        while not ended:
+            action, _ = agent.predict(observation, deterministic=True)
+            observation, rewards, terminated, truncated, _ = env.step(action)
+            reward += float(rewards[0])
+            ended = bool(terminated[0] or truncated[0])
+        assert movement.reward == pytest.approx(reward, abs=1e-6)
 
 
 def test_a_dragged_goal_jumps_no_more(arenas):

@@ -11,11 +11,13 @@ pytest.importorskip("viser", reason="the extra `live` is not installed")
 pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 
 from browser import Browser, chromium, wait_for
-from tasks import PANDA
+from tasks import JUMPS, PANDA
 from tasks import PLANE as PLANAR
 from viser import transforms
 
+from viapoint.envs import Cylinder
 from viapoint.training import LivePage
+from viapoint.training.live.arena import SEARCH
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine")
 
@@ -47,7 +49,7 @@ def opened(browser):
         tabs.append(browser.tab(page.url))
         (session,) = wait_for(lambda: set(page.tabs) - before)
         wait_for(lambda: session.idle and session.state.plan is not None)
-        wait_for(lambda: "plan" in tabs[-1].text(MESSAGE))
+        wait_for(lambda: tabs[-1].text(MESSAGE) not in ("", "Getting ready."))
         # The library's notice on software rendering would hide a part of the scene.
         tabs[-1].run("document.querySelector('.mantine-Notification-closeButton')?.click()")
         wait_for(lambda: steady(tabs[-1]))
@@ -87,6 +89,16 @@ def drag(tab, session, first, last, **kwargs):
     tab.drag(on_screen(tab, session, first), on_screen(tab, session, last), **kwargs)
 
 
+def type_into(tab, session, number, text):
+    """Type a number into one of the fields beside the sliders, and leave the field."""
+    fields = "[...document.querySelectorAll('input[inputmode=decimal], input[inputmode=numeric]')]"
+    tab.run(f"(() => {{const e = {fields}[{number}]; e.focus(); e.select()}})()")
+    tab.call("Input.insertText", text=text)
+    tab.run("document.activeElement.blur()")
+    settled(session)
+    return float(tab.run(f"{fields}[{number}].value"))
+
+
 def test_what_a_user_does_changes_the_plan(opened):
     open_page, open_tab = opened
     page = open_page(PLANAR)
@@ -114,6 +126,10 @@ def test_what_a_user_does_changes_the_plan(opened):
 
     tab.press("button", "Execute")
     wait_for(lambda: "Success" in tab.text(MESSAGE) or "Failure" in tab.text(MESSAGE))
+    times, jerk, _ = session._panels._plots["jerk"].data
+    rests = times > session.state.plan.duration
+    assert rests.any()
+    assert not jerk[rests].any()
 
     tab.press("[role=tab]", "Methods")
     tab.press("button", "Compare in this scene")
@@ -137,6 +153,38 @@ def test_what_a_user_does_changes_the_plan(opened):
     wait_for(lambda: "in contact" not in tab.text(MESSAGE))
     np.testing.assert_array_equal(session.state.scene.goal, goal)
     np.testing.assert_array_equal(session.state.scene.obstacles[0].position, obstacle)
+
+
+@pytest.mark.parametrize("text", ["-1", "40"])
+def test_numbers_beyond_a_slider_are_its_ends(text, opened):
+    open_page, open_tab = opened
+    tab, session = open_tab(open_page(PLANAR))
+    low, high = session.arena.task.action.duration_range
+    duration = type_into(tab, session, 0, text)
+    assert duration == pytest.approx(session.state.duration)
+    assert session.state.duration in (low, high)
+    number = type_into(tab, session, 1, text)
+    assert number == session.state.n_via == (1 if text == "-1" else 3)
+    assert "must be" not in tab.text(MESSAGE)
+    vias = session._panels._vias
+    assert (vias.visible, vias.min) == (True, 1)
+    session.act("change", method=SEARCH, n_via=None)
+    settled(session)
+    assert (vias.visible, vias.min, vias.value) == (True, 0, session.arena.task.n_via)
+
+
+def test_a_scene_without_a_decision_is_not_shown(opened):
+    """A post stands where the target jumps to, which no method can plan for."""
+    open_page, open_tab = opened
+    tab, session = open_tab(open_page(JUMPS))
+    before = session.state
+    post = Cylinder(0.02, 0.04, position=(*before.scene.jumps[0][1:], 0.0))
+    session.act("change", scene=before.scene.with_obstacle(0, post))
+    wait_for(lambda: "jump" in tab.text(MESSAGE))
+    assert session.state is before
+    tab.press("button", "Random")
+    wait_for(lambda: "The plan takes" in tab.text(MESSAGE))
+    assert session.state.scene is not before.scene
 
 
 def test_an_arm_in_space_follows_what_is_dragged_and_turned(opened):

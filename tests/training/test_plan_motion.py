@@ -92,6 +92,13 @@ def test_what_is_free_stays_straight() -> None:
     assert len(plan.durations) == 1
 
 
+@pytest.mark.parametrize(("seeds", "end"), [(0, "from 1 seed"), (1, "from 2 seeds")])
+def test_a_plan_that_is_not_free_says_how_many_seeds_were_tried(seeds, end) -> None:
+    wall = Box((0.01, 0.5, 0.04), position=(0.0, 0.4, 0.0))
+    plan = plan_motion("planar", (-0.2, 0.3), (0.2, 0.3), [wall], seeds=seeds, ompl=False, time_limit=20.0)
+    assert plan.reason.endswith(end)
+
+
 @pytest.mark.parametrize(
     ("obstacles", "arguments"),
     [(WALL, {"time_limit": 0.0}), (WALL, {"seeds": 4}), ([POST], {"time_limit": 0.0})],

@@ -53,14 +53,13 @@ class Arena:
         others = {**own, "shapes": any_shape, "n_obstacles": (0, MOST_OBSTACLES)}
         self.arguments = {"own": own, "any": others}  # as a user writes them
 
-        # The page plans whole movements, or revises them; a movement soon follows a goal that is dragged.
+        # The page plans whole movements, or revises them.
         changes: dict[str, Any] = {}
         never: dict[str, Any] = {}
         if self.stepwise:
             task = task.of_movements()
             changes = {"decide_at": task.decide_at, "reward_weights": task.weights}
         if task.replanning:
-            changes["horizon"] = min(task.horizon, 0.1)
             never = {"decide_at": (), "horizon": 1e3}
         self._arguments = {
             "steps": own,  # as the id says

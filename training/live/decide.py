@@ -78,19 +78,30 @@ def _planned(arena: Arena, state: State, time_limit: float) -> Proposal:
     """Return the plan of a motion planner, which also says why there is no free movement."""
     scene, task = state.scene, arena.task
     problem = task.arm, scene.start, scene.goal, pack([scene.obstacles])
+    maker = OMPL if state.method == OMPL else MOTION
     begin = time.perf_counter()
-    if state.method == OMPL:
+    if maker == OMPL:
         motion = ompl_motion(*problem, space=task.space_name)
-        return Proposal(motion, OMPL, time.perf_counter() - begin)
-    n_via = int(np.clip(arena.n_via(state), 1, 3))
-    seeds: Any = SEEDS
-    if state.before is not None and len(state.before.waypoints) == n_via + 2 and time_limit == TIME_LIMIT:
-        seeds = state.before.waypoints[None, 1:-1]
-    motion = plan_motion(
-        *problem, n_via=n_via, seeds=seeds, time_limit=time_limit, duration=state.duration,
-        space=task.space_name, ompl=False,
-    )  # fmt: skip
-    return Proposal(motion, MOTION, time.perf_counter() - begin)
+    else:
+        n_via = int(np.clip(arena.n_via(state), 1, 3))
+        seeds: Any = SEEDS
+        if state.before is not None and len(state.before.waypoints) == n_via + 2 and time_limit == TIME_LIMIT:
+            seeds = state.before.waypoints[None, 1:-1]
+        motion = plan_motion(
+            *problem, n_via=n_via, seeds=seeds, time_limit=time_limit, duration=state.duration,
+            space=task.space_name, ompl=False,
+        )  # fmt: skip
+    seconds = time.perf_counter() - begin
+    if state.duration is not None:
+        motion = _retimed(motion, state.duration)
+    return Proposal(motion, maker, seconds)
+
+
+def _retimed(motion: MotionPlan, duration: float) -> MotionPlan:
+    """Return a movement in another duration, [s], or the shortest that the limits allow; as it is if that fails."""
+    plan = Plan(motion.waypoints, motion.durations * (duration / motion.duration))
+    other = checked_motion(motion.arm, motion.space, plan, motion.obstacles, motion.source)
+    return other if other.success else motion
 
 
 def _by_hand(arena: Arena, state: State, vias: Float, duration: float) -> Proposal:
@@ -236,8 +247,8 @@ def profile(arena: Arena, scene: Scene, plan: Plan) -> dict[str, Float]:
     }
 
 
-def describe_plan(proposal: Proposal) -> str:
-    """Return one sentence on a plan."""
+def describe_plan(proposal: Proposal, duration: float | None = None) -> str:
+    """Return one sentence on a plan, for which a user may want a duration, [s]."""
     motion = proposal.motion
     if not motion.success and proposal.maker == MOTION:
         return f"No free movement was found: {motion.reason}. The best one is shown in red."
@@ -247,7 +258,9 @@ def describe_plan(proposal: Proposal) -> str:
         "no obstacle near" if motion.clearance >= 0.999 * FAR else f"{1e3 * motion.clearance:.0f} mm clear"
     )
     jerk = f"{motion.jerk:.1f} times the jerk of the straight line"
-    return f"The plan takes {motion.duration:.2f} s, {clear}, with {jerk}."
+    short = duration is not None and motion.duration > duration + 0.005
+    limits = ", the shortest time that the limits of the arm allow" if short else ""
+    return f"The plan takes {motion.duration:.2f} s{limits}, {clear}, with {jerk}."
 
 
 def describe_outcome(info: Mapping[str, Any], in_joints: bool) -> str:

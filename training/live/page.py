@@ -140,18 +140,17 @@ class Tab:
     # Decisions
 
     def change(self, **changes: Any) -> None:
-        """Decide anew after changes of the state, and show the plan; the rest follows in a pause."""
-        state = self.state
-        for name, value in changes.items():
-            setattr(state, name, value)
+        """Decide anew after changes, and show the plan, the rest in a pause; without a decision nothing changes."""
+        state = dataclasses.replace(self.state, movement=None, playing=False, **changes)
+        state.before = state.plan
         if "scene" in changes:
             state.results = ()
-        state.movement, state.playing, state.before = None, False, state.plan
+        proposal = decide(self.arena, state)
         with self._wake:
             self._jobs.pop(("propose",), None)  # those of the scene before
-        proposal = decide(self.arena, state)
         state.proposals, state.picked, state.profile = (proposal,), 0, None
-        self._say(describe_plan(proposal), proposal.motion.success)
+        self.state = state
+        self._say(describe_plan(proposal, state.duration), proposal.motion.success)
         self.client.flush()
         self.latencies.append(time.perf_counter() - self._due)
         self.act("propose", delay=PAUSE)
@@ -171,7 +170,8 @@ class Tab:
             state.picked, state.movement, state.playing, state.before = index, None, False, None
             proposal = state.proposals[index]
             state.profile = profile(self.arena, state.scene, proposal.motion.plan)
-            self._say(describe_plan(proposal), proposal.motion.success)
+            wanted = None if index else state.duration  # the others have durations of their own
+            self._say(describe_plan(proposal, wanted), proposal.motion.success)
 
     # Scenes
 

@@ -14,7 +14,7 @@ from matplotlib.colors import to_hex
 from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.common.types import Float
-from viapoint.training.live.arena import AGENT, SIZES, Arena
+from viapoint.training.live.arena import AGENT, MOTION, OMPL, SIZES, Arena
 from viapoint.training.live.state import Movement, State
 
 WIDTH = 330  # Width of a panel, [pixels]
@@ -57,11 +57,12 @@ class Panels:
         message = MESSAGE.format("#1b7f4b" if state.good else "#c4202b", html.escape(state.message))
         self._message.content = message + NOTE.format(html.escape(remark))
         self._execute.label = "Stop" if state.playing else "Execute"
-        if plan is not None:
-            self._vias.value = len(plan.durations) - 1
-            if state.duration is None:
-                low, high = self._duration.min, self._duration.max
-                self._duration.value = float(np.clip(round(plan.duration, 2), low, high))
+        self._vias.visible = state.method != OMPL  # which takes as many as its path needs
+        self._vias.min = int(state.method == MOTION)
+        self._vias.value = self._arena.n_via(state)
+        if plan is not None and state.duration is None:
+            low, high = self._duration.min, self._duration.max
+            self._duration.value = float(np.clip(round(plan.duration, 2), low, high))
         self._draw_selection(state)
         self._draw_comparison(state)
         if state.profile is not None and not state.playing:
@@ -97,7 +98,8 @@ class Panels:
             executed["speed"] = norm(np.gradient(rollout.hand, time, axis=0))
             executed["clearance"] = rollout.clearance
         for name, plot in self._plots.items():
-            planned = np.interp(time, profile["time"], profile[name])
+            beyond = 0.0 if name == "jerk" else None  # the arm rests after the plan
+            planned = np.interp(time, profile["time"], profile[name], right=beyond)
             other = np.full(len(time), np.nan)
             other[0] = planned[0]  # a line without numbers would leave the plot empty
             lines = [planned, executed.get(name, other)]
@@ -175,7 +177,7 @@ class Panels:
             for name, (least, most) in SIZES.items():
                 label = f"{name.capitalize()} [m]"
                 self._sizes[name] = gui.add_slider(label, least, most, 0.001, least, visible=False)
-                self._sizes[name].on_update(_by_user(functools.partial(act, "resize", name)))
+                _on_slide(self._sizes[name], functools.partial(act, "resize", name))
             shapes = gui.add_button_group("Add", tuple(arena.new_shapes()))
             shapes.on_click(lambda event: act("add", event.target.value))
             self._remove = self._button("Remove the selected one", "remove", disabled=True)
@@ -196,12 +198,12 @@ class Panels:
         anew: dict[str, Any] = {"by_hand": None, "duration": None, "n_via": None}
         low, high = action.duration_range if arena.task.space.of_hand else (0.3, 12.0)
         self._duration = gui.add_slider("Duration [s]", low, high, 0.01, (low * high) ** 0.5)
-        self._duration.on_update(_by_user(lambda value: act("change", duration=value)))
+        _on_slide(self._duration, lambda value: act("change", duration=value))
         methods = gui.add_dropdown("Method", arena.methods, hint="Decides after each change of the scene")
-        methods.on_update(_by_user(lambda name: act("change", method=name, **anew)))
+        methods.on_update(lambda event: act("change", method=event.target.value, **anew))
         most = action.n_via if arena.task.replanning else max(3, action.n_via)
         self._vias = gui.add_slider("Via-points", 0, most, 1, action.n_via, disabled=most == action.n_via)
-        self._vias.on_update(_by_user(lambda value: act("change", n_via=value, by_hand=None)))
+        _on_slide(self._vias, lambda value: act("change", n_via=value, by_hand=None))
         if hasattr(getattr(arena.agent, "policy", None), "checks"):
             hint = "Proposals whose clearance is computed"
             checks = gui.add_dropdown("Exact checks", tuple(CHECKS), hint=hint)
@@ -215,9 +217,14 @@ class Panels:
         return button
 
 
-def _by_user(function: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Return a callback that ignores changes made by the page itself."""
-    return lambda event: function(event.target.value) if event.client is not None else None
+def _on_slide(slider: Any, function: Callable[[Any], None]) -> None:
+    """Call a function with the values that a user gives a slider; a number that is typed may lie outside."""
+
+    def call(event: Any) -> None:
+        if event.client is not None:  # otherwise the page itself has set it
+            function(min(max(slider.value, slider.min), slider.max))
+
+    slider.on_update(call)
 
 
 def _table(names: Iterable[str], rows: Iterable[Iterable[str]], bold: int = -1) -> str:

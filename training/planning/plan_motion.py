@@ -546,7 +546,8 @@ def _plan(problem: _Problem, effort: _Effort) -> MotionPlan:
         effort = effort._replace(given=(found.vias + problem.start)[None])
     plan = _result(problem, found, "")
     ended = "the time limit was reached" if time.perf_counter() >= effort.until else "no free one was found"
-    reason = f"{plan.reason}; {ended} from {tried} seeds"
+    number = "1 seed" if tried == 1 else f"{tried} seeds"
+    reason = f"{plan.reason}; {ended} from {number}"
     return dataclasses.replace(plan, success=False, seeds=tried, reason=reason)
 
 
