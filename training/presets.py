@@ -114,14 +114,7 @@ JOINT_SIGHT: dict[str, Any] = {
     "labels": 16,
     "explore_candidates": 48,
     "gradient_steps": 6,
-    "policy_kwargs": {
-        "instants": 16,
-        "nearest": 48,
-        "candidates": 128,
-        "refinements": 2,
-        "per_refinement": 64,
-        "refine": 4,
-    },
+    "policy_kwargs": {"instants": 16, "nearest": 48, "candidates": 128, "refinements": 0, "refine": 4},
 }
 
 
