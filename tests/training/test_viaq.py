@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from tasks import MOVING, PANDA, PLANE, REACH, SENSED, WHOLE, problem_of, scenes_of
 
 from viapoint.training import ViaQ, ViaVecEnv, load_agent
+from viapoint.training.agents import viaq_policy
 from viapoint.training.agents.agent import SAC
 from viapoint.training.agents.viaq import Outcomes, outcome_of
 from viapoint.training.agents.viaq_policy import ViaQPolicy
@@ -260,6 +261,26 @@ def test_an_environment_of_another_task_is_to_blame_and_not_the_file():
     with pytest.raises(ValueError, match="env does not fit the agent") as raised:
         load_agent(PLANE, env=ViaVecEnv(PLANE, 2, n_via=2))
     assert not isinstance(raised.value, BadFileError)
+
+
+def test_refined_candidates_are_apart_from_each_other(monkeypatch):
+    refined = []
+
+    def refine(task, problem, actions):
+        refined.append(actions)
+        return actions
+
+    monkeypatch.setattr(viaq_policy, "refined_actions", refine)
+    agent = load_agent(PLANE)
+    agent.policy.refine = 4
+    problem = problem_of(agent.policy.task, 16)
+    agent.policy._chosen(problem)
+    vias = refined[0][..., :2]
+    distance = np.linalg.norm(vias[:, :, None] - vias[:, None], axis=-1)
+    assert distance[:, ~np.eye(4, dtype=bool)].min() >= viaq_policy.APART
+    actions, values = agent.policy.propose(problem)
+    best = actions[np.arange(16), values.argmax(axis=1)]
+    np.testing.assert_array_equal(refined[0][:, 0], best)
 
 
 def test_one_of_many_good_plans_out_of_reach_is_not_taken():

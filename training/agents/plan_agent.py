@@ -16,7 +16,6 @@ from stable_baselines3.common.utils import is_vectorized_observation
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
-from viapoint.envs.common.arrays import norm
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
@@ -27,9 +26,6 @@ from viapoint.training.vec_env import check_spaces, check_unwrapped
 N_ELITES = 8  # Number of candidates around which each round of refinement samples
 # Standard deviation of the first round of refinement, in the action space; each round halves it
 SPREAD = 0.15
-# Least distance of the via-points of two candidates that are refined, in the action space. Of .2 to 1.8, .5 solved most
-# of the `validation` scenes of PandaObstacles.
-APART = 0.5
 
 Observation = Mapping[str, NDArray[Any]]
 Numbers = NDArray[np.floating[Any]]
@@ -119,21 +115,6 @@ class PlanPolicy(BasePolicy):
         steps = normal_steps(number, self.task.action.size, each) * (SPREAD * 0.5**each)
         around = centres[:, np.arange(number) % centres.shape[1]]
         return np.clip(around + steps, -1.0, 1.0).astype(np.float32)
-
-    def best_apart(self, actions: Numbers, values: Numbers, count: int) -> Numbers:
-        """Return the best candidates that are APART from each other, shape (B, count, m).
-
-        The planner's refinement would bring those that are close together to the same movement.
-        """
-        vias = actions[..., : self.task.n_via * self.task.action.dimension]
-        left = values.copy()
-        rows = np.arange(len(values))
-        found = []
-        for _ in range(count):
-            best = left.argmax(axis=1)
-            found.append(actions[rows, best])
-            left[norm(vias - vias[rows, best][:, None]) < APART] = -np.inf
-        return np.stack(found, axis=1)
 
     @abstractmethod
     def decide(self, observation: Observation) -> Numbers:

@@ -179,7 +179,8 @@ class ViaRankPolicy(PlanPolicy):
             rank = functools.partial(self.rank, there, some)
             actions, value = self.proposals(len(there.start), rank)
             if self.refine:
-                seeds = self.best_apart(actions, value, self.refine)
+                top = np.argsort(-value, axis=1, kind="stable")[:, : self.refine]
+                seeds = np.take_along_axis(actions, top[..., None], axis=1)
                 refined = refined_actions(self.task, there, seeds)
                 actions = np.concatenate((actions, refined), axis=1)
                 value = np.concatenate((value, rank(refined)), axis=1)
