@@ -158,7 +158,7 @@ def plan_motion(
     """Plan a minimum-jerk movement through via-points from a start to a goal around obstacles.
 
     The straight movement is taken if it is free. Otherwise via-points are refined by the gradient of clearance and jerk
-    (see :mod:`viapoint.training.planning.refine`), from the straight line first, and then from random seeds, until
+    (see `viapoint.training.planning.refine`), from the straight line first, and then from random seeds, until
     `enough` free movements are found. Each is checked at 256 instants and polished; the one with the least jerk is
     taken. The duration is the shortest that keeps 97 % of the velocity and torque limits, 0.25 s or more, if none is
     given.
