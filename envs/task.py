@@ -171,7 +171,7 @@ class Task:
             raise ValueError(
                 "obstacles that move and targets that jump need decide_at with events of a movement"
             )
-        # Making the layout of actions checks the control step and the durations, and makes plain n_obstacles of these.
+        # Making the layout of actions checks the control step and the durations, and makes plain numbers of these.
         if task.stepwise:
             task.steering  # noqa: B018
         return dataclasses.replace(task, duration_range=task.action.duration_range)
