@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -21,7 +22,7 @@ version = release = tomllib.loads((DOCS.parent / "pyproject.toml").read_text())[
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext", ".ipynb": "notebook"}
-exclude_patterns = ["_build", "figures"]
+exclude_patterns = ["_build", "figures", generated.TASK_PAGE]
 suppress_warnings = ["myst.header"]  # the changelog repeats its headings in every version
 myst_heading_anchors = 3
 default_role = "code"
@@ -63,9 +64,12 @@ def complete(app: Any, docname: str, source: list[str]) -> None:
     if docname == "index":
         text = generated.with_contents(text)
     elif docname == "environments":
+        text = re.sub(
+            rf"\({generated.TASK_PAGE}#(\w+)-v0\)",
+            lambda found: f"(environments/{generated.NAMES[found[1]]}-v0.md)",
+            text,
+        )
         text += "\n" + generated.contents(["environments/*"], glob=True)
-    elif docname.startswith("environments/"):
-        text = generated.with_head(text, docname.partition("/")[2])
     up = "../" * docname.count("/")
     for name, page in generated.ROOT_PAGES.items():
         text = text.replace(f"]({up}../{name}", f"]({up}{page}")

@@ -17,14 +17,16 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("viapoint.primitives", "viapoint.envs", "viapoint.training")
 EXPORTS = {name: package for package in PACKAGES for name in importlib.import_module(package).__all__}
 """Package of each exported name."""
+NAMES = {name.lower(): name for name in (re.sub(r".*/|-v0", "", env_id) for env_id in TASKS)}
+"""Names of the tasks without version, by their lower-case forms in references."""
 ROOT_PAGES = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "project/contributing.md",
     "CHANGELOG.md": "project/changelog.md",
 }
 """Pages of the site that files in the root are copied to."""
-HERE = "<!-- generated: spaces and defaults -->"
-"""Line of a page of an environment that a table takes the place of."""
+TASK_PAGE = "tasks.md"
+"""Page with a section on each task, which becomes a page of its own."""
 
 
 def write_pages(docs: Path) -> None:
@@ -34,10 +36,8 @@ def write_pages(docs: Path) -> None:
             text = (ROOT / name).read_text(encoding="utf-8")
             text = re.sub(r"\]\((?!https?:|#|docs/)", "](../../", text).replace("](docs/", "](../")
             write(docs / page, text)
-    for env_id in TASKS:
-        name = env_id.partition("/")[2]
-        if "Step-" in name:
-            write(docs / "environments" / f"{name}.md", stepwise_page(docs, name))
+    for name, text in task_pages((docs / TASK_PAGE).read_text(encoding="utf-8")).items():
+        write(docs / "environments" / f"{name}.md", f"{text}\n{head(name)}")
     for package in PACKAGES:
         module = importlib.import_module(package)
         write(docs / "api" / f"{package}.rst", package_page(package))
@@ -100,19 +100,26 @@ def title(text: str) -> str:
     return f"{text}\n{'=' * len(text)}\n\n"
 
 
-def stepwise_page(docs: Path, name: str) -> str:
-    """Return the page of a task with an action in every control step, with the picture of its twin."""
-    twin = name.replace("Step-", "-")
-    text = (docs / "environments" / f"{twin}.md").read_text(encoding="utf-8")
-    picture = re.findall(r"(?m)^!\[.*$", text)[:1]
-    return (
-        f"# {name}\n\nThe task of [{twin}]({twin}.md) with an action in every control step: a velocity of the hand or "
-        f"of the joints ([actions](../environments.md#actions)).\n\n{''.join(picture)}\n\n{HERE}\n"
-    )
+def task_pages(text: str) -> dict[str, str]:
+    """Return the text on each task from those of their sections; twins have the picture of the other task."""
+    text = re.sub(r"\]\(#(\w+)-v0\)", lambda found: f"](../environments/{NAMES[found[1]]}-v0.md)", text)
+    text = re.sub(r"\]\((?!https?:|\.\./)", "](../", text)
+    sections = dict(part.split("\n", 1) for part in text.split("\n## ")[1:])
+    found = {name: f"# {name}\n{section}" for name, section in sections.items()}
+    for name in NAMES.values():
+        twin = name.replace("Step", "")
+        if name == twin:
+            continue
+        picture = re.findall(r"(?m)^!\[.*$", sections[f"{twin}-v0"])[:1]
+        found[f"{name}-v0"] = (
+            f"# {name}-v0\n\nThe task of [{twin}-v0]({twin}-v0.md) with an action in every control step: a velocity of "
+            f"the hand or of the joints ([actions](../environments.md#actions)).\n\n{''.join(picture)}\n"
+        )
+    return found
 
 
-def with_head(text: str, name: str) -> str:
-    """Return the page of an environment with a call, its spaces and the values of its arguments."""
+def head(name: str) -> str:
+    """Return a call of an environment, its spaces, and the values of its arguments."""
     env_id = f"viapoint/{name}"
     task = Task.of(**TASKS[env_id])
     size = len(task.action_names)
@@ -124,7 +131,7 @@ def with_head(text: str, name: str) -> str:
     values = {key: value for key, value in task.as_dict().items() if key not in apart}
     weights = ", ".join(f"{key} {value:g}" for key, value in task.as_dict()["reward_weights"].items())
     defaults = "\n".join(f"| `{key}` | {plain(value)} |" for key, value in values.items())
-    head = f"""```python
+    return f"""```python
 import gymnasium as gym
 
 env = gym.make("viapoint.envs:{env_id}")
@@ -146,7 +153,6 @@ envs = gym.make_vec("viapoint.envs:{env_id}", num_envs=64)
 {defaults}
 | `reward_weights` | {weights} |
 """
-    return text.replace(HERE, head) if HERE in text else f"{text}\n{head}"
 
 
 def plain(value: object) -> str:

@@ -13,7 +13,7 @@ from viapoint.training import configs
 from viapoint.training.cli import entry as cli
 
 ROOT = Path(__file__).parents[1]
-WRITTEN = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/environments/*-v0.md")]
+WRITTEN = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]
 PAGES = {path.relative_to(ROOT).as_posix(): path for path in WRITTEN if "Step-" not in path.name}
 """Pages that were written by hand; the site has generated ones, too."""
 PUBLIC = ("viapoint.primitives", "viapoint.envs", "viapoint.training")
