@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.arrays import Bool, Float
 from viapoint.envs.registration import TASKS
 from viapoint.envs.scenes.families_registry import scene_families
 from viapoint.envs.scenes.sampler import is_planar

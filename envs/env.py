@@ -11,7 +11,7 @@ import gymnasium as gym
 from gymnasium.utils import EzPickle
 from gymnasium.wrappers import RecordVideo
 
-from viapoint.envs.common.types import Observation
+from viapoint.envs.common.arrays import Observation
 from viapoint.envs.common.validation import as_given, finite_array
 from viapoint.envs.episodes import History
 from viapoint.envs.outcome import Rollout

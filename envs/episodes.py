@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.arms.kinematics import slowdowns
-from viapoint.envs.common.arrays import as_dict, from_dict, norm, put, take
-from viapoint.envs.common.types import Bool, Float, Int, Observation
+from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict, norm, put, take
 from viapoint.envs.events import NEVER, Event, EventPredictor, next_step
 from viapoint.envs.executor import Executor, Pieces, References
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles

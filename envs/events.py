@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.arms.kinematics import Chain, Spheres
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.geometry.clearance import memory, obstacle_clearance, place
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles

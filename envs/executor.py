@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.geometry.clearance import (
     Placed,
     bounds_memory,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.common.arrays import Float, Observation
 from viapoint.envs.geometry.obstacles import POSE_SIZE, Obstacles, observation_rows
 from viapoint.envs.plans import Motion
 from viapoint.envs.replanning import NominalPlan

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int
 
 SETTLING = 0.1
 """Time after the movement in which the arm must come to rest, [s]."""

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from viapoint import primitives
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.validation import check_increasing_pair, finite_array, whole_number
 from viapoint.envs.geometry.compiled import compiled
 

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint import primitives
-from viapoint.envs.common.arrays import norm, put, take
-from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.arrays import Bool, Float, norm, put, take
 from viapoint.envs.plans import ActionLayout, Motion, Plan, turned
 
 # Jerk with which a plan follows a goal that moves a little, [m/s^3] or [rad/s^3]: 60 distance / time^3

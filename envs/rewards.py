@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.arrays import Bool, Float
 from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.outcome import Outcome, straight_jerk_cost
 

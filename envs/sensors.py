@@ -17,8 +17,7 @@ import numpy as np
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.kinematics import forward, link_poses
-from viapoint.envs.common.arrays import frame_matrices
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int, frame_matrices
 from viapoint.envs.common.validation import (
     finite_array,
     number_of_at_least,

@@ -10,7 +10,7 @@ import numpy as np
 from mujoco import batch
 
 from viapoint.envs.arms.arm import WAITING, Arm
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.geometry.obstacles import MESH, Obstacles, geom_fields, geom_meshes, quaternions_of
 
 # Parts of a control sequence with moving obstacles: controls, then the obstacles' positions

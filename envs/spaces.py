@@ -8,7 +8,7 @@ import numpy as np
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import planar_joints, planar_motion, planar_solutions
-from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.arrays import Bool, Float
 from viapoint.envs.plans import Motion, SpaceName
 
 # Greatest distance of the hand from a reference within reach, [m], and of a joint beyond its range, [rad]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.plans import Motion, SpaceName, turned
 
 QUADRATURE = 12  # Gauss-Legendre nodes for the jerk cost of a control step

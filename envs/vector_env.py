@@ -17,8 +17,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.common.arrays import as_dict, from_dict
-from viapoint.envs.common.types import Bool, Float, Int, Observation
+from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict
 from viapoint.envs.common.validation import (
     as_given,
     finite_array,
@@ -30,7 +29,7 @@ from viapoint.envs.episodes import Decision, Episodes, History
 from viapoint.envs.geometry.obstacles import geom_meshes
 from viapoint.envs.outcome import Rollout
 from viapoint.envs.plans import Plan
-from viapoint.envs.rendering.renderer import RENDER_MODES, EpisodeRenderer
+from viapoint.envs.renderer import RENDER_MODES, EpisodeRenderer
 from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.scenes.scene import Scenes, check_jumps
 from viapoint.envs.task import Task

@@ -4,7 +4,7 @@ Every function takes NumPy arrays or torch tensors with any leading (batch) dime
 kind. Units are metres and seconds.
 """
 
-from ._extrema import Extrema
+from ._polynomial import Extrema
 from .array_api import FREE
 from .fitting import ViaPointFit, fit_via_points
 from .gradients import CostGradient, cost_gradient

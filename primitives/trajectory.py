@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from ._evaluate import derivative_coefficients, evaluate
-from ._extrema import Extrema, axis_extrema, largest_norm
 from ._hermite_tables import energy_table
 from ._knot_solver import States, least_cost_coefficients
+from ._polynomial import Extrema, axis_extrema, largest_norm
 from .array_api import (
     Array,
     Namespace,

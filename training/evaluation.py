@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.common.arrays import Float, Observation
 from viapoint.envs.common.validation import finite_array
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.scenes.scene import NEVER, Scenes

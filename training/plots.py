@@ -11,8 +11,8 @@ import matplotlib.style
 import numpy as np
 from matplotlib.figure import Figure
 
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.palette import PALETTE
-from viapoint.envs.common.types import Float
 from viapoint.primitives import ViaPointFit
 from viapoint.training.files import write_figure
 from viapoint.training.scene_sets import BANDS

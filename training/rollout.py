@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.common.types import Float, Int, Observation
+from viapoint.envs.common.arrays import Float, Int, Observation
 from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.planning.search import registered_task

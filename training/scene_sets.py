@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.common.types import Float, Int
+from viapoint.envs.common.arrays import Float, Int
 from viapoint.envs.geometry.obstacles import ABSENT, KINDS, no_obstacles
 from viapoint.envs.geometry.shapes import IN_TABLES, PLAIN_KINDS
 from viapoint.envs.scenes.scene import NEVER, Scenes, check_scenes, resting

@@ -18,9 +18,9 @@ from matplotlib.font_manager import findfont
 from matplotlib.lines import Line2D
 from PIL import Image, ImageDraw, ImageFont
 
+from viapoint.envs.common.arrays import Frame
 from viapoint.envs.common.palette import PALETTE, Colour
-from viapoint.envs.common.types import Frame
-from viapoint.envs.rendering.renderer import EpisodeRenderer
+from viapoint.envs.renderer import EpisodeRenderer
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.checks import check_file
 from viapoint.training.files import MARK, write_figure

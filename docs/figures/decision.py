@@ -10,15 +10,14 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch
-from footprint import footprint
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
-from top_view import View, draw_movement, planned_only
+from top_view import View, draw_movement, footprint, planned_only
 
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.palette import PALETTE
-from viapoint.envs.common.types import Float
 from viapoint.envs.episodes import Recorded
 from viapoint.envs.geometry.obstacles import unpack
 from viapoint.envs.scenes.scene import Scenes

@@ -14,9 +14,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from viapoint.envs import Box, Capsule, Cylinder, Shape, arm_of
-from viapoint.envs.common.types import Float, Frame
-from viapoint.envs.rendering.gl import Canvas
-from viapoint.envs.rendering.renderer import SceneView, frame_steps, picture_of
+from viapoint.envs.common.arrays import Float, Frame
+from viapoint.envs.gl import Canvas
+from viapoint.envs.renderer import SceneView, frame_steps, picture_of
 from viapoint.training import MotionPlan, plan_motion
 from viapoint.training.planning.motion_plan import execute_plans
 

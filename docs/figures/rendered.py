@@ -15,11 +15,11 @@ from PIL import Image
 
 from viapoint.envs import Box, Pose, inverse_kinematics, load_arm
 from viapoint.envs.arms.arm import asset
+from viapoint.envs.common.arrays import Frame
 from viapoint.envs.common.palette import PALETTE
-from viapoint.envs.common.types import Frame
 from viapoint.envs.geometry.obstacles import add_to_model, unpack
-from viapoint.envs.rendering.gl import Canvas
-from viapoint.envs.rendering.renderer import GLOWING, PLAN, ShapeWriter
+from viapoint.envs.gl import Canvas
+from viapoint.envs.renderer import GLOWING, PLAN, ShapeWriter
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training import GeometrySearch, load_agent, plan_motion
 from viapoint.training.checks import SHIPPED_IDS

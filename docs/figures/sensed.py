@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from footprint import footprint
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
+from top_view import footprint
 
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.geometry.obstacles import unpack

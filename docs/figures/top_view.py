@@ -7,20 +7,20 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from footprint import footprint, outline
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
+from scipy.spatial import ConvexHull
 
-from viapoint.envs import HalfSpace, Shape, Task
+from viapoint.envs import Box, ConvexMesh, Cylinder, HalfSpace, PointCloud, Shape, Task
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.kinematics import sphere_centres
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.palette import PALETTE, Colour
-from viapoint.envs.common.types import Float
 from viapoint.envs.episodes import Recorded
 from viapoint.envs.geometry.obstacles import unpack
 from viapoint.envs.outcome import Rollout
 from viapoint.envs.plans import Plan
-from viapoint.envs.rendering.renderer import FADED, Picture, picture_of
+from viapoint.envs.renderer import FADED, Picture, picture_of
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.rollout import Decide
 
@@ -33,6 +33,7 @@ MARGIN = 0.1
 """Margin around the movement of an arm in space, [m]."""
 GOAL_RADIUS, START_RADIUS, HAND_RADIUS = 0.026, 0.018, 0.015
 """Radii of the drawn circles, [m]."""
+CIRCLE = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]  # Angles of the points of a circle, [rad]
 CONTACT_TOLERANCE = 0.01
 """Greatest clearance of an obstacle that counts as the one in contact, [m]."""
 
@@ -211,3 +212,52 @@ def play(env_id: str, scenes: Scenes, decide: Decide, **kwargs: Any) -> list[tup
         episodes.append((recorded, bool(success[row])))
     envs.close()
     return episodes
+
+
+def footprint(shape: Shape, rim: float = 0.0) -> list[Float]:
+    """Return the outlines of a shape from above, widened by a rim, convex polygons of shape (K, 2) each, [m].
+
+    A half-space is a large square if it is a wall; a floor or a ceiling has no outline.
+    """
+    if isinstance(shape, HalfSpace):
+        normal = shape.rotation[:2, 2]
+        if np.linalg.norm(normal) < 0.7:
+            return []
+        normal = normal / np.linalg.norm(normal)
+        along = np.array([-normal[1], normal[0]])
+        corners = [4.0 * (way * along - depth * normal) for way in (-1.0, 1.0) for depth in (0.0, 1.0)]
+        return [outline(shape.position[:2] + np.array(corners), rim)]
+    points, radius = _outer_points(shape)
+    places = (points @ shape.rotation.T + shape.position)[:, :2]
+    if isinstance(shape, PointCloud):
+        return [outline(place[None], radius + rim) for place in places]
+    return [outline(places, radius + rim)]
+
+
+def outline(points: Float, radius: Any) -> Float:
+    """Return the outline of the convex hull of discs around points, shape (K, 2), [m].
+
+    Args:
+        points: Centres of the discs, shape (n, 2), [m].
+        radius: Radius of all discs, or of each, shape (n,), [m].
+    """
+    circle = np.stack((np.cos(CIRCLE), np.sin(CIRCLE)), axis=-1)
+    discs = points[:, None] + np.reshape(radius, (-1, 1, 1)) * circle
+    around = discs.reshape(-1, 2)
+    return np.asarray(around[ConvexHull(around).vertices])
+
+
+def _outer_points(shape: Shape) -> tuple[Float, float]:
+    """Return points in the frame of a shape, (n, 3), and the radius of balls of which it is the hull, [m]."""
+    if isinstance(shape, Box):
+        return np.array(list(itertools.product(*((-half, half) for half in shape.size)))), 0.0
+    if isinstance(shape, ConvexMesh):
+        return np.asarray(shape.vertices), 0.0
+    if isinstance(shape, PointCloud):
+        return np.asarray(shape.points), shape.radius
+    if isinstance(shape, Cylinder):
+        rim = [shape.radius * np.cos(CIRCLE), shape.radius * np.sin(CIRCLE)]
+        ends = [np.stack((*rim, np.full(len(CIRCLE), way * shape.half_length)), axis=-1) for way in (-1, 1)]
+        return np.concatenate(ends), 0.0
+    radius, half, _ = shape.packed_size
+    return np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]), float(radius)

@@ -12,7 +12,7 @@ import numpy as np
 
 from viapoint.envs.arms.kinematics import Chain, FirstTwo, Spheres, forward, inverse_dynamics
 from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, overlapping, touching_at_home
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import add_to_model
 from viapoint.envs.geometry.shapes import as_obstacle

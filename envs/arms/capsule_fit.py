@@ -17,7 +17,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.meshes import convex_hull
 from viapoint.envs.geometry.shapes import ConvexMesh

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.validation import finite_array
 
 # Types of joints that an arm may have

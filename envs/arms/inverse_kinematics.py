@@ -9,8 +9,7 @@ import numpy as np
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.kinematics import Chain, link_frames, tool_jacobian, transform
-from viapoint.envs.common.arrays import frame_matrices
-from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.arrays import Bool, Float, frame_matrices
 from viapoint.envs.common.validation import finite_array, unit_quaternion, whole_number
 from viapoint.envs.geometry.compiled import compiled, kernel
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel
 

@@ -32,8 +32,7 @@ from viapoint.envs.arms.choices import (
 from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.arms.stored import cached_arm
 from viapoint.envs.arms.urdf import WARNING, Urdf, read_urdf
-from viapoint.envs.common.arrays import frame_matrices
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float, frame_matrices
 from viapoint.envs.common.validation import finite_array, number_of_at_least
 from viapoint.envs.geometry.obstacles import quaternions_of
 

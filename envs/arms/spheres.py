@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.arms.kinematics import PART, Chain, Spheres
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.geometry.clearance import memory, nearest_spheres, place
 from viapoint.envs.geometry.compiled import compiled
 

@@ -1,4 +1,4 @@
-"""Operations on NumPy arrays, and rows of records."""
+"""Type aliases of NumPy arrays, operations on them, and rows of records."""
 
 from __future__ import annotations
 
@@ -7,9 +7,14 @@ from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
-from viapoint.envs.common.types import Float
-
+Float = NDArray[np.float64]  # Array of double precision
+Single = NDArray[np.float32]  # Array of single precision
+Bool = NDArray[np.bool_]  # Array of truth values
+Int = NDArray[np.int64]  # Array of integers: counts, row numbers, physics steps
+Frame = NDArray[np.uint8]  # Picture, shape (height, width, 3)
+Observation = dict[str, Single]  # Observation of one environment or of a batch, by the names of its parts
 Record = TypeVar("Record", bound=tuple[Any, ...])
 
 

@@ -11,7 +11,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.common.types import Float, Int
+from viapoint.envs.common.arrays import Float, Int
 
 Record = TypeVar("Record")
 UNIT_TOLERANCE = 1e-3  # Greatest error of a quaternion's length; smaller ones are corrected

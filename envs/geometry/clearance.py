@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from viapoint.envs.arms.kinematics import PART, Chain, Spheres, link_frames
-from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.arrays import Bool, Float
 from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel
 from viapoint.envs.geometry.distance import point_distance
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles

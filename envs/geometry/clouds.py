@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.types import Float, Int
+from viapoint.envs.common.arrays import Float, Int
 from viapoint.envs.geometry.compiled import TINY, kernel
 
 LEAF = 16  # Greatest number of points of a leaf of the tree

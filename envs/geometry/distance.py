@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.compiled import compiled, inlined
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.types import Float, Int
+from viapoint.envs.common.arrays import Float, Int
 from viapoint.envs.geometry.compiled import TINY, kernel
 
 FAR = 1e6  # Distance beyond everything, [m]

@@ -7,9 +7,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from viapoint.envs.common.arrays import frame_matrices
+from viapoint.envs.common.arrays import Bool, Float, Int, frame_matrices
 from viapoint.envs.common.mujoco_check import mujoco
-from viapoint.envs.common.types import Bool, Float, Int
 from viapoint.envs.geometry.clouds import Clouds, join_clouds, split_clouds
 from viapoint.envs.geometry.meshes import Meshes, join_meshes, split_meshes
 from viapoint.envs.geometry.shapes import (

@@ -21,9 +21,8 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from viapoint.envs.common.arrays import frame_matrices, frozen, quaternion_to
+from viapoint.envs.common.arrays import Float, frame_matrices, frozen, quaternion_to
 from viapoint.envs.common.mujoco_check import mujoco
-from viapoint.envs.common.types import Float
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, unit_quaternion
 from viapoint.envs.geometry.clouds import Clouds, build_cloud, cloud_distance, join_clouds
 from viapoint.envs.geometry.compiled import TINY, inlined, kernel

@@ -8,7 +8,7 @@ import numpy as np
 
 from viapoint.envs.arms.inverse_kinematics import descend, solve_planar
 from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position, transform
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, row_clearance, self_clearance
 from viapoint.envs.geometry.compiled import inlined, inner, kernel
 from viapoint.envs.geometry.obstacles import ABSENT

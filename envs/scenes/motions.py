@@ -9,7 +9,7 @@ import numpy as np
 
 from viapoint.envs.arms.inverse_kinematics import solve_planar
 from viapoint.envs.arms.kinematics import tool_position
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.geometry.clearance import place
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE

@@ -11,8 +11,7 @@ import numpy as np
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import inverse_kinematics, planar_joints
 from viapoint.envs.arms.kinematics import sphere_centres
-from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.envs.geometry.distance import point_clearances

@@ -15,8 +15,7 @@ import numpy as np
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import planar_joints
 from viapoint.envs.arms.kinematics import link_poses, sphere_centres
-from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int, norm
 from viapoint.envs.geometry.clearance import memory, row_clearances
 from viapoint.envs.geometry.distance import point_clearances
 from viapoint.envs.geometry.obstacles import no_obstacles

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.arrays import Bool, Float, norm
 from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import HALF_SPACE, Obstacles, no_obstacles

@@ -6,8 +6,8 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 
-from viapoint.envs.rendering import renderer
-from viapoint.envs.rendering.gl import GLUnavailableError
+from viapoint.envs import renderer
+from viapoint.envs.gl import GLUnavailableError
 from viapoint.envs.scenes import families_registry
 
 sys.path.append(str(Path(__file__).parent))

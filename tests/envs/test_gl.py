@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from episodes import OBSTACLES
 
-from viapoint.envs.rendering import gl
-from viapoint.envs.rendering.gl import GLUnavailableError
+from viapoint.envs import gl
+from viapoint.envs.gl import GLUnavailableError
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
 

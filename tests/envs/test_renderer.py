@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from episodes import AROUND, DRAWN, JUMP, OBSTACLES, STRAIGHT, moved, play
 
-from viapoint.envs import HalfSpace, RecordMovements, Sphere, arm_of
-from viapoint.envs.rendering import gl, renderer
+from viapoint.envs import HalfSpace, RecordMovements, Sphere, arm_of, gl, renderer
 
 WHOLE_ARM = "viapoint.envs:viapoint/PlanarWholeArm-v0"
 

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, place_group, self_clearance
 from viapoint.envs.geometry.compiled import compiled, inner, kernel
 from viapoint.envs.geometry.obstacles import ABSENT, KINDS, Obstacles, bounding_boxes

@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 from torch.nn import functional
 
-from viapoint.envs.common.types import Single
+from viapoint.envs.common.arrays import Single
 from viapoint.envs.task import Task
 from viapoint.primitives.array_api import Array
 from viapoint.training.agents.model_io import ALGORITHMS

@@ -11,8 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor
 
-from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import turned

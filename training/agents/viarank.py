@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 from torch.nn import functional
 
-from viapoint.envs.common.types import Float, Single
+from viapoint.envs.common.arrays import Float, Single
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.sensors import Sensor

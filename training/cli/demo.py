@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from viapoint.envs.rendering.gl import GLUnavailableError
+from viapoint.envs.gl import GLUnavailableError
 from viapoint.training import plots, report
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.agents.model_io import untrained

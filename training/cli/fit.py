@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.primitives import ViaPointFit, fit_via_points
 from viapoint.primitives.fitting import USUAL_RANGE
 from viapoint.training.configs import FitConfig

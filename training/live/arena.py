@@ -14,7 +14,7 @@ import numpy as np
 
 import viapoint.envs as ve
 from viapoint.envs.arms.kinematics import forward
-from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.common.arrays import Float, Observation
 from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import KINDS, pack, quaternions_of
 from viapoint.envs.scenes.options import scene_options

@@ -12,8 +12,7 @@ import numpy as np
 
 from viapoint import primitives
 from viapoint.envs import Plan, ReachVectorEnv, Task
-from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.common.arrays import Float, Observation, norm
 from viapoint.envs.geometry.clearance import FAR
 from viapoint.envs.geometry.obstacles import pack
 from viapoint.training.live.arena import AGENT, HAND, MOTION, OMPL, SEARCH, STRAIGHT, Arena

@@ -15,9 +15,8 @@ from mjviser.conversions import get_geom_texture_id, merge_geoms
 
 from viapoint.envs import Arm, Box, Capsule, HalfSpace, Shape, Sphere
 from viapoint.envs.arms.load import read_model
-from viapoint.envs.common.arrays import frame_matrices, norm, quaternion_to
+from viapoint.envs.common.arrays import Float, frame_matrices, norm, quaternion_to
 from viapoint.envs.common.palette import PALETTE, Colour
-from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import add_to_model, pack
 from viapoint.training.live.arena import SAMPLES, Arena
 from viapoint.training.live.state import State

@@ -24,7 +24,7 @@ import viser
 from PIL import Image
 
 from viapoint.envs import Arm
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.registration import check_registered
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.checks import DEFAULT_ENV, SHIPPED_IDS

@@ -11,9 +11,8 @@ import numpy as np
 import viser
 from matplotlib.colors import to_hex
 
-from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.common.palette import PALETTE
-from viapoint.envs.common.types import Float
 from viapoint.training.live.arena import AGENT, MOTION, OMPL, SIZES, Arena
 from viapoint.training.live.state import Movement, State
 

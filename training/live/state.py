@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs import Plan, Scenes, Shape
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.outcome import Rollout
 from viapoint.envs.scenes.options import OPTIONS, options_to_json
 from viapoint.training.planning.motion_plan import MotionPlan

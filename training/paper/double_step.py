@@ -22,7 +22,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 from scipy.interpolate import BPoly
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.primitives import Trajectory, minimum_jerk_coefficients, point_to_point, retarget
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, instants, straight, track

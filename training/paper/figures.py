@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from viapoint import primitives
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.palette import PALETTE
-from viapoint.envs.common.types import Float
 from viapoint.envs.geometry.obstacles import unpack
 from viapoint.training.files import write_figure
 from viapoint.training.paper import double_step, movements, one_via, point_to_point

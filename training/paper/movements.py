@@ -12,7 +12,7 @@ from scipy.signal import find_peaks
 
 from viapoint.envs import Box, Task
 from viapoint.envs.arms.kinematics import torques
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.plans import Motion
 from viapoint.primitives import Trajectory, passage_durations, point_to_point, through
 

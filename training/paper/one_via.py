@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from sympy import Poly
 from sympy.abc import tau as tau1
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.primitives import Trajectory, speed_valleys
 from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, at_least, at_most, near

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from viapoint import primitives
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.primitives import FREE, Trajectory, minimum_duration, point_to_point, through
 from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, at_least, at_most, near

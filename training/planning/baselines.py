@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.common.arrays import Float, Observation
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import Scenes

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from viapoint.envs.arms.kinematics import sphere_centres
-from viapoint.envs.common.types import Bool, Float
+from viapoint.envs.common.arrays import Bool, Float
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles, pack, quaternions_of
 from viapoint.envs.geometry.shapes import Box, PointCloud, Shape

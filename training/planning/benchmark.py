@@ -22,8 +22,7 @@ import yaml
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.stored import read_arm
-from viapoint.envs.common.arrays import frame_matrices
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float, frame_matrices
 from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.obstacles import pack, quaternions_of
 from viapoint.envs.geometry.shapes import Box, Cylinder, Shape, as_obstacle

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from viapoint.envs.common.types import Single
+from viapoint.envs.common.arrays import Single
 from viapoint.envs.task import Task
 
 MOST_CANDIDATES = 1 << 16  # Greatest number of candidates of one decision; usual are up to 4096

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.common.types import Bool, Float, Int, Observation, Single
+from viapoint.envs.common.arrays import Bool, Float, Int, Observation, Single
 from viapoint.envs.geometry.clearance import place_group
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.validation import finite_array
 from viapoint.training.files import write_bytes
 from viapoint.training.planning.motion_plan import JointMotion, MotionPlan

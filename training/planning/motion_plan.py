@@ -13,7 +13,7 @@ import numpy as np
 from viapoint import primitives
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.kinematics import torques
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.episodes import Episodes
 from viapoint.envs.geometry.obstacles import Obstacles, mesh_names, no_obstacles, pack, unpack

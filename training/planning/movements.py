@@ -25,7 +25,7 @@ from viapoint.envs.arms.inverse_kinematics import (
     solve_symmetric,
 )
 from viapoint.envs.arms.kinematics import Chain, Spheres
-from viapoint.envs.common.types import Float, Int
+from viapoint.envs.common.arrays import Float, Int
 from viapoint.envs.geometry.clearance import (
     WINDOW,
     Placed,

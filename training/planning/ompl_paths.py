@@ -13,8 +13,7 @@ import numpy as np
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.kinematics import Chain, Spheres
-from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.geometry.clearance import memory, obstacle_clearance, place, self_clearance
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles

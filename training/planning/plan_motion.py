@@ -19,7 +19,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import UnreachableError, inverse_kinematics
 from viapoint.envs.arms.kinematics import motion_torques, slowdown, torques
 from viapoint.envs.arms.registry import arm_of
-from viapoint.envs.common.types import Float
+from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least, whole_number
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Float, Observation
+from viapoint.envs.common.arrays import Float, Observation, norm
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.scenes.motions import REACH_LENGTH, REACH_TIME

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.spheres import grouped
-from viapoint.envs.common.arrays import norm
-from viapoint.envs.common.types import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int, norm
 from viapoint.envs.geometry.clearance import Placed, place
 from viapoint.envs.geometry.compiled import compiled, inlined, inner
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows

@@ -15,7 +15,7 @@ import numpy as np
 
 from viapoint.envs.arms.inverse_kinematics import solve_symmetric
 from viapoint.envs.arms.kinematics import point_jacobian
-from viapoint.envs.common.types import Float, Int
+from viapoint.envs.common.arrays import Float, Int
 from viapoint.envs.geometry.clearance import (
     WINDOW,
     Placed,

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from viapoint.envs.common.types import Bool, Float, Single
+from viapoint.envs.common.arrays import Bool, Float, Single
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.env import ReachEnv
 from viapoint.envs.geometry.compiled import compiled, inner

@@ -10,13 +10,12 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.common.arrays import norm
+from viapoint.envs.common.arrays import Float, Int, norm
 from viapoint.envs.common.palette import PALETTE, Colour
-from viapoint.envs.common.types import Float, Int
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.episodes import Episodes, Recorded
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes
-from viapoint.envs.rendering.gl import Canvas, Window
+from viapoint.envs.gl import Canvas, Window
 from viapoint.envs.simulator import Simulator
 from viapoint.envs.task import Task
 

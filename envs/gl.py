@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from mujoco.rendering.classic import gl_context
 
-from viapoint.envs.common.types import Frame
+from viapoint.envs.common.arrays import Frame
 
 MAX_SIDE = 8192  # Longest side of a supersampled picture, in pixels; OpenGL may not support larger ones
 MAX_GEOMS = 2000  # Greatest number of shapes in a scene
