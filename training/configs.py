@@ -386,6 +386,12 @@ class EvaluateConfig(AgentConfig):
             raise ValueError(f"{BENCHMARK} measures planners: name neither an agent nor an environment")
         if self.of_planners and self.arm is not None and self.problems is None:
             raise ValueError("the problems that are shipped are for one arm; --arm needs --problems")
+        if self.problems is not None and self.scenes not in ("test", BENCHMARK):
+            raise ValueError(
+                f"name a set of scenes or a folder of problems, not both: got scenes={self.scenes!r}"
+            )
+        if self.of_planners and not self.baselines:
+            raise ValueError("baselines must name at least one planner")
         if not self.checks:
             raise ValueError("checks must name at least one number, such as 0")
         if (any(self.checks) or self.refine) and self.agent is None:

@@ -21,6 +21,7 @@ DAMPING = 1e-2  # Damping for errors of 1; it falls with the error, so that the 
 STALLED = 1e-9  # Greatest step of the joints that ends the iterations, [rad]
 SAME = 1e-3  # Greatest difference of joints in solutions that count as the same, [rad]
 NEAREST, INSIDE = 8, 1e-6
+PATIENCE = 4  # Factor on the number of seeds where the first ones find nothing
 """Number of configurations from which the nearest place is looked for, and their distance from the limits, [rad]."""
 REACHED = 1e-9  # Greatest distance of the hand from a target in the plane, [m]
 
@@ -286,6 +287,16 @@ def _descend(arm: Arm, position: Float, axes: Float | None, joints: Float) -> fl
     return descend(arm.chain, arm.joint_range, position, target, axes is not None, joints, *memory)
 
 
+def _different_solutions(arm: Arm, position: Float, axes: Float | None, begin: Float) -> list[Float]:
+    """Return the different configurations that put the tool at a target from those to begin with, (N, J)."""
+    found: list[Float] = []
+    for configuration in begin.copy():
+        error = _descend(arm, position, axes, configuration)
+        if error == 0.0 and all(np.abs(configuration - other).max() > SAME for other in found):
+            found.append(configuration)
+    return found
+
+
 class UnreachableError(ValueError):
     """Error of a pose that no joint positions were found for."""
 
@@ -307,7 +318,7 @@ def inverse_kinematics(
         quaternion: Orientation (w, x, y, z) of the tool, shape (4,); None for any.
         seed: Joint positions to begin with, shape (J,); home by default.
         rng: Random generator of further seeds; one with a fixed seed by default.
-        n_seeds: Number of seeds.
+        n_seeds: Number of seeds; as many again, four times, where these find nothing.
 
     Raises:
         UnreachableError: No solution was found; the message tells the nearest distance.
@@ -330,11 +341,10 @@ def inverse_kinematics(
     rng = np.random.default_rng(0) if rng is None else rng
     low, high = arm.joint_range.T
     begin = np.concatenate((first[None], rng.uniform(low, high, (number - 1, len(low)))))
-    found: list[Float] = []
-    for configuration in begin.copy():
-        error = _descend(arm, position, axes, configuration)
-        if error == 0.0 and all(np.abs(configuration - other).max() > SAME for other in found):
-            found.append(configuration)
+    found = _different_solutions(arm, position, axes, begin)
+    if not found:  # some poses near the joint limits are reached from few places
+        begin = rng.uniform(low, high, (PATIENCE * number, len(low)))
+        found = _different_solutions(arm, position, axes, begin)
     if not found:
         away = _least_distance(arm, position, begin)
         pose = "position" if quaternion is None else "pose"

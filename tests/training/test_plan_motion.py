@@ -463,6 +463,15 @@ def test_command_line_plans_and_measures(tmp_path, capsys, failed) -> None:
     assert "| plan_motion | all" in capsys.readouterr().out
 
 
+def test_a_movement_waits_or_hurries_where_an_obstacle_crosses_its_goal() -> None:
+    passing = np.array((-0.18, 0.24, 0.0))
+    for seconds in (1.0, 1.25, 1.5, 1.75):  # until it is at the goal
+        ball = Sphere(0.05, position=np.array((0.1, 0.4, 0.0)) - seconds * passing, velocity=passing)
+        plan = plan_motion("planar", (-0.2, 0.3), (0.1, 0.4), [ball])
+        assert plan.success
+        assert plan.execute().is_success.all()
+
+
 def test_problems_are_read_from_the_original_files(tmp_path) -> None:
     folder = tmp_path / "cage_panda"
     folder.mkdir()
@@ -499,6 +508,11 @@ world:
     assert np.allclose(box.size, (0.1, 0.2, 0.3))
     assert (can.radius, can.half_length) == (0.05, 0.15)
     scene = folder / "scene0007.yaml"
+    request = folder / "request0007.yaml"
+    base = "multi_dof_joint_state: {transforms: [{translation: [0.4, 0, 0], rotation: [0, 0, 1, 0]}]}"
+    request.write_text(request.read_text().replace("start_state:\n", f"start_state:\n  {base}\n"))
+    [moved], _ = read_problems(tmp_path)
+    assert np.allclose(moved.obstacles[0].position, (-0.1, -0.1, 0.2))  # relative to the robot
     whole = scene.read_text()
     scene.write_text(whole + "robot_state: {attached_collision_objects: [{link_name: hand}]}\n")
     with pytest.raises(ValueError):
@@ -538,7 +552,7 @@ def test_points_of_an_obstacle_are_planned_around_like_the_obstacle() -> None:
 
 def test_without_the_library_its_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl.base", None)
-    ompl_paths.import_ompl.cache_clear()
+    ompl_paths._ompl.cache_clear()
     with pytest.raises(ValueError, match=r"pip install 'viapoint\[planning\]'"):
         make_method("ompl", PLANE)
 

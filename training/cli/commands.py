@@ -121,7 +121,7 @@ def _measure_planners(config: EvaluateConfig) -> None:
     faults += [f"{each.set} {each.number}: {each.refused}" for each in refused.itertuples()]
     if faults:
         told = [*faults[:MOST_FAULTS], "..."] if len(faults) > MOST_FAULTS else faults
-        print(f"{len(faults)} problems are left out:", *told, sep="\n  ", file=sys.stderr)
+        print(f"problems left out: {len(faults)}", *told, sep="\n  ", file=sys.stderr)
     if config.format == "csv":
         print(table.to_csv(index=False).rstrip())
     elif config.format == "json":

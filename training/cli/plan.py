@@ -90,9 +90,12 @@ def _scene(path: Path | None, arm: Arm) -> dict[str, Any]:
     if path is None:
         return {}
     text = read_bytes(path, LARGEST_JSON).decode("utf-8-sig")
-    if text.lstrip().startswith("["):
-        return {"obstacles": obstacles_from_json(text)}
-    scene = scene_from_json(text)
+    try:
+        if text.lstrip().startswith("["):
+            return {"obstacles": obstacles_from_json(text)}
+        scene = scene_from_json(text)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from None
     env_id = json.loads(text).get("env")
     if env_id and {"start", "goal"} & scene.keys():
         other = registered_task(env_id).arm

@@ -28,7 +28,7 @@ from viapoint.envs.geometry.obstacles import pack, quaternions_of
 from viapoint.envs.geometry.shapes import Box, Cylinder, Shape, as_obstacle
 from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import resting
-from viapoint.envs.task import Task
+from viapoint.envs.task import MOST_OBSTACLES, Task
 from viapoint.training.checks import unknown_name
 from viapoint.training.planning.candidates import MOST_CANDIDATES
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
@@ -112,14 +112,18 @@ def read_problems(
     """Return the problems of a folder of MotionBenchMaker's files, in the order of their sets and numbers.
 
     The files are `sceneNNNN.yaml` and `requestNNNN.yaml`, in folders named after their sets; `joints` are the names of
-    the arm's joints in them, those of the Panda by default. Values of other joints, frames of objects, and goals after
-    the first are not looked at. The second result has a line for each problem that cannot be read, which names its
-    file; meshes, planes and objects that are attached to the arm cannot be read.
+    the arm's joints in them, those of the Panda by default. Obstacles are placed relative to the base of the robot,
+    which a joint such as `virtual_joint` moves. Values of other joints, frames of objects, and goals after the first
+    are not looked at. The second result has a line for each problem that cannot be read, which names its file; meshes,
+    planes and objects that are attached to the arm cannot be read.
 
     Raises:
         ValueError: There is no problem that can be read.
     """
-    scenes = sorted(Path(folder).expanduser().rglob("scene*.yaml"))
+    folder = Path(folder).expanduser()
+    if not folder.is_dir():
+        raise ValueError(f"problems must be a folder of MotionBenchMaker's files, got {folder}")
+    scenes = sorted(folder.rglob("scene*.yaml"))
     problems, faults = [], []
     for scene in scenes:
         if re.fullmatch(r"scene\d+", scene.stem):
@@ -155,8 +159,15 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
         for held in (read.get("robot_state"), asked["start_state"]):
             if held and held.get("attached_collision_objects"):
                 raise ValueError("an object is attached to the arm; plan for an arm whose model holds it")
-        obstacles = tuple(_shapes_of(read["world"]["collision_objects"]))
-    except (KeyError, TypeError, IndexError, AttributeError, OSError, yaml.YAMLError) as error:
+        base: Float = np.linalg.inv(_base(asked["start_state"])).astype(np.float64)
+        obstacles = tuple(_shapes_of(read["world"]["collision_objects"], base))
+        if len(obstacles) > MOST_OBSTACLES:
+            raise ValueError(
+                f"plans are executed among at most {MOST_OBSTACLES} obstacles, got {len(obstacles)}"
+            )
+    except yaml.YAMLError as error:
+        raise ValueError(f"{scene} or {request.name} is no YAML: {' '.join(str(error).split())}") from None
+    except (KeyError, TypeError, IndexError, AttributeError, OSError) as error:
         raise ValueError(f"{scene}: no problem of MotionBenchMaker ({error!r:.80})") from None
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from None
@@ -164,15 +175,24 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
     return BenchmarkProblem(scene.parent.name.removesuffix("_panda"), number, begin, end, obstacles)
 
 
-def _shapes_of(objects: list[Mapping[str, Any]]) -> Iterator[Shape]:
-    """Yield the shapes of collision objects."""
+def _base(state: Mapping[str, Any]) -> Float:
+    """Return the place of the robot's base in a state, shape (4, 4)."""
+    joints = state.get("multi_dof_joint_state") or {}
+    place = np.eye(4)
+    for each in joints.get("transforms") or ():
+        place = place @ _matrix({"position": each["translation"], "orientation": each["rotation"]})
+    return place
+
+
+def _shapes_of(objects: list[Mapping[str, Any]], base: Float) -> Iterator[Shape]:
+    """Yield the shapes of collision objects; the matrix `base` maps the world into the frame of the arm."""
     for each in objects:
         unread = [name for name in ("mesh", "meshes", "planes") if each.get(name)]
         if unread:
             raise ValueError(
                 f"object {each.get('id')!r} has {unread[0]}; boxes, cylinders and spheres are read"
             )
-        outer = _matrix(each.get("pose"))
+        outer = base @ _matrix(each.get("pose"))
         for primitive, pose in zip(each["primitives"], each["primitive_poses"], strict=True):
             place = outer @ _matrix(pose)
             turn = quaternions_of(place[:3, :3])

@@ -75,13 +75,15 @@ def read_motion(path: str | Path) -> tuple[tuple[str, ...], JointMotion]:
     """
     path = Path(path).expanduser()
     form = _form(path)
-    text = path.read_text(encoding="utf-8")
     try:
+        text = path.read_text(encoding="utf-8")
         names, time, parts = _read_table(text) if form == "csv" else _read_message(text)
         shape = (len(time), len(names))
         return names, JointMotion(time, *(finite_array("motion", part, shape) for part in parts))
     except (KeyError, IndexError, StopIteration, TypeError, ValueError, yaml.YAMLError) as error:
-        raise ValueError(f"{path} is no movement of joints ({error!r:.80})") from None
+        raise ValueError(
+            f"{path} is no movement of joints ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
+        ) from None
 
 
 def _form(path: Path) -> str:

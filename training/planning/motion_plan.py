@@ -221,7 +221,7 @@ def _solids(obstacles: Obstacles) -> Obstacles:
     Raises:
         ValueError: A cloud has too many points.
     """
-    if not np.isin(obstacles.kind, IN_TABLES).any():
+    if not np.isin(obstacles.kind, IN_TABLES).any() and obstacles.kind.shape[1] <= MOST_OBSTACLES:
         return obstacles
     found = list[Shape]()
     for shape in unpack(obstacles, 0):

@@ -7,6 +7,8 @@ it.
 from __future__ import annotations
 
 import functools
+import threading
+import time
 from typing import Any
 
 import numpy as np
@@ -19,16 +21,23 @@ from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
 
 CHECK_SPACING = 0.05  # Spacing of collision checks along a line, [rad]
+FIRST = threading.Lock()  # of the import, which several threads may ask for
 VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12)  # Numbers of via-points, tried in this order
 
 
-@functools.cache
 def import_ompl() -> Any:
     """Import the library `ompl`.
 
     Raises:
         ValueError: The library is not installed.
     """
+    with FIRST:
+        return _ompl()
+
+
+@functools.cache
+def _ompl() -> Any:
+    """Return the library with its random generator set, which it allows only once."""
     try:
         import ompl.base
         import ompl.geometric
@@ -79,10 +88,11 @@ def path_around(arm: Arm, ends: Float, obstacles: Obstacles, margin: float, pati
     planner = geometric.RRTConnect(information)
     planner.setProblemDefinition(problem)
     planner.setup()
+    begin = time.perf_counter()
     if not planner.solve(patience) or not problem.hasExactSolution():
         return None
     path = problem.getSolutionPath()
-    geometric.PathSimplifier(information).simplify(path, patience)
+    geometric.PathSimplifier(information).simplify(path, max(patience - time.perf_counter() + begin, 1e-3))
     corners = [joints(path.getState(i)) for i in range(1, path.getStateCount() - 1)]
     return np.stack((ends[0], *corners, ends[1]))
 
