@@ -4,8 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from random_shapes import random_shape
-from self_contact import least_pair_distance
+from helpers import least_pair_distance, random_shape
 
 from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.arms.registry import arm_of

@@ -6,16 +6,17 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from episodes import IDS, play, same
 from gymnasium.utils.env_checker import check_env as gymnasium_check
+from helpers import play, same
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
+from viapoint.envs import ENV_IDS
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.registration import TASKS
 from viapoint.envs.rewards import TERMS
 
 INFO = {*Outcome._fields, *TERMS, "elapsed", "time", "event"}
-DIFFERENT = sorted({str(TASKS[env_id]): env_id for env_id in reversed(IDS)}.values())
+DIFFERENT = sorted({str(TASKS[env_id]): env_id for env_id in reversed(ENV_IDS)}.values())
 """One id of each task."""
 
 
@@ -30,7 +31,7 @@ def actions_for(env, number, seed=3):
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (number, *shape)).astype(np.float32)
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", ENV_IDS)
 def test_both_checkers_pass_without_a_warning(env_id):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -4,7 +4,7 @@ import coal
 import mujoco
 import numpy as np
 import pytest
-from random_shapes import random_shape
+from helpers import random_shape
 from scipy.spatial.transform import Rotation
 
 from viapoint.envs.geometry.compiled import compiled

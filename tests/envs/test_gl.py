@@ -11,7 +11,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from episodes import OBSTACLES
+from helpers import PLANE
 
 from viapoint.envs.rendering import gl
 from viapoint.envs.rendering.gl import GLUnavailableError
@@ -38,7 +38,7 @@ def test_a_renderer_is_opened_with_the_first_picture_and_freed_with_its_environm
 
     monkeypatch.setattr(mujoco, "Renderer", Renderer)
     for number in range(1, 5):
-        env = gym.make(OBSTACLES, render_mode="rgb_array", width=16, height=16)
+        env = gym.make(PLANE, render_mode="rgb_array", width=16, height=16)
         env.reset(seed=0)
         assert len(opened) == number - 1
         env.render()
@@ -70,7 +70,7 @@ def test_without_opengl_the_error_says_what_to_install(monkeypatch, reason, mode
 
     monkeypatch.setenv("MUJOCO_GL", mode)
     monkeypatch.setattr(gl, "_gl_context", missing)
-    env = gym.make(OBSTACLES, render_mode="rgb_array")
+    env = gym.make(PLANE, render_mode="rgb_array")
     env.reset(seed=0)
     with pytest.raises(GLUnavailableError, match=r"apt-get install libegl1 libgl1.*MUJOCO_GL"):
         env.render()
@@ -78,7 +78,7 @@ def test_without_opengl_the_error_says_what_to_install(monkeypatch, reason, mode
 
 @pytest.mark.usefixtures("opengl")
 def test_a_picture_too_large_for_opengl_is_refused_with_its_size():
-    env = gym.make(OBSTACLES, render_mode="rgb_array", width=40000, height=40000)
+    env = gym.make(PLANE, render_mode="rgb_array", width=40000, height=40000)
     env.reset(seed=0)
     with pytest.raises(ValueError, match="40000 x 40000"):
         env.render()

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
-from self_contact import check_contact_implies_overlap
+from helpers import check_contact_implies_overlap
 
 from viapoint.envs.arms import load
 from viapoint.envs.arms.choices import KNOWN_VELOCITIES, known_limits

@@ -7,16 +7,16 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from episodes import (
+from helpers import (
     CRATE,
     ENDS,
     HOME,
-    JUMP,
+    JUMPS,
     MOVING,
-    OBSTACLES,
     OTHER,
     PANDA,
     PANDA_ENDS,
+    PLANE,
     STEP,
     post,
     same_scenes,
@@ -52,7 +52,7 @@ from viapoint.envs.scenes.families_registry import scene_families
 from viapoint.envs.scenes.layout import Layout
 from viapoint.envs.scenes.sampler import room_of
 
-KINDS = (OBSTACLES, STEP, MOVING, PANDA)
+KINDS = (PLANE, STEP, MOVING, PANDA)
 ANY_ENVIRONMENT = [
     *(({name: 1.0}, TypeError) for name in ("speed", "workers", "uniform_share", "dimension")),
     ({"render_mode": "rgb"}, ValueError), ({"width": 0}, ValueError), ({"height": -3}, ValueError),
@@ -78,8 +78,8 @@ ANY_ENVIRONMENT = [
 ONE_ENVIRONMENT = [
     (PANDA, {"space": "hand"}), (PANDA, {"duration_range": (0.5, 2.0)}),
     (PANDA, {"families": "gate", "n_obstacles": 2}),
-    (PANDA, {"families": "gate", "shapes": "sphere"}), (OBSTACLES, {"families": "shelf"}), (OBSTACLES, {"n_jumps": 1}),
-    (OBSTACLES, {"moving_obstacles": True}), (MOVING, {"timing": "learned"}), (STEP, {"timing": "learned"}),
+    (PANDA, {"families": "gate", "shapes": "sphere"}), (PLANE, {"families": "shelf"}), (PLANE, {"n_jumps": 1}),
+    (PLANE, {"moving_obstacles": True}), (MOVING, {"timing": "learned"}), (STEP, {"timing": "learned"}),
     *((STEP, {"control_step": step}) for step in (0.0, -0.04, 0.003, 2.0, np.nan, "fast", True)),
 ]  # fmt: skip
 
@@ -103,7 +103,7 @@ def test_an_unknown_argument_is_the_error_that_others_raise():
     """TorchRL looks for these words."""
     for make in (gym.make, gym.make_vec):
         with pytest.raises(TypeError, match="got an unexpected keyword argument 'speed'"):
-            make(OBSTACLES, speed=3)
+            make(PLANE, speed=3)
 
 
 def both(env_id):
@@ -165,7 +165,7 @@ def test_steps_before_a_reset(env_id):
         lambda way, time: ("there", time),
     ],
 )
-@pytest.mark.parametrize("env_id", [OBSTACLES, MOVING, PANDA])
+@pytest.mark.parametrize("env_id", [PLANE, MOVING, PANDA])
 def test_plans(env_id, change):
     env = gym.make_vec(env_id, num_envs=2, threads=1).unwrapped
     env.reset(seed=0)
@@ -190,7 +190,7 @@ def test_plans_are_for_the_twin_of_an_environment_with_steps():
     "goals", [np.full((2, 2), 3.0), np.zeros(2), np.full((2, 2), np.nan), "there", np.zeros((2, 3))]
 )
 def test_goals_that_are_moved(goals):
-    env = gym.make_vec(JUMP, num_envs=2, threads=1).unwrapped
+    env = gym.make_vec(JUMPS, num_envs=2, threads=1).unwrapped
     env.reset(seed=0)
     before = env.observe()
     with pytest.raises(ValueError):

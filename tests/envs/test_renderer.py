@@ -5,7 +5,7 @@ import imageio_ffmpeg
 import mujoco
 import numpy as np
 import pytest
-from episodes import AROUND, DRAWN, JUMP, OBSTACLES, STRAIGHT, moved, play
+from helpers import AROUND, DRAWN, JUMPS, PLANE, STRAIGHT, moved, play
 
 from viapoint.envs import HalfSpace, RecordMovements, Sphere, arm_of
 from viapoint.envs.rendering import gl, renderer
@@ -21,7 +21,7 @@ def red(frame):
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 120), (1, 1), (1400, 64)])
-@pytest.mark.parametrize("name", [OBSTACLES, "viapoint.envs:viapoint/PandaReach-v0"])
+@pytest.mark.parametrize("name", [PLANE, "viapoint.envs:viapoint/PandaReach-v0"])
 def test_a_picture_has_the_size_asked_for(make, name, width, height):
     env = make(name, width=width, height=height)
     env.reset(seed=1)
@@ -46,7 +46,7 @@ def test_a_film_lasts_as_long_as_the_movement(make, duration):
     assert np.abs(frames[0].astype(int) - frames[-1]).max() > 50
 
 
-@pytest.mark.parametrize("name", [OBSTACLES, WHOLE_ARM])
+@pytest.mark.parametrize("name", [PLANE, WHOLE_ARM])
 def test_contact_is_red_and_nothing_else_is(make, name):
     env = make(name, side=240)
     env.reset(options=DRAWN)
@@ -70,7 +70,7 @@ def test_a_half_space_below_the_table_is_hidden_by_it(make):
 
 def test_points_that_a_sensor_sees_are_drawn(make):
     yellow = []
-    for name in (OBSTACLES, "viapoint.envs:viapoint/PlanarSensed-v0"):
+    for name in (PLANE, "viapoint.envs:viapoint/PlanarSensed-v0"):
         env = make(name, side=240)
         env.reset(options=DRAWN)
         r, g, b = (env.render()[..., i].astype(int) for i in range(3))
@@ -80,7 +80,7 @@ def test_points_that_a_sensor_sees_are_drawn(make):
 
 
 def test_pictures_leave_no_trace_in_the_simulation(make):
-    plain, drawn = gym.make(OBSTACLES), make(side=16)
+    plain, drawn = gym.make(PLANE), make(side=16)
     for env in (plain, drawn):
         env.reset(seed=3)
     for _ in range(3):
@@ -97,8 +97,8 @@ def test_pictures_leave_no_trace_in_the_simulation(make):
 def test_pictures_of_a_batch_are_those_of_its_environments(mode):
     """Also of an episode that is over, where the next one has begun."""
     sizes = {"render_mode": "rgb_array", "width": 48, "height": 32}
-    batch = gym.make_vec(OBSTACLES, num_envs=3, autoreset_mode=mode, **sizes)
-    singles = [gym.make(OBSTACLES, **sizes) for _ in range(3)]
+    batch = gym.make_vec(PLANE, num_envs=3, autoreset_mode=mode, **sizes)
+    singles = [gym.make(PLANE, **sizes) for _ in range(3)]
     batch.reset(seed=0)
     for seed, single in enumerate(singles):
         single.reset(seed=seed)
@@ -130,7 +130,7 @@ def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
             shown.append("closed")
 
     monkeypatch.setattr(renderer, "Window", Window)
-    env = gym.make(OBSTACLES, render_mode="human")
+    env = gym.make(PLANE, render_mode="human")
     env.reset(seed=0)
     assert len(shown) == 1
     env.step(AROUND)
@@ -146,7 +146,7 @@ def frames_of(path):
     return sum(1 for _ in reader)
 
 
-@pytest.mark.parametrize("env_id", [OBSTACLES, JUMP])
+@pytest.mark.parametrize("env_id", [PLANE, JUMPS])
 def test_each_frame_of_a_movement_of_one_or_several_steps_is_recorded_once(env_id, make, tmp_path):
     made = make(f"viapoint.envs:{env_id}", "rgb_array_list", side=64, duration_range=(0.4, 0.6))
     env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
@@ -154,7 +154,7 @@ def test_each_frame_of_a_movement_of_one_or_several_steps_is_recorded_once(env_i
     steps = len(play(env, 0.3))
     expected = 1 + round(env.unwrapped.last_rollout.time[-1] * env.metadata["render_fps"])
     env.close()
-    assert (steps > 1) == (env_id == JUMP)
+    assert (steps > 1) == (env_id == JUMPS)
     assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == pytest.approx(expected, abs=1)
 
 

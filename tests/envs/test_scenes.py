@@ -5,16 +5,16 @@ import json
 import gymnasium as gym
 import numpy as np
 import pytest
-from episodes import (
+from helpers import (
     CRATE,
     ENDS,
     HOME,
     MOVING,
-    OBSTACLES,
     OTHER,
     PANDA,
     PANDA_ENDS,
     PANDA_MOVING,
+    PLANE,
     given,
     post,
     same,
@@ -55,9 +55,9 @@ def several():
 @pytest.mark.parametrize(
     ("env_id", "kwargs"),
     [
-        (OBSTACLES, {}),
-        (OBSTACLES, {"whole_arm": True}),
-        (OBSTACLES, {"n_obstacles": (3, 5), "families": ("clutter", "gate")}),
+        (PLANE, {}),
+        (PLANE, {"whole_arm": True}),
+        (PLANE, {"n_obstacles": (3, 5), "families": ("clutter", "gate")}),
         (PANDA, {"n_obstacles": (1, 16)}),
         (PANDA, {"n_obstacles": 9, "families": ("shelf", "cage")}),
         (PANDA, {"n_obstacles": (2, 4), "shapes": "sphere", "families": "clutter"}),
@@ -76,7 +76,7 @@ def test_ends_are_free_and_the_straight_movement_is_not(env_id, kwargs):
     assert ((info["planned_clearance"] < 0.01) | ~info["reachable"]).all()
 
 
-@pytest.mark.parametrize("env_id", [OBSTACLES, MOVING, PANDA, PANDA_MOVING])
+@pytest.mark.parametrize("env_id", [PLANE, MOVING, PANDA, PANDA_MOVING])
 def test_a_scene_depends_on_its_generator_alone(env_id):
     sampler = gym.make(env_id).unwrapped.task.sampler()
     together = sampler(generators(6))
@@ -104,7 +104,7 @@ def test_shapes_their_dictionaries_and_their_json_give_the_same_movement():
 @pytest.mark.parametrize(
     ("env_id", "kwargs"),
     [
-        (OBSTACLES, {}), (PANDA, {}), (MOVING, {}), (MOVING, REACHING), ("viapoint/PlanarTargetJump-v0", {}),
+        (PLANE, {}), (PANDA, {}), (MOVING, {}), (MOVING, REACHING), ("viapoint/PlanarTargetJump-v0", {}),
         ("viapoint/PlanarTargetJumpStep-v0", {}), ("viapoint/PlanarMovingObstaclesStep-v0", REACHING),
     ],
 )  # fmt: skip
@@ -162,11 +162,11 @@ def test_each_scene_of_a_batch_has_its_own_obstacles_and_names(several):
 def test_obstacles_that_are_given_a_velocity_move_in_any_task():
     """Contact and clearance agree on it."""
     coming = post(0.1, 0.7, 0.03, velocity=(0.0, -0.35, 0.0))
-    env, _ = given(OBSTACLES, [coming])
+    env, _ = given(PLANE, [coming])
     *_, info = env.step(np.array([0.0, 0.0, 1.0], np.float32))
     assert info["collision"]
     assert -0.01 < info["min_clearance"] < 0.0
-    still, _ = given(OBSTACLES, [post(0.1, 0.7, 0.03)])
+    still, _ = given(PLANE, [post(0.1, 0.7, 0.03)])
     assert not still.step(np.array([0.0, 0.0, 1.0], np.float32))[4]["collision"]
 
 
@@ -201,7 +201,7 @@ def test_a_mesh_survives_json_and_one_without_a_name_changes_nothing():
 
 
 def test_where_nothing_fits_the_random_generator_stays_as_it_was():
-    usual, refused = (gym.make(OBSTACLES).unwrapped for _ in range(2))
+    usual, refused = (gym.make(PLANE).unwrapped for _ in range(2))
     usual.reset(seed=0)
     refused.reset(seed=0)
     start = np.array([0.2, 0.5, 0.0])

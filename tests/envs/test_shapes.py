@@ -5,7 +5,7 @@ import json
 import mujoco
 import numpy as np
 import pytest
-from random_shapes import random_shape
+from helpers import random_shape
 
 from viapoint.envs.geometry.distance import signed_distances
 from viapoint.envs.geometry.obstacles import (

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from self_contact import check_contact_implies_overlap
+from helpers import check_contact_implies_overlap
 
 from viapoint.envs.arms.capsule_fit import cover_geom, polytope_around
 from viapoint.envs.arms.registry import arm_of

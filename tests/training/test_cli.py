@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tasks import PLANE as ENV
-from tasks import REACH
+from helpers import PLANE as ENV
+from helpers import REACH
 
 from viapoint.envs import load_arm
 from viapoint.training import Run, TrainConfig, evaluate, load_agent

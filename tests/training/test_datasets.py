@@ -6,7 +6,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from tasks import JUMPS, MOVING, PLANE, SENSED, STEP
+from helpers import JUMPS, MOVING, PLANE, SENSED, STEP
 
 from viapoint.training.cli import entry as cli
 from viapoint.training.datasets import record_dataset

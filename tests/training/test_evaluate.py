@@ -9,10 +9,10 @@ from statistics import NormalDist
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import MOVING, REACH
+from helpers import PLANE as ENV
 from PIL import Image
 from stable_baselines3.common.vec_env import VecNormalize
-from tasks import MOVING, REACH
-from tasks import PLANE as ENV
 
 from viapoint.training import ViaVecEnv, evaluate, plots, report, statistics
 from viapoint.training.agents.agent import PPO

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from tasks import JUMPS, PANDA, REACH, STEP
-from tasks import PLANE as OBSTACLES
+from helpers import JUMPS, PANDA, REACH, STEP
+from helpers import PLANE as OBSTACLES
 
 from viapoint.envs.geometry.obstacles import POSE_SIZE
 from viapoint.training import SceneExtractor, ViaVecEnv

@@ -13,8 +13,8 @@ import pytest
 pytest.importorskip("viser", reason="the extra `live` is not installed")
 pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 
-from tasks import JUMPS, MOVING, PANDA, STEP
-from tasks import PLANE as PLANAR
+from helpers import JUMPS, MOVING, PANDA, STEP
+from helpers import PLANE as PLANAR
 from viser import transforms
 
 import viapoint.envs as ve

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tasks import PANDA as PANDA_TASK
-from tasks import PLANE, WHOLE, scenes_of
+from helpers import PANDA as PANDA_TASK
+from helpers import PLANE, WHOLE, scenes_of
 
 from viapoint.envs import (
     Box,

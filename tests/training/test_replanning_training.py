@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from tasks import JUMPS, MOVING, STEP, scenes_of
+from helpers import JUMPS, MOVING, STEP, scenes_of
 
 from viapoint.envs import scene_from_json, scene_to_json
 from viapoint.training import ViaVecEnv, evaluate

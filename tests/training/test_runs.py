@@ -10,8 +10,8 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from helpers import PLANE, REACH
 from stable_baselines3.common.env_util import make_vec_env
-from tasks import PLANE, REACH
 
 from viapoint.envs import RewardWeights, Sensor, arm_of, register_arm
 from viapoint.envs.arms import registry

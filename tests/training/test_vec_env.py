@@ -4,8 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from helpers import PLANE, STEP
 from stable_baselines3.common.monitor import Monitor
-from tasks import PLANE, STEP
 
 from viapoint.envs import obstacles_to_json, scene_from_json, scene_to_json
 from viapoint.training import TrainConfig, ViaVecEnv, evaluate, load_agent, train

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from helpers import MOVING, PANDA, PLANE, REACH, SENSED, WHOLE, problem_of, scenes_of
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
-from tasks import MOVING, PANDA, PLANE, REACH, SENSED, WHOLE, problem_of, scenes_of
 
 from viapoint.training import ViaQ, ViaVecEnv, load_agent
 from viapoint.training.agents import viaq_policy

@@ -5,7 +5,7 @@ import inspect
 import numpy as np
 import pytest
 import torch
-from tasks import MOVING, PANDA, PLANE, WHOLE, problem_of
+from helpers import MOVING, PANDA, PLANE, WHOLE, problem_of
 
 import viapoint.envs.geometry.clearance
 import viapoint.envs.geometry.distance

@@ -4,8 +4,8 @@ import functools
 
 import numpy as np
 import pytest
-from tasks import PLANE, scenes_of
-from tasks import SENSED as ENV
+from helpers import PLANE, scenes_of
+from helpers import SENSED as ENV
 
 from viapoint.training import ViaRank, ViaVecEnv, evaluate
 from viapoint.training.planning.beliefs import Sight
