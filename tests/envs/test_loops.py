@@ -1,4 +1,4 @@
-"""Autoreset modes and wrappers of Gymnasium, and what other libraries do with environments."""
+"""Autoreset modes and wrappers of Gymnasium, and processes that fork."""
 
 import subprocess
 import sys
@@ -111,18 +111,6 @@ def test_statistics_of_episodes_are_sums_of_rewards(mode):
             np.testing.assert_allclose(found[over], total[over])
             break
     assert over.any()
-
-
-def test_rllib():
-    pytest.importorskip("ray.rllib")
-    from ray.rllib.algorithms.ppo import PPOConfig
-    from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
-    from ray.tune.registry import register_env
-
-    register_env("reach", lambda config: gym.wrappers.FlattenObservation(gym.make(PLANE, **config)))
-    config = PPOConfig().environment("reach", env_config={"n_obstacles": 2}).env_runners(num_env_runners=0)
-    episodes = SingleAgentEnvRunner(config=config).sample(num_episodes=3)
-    assert [len(episode) for episode in episodes] == [1, 1, 1]
 
 
 FORKED = """

@@ -5,38 +5,27 @@ import mujoco
 import numpy as np
 import pytest
 
-from viapoint.envs import (
-    Box,
-    Capsule,
-    ConvexMesh,
-    Cylinder,
-    HalfSpace,
-    Sensor,
-    Sphere,
-    Task,
-    arm_of,
-    signed_distances,
-)
+import viapoint.envs as ve
 from viapoint.envs.events import NEW_DISTANCE, NEW_POINTS, Event
 from viapoint.envs.geometry.obstacles import add_to_model, pack, unpack
 from viapoint.training.planning.beliefs import Sight, fitted_boxes, thick_points
 from viapoint.training.planning.search import registered_task
 
-PANDA = arm_of("panda")
+PANDA = ve.arm_of("panda")
 CORNERS = np.array([(x, y, z) for x in (-0.1, 0.1) for y in (-0.05, 0.08) for z in (-0.1, 0.12)])
 SCENE = [
-    Box((0.1, 0.05, 0.2), position=(0.8, 0.1, 0.1), quaternion=(0.9239, 0.2209, 0.2209, 0.2209)),
-    Sphere(0.1, position=(0.9, -0.3, 0.2)),
-    Capsule(0.05, 0.1, position=(0.7, 0.4, 0.0), quaternion=(0.8, 0.6, 0.0, 0.0)),
-    Cylinder(0.08, 0.1, position=(0.6, -0.1, -0.2), quaternion=(0.6, 0.0, 0.8, 0.0)),
-    HalfSpace(position=(0.0, 0.0, -0.5)),
-    ConvexMesh(CORNERS, position=(0.9, 0.3, 0.5)),
+    ve.Box((0.1, 0.05, 0.2), position=(0.8, 0.1, 0.1), quaternion=(0.9239, 0.2209, 0.2209, 0.2209)),
+    ve.Sphere(0.1, position=(0.9, -0.3, 0.2)),
+    ve.Capsule(0.05, 0.1, position=(0.7, 0.4, 0.0), quaternion=(0.8, 0.6, 0.0, 0.0)),
+    ve.Cylinder(0.08, 0.1, position=(0.6, -0.1, -0.2), quaternion=(0.6, 0.0, 0.8, 0.0)),
+    ve.HalfSpace(position=(0.0, 0.0, -0.5)),
+    ve.ConvexMesh(CORNERS, position=(0.9, 0.3, 0.5)),
 ]
 
 
 @pytest.mark.parametrize("shape", SCENE, ids=lambda shape: shape.kind)
 def test_ranges_are_those_of_mujoco(shape) -> None:
-    sensor = Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0)
+    sensor = ve.Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0)
     found = sensor.read(PANDA, PANDA.home[None], pack([[shape]]))
     spec = mujoco.MjSpec()
     add_to_model(spec, [shape])
@@ -54,12 +43,12 @@ def test_ranges_are_those_of_mujoco(shape) -> None:
 
 
 def test_the_nearest_obstacle_is_seen_and_readings_do_not_depend_on_the_batch() -> None:
-    sensor = Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0, noise=0.01, dropped=0.1)
+    sensor = ve.Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0, noise=0.01, dropped=0.1)
     each = [pack([[shape]], rows=1) for shape in SCENE]
     alone = np.array([sensor.read(PANDA, PANDA.home[None], one).ranges[0] for one in each])
     batch = sensor.read(PANDA, np.tile(PANDA.home, (len(SCENE), 1)), pack([[shape] for shape in SCENE]))
     assert np.array_equal(alone, batch.ranges)
-    exact = Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0)
+    exact = ve.Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0)
     separate = np.array([exact.read(PANDA, PANDA.home[None], one).ranges[0] for one in each])
     together = exact.read(PANDA, PANDA.home[None], pack([SCENE]))
     assert np.array_equal(together.ranges[0], separate.min(axis=0))
@@ -68,29 +57,29 @@ def test_the_nearest_obstacle_is_seen_and_readings_do_not_depend_on_the_batch() 
 
 
 def test_noise_and_dropped_rays_are_as_stated() -> None:
-    wall = pack([[Box((0.01, 5.0, 5.0), position=(1.0, 0.0, 0.0))]])
-    sensor = Sensor(columns=200, rows=150, field_of_view=1.0, range=3.0, noise=0.02, dropped=0.2)
+    wall = pack([[ve.Box((0.01, 5.0, 5.0), position=(1.0, 0.0, 0.0))]])
+    sensor = ve.Sensor(columns=200, rows=150, field_of_view=1.0, range=3.0, noise=0.02, dropped=0.2)
     noisy = sensor.read(PANDA, PANDA.home[None], wall).ranges[0]
-    exact = Sensor(columns=200, rows=150, field_of_view=1.0, range=3.0)
+    exact = ve.Sensor(columns=200, rows=150, field_of_view=1.0, range=3.0)
     error = (noisy - exact.read(PANDA, PANDA.home[None], wall).ranges[0])[noisy < 3.0]
     assert np.isclose((noisy == 3.0).mean(), 0.2, atol=0.01)
     assert np.isclose(error.std(), 0.02, rtol=0.03)
     assert abs(error.mean()) < 1e-3
     # A scene that was written and read differs in its last bits, and looks the same.
-    moved = pack([[Box((0.01, 5.0, 5.0), position=(1.0 + 1e-15, 0.0, 0.0))]])
+    moved = pack([[ve.Box((0.01, 5.0, 5.0), position=(1.0 + 1e-15, 0.0, 0.0))]])
     assert np.allclose(sensor.read(PANDA, PANDA.home[None], moved).ranges[0], noisy, atol=1e-9)
 
 
 def test_a_sensor_at_the_hand_moves_with_it() -> None:
-    task = Task.of(arm="panda", n_obstacles=(1, 4), sensor="hand_camera")
+    task = ve.Task.of(arm="panda", n_obstacles=(1, 4), sensor="hand_camera")
     below = np.array([0.0, 0.0, -0.3])
-    obstacles = pack([[Sphere(0.05, position=PANDA.hand(PANDA.home) + below)]])
+    obstacles = pack([[ve.Sphere(0.05, position=PANDA.hand(PANDA.home) + below)]])
     first = task.sensor.read(PANDA, PANDA.home[None], obstacles)
     # The first joint turns arm and sensor about the vertical axis; the sphere turned alike looks the same.
     turned = PANDA.home.copy()
     turned[0] += 0.5
     second = task.sensor.read(
-        PANDA, turned[None], pack([[Sphere(0.05, position=PANDA.hand(turned) + below)]])
+        PANDA, turned[None], pack([[ve.Sphere(0.05, position=PANDA.hand(turned) + below)]])
     )
     assert (first.seen >= 0).any()
     assert np.allclose(first.ranges, second.ranges, atol=1e-4)
@@ -126,9 +115,9 @@ def test_beliefs_hold_what_is_seen_and_leave_the_ends_free(env_id, belief) -> No
         points = sight.points[b][sight.hit[b]]
         ends = np.linalg.norm(points[:, None] - sight.free[b], axis=-1) - sight.free_radius
         far = points[ends.min(axis=1) > 0.06]
-        assert (signed_distances(unpack(obstacles, b), far).min(axis=1) < 0.03).all()
+        assert (ve.signed_distances(unpack(obstacles, b), far).min(axis=1) < 0.03).all()
         if belief is thick_points:
-            free = signed_distances(unpack(obstacles, b), sight.free[b], sight.free_radius)
+            free = ve.signed_distances(unpack(obstacles, b), sight.free[b], sight.free_radius)
             assert (free > 0.009).all()
 
 
