@@ -12,13 +12,11 @@ import imageio_ffmpeg
 import mujoco
 import numpy as np
 import pytest
-from helpers import AROUND, DRAWN, JUMPS, PLANE, STRAIGHT, moved, play
+from helpers import AROUND, DRAWN, JUMPS, PANDA, PLANE, SENSED, STRAIGHT, WHOLE, moved, play
 
 from viapoint.envs import HalfSpace, RecordMovements, Sphere, arm_of
 from viapoint.envs.rendering import gl, renderer
 from viapoint.envs.rendering.gl import GLUnavailableError
-
-WHOLE_ARM = "viapoint.envs:viapoint/PlanarWholeArm-v0"
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
 
@@ -29,7 +27,7 @@ def red(frame):
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 120), (1, 1), (1400, 64)])
-@pytest.mark.parametrize("name", [PLANE, "viapoint.envs:viapoint/PandaReach-v0"])
+@pytest.mark.parametrize("name", [PLANE, PANDA])
 def test_a_picture_has_the_size_asked_for(make, name, width, height):
     env = make(name, width=width, height=height)
     env.reset(seed=1)
@@ -54,7 +52,7 @@ def test_a_film_lasts_as_long_as_the_movement(make, duration):
     assert np.abs(frames[0].astype(int) - frames[-1]).max() > 50
 
 
-@pytest.mark.parametrize("name", [PLANE, WHOLE_ARM])
+@pytest.mark.parametrize("name", [PLANE, WHOLE])
 def test_contact_is_red_and_nothing_else_is(make, name):
     env = make(name, side=240)
     env.reset(options=DRAWN)
@@ -67,7 +65,7 @@ def test_contact_is_red_and_nothing_else_is(make, name):
 
 def test_a_half_space_below_the_table_is_hidden_by_it(make):
     # MuJoCo would draw a plane that the compiled model did not have as something else.
-    env = make("viapoint.envs:viapoint/PandaObstacles-v0", side=120)
+    env = make(PANDA, side=120)
     ball, home = Sphere(0.05, position=(0.5, 0.4, 0.6)), arm_of("panda").home
     frames = []
     for obstacles in ([ball], [ball, HalfSpace(position=(0.0, 0.0, -0.01))]):
@@ -78,7 +76,7 @@ def test_a_half_space_below_the_table_is_hidden_by_it(make):
 
 def test_points_that_a_sensor_sees_are_drawn(make):
     yellow = []
-    for name in (PLANE, "viapoint.envs:viapoint/PlanarSensed-v0"):
+    for name in (PLANE, SENSED):
         env = make(name, side=240)
         env.reset(options=DRAWN)
         r, g, b = (env.render()[..., i].astype(int) for i in range(3))
@@ -156,7 +154,7 @@ def frames_of(path):
 
 @pytest.mark.parametrize("env_id", [PLANE, JUMPS])
 def test_each_frame_of_a_movement_of_one_or_several_steps_is_recorded_once(env_id, make, tmp_path):
-    made = make(f"viapoint.envs:{env_id}", "rgb_array_list", side=64, duration_range=(0.4, 0.6))
+    made = make(env_id, "rgb_array_list", side=64, duration_range=(0.4, 0.6))
     env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
     env.reset(seed=0)
     steps = len(play(env, 0.3))
@@ -172,9 +170,6 @@ def test_gymnasium_records_two_frames_of_a_movement_and_a_warning_says_so(make, 
         moved(env, AROUND)
     env.close()
     assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == 2
-
-
-pytestmark = pytest.mark.usefixtures("quick_pictures")
 
 
 def in_a_thread(function):
@@ -243,14 +238,16 @@ def test_a_picture_too_large_for_opengl_is_refused_with_its_size():
 
 
 def run(code, **environment):
-    """Run a script in a process of its own."""
+    """Run a script in a process of its own, and return what it printed."""
     inherited = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     command = [sys.executable, "-c", code]
-    return subprocess.run(command, capture_output=True, text=True, env={**inherited, **environment})
+    done = subprocess.run(command, capture_output=True, text=True, env={**inherited, **environment})
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def test_nothing_of_opengl_is_loaded_before_the_first_picture():
-    code = (
+    run(
         "import os, sys; before = dict(os.environ)\n"
         "import gymnasium as gym, viapoint.envs\n"
         "env = gym.make('viapoint/PlanarObstacles-v0', render_mode='rgb_array')\n"
@@ -258,8 +255,6 @@ def test_nothing_of_opengl_is_loaded_before_the_first_picture():
         "assert not {'OpenGL', 'OpenGL.GL', 'OpenGL.EGL', 'mujoco.egl'} & set(sys.modules)\n"
         "assert dict(os.environ) == before\n"
     )
-    done = run(code)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.usefixtures("opengl")
@@ -270,11 +265,9 @@ def test_triton_is_loaded_before_opengl_where_torch_could_use_it(tmp_path):
             f"import sys; assert 'mujoco.egl' not in sys.modules; print('{name}')"
         )
     code = (
-        "import sys\n"
         "import gymnasium as gym, viapoint.envs\n"
         "env = gym.make('viapoint/PlanarObstacles-v0', render_mode='rgb_array', width=16, height=16)\n"
         "env.reset(seed=0); env.render(); env.close()\n"
     )
-    done = run(code, PYTHONPATH=os.pathsep.join((str(tmp_path), os.environ.get("PYTHONPATH", ""))))
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["triton"]
+    path = os.pathsep.join((str(tmp_path), os.environ.get("PYTHONPATH", "")))
+    assert run(code, PYTHONPATH=path).split() == ["triton"]

@@ -24,7 +24,7 @@ from helpers import (
 
 import viapoint.envs as ve
 from viapoint import primitives
-from viapoint.envs.arms.kinematics import forward, link_poses
+from viapoint.envs.arms.kinematics import forward
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles, unpack
 from viapoint.envs.scenes.families_registry import FAMILIES, default_families, scene_families
 from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, most_rows
@@ -338,16 +338,6 @@ def test_layouts_grow_with_the_arm_around_its_foot():
         np.testing.assert_allclose(two[:, 1:4], foot + scale * one[:, 1:4], atol=1e-12, err_msg=name)
         np.testing.assert_allclose(two[:, 13:], scale * one[:, 13:], atol=1e-12)
         np.testing.assert_allclose(two[:, 4:13], one[:, 4:13])
-
-
-def test_elbow_is_that_of_the_arm():
-    arm, rng = ve.arm_of("planar"), np.random.default_rng(0)
-    furniture = ve.Furniture(room(True, 5), 0.1, 0.2, 0.7)
-    turn = np.array([[math.cos(0.7), -math.sin(0.7)], [math.sin(0.7), math.cos(0.7)]])
-    for joints in rng.uniform(*arm.joint_range.T, (50, 2)):
-        elbow = link_poses(arm.chain, joints)[1][2, :2]
-        hand = (arm.hand(joints)[:2] - (0.1, 0.2)) @ turn
-        np.testing.assert_allclose(furniture.elbow(*hand), (elbow - (0.1, 0.2)) @ turn, atol=1e-9)
 
 
 @pytest.mark.usefixtures("registry")
