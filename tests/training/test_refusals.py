@@ -334,8 +334,9 @@ def test_what_copies_of_an_environment_cannot_share(call, error, env):
 
 
 def test_an_environment_of_another_task_is_named():
-    with pytest.raises(ValueError, match=f"{ENV}, .*{PANDA} {{'n_via': 2}}"):
+    with pytest.raises(ValueError, match=f"{ENV}, .*{PANDA} {{'n_via': 2}}") as raised:
         load_agent(ENV, env=ViaVecEnv(PANDA, 1, n_via=2))
+    assert not isinstance(raised.value, BadFileError)  # the file is not to blame
 
 
 def test_folders_that_are_no_runs(tmp_path):

@@ -341,14 +341,6 @@ def test_a_run_that_has_lost_files_does_not_go_on(tmp_path, capsys):
     assert "begins anew" in capsys.readouterr().err
 
 
-def test_a_run_is_not_made_shorter(tmp_path):
-    """Learning rates fall in the course of all decisions, so a part of a run is no shorter run."""
-    train(tiny(tmp_path / "run", n_timesteps=48))
-    with pytest.raises(BadFileError):
-        train(TrainConfig(out=tmp_path / "run", resume=True, n_timesteps=32))
-    assert Run(tmp_path / "run").config.n_timesteps == 48
-
-
 @pytest.mark.parametrize("name", ["final/notes.txt", "final/thesis/a.tex", "final/model.json", "final"])
 def test_a_training_keeps_a_model_with_foreign_files_and_goes_on(name, tmp_path):
     folder = tmp_path / "run"
