@@ -1,6 +1,9 @@
 """Pages and code agree: links, examples, tutorials and commands; docstrings begin with whole sentences."""
 
 import ast
+import doctest
+import enum
+import inspect
 import json
 import os
 import re
@@ -11,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from viapoint import envs, primitives, training
+from viapoint.envs.scenes import families_registry
 from viapoint.training import configs
 from viapoint.training.cli import entry as cli
 
@@ -155,3 +160,32 @@ def docstrings(tree):
 def test_docstrings_begin_with_a_whole_sentence(path):
     found = docstrings(ast.parse(path.read_text()))
     assert [each for each in found if FRAGMENT.match(each[1])] == []
+
+
+EXPORTS = [(package, name) for package in (primitives, envs, training) for name in package.__all__]
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Leave shapes and families as they were, to which an example may add."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(families_registry, "FAMILIES", dict(families_registry.FAMILIES))
+
+
+@pytest.mark.parametrize(("package", "name"), EXPORTS)
+@pytest.mark.usefixtures("registered")
+def test_examples_of_docstrings_run(package, name):
+    try:
+        value = getattr(package, name)
+    except ImportError:
+        pytest.skip(f"{name} needs an extra")
+    if name == "run_study":
+        return  # tests/training/test_study.py runs it, where a Ray is there
+    value = type(value) if isinstance(value, enum.Enum) else value
+    if not (inspect.isclass(value) or inspect.isfunction(value)):
+        return
+    tests = doctest.DocTestFinder().find(value, name, globs={})
+    assert any(test.examples for test in tests), f"{name} has no example"
+    for test in tests:
+        report = []
+        assert not doctest.DocTestRunner().run(test, out=report.append).failed, "".join(report)

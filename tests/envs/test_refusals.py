@@ -1,6 +1,5 @@
 """Bad input raises one error where it enters: the input, and the type of the error."""
 
-import copy
 import functools
 
 import gymnasium as gym
@@ -331,11 +330,6 @@ SCENES = [
     (PANDA, OTHER_SHAPES, {**PANDA_ENDS, "obstacles": [ve.ConvexMesh.hull(CUBE)]}),
     ("viapoint/PlanarSensed-v0", {}, {"obstacles": [post(0.03, 0.0, 0.05)]}),  # contains the sensor
 ]
-
-
-def test_a_copy_of_a_task_is_equal():
-    task = ve.Task.of(arm="panda")
-    assert copy.deepcopy(task) == task
 
 
 @functools.cache

@@ -16,7 +16,7 @@ from PIL import Image
 from stable_baselines3.common.vec_env import VecNormalize
 
 from viapoint.envs import scene_from_json, scene_to_json
-from viapoint.training import ViaVecEnv, evaluate, plots, report, statistics
+from viapoint.training import GeometrySearch, ViaVecEnv, evaluate, plots, report, statistics
 from viapoint.training.agents.agent import PPO
 from viapoint.training.agents.model_io import build
 from viapoint.training.evaluation import SLOW_DECISION, MethodResult, evaluate_methods
@@ -420,3 +420,14 @@ def test_an_agent_of_steps_stands_in_one_table_with_the_others(env_id):
     for each in found.results:
         assert each.summary()["scenes"] == 12
     assert set(found.results[1].outcomes) <= set(found.results[0].outcomes)
+
+
+def test_an_evaluation_has_one_row_for_each_method_and_number_of_checks():
+    search = GeometrySearch(ENV, 8)
+    result = evaluate(ENV, checks=(0, 4), baselines=["untrained", search], n_scenes=10)
+    names = [row["method"] for row in result.rows]
+    assert names == ["agent", "agent, 4 checks", "untrained", "untrained, 4 checks", "sobol8"]
+    low, high = result.success_interval
+    assert low <= result.success_rate <= high
+    assert result.to_dict()["methods"]["agent"]["success"]["rate"] == result.success_rate
+    assert evaluate(search, env=ENV, n_scenes=10).success_rate == result.rows[-1]["success"]["rate"]
