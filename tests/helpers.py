@@ -1,6 +1,7 @@
 """Tasks, scenes, episodes and shapes that tests of several packages begin with."""
 
 import itertools
+from pathlib import Path
 
 import gymnasium as gym
 import mujoco
@@ -19,6 +20,8 @@ MOVING, JUMPS, SENSED = (
     f"viapoint/{name}-v0" for name in ("PlanarMovingObstacles", "PlanarTargetJump", "PlanarSensed")
 )
 PANDA, PANDA_MOVING = "viapoint/PandaObstacles-v0", "viapoint/PandaMovingObstacles-v0"
+UR5E = Path(__file__).parents[1] / "docs" / "ur5e.xml"
+"""Model file of an arm that is not of the package."""
 START, GOAL, OTHER = np.array([-0.3, 0.4]), np.array([0.1, 0.4]), np.array([0.0, 0.55])
 ENDS = {"start": START, "goal": GOAL}
 WALL = Box((0.008, 0.1, 0.04), position=(-0.1, 0.4, 0.0))

@@ -1,13 +1,13 @@
 """Laws of planning around known obstacles, also with the library OMPL."""
 
 import dataclasses
+import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers import PANDA as PANDA_TASK
-from helpers import PLANE, WHOLE, scenes_of
+from helpers import PLANE, UR5E, WHOLE, scenes_of
 
 from viapoint.envs import (
     Box,
@@ -41,7 +41,6 @@ from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import BANDS, load, scenes_for, shipped_path
 
-UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 PANDA = arm_of("panda")
 GOAL = PANDA.home + np.array([0.8, 0.5, 0.0, 0.6, 0.0, 0.3, 0.0])
 POST = Box((0.05, 0.05, 0.4), position=(0.5, 0.15, 0.4))
@@ -176,24 +175,6 @@ def objective(setting, table, row, start, offsets, scene, aim, gradient):
     movement = Movement(table, row, np.ascontiguousarray(start), offsets, 1.0)
     hessian = np.empty((len(gradient), len(gradient)))
     return refine._assemble(setting, movement, scene, 0, aim, 360.0, np.inf, hessian, gradient, work)[0]
-
-
-@pytest.mark.parametrize(
-    "kwargs", [{"arm": "planar", "whole_arm": True, "space": "joints"}, {"arm": "panda"}]
-)
-def test_objective_does_not_depend_on_the_direction_of_time(kwargs) -> None:
-    """What is skipped far from obstacles depends on what was seen before, and must not matter."""
-    task, starts, goals, obstacles = drawn(8, **kwargs)
-    setting, table = module._setting(task.arm, False), movement_table(0)
-    setting = setting._replace(spheres=setting.spheres._replace(pairs=np.zeros((0, 2), np.int64)))
-    aim, nothing = module.AIMS[0]._replace(stride=1, clearance=0.1), np.zeros((2, len(starts[0])))
-    found = []
-    for start, goal, scene in zip(starts, goals, obstacles, strict=True):
-        for one, other in ((start, goal), (goal, start)):
-            offsets = np.concatenate(((other - one)[None], nothing))
-            found.append(objective(setting, table, 0, one, offsets, scene, aim, np.empty(0)))
-    assert np.ptp(found) > 1.0
-    np.testing.assert_allclose(found[::2], found[1::2], rtol=1e-9)
 
 
 def test_moving_obstacles_are_avoided_where_they_are_then() -> None:
@@ -469,53 +450,74 @@ def test_command_line_plans_and_measures(tmp_path, capsys, failed) -> None:
     assert "| plan_motion | all" in capsys.readouterr().out
 
 
+def write_problem(folder, number, objects, names, start, goal) -> None:
+    """Write a problem as the benchmark does; values of JSON are values of YAML."""
+    folder.mkdir(exist_ok=True)
+    wanted = [{"joint_name": name, "position": q} for name, q in zip(names, goal, strict=True)]
+    # Joints of a gripper and of a head are in the files, too.
+    state = {"name": ["head", *names], "position": [0.1, *start]}
+    request = {"start_state": {"joint_state": state}, "goal_constraints": [{"joint_constraints": wanted}]}
+    scene = {"world": {"collision_objects": objects}}
+    (folder / f"scene{number:04}.yaml").write_text(json.dumps(scene))
+    (folder / f"request{number:04}.yaml").write_text(json.dumps(request))
+
+
+NO_TURN, QUARTER = [0, 0, 0, 1], [0, 0, 0.5**0.5, 0.5**0.5]
+SHELF = {
+    "id": "shelf",
+    "pose": {"position": [0.5, 0, 0], "orientation": QUARTER},
+    "primitive_poses": [
+        {"position": [0.1, 0, 0.2], "orientation": NO_TURN},
+        {"position": [0, 0, 0.4], "orientation": NO_TURN},
+    ],
+    "primitives": [
+        {"type": "box", "dimensions": [0.2, 0.4, 0.6]},
+        {"type": "cylinder", "dimensions": [0.3, 0.05]},
+    ],
+}
+
+
 def test_problems_are_read_from_the_original_files(tmp_path) -> None:
-    folder = tmp_path / "cage_panda"
-    folder.mkdir()
-    half = 0.5**0.5
-    (folder / "scene0007.yaml").write_text(
-        f"""
-world:
-  collision_objects:
-    - id: shelf
-      pose: {{position: [0.5, 0, 0], orientation: [0, 0, {half}, {half}]}}
-      primitive_poses:
-        - {{position: [0.1, 0, 0.2], orientation: [0, 0, 0, 1]}}
-        - {{position: [0, 0, 0.4], orientation: [0, 0, 0, 1]}}
-      primitives:
-        - {{type: box, dimensions: [0.2, 0.4, 0.6]}}
-        - {{type: cylinder, dimensions: [0.3, 0.05]}}
-"""
-    )
-    names = ", ".join(f"panda_joint{j}" for j in range(1, 8))
-    goals = "".join(f"    - {{joint_name: panda_joint{j}, position: 0.{j}}}\n" for j in range(1, 8))
-    (folder / "request0007.yaml").write_text(
-        f"start_state:\n  joint_state: {{name: [{names}], position: [0, 0, 0, -1, 0, 1, 0]}}\n"
-        f"goal_constraints:\n  - joint_constraints:\n{goals}"
-    )
-    (folder / "request0007_more.yaml").touch()
-    (folder / "scene_sensed0007.yaml").touch()
-    (folder / "scene0008.yaml").touch()  # the others go on
+    folder, names = tmp_path / "cage_panda", [f"panda_joint{j}" for j in range(1, 8)]
+    goal = [j / 10 for j in range(1, 8)]
+    write_problem(folder, 7, [SHELF], names, [0, 0, 0, -1, 0, 1, 0], goal)
+    for name in ("request0007_more.yaml", "scene_sensed0007.yaml", "scene0008.yaml"):
+        (folder / name).touch()
     [problem], [fault] = read_problems(tmp_path)
-    assert "scene0008.yaml" in fault
+    assert "scene0008.yaml" in fault  # the others go on
     assert problem.name == "cage 7"
-    assert np.allclose(problem.goal, np.arange(1, 8) / 10)
+    assert np.allclose(problem.goal, goal)
     box, can = problem.obstacles
     assert np.allclose(box.position, (0.5, 0.1, 0.2))  # turned by a quarter of a turn about z
     assert np.allclose(box.size, (0.1, 0.2, 0.3))
     assert (can.radius, can.half_length) == (0.05, 0.15)
     scene = folder / "scene0007.yaml"
-    whole = scene.read_text()
-    scene.write_text(whole + "robot_state: {attached_collision_objects: [{link_name: hand}]}\n")
+    world = json.loads(scene.read_text())
+    scene.write_text(
+        json.dumps(world | {"robot_state": {"attached_collision_objects": [{"link_name": "hand"}]}})
+    )
     with pytest.raises(ValueError):
         read_problems(tmp_path)
-    scene.write_text(whole + "      meshes: [{vertices: []}]\n")
+    write_problem(folder, 7, [SHELF | {"meshes": [{"vertices": []}]}], names, goal, goal)
     with pytest.raises(ValueError, match=r"shelf.*meshes"):  # not left out without a word
         read_problems(tmp_path)
     (folder / "request0007.yaml").write_text("start_state: {}\n")
     for bad in (tmp_path, tmp_path / "nothing"):
         with pytest.raises(ValueError):
             read_problems(bad)
+
+
+def test_planners_are_measured_on_problems_of_another_arm(tmp_path, capsys, failed) -> None:
+    arm = load_arm(UR5E)
+    box = {"primitives": [{"type": "box", "dimensions": [0.1, 0.1, 0.4]}]}
+    box["primitive_poses"] = [{"position": [0.5, 0.3, 0.2], "orientation": NO_TURN}]
+    write_problem(tmp_path / "box_ur5e", 1, [box], arm.joint_names, arm.home, arm.home + 0.2)
+    words = ["evaluate", "--problems", str(tmp_path)]
+    main([*words, "--arm", str(UR5E), "--baselines", "plan_motion", "--format", "json"])
+    [line] = json.loads(capsys.readouterr().out)
+    assert (line["set"], line["solved"], line["physics"]) == ("box_ur5e", True, True)
+    assert line["length"] == pytest.approx(0.2 * 6**0.5, rel=1e-3)
+    assert "panda_joint1" in failed(*words)
 
 
 def test_narrow_passages_that_a_search_finds_are_planned() -> None:
