@@ -12,14 +12,15 @@ from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.events import Event
 from viapoint.training.planning.problem import Problem
 
-PLANE, REACH, STEP, WHOLE = (
-    f"viapoint/{name}-v0"
-    for name in ("PlanarObstacles", "PlanarReach", "PlanarObstaclesStep", "PlanarWholeArm")
-)
-MOVING, JUMPS, SENSED = (
-    f"viapoint/{name}-v0" for name in ("PlanarMovingObstacles", "PlanarTargetJump", "PlanarSensed")
-)
-PANDA, PANDA_MOVING = "viapoint/PandaObstacles-v0", "viapoint/PandaMovingObstacles-v0"
+PLANE = "viapoint/PlanarObstacles-v0"
+REACH = "viapoint/PlanarReach-v0"
+STEP = "viapoint/PlanarObstaclesStep-v0"
+WHOLE = "viapoint/PlanarWholeArm-v0"
+MOVING = "viapoint/PlanarMovingObstacles-v0"
+JUMPS = "viapoint/PlanarTargetJump-v0"
+SENSED = "viapoint/PlanarSensed-v0"
+PANDA = "viapoint/PandaObstacles-v0"
+PANDA_MOVING = "viapoint/PandaMovingObstacles-v0"
 UR5E = Path(__file__).parents[1] / "docs" / "ur5e.xml"
 """Model file of an arm that is not of the package."""
 START, GOAL, OTHER = np.array([-0.3, 0.4]), np.array([0.1, 0.4]), np.array([0.0, 0.55])
@@ -85,21 +86,6 @@ def same_scenes(first, second):
         strict=True,
     ):
         np.testing.assert_array_equal(one, other)
-
-
-DRAWN = {
-    "start": [-0.1, 0.25],
-    "goal": [-0.1, 0.55],
-    "obstacles": [post(-0.4, 0.6), Box((0.05, 0.01, 0.04), position=(-0.16, 0.4, 0.0))],
-}
-"""Scene of the tests of pictures."""
-STRAIGHT, AROUND = np.zeros(3, np.float32), np.array([0.0, -0.5, 0.5], np.float32)
-
-
-def moved(env, action):
-    """Return the info of a movement in the scene of the tests of pictures."""
-    env.reset(options=DRAWN)
-    return env.step(action)[-1]
 
 
 def scenes_of(task, number, seed=0):

@@ -12,13 +12,27 @@ import imageio_ffmpeg
 import mujoco
 import numpy as np
 import pytest
-from helpers import AROUND, DRAWN, JUMPS, PANDA, PLANE, SENSED, STRAIGHT, WHOLE, moved, play
+from helpers import JUMPS, PANDA, PLANE, SENSED, WHOLE, play, post
 
-from viapoint.envs import HalfSpace, RecordMovements, Sphere, arm_of
+from viapoint.envs import Box, HalfSpace, RecordMovements, Sphere, arm_of
 from viapoint.envs.rendering import gl, renderer
 from viapoint.envs.rendering.gl import GLUnavailableError
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
+
+DRAWN = {
+    "start": [-0.1, 0.25],
+    "goal": [-0.1, 0.55],
+    "obstacles": [post(-0.4, 0.6), Box((0.05, 0.01, 0.04), position=(-0.16, 0.4, 0.0))],
+}
+"""Scene of the tests of pictures."""
+STRAIGHT, AROUND = np.zeros(3, np.float32), np.array([0.0, -0.5, 0.5], np.float32)
+
+
+def moved(env, action):
+    """Return the info of a movement in the scene of the tests of pictures."""
+    env.reset(options=DRAWN)
+    return env.step(action)[-1]
 
 
 def red(frame):
