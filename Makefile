@@ -30,7 +30,7 @@ check: $(READY)  ## format, lint, strict types and docstrings
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
-	@$(BIN)/python -m pytest --quiet tests/test_docstrings.py
+	@$(BIN)/python -m pytest --quiet tests/test_docs.py -k docstrings_begin
 
 format: $(READY) ## let ruff put the source in order
 	@$(BIN)/ruff format .

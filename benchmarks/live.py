@@ -30,7 +30,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path)
     file, found = parser.parse_args().json, {}
-    sys.path.append(str(Path(__file__).parents[1] / "tests" / "training"))
+    tests = Path(__file__).parents[1] / "tests"
+    sys.path += [str(tests), str(tests / "training")]
     import browser
     from test_live_page import drag, steady
 

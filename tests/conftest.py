@@ -1,12 +1,17 @@
-"""Settings for tests that start Ray, the order of the files, and random numbers."""
+"""Settings for tests that start Ray, modules that tests import, the order of the files, and random numbers."""
 
 import os
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 # Ray reads this once, when it is imported; otherwise it replaces 127.0.0.1 by another address.
 os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
+
+TESTS = Path(__file__).parent
+sys.path += [str(TESTS), str(TESTS.parent / "benchmarks")]
 
 
 def pytest_collection_modifyitems(items):

@@ -1,5 +1,10 @@
-"""Pages and code agree: links lead somewhere, examples run, and commands are understood."""
+"""Pages and code agree: links, examples, tutorials and commands; docstrings begin with whole sentences."""
 
+import ast
+import doctest
+import enum
+import inspect
+import json
 import os
 import re
 import shlex
@@ -9,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from viapoint import envs, primitives, training
+from viapoint.envs.scenes import families_registry
 from viapoint.training import configs
 from viapoint.training.cli import entry as cli
 
@@ -107,3 +114,78 @@ def test_the_example_of_each_command_is_understood(name):
     config = getattr(configs, f"{name.capitalize()}Config")
     example = re.search(r"Example: (?:.*; )?viapoint (.+)", config.__doc__).group(1)
     assert type(cli.parse(shlex.split(example))) is config
+
+
+RUN = "import json, pathlib, sys, notebooks; json.dump(notebooks.run(pathlib.Path(sys.argv[1])), sys.stdout)"
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("docs/tutorials/*.ipynb")), ids=lambda path: path.stem)
+def test_a_tutorial_runs(path):
+    folders = os.pathsep.join((str(ROOT / "docs"), os.environ.get("PYTHONPATH", "")))
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": folders}
+    command = [sys.executable, "-c", RUN, str(path)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    stored = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    assert kinds_of_outputs(stored) == kinds_of_outputs(json.loads(done.stdout))
+
+
+def kinds_of_outputs(cells):
+    """Return the kinds of outputs of each code cell: text or pictures."""
+    return [[each["output_type"] for each in cell["outputs"]] for cell in cells if "outputs" in cell]
+
+
+FRAGMENT = re.compile(
+    r"(What|Of|How|Whether|That|Where|They|It|As|The same|Who|Whose|Which|Why|By|Those|Both|Also|For|From|With|In|"
+    r"Let)\b"
+)
+"""Beginnings of sentences that depend on something outside the docstring."""
+FOLDERS = ("primitives", "envs", "training", "benchmarks", "docs")
+FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
+
+
+def docstrings(tree):
+    """Yield line and text of the docstrings of modules, classes, functions, attributes and constants."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        for before, statement in zip([None, *node.body], node.body, strict=False):
+            value = getattr(statement, "value", None)
+            is_text = isinstance(statement, ast.Expr) and isinstance(getattr(value, "value", None), str)
+            if is_text and (before is None or isinstance(before, ast.Assign | ast.AnnAssign)):
+                yield statement.lineno, value.value.strip()
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_docstrings_begin_with_a_whole_sentence(path):
+    found = docstrings(ast.parse(path.read_text()))
+    assert [each for each in found if FRAGMENT.match(each[1])] == []
+
+
+EXPORTS = [(package, name) for package in (primitives, envs, training) for name in package.__all__]
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Leave shapes and families as they were, to which an example may add."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(families_registry, "FAMILIES", dict(families_registry.FAMILIES))
+
+
+@pytest.mark.parametrize(("package", "name"), EXPORTS)
+@pytest.mark.usefixtures("registered")
+def test_examples_of_docstrings_run(package, name):
+    try:
+        value = getattr(package, name)
+    except ImportError:
+        pytest.skip(f"{name} needs an extra")
+    if name == "run_study":
+        return  # tests/training/test_study.py runs it, where a Ray is there
+    value = type(value) if isinstance(value, enum.Enum) else value
+    if not (inspect.isclass(value) or inspect.isfunction(value)):
+        return
+    tests = doctest.DocTestFinder().find(value, name, globs={})
+    assert any(test.examples for test in tests), f"{name} has no example"
+    for test in tests:
+        report = []
+        assert not doctest.DocTestRunner().run(test, out=report.append).failed, "".join(report)

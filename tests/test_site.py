@@ -11,14 +11,11 @@ import threading
 from pathlib import Path
 
 import pytest
+from browser import Browser, chromium, wait_for
 
 from viapoint import envs, primitives, training
 
 ROOT = Path(__file__).parents[1]
-sys.path.append(str(Path(__file__).parent / "training"))
-
-from browser import Browser, chromium, wait_for  # noqa: E402
-
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("furo") is None, reason="the extra `docs` is not installed"
 )

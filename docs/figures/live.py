@@ -36,7 +36,7 @@ ASIDE = 24
 
 def main() -> None:
     """Write the picture."""
-    sys.path.append(str(ROOT / "tests" / "training"))
+    sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "training")]
     import browser
     from test_live_page import on_screen, steady
 

@@ -1,18 +1,12 @@
-"""Fixtures of the tests of environments: helpers that they import, and how pictures are made."""
-
-import sys
-from pathlib import Path
+"""Fixtures of the tests of environments: families of a test alone, and how pictures are made."""
 
 import gymnasium as gym
 import pytest
+from helpers import PLANE
 
 from viapoint.envs import renderer
 from viapoint.envs.gl import GLUnavailableError
 from viapoint.envs.scenes import families_registry
-
-sys.path.append(str(Path(__file__).parent))
-
-OBSTACLES = "viapoint.envs:viapoint/PlanarObstacles-v0"
 
 
 @pytest.fixture
@@ -30,7 +24,7 @@ def quick_pictures(monkeypatch):
 @pytest.fixture(scope="session")
 def opengl():
     """OpenGL, or the test is skipped."""
-    env = gym.make(OBSTACLES, render_mode="rgb_array", width=16, height=16)
+    env = gym.make(PLANE, render_mode="rgb_array", width=16, height=16)
     env.reset(seed=0)
     try:
         env.render()
@@ -45,7 +39,7 @@ def make(opengl):
     """Function that makes environments with small pictures, which are closed after the test."""
     opened = []
 
-    def made(name=OBSTACLES, mode="rgb_array", *, side=96, **kwargs):
+    def made(name=PLANE, mode="rgb_array", *, side=96, **kwargs):
         opened.append(gym.make(name, render_mode=mode, **{"width": side, "height": side, **kwargs}))
         return opened[-1]
 

@@ -1,29 +1,19 @@
 """Signed distances of points and their gradients are those of independent libraries and of differences."""
 
+import subprocess
+import sys
+
 import coal
 import mujoco
 import numpy as np
 import pytest
-from random_shapes import random_shape
+from helpers import random_shape
 from scipy.spatial.transform import Rotation
 
-from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.distance import (
-    point_distance,
-    point_distance_and_normal,
-    signed_distances,
-)
+import viapoint.envs as ve
+from viapoint.envs.geometry.compiled import compiled, inner, kernel
+from viapoint.envs.geometry.distance import point_distance, point_distance_and_normal
 from viapoint.envs.geometry.obstacles import KINDS, add_to_model, no_obstacles, pack
-from viapoint.envs.geometry.shapes import (
-    Box,
-    Capsule,
-    ConvexMesh,
-    Cylinder,
-    HalfSpace,
-    PointCloud,
-    Sphere,
-    as_obstacle,
-)
 
 ALL = pytest.mark.parametrize("kind", KINDS)
 CONVEX = pytest.mark.parametrize("kind", KINDS[:-1])
@@ -63,21 +53,21 @@ def coal_bodies(shape):
     turn, place = shape.rotation, np.array(shape.position)
     pose = coal.Transform3s(turn, place)
     match shape:
-        case Sphere():
+        case ve.Sphere():
             return [(coal.Sphere(shape.radius), pose)]
-        case Capsule():
+        case ve.Capsule():
             return [(coal.Capsule(shape.radius, 2.0 * shape.half_length), pose)]
-        case Cylinder():
+        case ve.Cylinder():
             return [(coal.Cylinder(shape.radius, 2.0 * shape.half_length), pose)]
-        case Box():
+        case ve.Box():
             return [(coal.Box(*(2.0 * shape.size)), pose)]
-        case HalfSpace():
+        case ve.HalfSpace():
             return [(coal.Halfspace(turn[:, 2], float(turn[:, 2] @ place)), coal.Transform3s())]
-        case ConvexMesh():
+        case ve.ConvexMesh():
             points = coal.StdVec_Vec3s()
             points.extend(list(shape.vertices))
             return [(coal.Convex.convexHull(points, False, "Qt"), pose)]
-        case PointCloud():
+        case ve.PointCloud():
             ball = coal.Sphere(shape.radius)
             centres = shape.points @ turn.T + place
             return [(ball, coal.Transform3s(np.eye(3), centre)) for centre in centres]
@@ -187,13 +177,13 @@ def test_distances_move_and_turn_with_the_shape(kind, rng):
     turn, shift = Rotation.from_rotvec((0.5, -1.0, 2.0)), np.array([0.3, -0.1, 0.2])
     quaternion = (turn * Rotation.from_matrix(shape.rotation)).as_quat(scalar_first=True)
     place = turn.apply(np.array(shape.position)) + shift
-    moved = as_obstacle({**shape.to_dict(), "position": place, "quaternion": quaternion})
+    moved = ve.as_obstacle({**shape.to_dict(), "position": place, "quaternion": quaternion})
     there = turn.apply(points) + shift
     np.testing.assert_allclose(moved.distance(there), shape.distance(points), atol=1e-9)
     before, before_normals = measured(pack([[shape]]), points)
     _, normals = measured(pack([[moved]]), there)
     np.testing.assert_allclose(normals[0, 0], turn.apply(before_normals[0, 0]), atol=1e-6)
-    flying = as_obstacle({**shape.to_dict(), "velocity": velocity})
+    flying = ve.as_obstacle({**shape.to_dict(), "velocity": velocity})
     after, after_normals = measured(pack([[flying]]), points + 0.7 * velocity, 0.7)
     np.testing.assert_allclose(after, before, atol=1e-12)
     np.testing.assert_allclose(after_normals, before_normals, atol=1e-6)
@@ -203,15 +193,15 @@ def test_distances_move_and_turn_with_the_shape(kind, rng):
 def test_lists_batches_and_radii(kind, rng):
     shapes, points = [random_shape(kind, rng) for _ in range(3)], places(rng, 60)
     radius = rng.uniform(0.0, 0.1, (5, 1))
-    every = signed_distances([shapes[0], *(each.to_dict() for each in shapes[1:])], points)
+    every = ve.signed_distances([shapes[0], *(each.to_dict() for each in shapes[1:])], points)
     for i, shape in enumerate(shapes):
         np.testing.assert_array_equal(every[:, i], shape.distance(points))
     np.testing.assert_allclose(every.T, measured(pack([shapes]), points)[0][0], atol=1e-15)
-    found = signed_distances(shapes, points.reshape(5, 12, 3), radius)
+    found = ve.signed_distances(shapes, points.reshape(5, 12, 3), radius)
     np.testing.assert_allclose(found, every.reshape(5, 12, 3) - radius[..., None], atol=1e-15)
     assert np.shape(shapes[0].distance(points[0])) == ()
     assert shapes[0].distance(points[:0]).shape == (0,)
-    assert signed_distances([], points).shape == (60, 0)
+    assert ve.signed_distances([], points).shape == (60, 0)
     assert (measured(no_obstacles(1, 2), points)[0] > FAR).all()
 
 
@@ -220,7 +210,7 @@ def test_lists_batches_and_radii(kind, rng):
 def test_the_nearest_point_of_a_cloud_is_that_of_all_points(number, flat, rng):
     points = rng.normal(size=(number, 3)) * flat
     points[: number // 3] = points[-1]  # several are the same
-    cloud = PointCloud(points, 0.02)
+    cloud = ve.PointCloud(points, 0.02)
     asked = np.concatenate(
         (2.0 * rng.normal(size=(300, 3)), points[:50] + 1e-3 * rng.normal(size=(len(points[:50]), 3)))
     )
@@ -234,19 +224,19 @@ def test_the_nearest_point_of_a_cloud_is_that_of_all_points(number, flat, rng):
 def test_a_mesh_of_a_subdivided_box_is_the_box(parts, dtype, rng):
     """Corners in lines give triangles of no area, and rounding tilts the others."""
     half, axis = np.array([0.05, 0.05, 0.08]), np.linspace(-1.0, 1.0, parts + 1)
-    box = Box(half, position=(0.1, -0.2, 0.1), quaternion=HalfSpace.facing((1.0, 2.0, 3.0)).quaternion)
+    box = ve.Box(half, position=(0.1, -0.2, 0.1), quaternion=ve.HalfSpace.facing((1.0, 2.0, 3.0)).quaternion)
     grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
 
     def placed(points):
         return (points * half @ box.rotation.T + box.position).astype(dtype)
 
     surface = placed(grid[np.abs(grid).max(axis=1) == 1.0])
-    mesh = ConvexMesh(surface)
+    mesh = ve.ConvexMesh(surface)
     points = np.concatenate((places(rng, 500), placed(rng.uniform(-1.1, 1.1, (500, 3)))))
     atol = 1e-7 if dtype is np.float32 else 1e-9
     np.testing.assert_allclose(mesh.distance(points), box.distance(points), atol=atol)
     with pytest.raises(ValueError, match="hull"):
-        ConvexMesh(np.concatenate((surface, placed(np.array([(0.99, 0.1, -0.3)])))))
+        ve.ConvexMesh(np.concatenate((surface, placed(np.array([(0.99, 0.1, -0.3)])))))
 
 
 @CONVEX
@@ -259,3 +249,56 @@ def test_gradients_are_unit_vectors_on_planes_axes_and_corners(kind):
     distance, normals = measured(pack([[shape]]), points)
     assert np.isfinite(distance).all()
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1.0, atol=1e-12)
+
+
+RECORD = """
+from typing import NamedTuple
+
+class Length(NamedTuple):
+    metres: float
+"""
+FUNCTION = """
+from {module} import Length
+from viapoint.envs.geometry.compiled import compiled
+
+@compiled
+def doubled(length):
+    return 2.0 * length.metres
+"""
+USE = (
+    "from caller import Length, doubled; print(doubled(Length(1.5)), sum(doubled.stats.cache_hits.values()))"
+)
+
+
+@inner
+def twice(number):
+    return 2.0 * number
+
+
+@kernel
+def fourfold(number):
+    return twice(twice(number))
+
+
+def test_functions_for_compiled_ones_alone_refuse_calls_from_python():
+    with pytest.raises(TypeError):
+        twice(1.5)
+    assert fourfold(1.5) == 6.0
+    with pytest.raises(TypeError):
+        twice(1.5)  # though it is compiled now
+    assert twice.py_func(1.5) == 3.0
+
+
+def test_records_may_move_to_another_module(tmp_path):
+    """As in an update of the package: the machine code of before names a module that is gone."""
+    found = []
+    (tmp_path / "before.py").write_text(RECORD)
+    for module in ("before", "before", "after"):
+        if module == "after":
+            (tmp_path / "before.py").rename(tmp_path / "after.py")
+        (tmp_path / "caller.py").write_text(FUNCTION.format(module=module))
+        done = subprocess.run([sys.executable, "-c", USE], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        found.append(done.stdout.split())
+    assert [value for value, _ in found] == ["3.0"] * 3
+    assert found[2][1] == "0"

@@ -3,13 +3,12 @@
 import dataclasses
 import itertools
 import re
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 import trimesh
-from self_contact import check_contact_implies_overlap
+from helpers import UR5E, check_contact_implies_overlap
 
 from viapoint.envs.arms import load
 from viapoint.envs.arms.choices import KNOWN_VELOCITIES, known_limits
@@ -19,7 +18,6 @@ from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import pack
 
-UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 TEXT = UR5E.read_text(encoding="utf-8")
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 HOME = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)

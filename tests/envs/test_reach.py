@@ -5,8 +5,7 @@ import os
 import gymnasium as gym
 import numpy as np
 import pytest
-from episodes import ENDS, GOAL, OBSTACLES, PANDA, START, WALL, given, post, same
-from random_shapes import random_shape
+from helpers import ENDS, GOAL, PANDA, PLANE, START, WALL, given, random_shape, same
 
 from viapoint.envs import Box, HalfSpace, Task
 from viapoint.envs.geometry.obstacles import pack
@@ -65,7 +64,7 @@ def test_a_plan_out_of_reach_is_a_failed_movement_that_does_not_start():
 def test_thin_walls_are_not_tunnelled_at_the_highest_speed():
     """The fastest movements of the action space against the thinnest wall, at 100 places along the line."""
     number = 100
-    env = gym.make_vec(OBSTACLES, num_envs=number, n_obstacles=1).unwrapped
+    env = gym.make_vec(PLANE, num_envs=number, n_obstacles=1).unwrapped
     places = np.linspace(-0.22, 0.03, number)
     walls = [[Box((0.0005, 0.1, 0.04), position=(x, 0.4, 0.0))] for x in places]
     env.reset(seed=0, options={**ENDS, "obstacles": walls})
@@ -84,7 +83,7 @@ def test_contact_implies_negative_clearance_and_clearance_implies_no_contact(arm
     # Not all kinds have default families in the plane.
     kinds = (kind, "box", "cylinder")
     env = gym.make_vec(
-        PANDA if arm == "panda" else OBSTACLES,
+        PANDA if arm == "panda" else PLANE,
         num_envs=number,
         n_obstacles=1,
         shapes=tuple(dict.fromkeys(kinds)),
@@ -180,7 +179,7 @@ def test_zero_actions_are_straight_minimum_jerk_movements(n_via, timing, space):
     assert np.abs(across).max() < 1e-9
 
 
-@pytest.mark.parametrize("env_id", [OBSTACLES, "viapoint/PlanarWholeArm-v0", PANDA])
+@pytest.mark.parametrize("env_id", [PLANE, "viapoint/PlanarWholeArm-v0", PANDA])
 def test_any_success_is_worth_more_than_any_failure(env_id):
     number = 16 if env_id == PANDA else 256
     env = gym.make_vec(env_id, num_envs=number)
@@ -224,7 +223,7 @@ def test_turned_and_mirrored_obstacles_have_turned_and_mirrored_distances_along_
 def test_executed_actions_are_those_of_their_plans():
     results = []
     for by_plan in (False, True):
-        env = gym.make_vec(OBSTACLES, num_envs=4, threads=1).unwrapped
+        env = gym.make_vec(PLANE, num_envs=4, threads=1).unwrapped
         env.reset(seed=2)
         actions = np.random.default_rng(0).uniform(-0.5, 0.5, (4, 3))
         space, scenes = env.task.space, env.scenes

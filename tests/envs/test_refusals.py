@@ -1,58 +1,34 @@
 """Bad input raises one error where it enters: the input, and the type of the error."""
 
-import copy
 import functools
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from episodes import (
+from helpers import (
     CRATE,
     ENDS,
     HOME,
-    JUMP,
+    JUMPS,
     MOVING,
-    OBSTACLES,
     OTHER,
     PANDA,
     PANDA_ENDS,
+    PLANE,
     STEP,
     post,
     same_scenes,
 )
 
-from viapoint.envs import (
-    Box,
-    Capsule,
-    ConvexMesh,
-    HalfSpace,
-    Place,
-    PointCloud,
-    Pose,
-    ReachVectorEnv,
-    Sphere,
-    Task,
-    arm_of,
-    observation_rows,
-    obstacles_from_json,
-    obstacles_from_rows,
-    register_arm,
-    register_mesh,
-    register_scene_family,
-    scene_from_json,
-    signed_distances,
-)
-from viapoint.envs.env import RecordMovements
+import viapoint.envs as ve
 from viapoint.envs.geometry.obstacles import add_to_model, geom_meshes, pack
 from viapoint.envs.geometry.shapes import check_kinds
-from viapoint.envs.plans import Plan
-from viapoint.envs.rewards import RewardWeights
 from viapoint.envs.scenes.families_registry import scene_families
 from viapoint.envs.scenes.layout import Layout
 from viapoint.envs.scenes.sampler import room_of
 
-KINDS = (OBSTACLES, STEP, MOVING, PANDA)
+KINDS = (PLANE, STEP, MOVING, PANDA)
 ANY_ENVIRONMENT = [
     *(({name: 1.0}, TypeError) for name in ("speed", "workers", "uniform_share", "dimension")),
     ({"render_mode": "rgb"}, ValueError), ({"width": 0}, ValueError), ({"height": -3}, ValueError),
@@ -78,8 +54,8 @@ ANY_ENVIRONMENT = [
 ONE_ENVIRONMENT = [
     (PANDA, {"space": "hand"}), (PANDA, {"duration_range": (0.5, 2.0)}),
     (PANDA, {"families": "gate", "n_obstacles": 2}),
-    (PANDA, {"families": "gate", "shapes": "sphere"}), (OBSTACLES, {"families": "shelf"}), (OBSTACLES, {"n_jumps": 1}),
-    (OBSTACLES, {"moving_obstacles": True}), (MOVING, {"timing": "learned"}), (STEP, {"timing": "learned"}),
+    (PANDA, {"families": "gate", "shapes": "sphere"}), (PLANE, {"families": "shelf"}), (PLANE, {"n_jumps": 1}),
+    (PLANE, {"moving_obstacles": True}), (MOVING, {"timing": "learned"}), (STEP, {"timing": "learned"}),
     *((STEP, {"control_step": step}) for step in (0.0, -0.04, 0.003, 2.0, np.nan, "fast", True)),
 ]  # fmt: skip
 
@@ -103,7 +79,7 @@ def test_an_unknown_argument_is_the_error_that_others_raise():
     """TorchRL looks for these words."""
     for make in (gym.make, gym.make_vec):
         with pytest.raises(TypeError, match="got an unexpected keyword argument 'speed'"):
-            make(OBSTACLES, speed=3)
+            make(PLANE, speed=3)
 
 
 def both(env_id):
@@ -165,7 +141,7 @@ def test_steps_before_a_reset(env_id):
         lambda way, time: ("there", time),
     ],
 )
-@pytest.mark.parametrize("env_id", [OBSTACLES, MOVING, PANDA])
+@pytest.mark.parametrize("env_id", [PLANE, MOVING, PANDA])
 def test_plans(env_id, change):
     env = gym.make_vec(env_id, num_envs=2, threads=1).unwrapped
     env.reset(seed=0)
@@ -174,8 +150,8 @@ def test_plans(env_id, change):
     waypoints = np.stack((start, 0.5 * (start + goal), goal), axis=1)
     durations = np.full((2, 2), 0.4)
     with pytest.raises(ValueError):
-        env.execute_plan(Plan(*change(waypoints, durations)))
-    info = env.execute_plan(Plan(waypoints.tolist(), durations.tolist())).info
+        env.execute_plan(ve.Plan(*change(waypoints, durations)))
+    info = env.execute_plan(ve.Plan(waypoints.tolist(), durations.tolist())).info
     assert (info["jerk_ratio"] < 1.0 + 1e-9).all()
 
 
@@ -183,14 +159,14 @@ def test_plans_are_for_the_twin_of_an_environment_with_steps():
     env = gym.make_vec(STEP, num_envs=2).unwrapped
     env.reset(seed=0)
     with pytest.raises(TypeError):
-        env.execute_plan(Plan(np.zeros((2, 3, 2)), np.ones((2, 2))))
+        env.execute_plan(ve.Plan(np.zeros((2, 3, 2)), np.ones((2, 2))))
 
 
 @pytest.mark.parametrize(
     "goals", [np.full((2, 2), 3.0), np.zeros(2), np.full((2, 2), np.nan), "there", np.zeros((2, 3))]
 )
 def test_goals_that_are_moved(goals):
-    env = gym.make_vec(JUMP, num_envs=2, threads=1).unwrapped
+    env = gym.make_vec(JUMPS, num_envs=2, threads=1).unwrapped
     env.reset(seed=0)
     before = env.observe()
     with pytest.raises(ValueError):
@@ -199,17 +175,17 @@ def test_goals_that_are_moved(goals):
 
 
 CUBE = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]) / 10
-POINT, BALL = np.ones(3), Sphere(0.1)
+POINT, BALL = np.ones(3), ve.Sphere(0.1)
 
 
 def record(**change):
-    return Task.from_dict({**Task.of().as_dict(), **change})
+    return ve.Task.from_dict({**ve.Task.of().as_dict(), **change})
 
 
 def recorder(mode):
     env = gym.Wrapper(gym.Env())
     env.env.render_mode = mode
-    return RecordMovements(env, "nowhere")
+    return ve.RecordMovements(env, "nowhere")
 
 
 def nothing(rng, room):
@@ -217,77 +193,77 @@ def nothing(rng, room):
 
 
 def family(name, build=nothing, **values):
-    register_scene_family(name, build, **values)
+    ve.register_scene_family(name, build, **values)
 
 
 def built(result):
     """Return the layout of a family of one's own that answers so."""
-    register_scene_family("own", lambda rng, room: result)
-    room = room_of(arm_of("panda"), ("sphere",), (1, 2), False)
+    ve.register_scene_family("own", lambda rng, room: result)
+    room = room_of(ve.arm_of("panda"), ("sphere",), (1, 2), False)
     return scene_families(plane=False)["own"].build(np.random.default_rng(0), room)
 
 
 def from_rows(shape):
     """Return obstacles of rows of an observation, for a shape that has none."""
-    return obstacles_from_rows(observation_rows(pack([[shape]]), (shape.kind,)), (shape.kind,))
+    return ve.obstacles_from_rows(ve.observation_rows(pack([[shape]]), (shape.kind,)), (shape.kind,))
 
 
 CALLS = [
-    (ReachVectorEnv, [(0,), (-1,), (1.5,), (True,), ("two",)]),
+    (ve.ReachVectorEnv, [(0,), (-1,), (1.5,), (True,), ("two",)]),
     (lambda change: record(**change), [({"arm": "none"},), ({"n_via": 99},)]),
-    (lambda weights: RewardWeights(**weights), [
+    (lambda weights: ve.RewardWeights(**weights), [
         ({"success": np.nan},), ({"success": "much"},), ({"duration": -0.1},), ({"progress": True},),
     ]),
     (recorder, [(None,), ("human",), ("rgb_array",)]),
-    (lambda sensor: Task.of(sensor=sensor), [
+    (lambda sensor: ve.Task.of(sensor=sensor), [
         ("eyes",), (3,), ({"lens": 1},), ({"columns": 0},), ({"columns": 1.5},), ({"rows": 2, "columns": 40_000},),
         ({"field_of_view": 7.0},), ({"rows": 4, "field_of_view": 3.1},), ({"range": 0.0},), ({"noise": -1.0},),
         ({"dropped": 1.0},), ({"position": (0.0, np.nan, 0.0)},), ({"quaternion": (1.0, 1.0, 0.0, 0.0)},),
         ({"mount": "foot"},), ({"looks": 0},),
         ({"looks": 2},),  # an episode of one decision has one look
     ]),
-    (lambda change: Task.of(**change), [({"sensor": "rays", "n_obstacles": 0},), ({"decide_at": ["sight"]},)]),
-    (arm_of, [("large",)]),
-    (register_arm, [(arm_of("panda"),)]),
+    (lambda change: ve.Task.of(**change), [({"sensor": "rays", "n_obstacles": 0},), ({"decide_at": ["sight"]},)]),
+    (ve.arm_of, [("large",)]),
+    (ve.register_arm, [(ve.arm_of("panda"),)]),
     (family, [("",), ("shelf",)]),
     (lambda values: family("x", **values), [
         ({"kinds": ("ball",)},), ({"kinds": ("convex_mesh",)},), ({"n_obstacles": 0},),
     ]),
     (built, [
         (None,), (Layout([1.0], [], []),),
-        *((([BALL], places),) for places in ([Place((np.nan, 0.0, 0.0))], [Place((0.0, 0.0, 0.0))] * 9)),
+        *((([BALL], places),) for places in ([ve.Place((np.nan, 0.0, 0.0))], [ve.Place((0.0, 0.0, 0.0))] * 9)),
         *(((shapes,),) for shapes in (
-            [BALL] * 3, [Box((0.1, 0.1, 0.1))], [ConvexMesh.hull(CUBE)], [{"shape": "sphere", "radius": -1.0}],
+            [BALL] * 3, [ve.Box((0.1, 0.1, 0.1))], [ve.ConvexMesh.hull(CUBE)], [{"shape": "sphere", "radius": -1.0}],
         )),
     ]),
-    (scene_from_json, [
+    (ve.scene_from_json, [
         (None,), (b"\xff",), ("[]",), ("{}",), ("{",), ("[" * 100_000,), ("1" * (2 << 20),),
         ('{"format": "viapoint-scene", "obstacle": []}',), ('{"format": "viapoint-scene", "obstacles": 3}',),
         ('{"format": "viapoint-scene", "obstacles": [{"shape": "cube"}]}',),
     ]),
-    (obstacles_from_json, [("[",), ("{}",), ("[" * 100_000,), (None,), ('[{"shape": 1}]',)]),
-    (HalfSpace.facing, [((0, 0, 0),), ((0, np.nan, 1),), ((0, 1),)]),
-    (lambda end: Capsule.between((0, 0, 1), end, 0.1), [((0, 0, 1),), ((0, 1),), ((0, 0, np.inf),)]),
-    (ConvexMesh.hull, [(CUBE[:4],), (CUBE[:3],)]),
-    (PointCloud.covering, [(CUBE, -1.0), (CUBE, 0.0), (CUBE, 0.2, -0.1)]),
+    (ve.obstacles_from_json, [("[",), ("{}",), ("[" * 100_000,), (None,), ('[{"shape": 1}]',)]),
+    (ve.HalfSpace.facing, [((0, 0, 0),), ((0, np.nan, 1),), ((0, 1),)]),
+    (lambda end: ve.Capsule.between((0, 0, 1), end, 0.1), [((0, 0, 1),), ((0, 1),), ((0, 0, np.inf),)]),
+    (ve.ConvexMesh.hull, [(CUBE[:4],), (CUBE[:3],)]),
+    (ve.PointCloud.covering, [(CUBE, -1.0), (CUBE, 0.0), (CUBE, 0.2, -0.1)]),
     (BALL.distance, [
         *((points,) for points in (0.1, (0.1, 0.2), np.zeros((3, 4)), POINT * np.nan, "a")),
         *((POINT, radius) for radius in (np.nan, -0.1, "a", None, 1j, [0.1, np.inf])),
     ]),
-    (signed_distances, [
+    (ve.signed_distances, [
         *((each, POINT) for each in (BALL, None, "box", [{"shape": "boxx"}])), ([], (0, 1)), ([], POINT * np.nan),
     ]),
-    (register_mesh, [("box", CUBE), ("a b", CUBE), (3, CUBE), ("", CUBE), ("dent", [*CUBE, (0.05, 0.05, 0.05)])]),
+    (ve.register_mesh, [("box", CUBE), ("a b", CUBE), (3, CUBE), ("", CUBE), ("dent", [*CUBE, (0.05, 0.05, 0.05)])]),
     (check_kinds, [(["boxx"],), (["box", "box"],), ([3],)]),
-    (add_to_model, [(mujoco.MjSpec(), [Sphere(0.1, name="obstacle_1"), BALL])]),
-    (geom_meshes, [(pack([[ConvexMesh(CUBE)]]),), (pack([[PointCloud(CUBE)]]),)]),
-    (observation_rows, [(pack([[BALL]]), ("box",)), (pack([[ConvexMesh(CUBE)]]), ("box",))]),
-    (from_rows, [(PointCloud(CUBE),), (ConvexMesh(CUBE),)]),
+    (add_to_model, [(mujoco.MjSpec(), [ve.Sphere(0.1, name="obstacle_1"), BALL])]),
+    (geom_meshes, [(pack([[ve.ConvexMesh(CUBE)]]),), (pack([[ve.PointCloud(CUBE)]]),)]),
+    (ve.observation_rows, [(pack([[BALL]]), ("box",)), (pack([[ve.ConvexMesh(CUBE)]]), ("box",))]),
+    (from_rows, [(ve.PointCloud(CUBE),), (ve.ConvexMesh(CUBE),)]),
     (lambda rows: pack([[BALL] * 6], rows=rows), [(5,)]),
 ]  # fmt: skip
 OF_ANOTHER_TYPE = [
     (lambda change: record(**change), [({"speed": 1},), ({"shapes": 1},)]),
-    (register_arm, [("small",)]),
+    (ve.register_arm, [("small",)]),
     (family, [(3,), ("x", lambda rng: None), ("x", None)]),
 ]
 ROWS = [
@@ -304,24 +280,24 @@ def test_arguments_of_classes_and_functions(call, arguments, error):
             call(*each)
 
 
-HOUSE = Box((0.3, 0.3, 0.3), position=(0.3, 0.0, 0.5))
+HOUSE = ve.Box((0.3, 0.3, 0.3), position=(0.3, 0.0, 0.5))
 POST = {"obstacles": [post(-0.1, 0.6, 0.03)]}
 OTHER_SHAPES = {"shapes": ("box", "point_cloud", "convex_mesh"), "families": "clutter"}
 IN_SPACE = [
     *({"obstacles": given} for given in (
-        [HOUSE], [[CRATE, HOUSE.to_dict()]], [HalfSpace(position=(0, 0, 0.6))],
-        [Box((2.5, 0.1, 0.1))], [Box((0.1, 0.1, 0.1), position=(3.0, 0.0, 0.0))],
-        [Box((1.0, 1.0, 1.0))],  # contains the base
-        [Sphere(0.05, position=(0.2, 0.7, 0.4), velocity=(3.0, 0.0, 0.0))],
-        [ConvexMesh.hull(CUBE)], [PointCloud(CUBE)], [{"shape": "pyramid"}],
+        [HOUSE], [[CRATE, HOUSE.to_dict()]], [ve.HalfSpace(position=(0, 0, 0.6))],
+        [ve.Box((2.5, 0.1, 0.1))], [ve.Box((0.1, 0.1, 0.1), position=(3.0, 0.0, 0.0))],
+        [ve.Box((1.0, 1.0, 1.0))],  # contains the base
+        [ve.Sphere(0.05, position=(0.2, 0.7, 0.4), velocity=(3.0, 0.0, 0.0))],
+        [ve.ConvexMesh.hull(CUBE)], [ve.PointCloud(CUBE)], [{"shape": "pyramid"}],
         [CRATE] * 17, CRATE, CRATE.to_dict(), None, "[]]", np.zeros((1, 9, 15)), [[], []], [[CRATE], 3, []],
         [{"shape": "sphere", "radius": np.nan}], [{"shape": "sphere", "size": 0.1}],
     )),
     *({"start": start} for start in (np.full(7, 9.0), HOME[:6], np.full(7, np.nan), "home")),
     {"start": HOME, "goal": HOME},
     *({"goal": goal} for goal in (
-        Pose((3.0, 0.0, 0.0)), {"quaternion": (1, 0, 0, 0)}, [Pose((0.5, 0.0, 0.4))] * 3,
-        Pose((0.5, 0.0, 0.4), (0.5, 0.0, 0.0, 0.0)), Pose((0.5, np.nan, 0.4)),
+        ve.Pose((3.0, 0.0, 0.0)), {"quaternion": (1, 0, 0, 0)}, [ve.Pose((0.5, 0.0, 0.4))] * 3,
+        ve.Pose((0.5, 0.0, 0.4), (0.5, 0.0, 0.0, 0.0)), ve.Pose((0.5, np.nan, 0.4)),
         {"position": (0.5, 0.0, 0.4), "angle": 3.0}, np.array([0, 1.7, 0, -3.0, 0, 0.1, 0.0]),
     )),
     {"jumps": [[0.3, *HOME]]}, {"turns": [[0.3, 0.1, 0.0, 0.0]]}, {"begin": HOME}, {1: HOME},
@@ -337,7 +313,7 @@ IN_THE_PLANE = [
         [[0.1, 0.0]], [[-0.2, 0.1, 0.0, 0.0]], [[0.3, 3.0, 0.0, 0.0]],
     )),
     *({**ENDS, "goal": goal} for goal in (
-        (0.1, 0.4, 0.3), (2.0, 0.0), ENDS["start"], Pose((2.0, 0.0, 0.0)), Pose((0.1, 0.4, 0.0), (1, 0, 0, 0)),
+        (0.1, 0.4, 0.3), (2.0, 0.0), ENDS["start"], ve.Pose((2.0, 0.0, 0.0)), ve.Pose((0.1, 0.4, 0.0), (1, 0, 0, 0)),
     )),
     {**ENDS, "start": (0.0, 0.02)},
 ]  # fmt: skip
@@ -350,15 +326,10 @@ SCENES = [
     *((PANDA, {}, {**ends, **options}) for options in IN_SPACE for ends in ({}, PANDA_ENDS)),
     *((MOVING, {}, options) for options in IN_THE_PLANE),
     *((MOVING, {"courses": "reaches"}, {**ENDS, **POST, "reaches": reaches}) for reaches in REACHES),
-    (PANDA, OTHER_SHAPES, {**PANDA_ENDS, "obstacles": [PointCloud(CUBE, 0.02, position=(0.2, 0.7, 0.4))]}),
-    (PANDA, OTHER_SHAPES, {**PANDA_ENDS, "obstacles": [ConvexMesh.hull(CUBE)]}),
+    (PANDA, OTHER_SHAPES, {**PANDA_ENDS, "obstacles": [ve.PointCloud(CUBE, 0.02, position=(0.2, 0.7, 0.4))]}),
+    (PANDA, OTHER_SHAPES, {**PANDA_ENDS, "obstacles": [ve.ConvexMesh.hull(CUBE)]}),
     ("viapoint/PlanarSensed-v0", {}, {"obstacles": [post(0.03, 0.0, 0.05)]}),  # contains the sensor
 ]
-
-
-def test_a_copy_of_a_task_is_equal():
-    task = Task.of(arm="panda")
-    assert copy.deepcopy(task) == task
 
 
 @functools.cache

@@ -1,17 +1,37 @@
 """Pictures and films of movements."""
 
+import gc
+import os
+import subprocess
+import sys
+import threading
+import weakref
+
 import gymnasium as gym
 import imageio_ffmpeg
 import mujoco
 import numpy as np
 import pytest
-from episodes import AROUND, DRAWN, JUMP, OBSTACLES, STRAIGHT, moved, play
+from helpers import JUMPS, PANDA, PLANE, SENSED, WHOLE, play, post
 
-from viapoint.envs import HalfSpace, RecordMovements, Sphere, arm_of, gl, renderer
-
-WHOLE_ARM = "viapoint.envs:viapoint/PlanarWholeArm-v0"
+from viapoint.envs import Box, HalfSpace, RecordMovements, Sphere, arm_of, gl, renderer
+from viapoint.envs.gl import GLUnavailableError
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
+
+DRAWN = {
+    "start": [-0.1, 0.25],
+    "goal": [-0.1, 0.55],
+    "obstacles": [post(-0.4, 0.6), Box((0.05, 0.01, 0.04), position=(-0.16, 0.4, 0.0))],
+}
+"""Scene of the tests of pictures."""
+STRAIGHT, AROUND = np.zeros(3, np.float32), np.array([0.0, -0.5, 0.5], np.float32)
+
+
+def moved(env, action):
+    """Return the info of a movement in the scene of the tests of pictures."""
+    env.reset(options=DRAWN)
+    return env.step(action)[-1]
 
 
 def red(frame):
@@ -20,7 +40,7 @@ def red(frame):
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 120), (1, 1), (1400, 64)])
-@pytest.mark.parametrize("name", [OBSTACLES, "viapoint.envs:viapoint/PandaReach-v0"])
+@pytest.mark.parametrize("name", [PLANE, PANDA])
 def test_a_picture_has_the_size_asked_for(make, name, width, height):
     env = make(name, width=width, height=height)
     env.reset(seed=1)
@@ -45,7 +65,7 @@ def test_a_film_lasts_as_long_as_the_movement(make, duration):
     assert np.abs(frames[0].astype(int) - frames[-1]).max() > 50
 
 
-@pytest.mark.parametrize("name", [OBSTACLES, WHOLE_ARM])
+@pytest.mark.parametrize("name", [PLANE, WHOLE])
 def test_contact_is_red_and_nothing_else_is(make, name):
     env = make(name, side=240)
     env.reset(options=DRAWN)
@@ -58,7 +78,7 @@ def test_contact_is_red_and_nothing_else_is(make, name):
 
 def test_a_half_space_below_the_table_is_hidden_by_it(make):
     # MuJoCo would draw a plane that the compiled model did not have as something else.
-    env = make("viapoint.envs:viapoint/PandaObstacles-v0", side=120)
+    env = make(PANDA, side=120)
     ball, home = Sphere(0.05, position=(0.5, 0.4, 0.6)), arm_of("panda").home
     frames = []
     for obstacles in ([ball], [ball, HalfSpace(position=(0.0, 0.0, -0.01))]):
@@ -69,7 +89,7 @@ def test_a_half_space_below_the_table_is_hidden_by_it(make):
 
 def test_points_that_a_sensor_sees_are_drawn(make):
     yellow = []
-    for name in (OBSTACLES, "viapoint.envs:viapoint/PlanarSensed-v0"):
+    for name in (PLANE, SENSED):
         env = make(name, side=240)
         env.reset(options=DRAWN)
         r, g, b = (env.render()[..., i].astype(int) for i in range(3))
@@ -79,7 +99,7 @@ def test_points_that_a_sensor_sees_are_drawn(make):
 
 
 def test_pictures_leave_no_trace_in_the_simulation(make):
-    plain, drawn = gym.make(OBSTACLES), make(side=16)
+    plain, drawn = gym.make(PLANE), make(side=16)
     for env in (plain, drawn):
         env.reset(seed=3)
     for _ in range(3):
@@ -96,8 +116,8 @@ def test_pictures_leave_no_trace_in_the_simulation(make):
 def test_pictures_of_a_batch_are_those_of_its_environments(mode):
     """Also of an episode that is over, where the next one has begun."""
     sizes = {"render_mode": "rgb_array", "width": 48, "height": 32}
-    batch = gym.make_vec(OBSTACLES, num_envs=3, autoreset_mode=mode, **sizes)
-    singles = [gym.make(OBSTACLES, **sizes) for _ in range(3)]
+    batch = gym.make_vec(PLANE, num_envs=3, autoreset_mode=mode, **sizes)
+    singles = [gym.make(PLANE, **sizes) for _ in range(3)]
     batch.reset(seed=0)
     for seed, single in enumerate(singles):
         single.reset(seed=seed)
@@ -129,7 +149,7 @@ def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
             shown.append("closed")
 
     monkeypatch.setattr(renderer, "Window", Window)
-    env = gym.make(OBSTACLES, render_mode="human")
+    env = gym.make(PLANE, render_mode="human")
     env.reset(seed=0)
     assert len(shown) == 1
     env.step(AROUND)
@@ -145,15 +165,15 @@ def frames_of(path):
     return sum(1 for _ in reader)
 
 
-@pytest.mark.parametrize("env_id", [OBSTACLES, JUMP])
+@pytest.mark.parametrize("env_id", [PLANE, JUMPS])
 def test_each_frame_of_a_movement_of_one_or_several_steps_is_recorded_once(env_id, make, tmp_path):
-    made = make(f"viapoint.envs:{env_id}", "rgb_array_list", side=64, duration_range=(0.4, 0.6))
+    made = make(env_id, "rgb_array_list", side=64, duration_range=(0.4, 0.6))
     env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
     env.reset(seed=0)
     steps = len(play(env, 0.3))
     expected = 1 + round(env.unwrapped.last_rollout.time[-1] * env.metadata["render_fps"])
     env.close()
-    assert (steps > 1) == (env_id == JUMP)
+    assert (steps > 1) == (env_id == JUMPS)
     assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == pytest.approx(expected, abs=1)
 
 
@@ -163,3 +183,104 @@ def test_gymnasium_records_two_frames_of_a_movement_and_a_warning_says_so(make, 
         moved(env, AROUND)
     env.close()
     assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == 2
+
+
+def in_a_thread(function):
+    results = []
+    thread = threading.Thread(target=lambda: results.append(function()))
+    thread.start()
+    thread.join()
+    return results[0]
+
+
+@pytest.mark.usefixtures("opengl")
+def test_a_renderer_is_opened_with_the_first_picture_and_freed_with_its_environment(monkeypatch):
+    opened = []
+
+    class Renderer(mujoco.Renderer):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            opened.append(weakref.ref(self))
+
+    monkeypatch.setattr(mujoco, "Renderer", Renderer)
+    for number in range(1, 5):
+        env = gym.make(PLANE, render_mode="rgb_array", width=16, height=16)
+        env.reset(seed=0)
+        assert len(opened) == number - 1
+        env.render()
+        env.render()
+        assert len(opened) == number
+        if number % 2:
+            env.close()
+            env.close()
+        else:
+            del env
+            gc.collect()
+        assert opened[-1]() is None
+
+
+def test_any_thread_may_render_and_close(make):
+    env = make()
+    env.reset(seed=0)
+    before = env.render()
+    np.testing.assert_array_equal(in_a_thread(env.render), before)
+    np.testing.assert_array_equal(env.render(), before)
+    in_a_thread(env.unwrapped.batch._renderers[0].close)
+    np.testing.assert_array_equal(env.render(), before)  # by a new context
+
+
+@pytest.mark.parametrize(("reason", "mode"), [(AttributeError, "egl"), (mujoco.FatalError, "")])
+def test_without_opengl_the_error_says_what_to_install(monkeypatch, reason, mode):
+    def missing(*arguments):
+        raise reason("no library")
+
+    monkeypatch.setenv("MUJOCO_GL", mode)
+    monkeypatch.setattr(gl, "_gl_context", missing)
+    env = gym.make(PLANE, render_mode="rgb_array")
+    env.reset(seed=0)
+    with pytest.raises(GLUnavailableError, match=r"apt-get install libegl1 libgl1.*MUJOCO_GL"):
+        env.render()
+
+
+@pytest.mark.usefixtures("opengl")
+def test_a_picture_too_large_for_opengl_is_refused_with_its_size():
+    env = gym.make(PLANE, render_mode="rgb_array", width=40000, height=40000)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="40000 x 40000"):
+        env.render()
+
+
+def run(code, **environment):
+    """Run a script in a process of its own, and return what it printed."""
+    inherited = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, env={**inherited, **environment})
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_nothing_of_opengl_is_loaded_before_the_first_picture():
+    run(
+        "import os, sys; before = dict(os.environ)\n"
+        "import gymnasium as gym, viapoint.envs\n"
+        "env = gym.make('viapoint/PlanarObstacles-v0', render_mode='rgb_array')\n"
+        "env.reset(seed=0); env.step(env.action_space.sample())\n"
+        "assert not {'OpenGL', 'OpenGL.GL', 'OpenGL.EGL', 'mujoco.egl'} & set(sys.modules)\n"
+        "assert dict(os.environ) == before\n"
+    )
+
+
+@pytest.mark.usefixtures("opengl")
+def test_triton_is_loaded_before_opengl_where_torch_could_use_it(tmp_path):
+    for name in ("torch", "triton"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text(
+            f"import sys; assert 'mujoco.egl' not in sys.modules; print('{name}')"
+        )
+    code = (
+        "import gymnasium as gym, viapoint.envs\n"
+        "env = gym.make('viapoint/PlanarObstacles-v0', render_mode='rgb_array', width=16, height=16)\n"
+        "env.reset(seed=0); env.render(); env.close()\n"
+    )
+    path = os.pathsep.join((str(tmp_path), os.environ.get("PYTHONPATH", "")))
+    assert run(code, PYTHONPATH=path).split() == ["triton"]

@@ -5,14 +5,14 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from episodes import (
+from helpers import (
     GOAL,
-    JUMP,
+    JUMPS,
     MOVING,
-    OBSTACLES,
     OTHER,
     PANDA,
     PANDA_MOVING,
+    PLANE,
     events,
     given,
     play,
@@ -27,7 +27,7 @@ from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import Plan
 from viapoint.envs.replanning import least_remaining
 
-IDS = (JUMP, MOVING, PANDA_MOVING)
+IDS = (JUMPS, MOVING, PANDA_MOVING)
 DT = 0.002
 
 
@@ -41,7 +41,7 @@ def states(plan, time):
     return [part[:, 0] for part in plan.trajectory().sample(time[:, None])]
 
 
-@pytest.mark.parametrize("env_id", [OBSTACLES, PANDA, "viapoint/PlanarWholeArm-v0"])
+@pytest.mark.parametrize("env_id", [PLANE, PANDA, "viapoint/PlanarWholeArm-v0"])
 @pytest.mark.parametrize("number", [1, 5])
 def test_one_decision_is_a_whole_movement_bit_for_bit(env_id, number):
     """The executor that goes on until the next decision, without events before the goal."""
@@ -75,7 +75,7 @@ def test_position_velocity_and_acceleration_do_not_jump_at_a_revision(env_id):
 
 
 def test_a_zero_action_keeps_the_plan_bit_for_bit():
-    env, _ = given(JUMP, decide_at=("horizon",), horizon=0.048)
+    env, _ = given(JUMPS, decide_at=("horizon",), horizon=0.048)
     first = np.array([0.3, 0.6, -0.2], np.float32)
     env.step(first)
     infos = play(env)
@@ -93,7 +93,7 @@ def test_a_zero_action_keeps_the_plan_bit_for_bit():
 @pytest.mark.parametrize("n_via", [0, 1, 2])
 def test_nearly_nothing_changes_nearly_nothing(n_via):
     """By the principle of optimality the rest of a plan, made again through the default via-points, is itself."""
-    env, _ = given(JUMP, decide_at=("horizon",), horizon=0.25, n_via=n_via)
+    env, _ = given(JUMPS, decide_at=("horizon",), horizon=0.25, n_via=n_via)
     action = np.random.default_rng(1).uniform(-0.6, 0.6, env.action_space.shape)
     for nudge in (action, 1e-7 * action):
         env.step(nudge.astype(np.float32))
@@ -103,7 +103,7 @@ def test_nearly_nothing_changes_nearly_nothing(n_via):
 
 
 def test_after_a_jump_the_default_is_the_smoothest_movement_to_the_new_target():
-    env, _ = given(JUMP, jumps=[[0.2, *OTHER]])
+    env, _ = given(JUMPS, jumps=[[0.2, *OTHER]])
     *_, info = env.step(np.zeros(3))
     assert info["event"] == Event.TARGET
     assert (info["time"], info["elapsed"]) == pytest.approx((0.2, 0.2))
@@ -118,7 +118,7 @@ def test_after_a_jump_the_default_is_the_smoothest_movement_to_the_new_target():
 
 
 def test_offsets_of_a_revision_are_in_the_frame_of_hand_and_goal():
-    env, _ = given(JUMP, jumps=[[0.3, *OTHER]], horizon=5.0)
+    env, _ = given(JUMPS, jumps=[[0.3, *OTHER]], horizon=5.0)
     env.step(np.zeros(3))
     default = nominal(env)
     line = OTHER - default.state.position[0]
@@ -153,7 +153,7 @@ def test_reward_terms_sum_to_those_of_the_whole_episode(env_id):
 
 
 def test_a_plan_in_metres_and_seconds_can_be_executed_on_the_way():
-    env, _ = given(JUMP, horizon=0.2, decide_at=("horizon",))
+    env, _ = given(JUMPS, horizon=0.2, decide_at=("horizon",))
     env.step(np.zeros(3))
     default = nominal(env)
     waypoints = np.stack((default.state.position, default.vias[:, 0] + 0.02, default.goal), axis=1)
@@ -161,16 +161,9 @@ def test_a_plan_in_metres_and_seconds_can_be_executed_on_the_way():
     (_, before), (time, after) = env.last_plans
     np.testing.assert_array_equal(after.waypoints, waypoints)
     np.testing.assert_allclose(states(before, np.array([time]))[2], after.acceleration, atol=1e-9)
-    waypoints[:, 0] = nominal(env).state.position
-    for wrong in (
-        Plan(waypoints[:, ::2], np.array([[0.7]])),
-        Plan(waypoints + 0.1, np.array([[0.3, 0.4]])),
-    ):
-        with pytest.raises(ValueError):
-            env.batch.execute_plan(wrong)
 
 
-@pytest.mark.parametrize("env_id", [JUMP, PANDA_MOVING])
+@pytest.mark.parametrize("env_id", [JUMPS, PANDA_MOVING])
 def test_a_moved_goal_is_reached_without_a_jump(env_id):
     env = gym.make_vec(env_id, num_envs=3, horizon=0.1, threads=1, n_obstacles=0).unwrapped
     env.reset(seed=0)
@@ -235,7 +228,7 @@ def test_limits_hold_between_samples_and_no_movement_is_slower_than_they_need():
 
 
 def test_decisions_end_when_their_horizon_has_passed():
-    env, _ = given(JUMP, decide_at=("horizon",), horizon=0.1)
+    env, _ = given(JUMPS, decide_at=("horizon",), horizon=0.1)
     infos = play(env)
     assert [info["elapsed"] for info in infos[:-1]] == pytest.approx([0.1] * (len(infos) - 1))
     assert events(infos) == [Event.HORIZON] * (len(infos) - 1) + [Event.ARRIVAL]
@@ -258,7 +251,7 @@ def test_a_resting_hand_may_set_out_again():
 
 
 def test_a_jump_that_is_no_reason_to_decide_is_noticed_on_arrival():
-    env, _ = given(JUMP, jumps=[[0.2, *OTHER]], decide_at=())
+    env, _ = given(JUMPS, jumps=[[0.2, *OTHER]], decide_at=())
     infos = play(env)
     assert events(infos) == [Event.ARRIVAL, Event.ARRIVAL]
     assert [info["is_success"] for info in infos] == [False, True]
@@ -318,7 +311,7 @@ def test_an_obstacle_that_runs_into_a_resting_arm_is_a_collision_and_no_crash():
 
 
 def test_the_time_limit_ends_an_episode_as_a_failure():
-    env, _ = given(JUMP, horizon=0.1, decide_at=("horizon",))
+    env, _ = given(JUMPS, horizon=0.1, decide_at=("horizon",))
     stalling = np.array([0.0, 0.0, 1.0], np.float32)
     terminated = False
     while not terminated:

@@ -1,41 +1,38 @@
 """Scenes that are drawn, and scenes that are given to `reset`."""
 
 import json
+import math
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from episodes import (
+from helpers import (
     CRATE,
     ENDS,
     HOME,
     MOVING,
-    OBSTACLES,
     OTHER,
     PANDA,
     PANDA_ENDS,
     PANDA_MOVING,
+    PLANE,
     given,
     post,
     same,
     same_scenes,
 )
 
+import viapoint.envs as ve
 from viapoint import primitives
-from viapoint.envs import (
-    Box,
-    ConvexMesh,
-    Pose,
-    obstacles_to_json,
-    register_mesh,
-    scene_from_json,
-    scene_to_json,
-)
 from viapoint.envs.arms.kinematics import forward
-from viapoint.envs.scenes.scene import NEVER, Scenes, check_scenes
+from viapoint.envs.geometry.obstacles import KINDS, no_obstacles, unpack
+from viapoint.envs.scenes.families_registry import FAMILIES, default_families, scene_families
+from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, most_rows
+from viapoint.envs.scenes.sampler import room_of
+from viapoint.envs.scenes.scene import NEVER, check_scenes
 
 REACHING = {"courses": "reaches"}
-HOUSE = Box((0.3, 0.3, 0.3), position=(0.3, 0.0, 0.5), name="house")
+HOUSE = ve.Box((0.3, 0.3, 0.3), position=(0.3, 0.0, 0.5), name="house")
 
 
 def generators(number, seed=0):
@@ -55,9 +52,9 @@ def several():
 @pytest.mark.parametrize(
     ("env_id", "kwargs"),
     [
-        (OBSTACLES, {}),
-        (OBSTACLES, {"whole_arm": True}),
-        (OBSTACLES, {"n_obstacles": (3, 5), "families": ("clutter", "gate")}),
+        (PLANE, {}),
+        (PLANE, {"whole_arm": True}),
+        (PLANE, {"n_obstacles": (3, 5), "families": ("clutter", "gate")}),
         (PANDA, {"n_obstacles": (1, 16)}),
         (PANDA, {"n_obstacles": 9, "families": ("shelf", "cage")}),
         (PANDA, {"n_obstacles": (2, 4), "shapes": "sphere", "families": "clutter"}),
@@ -76,13 +73,13 @@ def test_ends_are_free_and_the_straight_movement_is_not(env_id, kwargs):
     assert ((info["planned_clearance"] < 0.01) | ~info["reachable"]).all()
 
 
-@pytest.mark.parametrize("env_id", [OBSTACLES, MOVING, PANDA, PANDA_MOVING])
+@pytest.mark.parametrize("env_id", [PLANE, MOVING, PANDA, PANDA_MOVING])
 def test_a_scene_depends_on_its_generator_alone(env_id):
     sampler = gym.make(env_id).unwrapped.task.sampler()
     together = sampler(generators(6))
     for i in (0, 5):
         same_scenes(sampler(generators(1, i)), together.take([i]))
-    same_scenes(Scenes.together([together.take([0, 1]), together.take([2, 3, 4, 5])]), together)
+    same_scenes(ve.Scenes.together([together.take([0, 1]), together.take([2, 3, 4, 5])]), together)
 
 
 # Given scenes
@@ -90,10 +87,10 @@ def test_a_scene_depends_on_its_generator_alone(env_id):
 
 def test_shapes_their_dictionaries_and_their_json_give_the_same_movement():
     env = gym.make(PANDA).unwrapped
-    shapes = [CRATE, Box((0.2, 0.2, 0.05), position=(0.0, 0.0, -0.03))]  # touches the base, which it may
+    shapes = [CRATE, ve.Box((0.2, 0.2, 0.05), position=(0.0, 0.0, -0.03))]  # touches the base, which it may
     read = json.loads(json.dumps([shape.to_dict() for shape in shapes]))
     results = []
-    for form in (shapes, tuple(shape.to_dict() for shape in shapes), obstacles_to_json(shapes), read):
+    for form in (shapes, tuple(shape.to_dict() for shape in shapes), ve.obstacles_to_json(shapes), read):
         first, _ = env.reset(seed=0, options={**PANDA_ENDS, "obstacles": form})
         results.append((first, env.step(np.zeros(8, np.float32))[4]))
     for first, info in results[1:]:
@@ -104,7 +101,7 @@ def test_shapes_their_dictionaries_and_their_json_give_the_same_movement():
 @pytest.mark.parametrize(
     ("env_id", "kwargs"),
     [
-        (OBSTACLES, {}), (PANDA, {}), (MOVING, {}), (MOVING, REACHING), ("viapoint/PlanarTargetJump-v0", {}),
+        (PLANE, {}), (PANDA, {}), (MOVING, {}), (MOVING, REACHING), ("viapoint/PlanarTargetJump-v0", {}),
         ("viapoint/PlanarTargetJumpStep-v0", {}), ("viapoint/PlanarMovingObstaclesStep-v0", REACHING),
     ],
 )  # fmt: skip
@@ -114,9 +111,9 @@ def test_drawn_scenes_survive_json(env_id, kwargs):
     for seed in range(3):
         env.reset(seed=seed)
         scenes = env.batch.scenes
-        text = scene_to_json(scenes, env.task.arm, env.task.space_name, env_id=env_id)
+        text = ve.scene_to_json(scenes, env.task.arm, env.task.space_name, env_id=env_id)
         before = env.step(np.zeros(env.action_space.shape, np.float32))[4]
-        env.reset(options=scene_from_json(text))
+        env.reset(options=ve.scene_from_json(text))
         again = env.batch.scenes
         for name, part in scenes.obstacles._asdict().items():
             if name not in ("meshes", "clouds"):
@@ -130,7 +127,7 @@ def test_drawn_scenes_survive_json(env_id, kwargs):
 
 def test_ends_may_be_poses_in_joint_space(several):
     down = (0.0, 1.0, 0.0, 0.0)
-    poses = [Pose((0.5, y, 0.4), down) for y in (-0.2, 0.0, 0.3)]
+    poses = [ve.Pose((0.5, y, 0.4), down) for y in (-0.2, 0.0, 0.3)]
     several.reset(seed=0, options={"start": HOME, "goal": poses, "obstacles": []})
     hands, axes = forward(several.arm.chain, several.scenes.goal)
     np.testing.assert_allclose(hands, [pose.position for pose in poses], atol=1e-5)
@@ -162,11 +159,11 @@ def test_each_scene_of_a_batch_has_its_own_obstacles_and_names(several):
 def test_obstacles_that_are_given_a_velocity_move_in_any_task():
     """Contact and clearance agree on it."""
     coming = post(0.1, 0.7, 0.03, velocity=(0.0, -0.35, 0.0))
-    env, _ = given(OBSTACLES, [coming])
+    env, _ = given(PLANE, [coming])
     *_, info = env.step(np.array([0.0, 0.0, 1.0], np.float32))
     assert info["collision"]
     assert -0.01 < info["min_clearance"] < 0.0
-    still, _ = given(OBSTACLES, [post(0.1, 0.7, 0.03)])
+    still, _ = given(PLANE, [post(0.1, 0.7, 0.03)])
     assert not still.step(np.array([0.0, 0.0, 1.0], np.float32))[4]["collision"]
 
 
@@ -183,14 +180,14 @@ def test_a_jump_and_a_turn_can_be_given_to_all_scenes_or_to_each():
 
 def test_a_mesh_survives_json_and_one_without_a_name_changes_nothing():
     """Whatever the order of its vertices is, and the number of its names."""
-    vertices = ConvexMesh.hull(np.random.default_rng(0).normal(0.0, 0.04, (30, 3))).vertices
-    register_mesh("pebble", vertices)
-    register_mesh("gravel", vertices[::-1])
+    vertices = ve.ConvexMesh.hull(np.random.default_rng(0).normal(0.0, 0.04, (30, 3))).vertices
+    ve.register_mesh("pebble", vertices)
+    ve.register_mesh("gravel", vertices[::-1])
     env = gym.make(PANDA, shapes=("box", "gravel"), families="clutter").unwrapped
     mesh = {"shape": "gravel", "position": (0.5, -0.5, 0.5)}
     first, _ = env.reset(seed=1, options={**PANDA_ENDS, "obstacles": [mesh]})
-    text = scene_to_json(env.batch.scenes, env.task.arm)
-    same(env.reset(seed=1, options=scene_from_json(text))[0], first)
+    text = ve.scene_to_json(env.batch.scenes, env.task.arm)
+    same(env.reset(seed=1, options=ve.scene_from_json(text))[0], first)
     other = gym.make(PANDA, shapes=("box", "convex_mesh"), families="clutter").unwrapped
     other.reset(seed=1)
     scenes = other.batch.scenes
@@ -201,12 +198,12 @@ def test_a_mesh_survives_json_and_one_without_a_name_changes_nothing():
 
 
 def test_where_nothing_fits_the_random_generator_stays_as_it_was():
-    usual, refused = (gym.make(OBSTACLES).unwrapped for _ in range(2))
+    usual, refused = (gym.make(PLANE).unwrapped for _ in range(2))
     usual.reset(seed=0)
     refused.reset(seed=0)
     start = np.array([0.2, 0.5, 0.0])
     ways = 0.56 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
-    walls = [Box((0.5, 0.5, 0.04), position=start + way) for way in ways]
+    walls = [ve.Box((0.5, 0.5, 0.04), position=start + way) for way in ways]
     with pytest.raises(ValueError, match="was found"):
         refused.reset(options={"start": start, "obstacles": walls})
     same(refused.reset()[0], usual.reset()[0])
@@ -260,3 +257,100 @@ def test_obstacles_reach_in_the_physics():
     apart = np.linalg.norm((rollout.hand - post_place)[:, :2], axis=-1) - 0.03 - radius
     assert info["collision"]
     assert info["first_contact_time"] == pytest.approx(rollout.time[int((apart < 0.0).argmax())], abs=0.01)
+
+
+ALL = KINDS[:5]
+NAMES = sorted(FAMILIES)
+
+
+def shapes_of(layout):
+    """Return the obstacles of a layout as shapes, which check their own numbers."""
+    rows = np.array(layout.rows).reshape(-1, ROW)
+    obstacles = no_obstacles(1, len(rows))
+    obstacles.kind[0] = rows[:, 0]
+    obstacles.centre[0], obstacles.size[0] = rows[:, 1:4], rows[:, 13:]
+    obstacles.rotation[0] = rows[:, 4:13].reshape(-1, 3, 3)
+    turned = obstacles.rotation[0] @ obstacles.rotation[0].transpose(0, 2, 1)
+    np.testing.assert_allclose(turned, np.broadcast_to(np.eye(3), turned.shape), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(obstacles.rotation[0]), 1.0)
+    return unpack(obstacles, 0)
+
+
+def room(plane, most, kinds=ALL, tall=False):
+    return room_of(ve.arm_of("planar" if plane else "panda"), kinds, (1, most), tall)
+
+
+@pytest.mark.parametrize(("plane", "name"), NAMES)
+@pytest.mark.parametrize("tall", [False, True])
+@pytest.mark.parametrize("spare", [0, 2, 12])
+def test_layouts_are_valid_obstacles_of_allowed_kinds(plane, name, tall, spare):
+    family = FAMILIES[plane, name]
+    most = family.n_obstacles + spare
+    for kinds in {ALL, (*family.kinds, "cylinder"), family.kinds or ("box",)}:
+        rng = np.random.default_rng(spare)
+        for _ in range(12):
+            layout = family.build(rng, room(plane, most, kinds, tall))
+            shapes = shapes_of(layout)
+            assert len(shapes) <= (most_rows(most) if layout.keep else most)
+            assert layout.keep <= most
+            assert {shape.kind for shape in shapes} <= set(kinds)
+            places = np.array([*layout.goals, *layout.starts]).reshape(-1, PLACE)
+            assert np.isfinite(places).all()
+            assert (places[:, 6:9] >= 0.0).all()
+            assert len(places) <= 2 * MOST_PLACES
+            if plane:
+                assert len(layout.starts) == len(layout.goals) == PLACE
+
+
+def test_families_never_trained_are_no_defaults():
+    names = default_families(False, ALL, 32)
+    assert set(names) == {"shelf", "table", "bin", "gate", "tunnel", "clutter"}
+    assert default_families(False, ("sphere",), 32) == ("clutter",)
+    assert "shelf" not in default_families(False, ALL, 3)
+
+
+def test_furniture_moves_with_its_frame():
+    """Turn and shift the frame: the layout is turned and shifted."""
+
+    def build(x, y, yaw):
+        furniture = ve.Furniture(ve.Room(ALL, 1, 9), x, y, yaw)
+        furniture.box((0.1, 0.2, 0.3), (0.01, 0.02, 0.03), 0.4)
+        furniture.capsule((0.3, -0.2, 0.1), 0.02, 0.1, 0.7, 0.5)
+        furniture.cylinder((0.0, 0.5, 0.2), 0.03, 0.1)
+        furniture.sphere((0.2, 0.0, 0.0), 0.1)
+        furniture.floor(-0.1)
+        return shapes_of(furniture.layout())
+
+    x, y, yaw = 0.4, -0.3, 1.1
+    turn = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))
+    moved = points @ turn.T + (x, y, 0.0)
+    for first, second in zip(build(0.0, 0.0, 0.0), build(x, y, yaw), strict=True):
+        np.testing.assert_allclose(first.distance(points), second.distance(moved), atol=1e-12)
+
+
+def test_layouts_grow_with_the_arm_around_its_foot():
+    small, foot, scale = room(False, 16), np.array([0.1, 0.2, 0.3]), 0.4
+    large = small._replace(scale=scale, foot=tuple(foot))
+    for name, family in scene_families(plane=False).items():
+        first, second = (family.build(np.random.default_rng(3), each) for each in (small, large))
+        one, two = (np.array(each.rows).reshape(-1, ROW) for each in (first, second))
+        np.testing.assert_allclose(two[:, 1:4], foot + scale * one[:, 1:4], atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(two[:, 13:], scale * one[:, 13:], atol=1e-12)
+        np.testing.assert_allclose(two[:, 4:13], one[:, 4:13])
+
+
+@pytest.mark.usefixtures("registry")
+def test_own_family_of_shapes_and_places_is_drawn():
+    def ball(rng, room):
+        return [ve.Sphere(0.1, position=(0.45, 0.0, 0.45))], [
+            ve.Place((0.6, 0.0, 0.4), half=(0.05, 0.1, 0.1))
+        ]
+
+    ve.register_scene_family("ball", ball, kinds=("sphere",), trained=True)
+    assert "ball" in default_families(False, ("sphere",), 1)
+    task = ve.Task.of(arm="panda", n_obstacles=1, shapes="sphere", families="ball")
+    sampler = task.sampler()
+    scenes = sampler([np.random.default_rng(seed) for seed in range(5)])
+    assert (scenes.obstacles.centre == (0.45, 0.0, 0.45)).all()
+    assert (scenes.obstacles.kind == 0).all()

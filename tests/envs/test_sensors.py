@@ -1,52 +1,54 @@
 """Laws of sensors: what is seen, and that nothing else is."""
 
+import dataclasses
+
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from helpers import PLANE, SENSED, scenes_of
 
-from viapoint.envs import (
-    Box,
-    Capsule,
-    ConvexMesh,
-    Cylinder,
-    HalfSpace,
-    Sensor,
-    Sphere,
-    Task,
-    arm_of,
-    signed_distances,
-)
+import viapoint.envs as ve
 from viapoint.envs.events import NEW_DISTANCE, NEW_POINTS, Event
 from viapoint.envs.geometry.obstacles import add_to_model, pack, unpack
+from viapoint.training import ViaRank, ViaVecEnv
 from viapoint.training.planning.beliefs import Sight, fitted_boxes, thick_points
 from viapoint.training.planning.search import registered_task
 
-PANDA = arm_of("panda")
+PANDA = ve.arm_of("panda")
 CORNERS = np.array([(x, y, z) for x in (-0.1, 0.1) for y in (-0.05, 0.08) for z in (-0.1, 0.12)])
 SCENE = [
-    Box((0.1, 0.05, 0.2), position=(0.8, 0.1, 0.1), quaternion=(0.9239, 0.2209, 0.2209, 0.2209)),
-    Sphere(0.1, position=(0.9, -0.3, 0.2)),
-    Capsule(0.05, 0.1, position=(0.7, 0.4, 0.0), quaternion=(0.8, 0.6, 0.0, 0.0)),
-    Cylinder(0.08, 0.1, position=(0.6, -0.1, -0.2), quaternion=(0.6, 0.0, 0.8, 0.0)),
-    HalfSpace(position=(0.0, 0.0, -0.5)),
-    ConvexMesh(CORNERS, position=(0.9, 0.3, 0.5)),
+    ve.Box((0.1, 0.05, 0.2), position=(0.8, 0.1, 0.1), quaternion=(0.9239, 0.2209, 0.2209, 0.2209)),
+    ve.Sphere(0.1, position=(0.9, -0.3, 0.2)),
+    ve.Capsule(0.05, 0.1, position=(0.7, 0.4, 0.0), quaternion=(0.8, 0.6, 0.0, 0.0)),
+    ve.Cylinder(0.08, 0.1, position=(0.6, -0.1, -0.2), quaternion=(0.6, 0.0, 0.8, 0.0)),
+    ve.HalfSpace(position=(0.0, 0.0, -0.5)),
+    ve.ConvexMesh(CORNERS, position=(0.9, 0.3, 0.5)),
 ]
+
+
+WIDE = ve.Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0)
+FINE = ve.Sensor(columns=200, rows=150, field_of_view=1.0, range=3.0)
+
+
+def look(sensor, *shapes, joints=PANDA.home):
+    """Return the readings of a sensor of the Panda among shapes."""
+    return sensor.read(PANDA, joints[None], pack([shapes]))
 
 
 @pytest.mark.parametrize("shape", SCENE, ids=lambda shape: shape.kind)
 def test_ranges_are_those_of_mujoco(shape) -> None:
-    sensor = Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0)
-    found = sensor.read(PANDA, PANDA.home[None], pack([[shape]]))
+    found = look(WIDE, shape)
     spec = mujoco.MjSpec()
     add_to_model(spec, [shape])
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     geom = np.zeros(1, np.int32)
-    theirs = np.array(
-        [mujoco.mj_ray(model, data, np.zeros(3), ray, None, 1, -1, geom, None) for ray in sensor.directions]
-    )
+    theirs = []
+    for ray in WIDE.directions:
+        theirs.append(mujoco.mj_ray(model, data, np.zeros(3), ray, None, 1, -1, geom, None))
+    theirs = np.array(theirs)
     theirs = np.where((theirs < 0.0) | (theirs > 3.0), 3.0, theirs)
     # Rays that graze an edge may differ.
     assert (np.abs(found.ranges[0] - theirs) < 1e-4).mean() > 0.995
@@ -54,81 +56,74 @@ def test_ranges_are_those_of_mujoco(shape) -> None:
 
 
 def test_the_nearest_obstacle_is_seen_and_readings_do_not_depend_on_the_batch() -> None:
-    sensor = Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0, noise=0.01, dropped=0.1)
-    each = [pack([[shape]], rows=1) for shape in SCENE]
-    alone = np.array([sensor.read(PANDA, PANDA.home[None], one).ranges[0] for one in each])
+    sensor = dataclasses.replace(WIDE, noise=0.01, dropped=0.1)
+    alone = np.array([look(sensor, shape).ranges[0] for shape in SCENE])
     batch = sensor.read(PANDA, np.tile(PANDA.home, (len(SCENE), 1)), pack([[shape] for shape in SCENE]))
     assert np.array_equal(alone, batch.ranges)
-    exact = Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0)
-    separate = np.array([exact.read(PANDA, PANDA.home[None], one).ranges[0] for one in each])
-    together = exact.read(PANDA, PANDA.home[None], pack([SCENE]))
+    separate = np.array([look(WIDE, shape).ranges[0] for shape in SCENE])
+    together = look(WIDE, *SCENE)
     assert np.array_equal(together.ranges[0], separate.min(axis=0))
     met = together.seen[0] >= 0
     assert np.array_equal(together.seen[0][met], separate.argmin(axis=0)[met])
 
 
 def test_noise_and_dropped_rays_are_as_stated() -> None:
-    wall = pack([[Box((0.01, 5.0, 5.0), position=(1.0, 0.0, 0.0))]])
-    sensor = Sensor(columns=200, rows=150, field_of_view=1.0, range=3.0, noise=0.02, dropped=0.2)
-    noisy = sensor.read(PANDA, PANDA.home[None], wall).ranges[0]
-    exact = Sensor(columns=200, rows=150, field_of_view=1.0, range=3.0)
-    error = (noisy - exact.read(PANDA, PANDA.home[None], wall).ranges[0])[noisy < 3.0]
+    wall = ve.Box((0.01, 5.0, 5.0), position=(1.0, 0.0, 0.0))
+    sensor = dataclasses.replace(FINE, noise=0.02, dropped=0.2)
+    noisy = look(sensor, wall).ranges[0]
+    error = (noisy - look(FINE, wall).ranges[0])[noisy < 3.0]
     assert np.isclose((noisy == 3.0).mean(), 0.2, atol=0.01)
     assert np.isclose(error.std(), 0.02, rtol=0.03)
     assert abs(error.mean()) < 1e-3
     # A scene that was written and read differs in its last bits, and looks the same.
-    moved = pack([[Box((0.01, 5.0, 5.0), position=(1.0 + 1e-15, 0.0, 0.0))]])
-    assert np.allclose(sensor.read(PANDA, PANDA.home[None], moved).ranges[0], noisy, atol=1e-9)
+    moved = dataclasses.replace(wall, position=(1.0 + 1e-15, 0.0, 0.0))
+    assert np.allclose(look(sensor, moved).ranges[0], noisy, atol=1e-9)
 
 
 def test_a_sensor_at_the_hand_moves_with_it() -> None:
-    task = Task.of(arm="panda", n_obstacles=(1, 4), sensor="hand_camera")
+    task = ve.Task.of(arm="panda", n_obstacles=(1, 4), sensor="hand_camera")
     below = np.array([0.0, 0.0, -0.3])
-    obstacles = pack([[Sphere(0.05, position=PANDA.hand(PANDA.home) + below)]])
-    first = task.sensor.read(PANDA, PANDA.home[None], obstacles)
     # The first joint turns arm and sensor about the vertical axis; the sphere turned alike looks the same.
-    turned = PANDA.home.copy()
-    turned[0] += 0.5
-    second = task.sensor.read(
-        PANDA, turned[None], pack([[Sphere(0.05, position=PANDA.hand(turned) + below)]])
+    turned = PANDA.home + 0.5 * np.eye(7)[0]
+    first, second = (
+        look(task.sensor, ve.Sphere(0.05, position=PANDA.hand(joints) + below), joints=joints)
+        for joints in (PANDA.home, turned)
     )
     assert (first.seen >= 0).any()
     assert np.allclose(first.ranges, second.ranges, atol=1e-4)
 
 
 def test_hidden_obstacles_change_nothing() -> None:
-    from viapoint.training import ViaRank, ViaVecEnv
-
-    task = registered_task("viapoint/PlanarSensed-v0")
-    scenes = task.sampler()([np.random.default_rng(i) for i in range(40)])
+    task = registered_task(SENSED)
+    scenes = scenes_of(task, 40)
     rotation, origin = task.sensor.pose(task.arm, scenes.start)
     hidden = task.sensor.hidden(rotation, origin, scenes.obstacles)
     assert hidden.any(axis=1).sum() >= 8
     without = scenes._replace(
         obstacles=scenes.obstacles._replace(kind=np.where(hidden, -1, scenes.obstacles.kind))
     )
-    env = gym.make_vec("viapoint/PlanarSensed-v0", num_envs=40).unwrapped
+    env = gym.make_vec(SENSED, num_envs=40).unwrapped
     seen, other = env.begin(scenes), env.begin(without)
     for name in seen:
         assert np.array_equal(seen[name], other[name])
-    agent = ViaRank("ViaRankPolicy", ViaVecEnv("viapoint/PlanarSensed-v0", 1), seed=0)
+    agent = ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1), seed=0)
     assert np.array_equal(agent.predict(seen)[0], agent.predict(other)[0])
 
 
 @pytest.mark.parametrize("belief", [thick_points, fitted_boxes])
-@pytest.mark.parametrize("env_id", ["viapoint/PlanarSensed-v0", "viapoint/PandaSensed-v0"])
+@pytest.mark.parametrize("env_id", [SENSED, "viapoint/PandaSensed-v0"])
 def test_beliefs_hold_what_is_seen_and_leave_the_ends_free(env_id, belief) -> None:
     task = registered_task(env_id)
-    scenes = task.sampler()([np.random.default_rng(i) for i in range(5)])
+    scenes = scenes_of(task, 5)
     sight = Sight.of_scenes(scenes, task)
     obstacles = belief(task, sight)
     for b in range(5):
         points = sight.points[b][sight.hit[b]]
         ends = np.linalg.norm(points[:, None] - sight.free[b], axis=-1) - sight.free_radius
         far = points[ends.min(axis=1) > 0.06]
-        assert (signed_distances(unpack(obstacles, b), far).min(axis=1) < 0.03).all()
+        assert (ve.signed_distances(unpack(obstacles, b), far).min(axis=1) < 0.03).all()
         if belief is thick_points:
-            free = signed_distances(unpack(obstacles, b), sight.free[b], sight.free_radius)
+            free = ve.signed_distances(unpack(obstacles, b), sight.free[b], sight.free_radius)
             assert (free > 0.009).all()
 
 
@@ -143,7 +138,7 @@ def looks_of(observation):
 
 
 def test_looks_are_remembered_and_new_points_end_decisions() -> None:
-    envs = gym.make_vec("viapoint/PlanarObstacles-v0", num_envs=24, **LOOKING)
+    envs = gym.make_vec(PLANE, num_envs=24, **LOOKING)
     envs.action_space.seed(0)
     before, _ = envs.reset(seed=3)
     seen = 0
@@ -169,8 +164,8 @@ def test_looks_are_remembered_and_new_points_end_decisions() -> None:
 
 
 def test_looks_do_not_depend_on_the_batch_and_are_restored() -> None:
-    many = gym.make_vec("viapoint/PlanarObstacles-v0", num_envs=3, **LOOKING)
-    alone = gym.make_vec("viapoint/PlanarObstacles-v0", num_envs=1, **LOOKING)
+    many = gym.make_vec(PLANE, num_envs=3, **LOOKING)
+    alone = gym.make_vec(PLANE, num_envs=1, **LOOKING)
     many.reset(seed=[5, 6, 7])
     alone.reset(seed=[6])
     action = np.full((3, many.single_action_space.shape[0]), 0.3, np.float32)

@@ -5,9 +5,9 @@ import json
 import mujoco
 import numpy as np
 import pytest
-from random_shapes import random_shape
+from helpers import random_shape
 
-from viapoint.envs.geometry.distance import signed_distances
+import viapoint.envs as ve
 from viapoint.envs.geometry.obstacles import (
     ABSENT,
     KINDS,
@@ -17,28 +17,11 @@ from viapoint.envs.geometry.obstacles import (
     geom_fields,
     geom_meshes,
     no_obstacles,
-    observation_rows,
-    obstacles_from_rows,
     pack,
     quaternions_of,
     unpack,
 )
-from viapoint.envs.geometry.shapes import (
-    REGISTERED_MESHES,
-    Box,
-    Capsule,
-    ConvexMesh,
-    Cylinder,
-    HalfSpace,
-    PointCloud,
-    Sphere,
-    as_obstacle,
-    as_obstacles,
-    check_kinds,
-    obstacles_from_json,
-    obstacles_to_json,
-    register_mesh,
-)
+from viapoint.envs.geometry.shapes import REGISTERED_MESHES, check_kinds
 
 ALL = pytest.mark.parametrize("kind", KINDS)
 CUBE = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]) / 10
@@ -52,7 +35,7 @@ TWISTED = [(0, 1, 2), (5, 4, 3), (0, 3, 1), (3, 4, 1), (1, 4, 2), (4, 5, 2), (2,
 @pytest.fixture
 def wedge():
     """A registered mesh, which is gone afterwards."""
-    register_mesh("wedge", WEDGE)
+    ve.register_mesh("wedge", WEDGE)
     yield "wedge"
     del REGISTERED_MESHES["wedge"]
 
@@ -65,8 +48,8 @@ def assert_same_distances(obstacles, scenes, rng, atol=1e-9):
     """Check that the obstacles of each scene have the distances of its shapes from random points."""
     points = rng.uniform(-0.5, 0.5, (100, 3))
     for i, shapes in enumerate(scenes):
-        found = signed_distances(unpack(obstacles, i), points)
-        np.testing.assert_allclose(found, signed_distances(shapes, points), atol=atol)
+        found = ve.signed_distances(unpack(obstacles, i), points)
+        np.testing.assert_allclose(found, ve.signed_distances(shapes, points), atol=atol)
 
 
 def prism(twist):
@@ -85,12 +68,12 @@ def prism(twist):
 def test_dictionaries_and_json_keep_shapes_as_they_are(kind, rng):
     every = some_shapes(rng, [kind], 20)
     off = [{**shape.to_dict(), "quaternion": 1.0005 * shape.quaternion, "name": "it"} for shape in every]
-    every += as_obstacles(off)
-    assert obstacles_from_json(obstacles_to_json(every)) == every
-    assert as_obstacles(each.to_dict() for each in every) == every
-    assert every[0] != as_obstacle({**every[0].to_dict(), "name": "it"})
+    every += ve.as_obstacles(off)
+    assert ve.obstacles_from_json(ve.obstacles_to_json(every)) == every
+    assert ve.as_obstacles(each.to_dict() for each in every) == every
+    assert every[0] != ve.as_obstacle({**every[0].to_dict(), "name": "it"})
     assert every[0] != every[1]
-    assert json.loads(obstacles_to_json(every))[0]["shape"] == kind
+    assert json.loads(ve.obstacles_to_json(every))[0]["shape"] == kind
     np.testing.assert_allclose([np.linalg.norm(each.quaternion) for each in every], 1.0, atol=1e-12)
 
 
@@ -131,13 +114,13 @@ def test_rows_of_observations_are_read_back(dtype, rng, wedge):
     kinds = ("box", wedge, "half_space", "sphere", "capsule", "cylinder")
     meshes = [{"shape": wedge, "position": rng.normal(size=3), "velocity": (0.1, 0.2, 0.3)} for _ in range(2)]
     scenes = [some_shapes(rng, KINDS[:5]), [*meshes, *some_shapes(rng, KINDS[:2])], []]
-    rows = observation_rows(pack(scenes, rows=20), kinds)
+    rows = ve.observation_rows(pack(scenes, rows=20), kinds)
     assert rows.shape == (3, 20, len(kinds) + POSE_SIZE)
     assert (rows[~pack(scenes, rows=20).present] == 0.0).all()
-    again = obstacles_from_rows(rows.astype(dtype), kinds)
+    again = ve.obstacles_from_rows(rows.astype(dtype), kinds)
     atol = 1e-5 if dtype is np.float32 else 1e-9
     assert_same_distances(again, scenes, rng, atol)
-    np.testing.assert_allclose(observation_rows(again, kinds), rows, atol=atol)
+    np.testing.assert_allclose(ve.observation_rows(again, kinds), rows, atol=atol)
 
 
 def test_bounding_boxes_contain_the_shapes(rng):
@@ -155,7 +138,7 @@ def test_bounding_boxes_contain_the_shapes(rng):
 
 
 def test_geoms_are_those_that_mujoco_compiles(rng, wedge):
-    shapes = [*some_shapes(rng, KINDS[:5]), as_obstacle({"shape": wedge, "position": (0.1, 0.2, 0.3)})]
+    shapes = [*some_shapes(rng, KINDS[:5]), ve.as_obstacle({"shape": wedge, "position": (0.1, 0.2, 0.3)})]
     spec = mujoco.MjSpec()
     assert add_to_model(spec, shapes)[0] == ["obstacle_0_0"]
     obstacles = pack([shapes, []], rows=len(shapes))
@@ -174,10 +157,10 @@ def test_geoms_are_those_that_mujoco_compiles(rng, wedge):
 
 
 def test_bars_have_their_ends_and_half_spaces_face_normals_of_any_length():
-    bar = Capsule.between((0.1, 0.2, 0.3), (0.4, 0.1, 0.2), 0.02, name="bar")
+    bar = ve.Capsule.between((0.1, 0.2, 0.3), (0.4, 0.1, 0.2), 0.02, name="bar")
     way = bar.half_length * bar.rotation[:, 2]
     np.testing.assert_allclose((bar.position - way, bar.position + way), [(0.1, 0.2, 0.3), (0.4, 0.1, 0.2)])
-    wall = HalfSpace.facing((1e-30, 0.0, 0.0), position=(0.5, 0.0, 0.0))
+    wall = ve.HalfSpace.facing((1e-30, 0.0, 0.0), position=(0.5, 0.0, 0.0))
     np.testing.assert_allclose(wall.rotation[:, 2], (1.0, 0.0, 0.0), atol=1e-12)
 
 
@@ -185,34 +168,34 @@ def test_bars_have_their_ends_and_half_spaces_face_normals_of_any_length():
 def test_hulls_are_closed_and_convex_and_look_outwards(flat, rng):
     for number in (4, 8, 40, 300):
         points = rng.normal(size=(number, 3)) * (1.0, 1.0, flat)
-        mesh = ConvexMesh.hull(points)
+        mesh = ve.ConvexMesh.hull(points)
         corners, normals = mesh.mesh.corners, mesh.mesh.normals
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         assert ((across * normals).sum(axis=1) > 0.0).all()
         assert ((points[:, None] - corners[:, 0]) * normals).sum(axis=-1).max() < 1e-6
         assert len(corners) == 2 * len(mesh.vertices) - 4  # Euler's formula
-        assert ConvexMesh.hull(mesh.vertices) == mesh
+        assert ve.ConvexMesh.hull(mesh.vertices) == mesh
         faces = np.array(
             [[np.flatnonzero((mesh.vertices == p).all(axis=1))[0] for p in face] for face in corners]
         )
-        assert ConvexMesh(mesh.vertices, faces).mesh.corners.shape == corners.shape
+        assert ve.ConvexMesh(mesh.vertices, faces).mesh.corners.shape == corners.shape
         np.testing.assert_allclose(mesh.distance(mesh.vertices), 0.0, atol=1e-9)
 
 
 def test_a_covering_cloud_contains_the_spheres_of_its_points(rng):
     points = rng.normal(size=(500, 3)) * 0.2
-    cloud = PointCloud.covering(points, spacing=0.1, radius=0.01)
+    cloud = ve.PointCloud.covering(points, spacing=0.1, radius=0.01)
     assert len(cloud.points) < 450
     assert (cloud.distance(points) <= -0.01 + 1e-12).all()
 
 
 def test_a_registered_mesh_is_a_shape_whose_name_is_taken(wedge):
-    register_mesh(wedge, WEDGE.tolist())  # the same again
-    placed = as_obstacle({"shape": wedge, "position": (1.0, 0.0, 0.0)})
-    assert placed == ConvexMesh(WEDGE, position=(1.0, 0.0, 0.0))
+    ve.register_mesh(wedge, WEDGE.tolist())  # the same again
+    placed = ve.as_obstacle({"shape": wedge, "position": (1.0, 0.0, 0.0)})
+    assert placed == ve.ConvexMesh(WEDGE, position=(1.0, 0.0, 0.0))
     assert check_kinds(["box", wedge]) == ("box", wedge)
     with pytest.raises(ValueError, match="another shape"):
-        register_mesh(wedge, CUBE)
+        ve.register_mesh(wedge, CUBE)
 
 
 # Refusals
@@ -248,18 +231,18 @@ REFUSED = {
 )  # fmt: skip
 def test_invalid_obstacles_are_refused_with_their_index(value):
     with pytest.raises(ValueError, match=r"^obstacle 1: "):
-        as_obstacles([Sphere(0.1), value])
+        ve.as_obstacles([ve.Sphere(0.1), value])
 
 
 def test_the_faces_of_a_mesh_are_accepted():
-    assert ConvexMesh(TETRAHEDRON, FACES).distance((-0.1, 0.0, 0.0)) == pytest.approx(0.1)
-    straight = ConvexMesh(prism(0.0), TWISTED)
-    assert ConvexMesh(prism(0.0)).distance((0.0, 0.0, 2.0)) == straight.distance((0.0, 0.0, 2.0))
+    assert ve.ConvexMesh(TETRAHEDRON, FACES).distance((-0.1, 0.0, 0.0)) == pytest.approx(0.1)
+    straight = ve.ConvexMesh(prism(0.0), TWISTED)
+    assert ve.ConvexMesh(prism(0.0)).distance((0.0, 0.0, 2.0)) == straight.distance((0.0, 0.0, 2.0))
 
 
 def test_shapes_cannot_be_changed():
     with pytest.raises(AttributeError):
-        Sphere(0.1).radius = 0.2
+        ve.Sphere(0.1).radius = 0.2
     with pytest.raises(ValueError):
-        Box((0.1, 0.1, 0.1)).size[0] = 0.2
-    assert Cylinder(0.1, 0.2) == Cylinder(radius=0.1, half_length=0.2)
+        ve.Box((0.1, 0.1, 0.1)).size[0] = 0.2
+    assert ve.Cylinder(0.1, 0.2) == ve.Cylinder(radius=0.1, half_length=0.2)

@@ -5,7 +5,7 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from episodes import GOAL, STEP, WALL, given, post
+from helpers import GOAL, STEP, WALL, given, post
 from scipy.integrate import simpson
 
 from viapoint.envs.outcome import SETTLING

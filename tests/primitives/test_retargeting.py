@@ -35,14 +35,6 @@ def test_an_unchanged_target_reproduces_the_movement(steps, rng):
         np.testing.assert_allclose(current(time, nu), expected, atol=1e-9 * np.abs(old.peak(nu)).max())
 
 
-def test_a_movement_through_a_via_point_goes_on_to_it():
-    waypoints = np.array([[0.0, 0.0], [0.4, 0.5], [1.0, 0.0]])
-    old = through(waypoints, passage_durations(waypoints, 1.0))
-    new = retarget(old, 0.2, waypoints[2], 1.0, via=waypoints[1])
-    time = np.linspace(0, 0.8, 30)
-    np.testing.assert_allclose(new(time), old(0.2 + time), atol=1e-9)
-
-
 ENDS = [
     {},
     {"goal_velocity": [0.7, -0.4], "goal_acceleration": [1.0, 2.0]},
@@ -70,7 +62,7 @@ def test_a_via_point_ahead_is_passed_as_before_if_it_is_given_again_and_else_dro
     old = moving_through_a_via_point(ends)
     again = retarget(old, 0.2, [1.0, 0.0], 1.0, via=[0.4, 0.5], **ends)
     time = np.linspace(0, 0.8, 30)
-    np.testing.assert_allclose(again(time), old(0.2 + time), atol=1e-8)
+    np.testing.assert_allclose(again(time), old(0.2 + time), atol=1e-9)
     dropped = retarget(old, 0.2, [1.0, 0.0], 1.0, **ends)
     state = {"start_velocity": old(0.2, 1), "start_acceleration": old(0.2, 2)}
     smoothest = point_to_point(old(0.2), [1.0, 0.0], 0.8, **state, **ends)
@@ -101,12 +93,3 @@ def test_freeze_keeps_the_old_target_near_arrival():
     np.testing.assert_allclose(ends, [[3.0, 3.0], [1.0, 1.0]], atol=1e-12)
     time = np.linspace(0, 0.05, 9)
     np.testing.assert_allclose(new(time)[1], old(0.95 + time)[1], atol=1e-11)
-
-
-@pytest.mark.parametrize("remaining", [0.3, 0.03, 0.003])
-def test_noise_of_the_state_grows_with_the_inverse_cube_of_the_remaining_time(remaining):
-    """Why replanning must stop: the jerk for errors of the measured position, velocity and acceleration."""
-    dx, dv, da = 1e-6, 3e-6, -2e-6
-    plan = point_to_point([dx], [0.0], remaining, start_velocity=[dv], start_acceleration=[da])
-    jerk = 60 * dx / remaining**3 + 36 * dv / remaining**2 + 9 * da / remaining
-    np.testing.assert_allclose(-plan(0.0, 3)[0], jerk, rtol=1e-9)

@@ -1,5 +1,7 @@
-"""Laws of a trajectory: what it passes, how smooth it is, that nothing near it costs less."""
+"""Laws of a trajectory: what it passes, that nothing near it costs less, its extremes, and that nothing changes it."""
 
+import copy
+import pickle
 from itertools import pairwise
 
 import hypothesis
@@ -10,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.integrate import quad
 from scipy.interpolate import make_interp_spline
 
-from viapoint.primitives import through
+from viapoint.primitives import minimum_duration, point_to_point, retarget, through
 
 
 def random_movement(rng, vias, order=3, batch=(), dimension=2):
@@ -50,30 +52,6 @@ def test_equals_scipys_spline_with_clamped_ends(vias, order, rng):
         reference = spline(time, nu)
         np.testing.assert_allclose(trajectory(time, nu), reference, atol=1e-9 * np.abs(reference).max())
     assert (trajectory(time, 2 * order) == 0).all()
-
-
-@pytest.mark.parametrize("order", [2, 3, 4])
-def test_no_admissible_perturbation_lowers_the_cost(order, rng):
-    waypoints, durations, ends = random_movement(rng, 2, order)
-    trajectory = through(waypoints, durations, order=order, **ends)
-    end = float(trajectory.duration)
-    time, weight = np.polynomial.legendre.leggauss(60)
-    # A bump that keeps points and boundary values: product of the knots' factors, flat at the ends.
-    t = np.polynomial.Polynomial([0, 1])
-    bump = (t * (end - t)) ** order
-    for knot in trajectory.knots[1:-1]:
-        bump = bump * (t - knot)
-    for shape in (bump, bump * t, bump * (1 - t * t)):
-        cross, own = 0.0, 0.0
-        for left, right in pairwise(trajectory.knots):
-            at = (left + right) / 2 + (right - left) / 2 * time
-            w = weight * (right - left) / 2
-            change = shape.deriv(order)(at)
-            cross += np.sum(w * change * trajectory(at, order)[:, 0])
-            own += 0.5 * np.sum(w * change**2)
-        assert own > 0
-        # cost(x + e bump) - cost(x) = e cross + e^2 own, so least cost means cross = 0
-        assert abs(cross) < 1e-8 * np.sqrt(own * float(trajectory.cost()))
 
 
 @pytest.mark.parametrize("order", [2, 3, 4])
@@ -210,3 +188,118 @@ def test_leading_dimensions_broadcast_or_are_refused(points, times):
     assert movement.duration.shape == movement.cost().shape == batch
     assert movement.knots.shape == (*batch, points[-2])
     assert movement.sample(3, 0)[0].shape == (*batch, 3, points[-1])
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize("nu", [0, 1, 2, 3])
+def test_no_sample_exceeds_the_extremes_and_dense_samples_reach_them(nu, order, rng):
+    waypoints, durations, ends = random_movement(rng, 2, order, batch=(25,))
+    trajectory = through(waypoints, durations, order=order, **ends)
+    values = trajectory.sample(5001, nu)[0]
+    norm = np.linalg.norm(values, axis=-1).max(axis=1)
+    peak = trajectory.peak(nu)
+    assert (norm <= peak * (1 + 1e-9)).all()
+    np.testing.assert_allclose(norm, peak, rtol=2e-3)
+    extrema = trajectory.extrema(nu)
+    size = np.abs(values).max(axis=(1, 2))[:, None]
+    assert (values.max(axis=1) <= extrema.maximum + 1e-9 * size).all()
+    assert (values.min(axis=1) >= extrema.minimum - 1e-9 * size).all()
+    np.testing.assert_allclose(values.max(axis=1) / size, extrema.maximum / size, atol=2e-3)
+    if nu < 2 * order - 2:  # continuous: the value is reached at the time given
+        for d in range(2):
+            at = trajectory(extrema.minimum_time[:, d, None], nu)[:, 0, d]
+            np.testing.assert_allclose(at, extrema.minimum[:, d], atol=1e-9 * size.max())
+
+
+def test_a_dropped_via_point_does_not_count_as_standing_still():
+    trajectory = through([[0.0], [0.0], [1.0]], [0.0, 1.0], start_velocity=[2.0], goal_velocity=[3.0])
+    assert trajectory.extrema(1).minimum > -10
+    plain = point_to_point([0.0], [1.0], 1.0, start_velocity=[2.0], goal_velocity=[3.0])
+    np.testing.assert_allclose(trajectory.extrema(1).minimum, plain.extrema(1).minimum)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"velocity": 0.7},
+        {"acceleration": np.array([3.0, 2.0])},
+        {"velocity": np.full((25, 1), 0.4), "acceleration": 5.0, "jerk": np.array([9.0, 30.0])},
+    ],
+)
+def test_the_performance_limited_movement_touches_a_limit_and_exceeds_none(limits, rng):
+    waypoints, durations, ends = random_movement(rng, 2, batch=(25,))
+    trajectory = through(waypoints, durations, **ends)
+    limited = trajectory.stretched(minimum_duration(trajectory, **limits))
+    ratios = []
+    for nu, name in enumerate(("velocity", "acceleration", "jerk"), start=1):
+        if name not in limits:
+            continue
+        limit = np.asarray(limits[name])
+        if limit.ndim == 0 or limit.shape[-1] == 1:
+            ratios.append(limited.peak(nu) / (limit[..., 0] if limit.ndim else limit))
+        else:
+            extrema = limited.extrema(nu)
+            ratios.append((np.maximum(-extrema.minimum, extrema.maximum) / limit).max(axis=-1))
+    np.testing.assert_allclose(np.max(ratios, axis=0), 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e-9, 1.0, 1e200])
+@pytest.mark.parametrize("kind", [np, torch])
+def test_peaks_of_any_size_and_pace_are_right(kind, size):
+    points = kind.asarray([[0.0, 0.0], [3.0, 4.0]], dtype=kind.float64) * size
+    movement = point_to_point(points[0], points[1], 2.0)
+    for nu, factor in ((1, 1.875), (2, 10 / np.sqrt(3)), (3, 60), (6, 0)):
+        np.testing.assert_allclose(movement.peak(nu), factor * 5 * size / 2**nu, rtol=1e-14)
+    np.testing.assert_allclose(movement.extrema(1).maximum[1], 1.875 * 4 * size / 2, rtol=1e-14)
+    np.testing.assert_allclose(movement.extrema(1).maximum_time, [1.0, 1.0], rtol=1e-7)
+    brief = point_to_point([0.0, 0.0], [1.0, 1.0], 1e-300)
+    np.testing.assert_allclose(brief.peak(1), 1.875e300 * 2**0.5, rtol=1e-14)
+    np.testing.assert_allclose(minimum_duration(brief, velocity=1.0), 1.875 * 2**0.5, rtol=1e-14)
+
+
+FIELDS = ("coefficients", "durations", "starts", "rates", "end", "duration")
+
+
+def with_a_dropped_via_point(points, durations):
+    points[..., 1, :] = points[..., 0, :]
+    durations[..., 0] = 0.0
+    return through(points, durations)
+
+
+def derived(points, durations):
+    reach = point_to_point(points[..., 0, :], points[..., 1, :], durations[..., 0])
+    moved = reach.stretched(durations[..., 1]).transformed(translation=points[..., 1, :])
+    return retarget(moved, 0.1, points[..., 2, :], durations[..., 0])
+
+
+def answers(movement):
+    return [movement.extrema(1).maximum, *movement.sample(7), movement.knots, movement.cost(), movement.end]
+
+
+@pytest.mark.parametrize("kind", [np, torch])
+@pytest.mark.parametrize("make", [through, with_a_dropped_via_point, derived])
+def test_nothing_written_later_changes_a_trajectory(kind, make):
+    points = kind.zeros((3, 3, 2)) + kind.asarray([[0.0], [1.0], [3.0]])
+    durations = kind.ones((3, 2))
+    movement = make(points, durations)
+    given = answers(movement)
+    before = [np.array(np.asarray(part)) for part in given]
+    points[...], durations[...] = 7.0, 9.0
+    for array in given[:4]:
+        array[...] = 7.0
+    copies = copy.copy(movement), copy.deepcopy(movement), pickle.loads(pickle.dumps(movement))
+    for each in (movement, *copies):
+        for was, now in zip(before, answers(each), strict=True):
+            np.testing.assert_array_equal(now, was)
+        for name in FIELDS if kind is np else ():
+            with pytest.raises(ValueError):
+                getattr(each, name)[...] = 0
+    with pytest.raises(AttributeError):
+        movement.order = 4
+
+
+def test_torch_does_not_share_the_memory_of_a_numpy_argument():
+    duration = np.ones(3, np.float32)
+    movement = point_to_point(torch.zeros(2), torch.ones(2), duration)
+    duration[:] = 4
+    assert (movement.duration == 1).all()

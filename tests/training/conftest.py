@@ -1,23 +1,17 @@
-"""Small scenes and small trainings, shared by the tests of training; what several files begin with lies beside them."""
+"""Small scenes and small trainings, shared by the tests of training."""
 
 import dataclasses
 import signal
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers import PLANE
 
 from viapoint.training import ViaVecEnv, scene_sets
 from viapoint.training.cli import entry
 from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import FrozenScenes
-
-sys.path.append(str(Path(__file__).parent))
-sys.path += [str(Path(__file__).parents[2] / folder) for folder in ("docs/figures", "benchmarks")]
-
-ENV = "viapoint/PlanarObstacles-v0"
 
 
 @pytest.fixture(autouse=True)
@@ -28,7 +22,7 @@ def one_thread():
 @pytest.fixture(scope="module")
 def env():
     """Six environments, which SB3 takes."""
-    env = ViaVecEnv(ENV, 6, seed=3, threads=1)
+    env = ViaVecEnv(PLANE, 6, seed=3, threads=1)
     yield env
     env.close()
 
@@ -38,7 +32,7 @@ def made():
     """Function that makes environments, which SB3 takes and which are closed at the end."""
     opened = []
 
-    def make(env_id=ENV, number=8, **kwargs):
+    def make(env_id=PLANE, number=8, **kwargs):
         opened.append(ViaVecEnv(env_id, number, seed=0, **kwargs))
         return opened[-1]
 
@@ -50,7 +44,7 @@ def made():
 @pytest.fixture(scope="session")
 def small_scenes():
     """Forty scenes, with the share of 32 random actions that solve each."""
-    simulation = SceneSimulation(ENV, 64, threads=1)
+    simulation = SceneSimulation(PLANE, 64, threads=1)
     generator = np.random.default_rng(0)
     scenes = simulation.task.sampler()([generator] * 40)
     actions = generator.uniform(-1.0, 1.0, (32, 40, simulation.task.action.size))

@@ -1,5 +1,6 @@
-"""The commands, from configurations and words to files: training, evaluation, play, demo and doctor."""
+"""The commands, from configurations and words to files: training, evaluation, films, demo, doctor and fit."""
 
+import errno
 import io
 import json
 import os
@@ -10,21 +11,25 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium as gym
+import imageio_ffmpeg
 import numpy as np
+import pandas as pd
 import pytest
-from tasks import PLANE as ENV
-from tasks import REACH
+from helpers import MOVING, PLANE, REACH, UR5E, scenes_of
+from helpers import PLANE as ENV
+from matplotlib.image import imread
+from PIL import Image
 
-from viapoint.envs import load_arm
-from viapoint.training import Run, TrainConfig, evaluate, load_agent
+from viapoint.primitives import fit_via_points, through
+from viapoint.training import GeometrySearch, Run, TrainConfig, evaluate, load_agent
 from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
 from viapoint.training.cli import demo, doctor
 from viapoint.training.cli import entry as cli
 from viapoint.training.configs import DemoConfig, EvaluateConfig, from_words, to_words
 from viapoint.training.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
 from viapoint.training.trainer import RunCallback, TrainingStoppedError
-
-UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
+from viapoint.training.video import gallery, record_video
 
 
 def run(*words):
@@ -299,28 +304,6 @@ def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch) -> None
     assert filmed == [str(UR5E)]
 
 
-def test_planners_are_measured_on_problems_of_another_arm(tmp_path, capsys) -> None:
-    arm = load_arm(UR5E)
-    folder = tmp_path / "box_ur5e"
-    folder.mkdir()
-    places = [{"position": [0.5, 0.3, 0.2], "orientation": [0, 0, 0, 1]}]
-    box = {"primitives": [{"type": "box", "dimensions": [0.1, 0.1, 0.4]}], "primitive_poses": places}
-    goal = arm.home + 0.2
-    # Joints of a gripper and of a head are in the files, too; values of JSON are values of YAML.
-    state = {"name": ["head", *arm.joint_names], "position": [0.1, *arm.home]}
-    wanted = [{"joint_name": name, "position": q} for name, q in zip(arm.joint_names, goal, strict=True)]
-    request = {"start_state": {"joint_state": state}, "goal_constraints": [{"joint_constraints": wanted}]}
-    (folder / "scene0001.yaml").write_text(json.dumps({"world": {"collision_objects": [box]}}))
-    (folder / "request0001.yaml").write_text(json.dumps(request))
-    run("evaluate", "--problems", tmp_path, "--arm", UR5E, "--baselines", "plan_motion", "--format", "json")
-    [line] = json.loads(capsys.readouterr().out)
-    assert (line["set"], line["solved"], line["physics"]) == ("box_ur5e", True, True)
-    assert line["length"] == pytest.approx(0.2 * len(goal) ** 0.5, rel=1e-3)
-    with pytest.raises(SystemExit):
-        cli.main(["evaluate", "--problems", str(tmp_path)])
-    assert "panda_joint1" in capsys.readouterr().err
-
-
 GOOD, GONE = "print('fine')", "import no_such_module"
 EXTRA = ("torch", "stable_baselines3", "sb3_contrib", "tyro", "rich", "matplotlib")
 
@@ -375,3 +358,192 @@ def test_without_the_extra_everything_says_what_to_install(words, code, tmp_path
     assert failed.returncode == code
     assert "pip install 'viapoint[training]'" in failed.stdout + failed.stderr
     assert code == 0 or len(failed.stderr.splitlines()) == 1
+
+
+@pytest.fixture(params=[PLANE, MOVING])
+def env(request):
+    env = gym.make(request.param, render_mode="rgb_array_list", width=96, height=96)
+    yield env
+    env.close()
+
+
+def search(env):
+    return GeometrySearch(env.unwrapped.task, 8).decide
+
+
+def read(path):
+    reader = imageio_ffmpeg.read_frames(str(path))
+    meta = next(reader)
+    width, height = meta["size"]
+    return meta, [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader]
+
+
+def check_film(path, count, env, number):
+    meta, frames = read(path)
+    assert len(frames) == count
+    assert meta["fps"] == pytest.approx(env.metadata["render_fps"] / 2.0)
+    duration = env.unwrapped.last_rollout.time[-1]
+    assert count > number * meta["fps"] * 0.4 + duration * env.metadata["render_fps"]
+    assert all(frame[:-48].std() > 5.0 for frame in frames)
+    assert np.abs(frames[0].astype(int) - frames[-1]).max() > 50
+
+
+def test_a_film_shows_every_movement(env, tmp_path):
+    number = 2 if env.spec.id == PLANE else 1
+    count = record_video(tmp_path / "film.mp4", env, scenes_of(env.unwrapped.task, number), search(env))
+    check_film(tmp_path / "film.mp4", count, env, number)
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+
+
+@pytest.mark.parametrize("env", [PLANE], indirect=True)
+def test_a_film_that_fails_half_way_leaves_nothing(env, tmp_path):
+    calls = []
+
+    def broken(observation, scenes):
+        calls.append(scenes)
+        if len(calls) == 2:
+            raise KeyError("policy")
+        return np.zeros((1, 3))
+
+    with pytest.raises(KeyError):
+        record_video(tmp_path / "film.mp4", env, scenes_of(env.unwrapped.task, 2), broken)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("env", [PLANE], indirect=True)
+def test_a_film_that_the_encoder_could_not_finish_is_refused(env, tmp_path, monkeypatch):
+    def on_a_full_disk(path, *_, **__):
+        Path(path).write_bytes(b"half a film")
+        while True:
+            yield
+
+    monkeypatch.setattr(imageio_ffmpeg, "write_frames", on_a_full_disk)
+    with pytest.raises(OSError):
+        record_video(tmp_path / "film.mp4", env, scenes_of(env.unwrapped.task, 1), search(env))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_gallery_is_a_page_of_movements(tmp_path):
+    env = gym.make(PLANE, render_mode="rgb_array", width=96, height=96)
+    titles = [f"scene {seed}" for seed in range(5)]
+    path = tmp_path / "gallery.png"
+    gallery(path, env, scenes_of(env.unwrapped.task, 5), search(env), titles, heading="test scenes")
+    assert np.asarray(Image.open(path).convert("RGB")).std() > 5.0
+
+
+WAYPOINTS = {
+    "around": [[0.0, 0.3, 0.1], [0.12, 0.45, 0.1], [0.3, 0.3, 0.2]],
+    "straight": [[0.0, 0.3, 0.1], [0.3, 0.35, 0.1]],
+}
+
+
+def recorded(*columns):
+    """Table of two movements with little noise, which begin and end within the recording."""
+    rng, parts = np.random.default_rng(0), []
+    for name, waypoints in WAYPOINTS.items():
+        trajectory = through(waypoints, [0.5] * (len(waypoints) - 1))
+        time = np.arange(-0.1, float(trajectory.duration) + 0.1, 0.01)
+        position = trajectory(time) + rng.normal(0.0, 2e-4, (len(time), 3))
+        part = pd.DataFrame({"time": time, **dict(zip("xyz", position.T, strict=True)), "movement": name})
+        parts.append(part[list(columns)])
+    return pd.concat(parts) if "movement" in columns else parts[0]
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "movements.csv"
+    recorded("movement", "time", "x", "y", "z").to_csv(path, index=False)
+    return path
+
+
+def test_a_file_gives_a_table_and_a_figure(file, tmp_path, capsys):
+    folder = tmp_path / "new" / "fit"
+    run("fit", file, "--out", folder)
+    printed = capsys.readouterr().out
+    table = pd.read_csv(folder / "fit.csv")
+    assert list(table["movement"]) == list(WAYPOINTS)
+    assert list(table["n_via"]) == [1, 0]
+    assert all(name in printed for name in WAYPOINTS)
+    around = table.iloc[0]
+    np.testing.assert_allclose(
+        around[["via1_x", "via1_y", "via1_z"]].astype(float), WAYPOINTS["around"][1], atol=5e-3
+    )
+    np.testing.assert_allclose(around[["duration", "via1_time"]].astype(float), [1.0, 0.5], atol=0.02)
+    assert table["via1_x"].isna().tolist() == [False, True]
+    assert np.ptp(imread(folder / "fit.png")) > 0.5
+    run("fit", file, "--out", folder, "--n-via", 0, 2)  # a folder of the command is written again
+    pd.testing.assert_frame_equal(pd.read_csv(folder / "fit.csv"), table)
+
+
+def test_a_plane_movement_needs_no_other_columns_and_is_that_of_the_function(tmp_path):
+    path, table = tmp_path / "one.csv", recorded("time", "x", "y")
+    table.to_csv(path, index=False)
+    run("fit", path, "--out", tmp_path, "--n-via", 1, "--no-free-ends")
+    fit = fit_via_points(table["time"].to_numpy(), table[["x", "y"]].to_numpy(), 1, free_ends=False)
+    written = pd.read_csv(tmp_path / "fit.csv").iloc[0]
+    np.testing.assert_allclose(written[["via1_x", "via1_y"]].astype(float), fit.via_points[0], atol=1e-9)
+    assert "via1_z" not in written
+
+
+@pytest.mark.parametrize("column", ["time", "x"])
+def test_other_units_than_seconds_and_metres_are_told(column, tmp_path, capsys):
+    table = recorded("time", "x", "y")
+    table[column] *= 1000.0
+    table.to_csv(tmp_path / "one.csv", index=False)
+    run("fit", tmp_path / "one.csv", "--out", tmp_path, "--n-via", 1)
+    assert ("seconds" if column == "time" else "metres") in capsys.readouterr().err
+
+
+def test_the_most_via_points_are_told(tmp_path, capsys):
+    recorded("time", "x", "y").to_csv(tmp_path / "one.csv", index=False)
+    run("fit", tmp_path / "one.csv", "--out", tmp_path, "--n-via", 0, 1)
+    assert "the most allowed" in capsys.readouterr().err
+    run("fit", tmp_path / "one.csv", "--out", tmp_path, "--n-via", 0, 2)
+    assert capsys.readouterr().err == ""
+
+
+TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
+
+
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [
+        ([TABLE[0], *(f"{line},0.3" for line in TABLE[1:])], "Expected 3 fields in line 2, saw 4"),
+        ([TABLE[0], *(f"{line}," for line in TABLE[1:])], "Expected 3 fields in line 2, saw 4"),
+        ([*TABLE[:3], "", "  ", "0.2,0.1"], "line 6, column y: nothing"),
+        ([*TABLE[:2], "", "0.1,far,0.2"], "line 4, column x: far"),
+        (["y", "0.1"], "no column time"),
+        (["time;x;y", "0.0;0.1;0.2"], "separate columns by commas"),
+        ([TABLE[0], *(f"{-time},0.1,0.2" for time in range(12))], "goes back in time in line 3"),
+        ([*TABLE, *TABLE[1:]], "add a column `movement`"),
+        (["time,x,y", "s,m,m", *TABLE[1:]], "leave out lines of units"),
+        (["# arm 1", *TABLE], "first line must name the columns"),
+        (TABLE[:1], "holds no samples"),
+        (["", *TABLE[:3], "0.1,,0.2"], "line 5, column x: nothing"),
+        (["time,x,y,x", "0.0,0.1,0.2,0.1"], "several columns x"),
+        (["time,x,y,movement", "0.0,0.1,0.2,a", "", "0.1,0.1,0.2,"], "names no movement in line 4"),
+        (["time,x,y,movement", "0.0,0.1,0.2,null"], "names no movement in line 2"),
+    ],
+)
+def test_lines_at_fault_are_told_by_their_number_in_the_file(lines, told, tmp_path, failed):
+    path = tmp_path / "lines.csv"
+    path.write_text("\n".join(lines))
+    assert told in failed("fit", path, "--out", tmp_path / "fit")
+    assert not (tmp_path / "fit").exists()
+
+
+def test_foreign_files_stay(file, tmp_path, failed):
+    (tmp_path / "fit.csv").write_text("mine")
+    assert "not written by viapoint" in failed("fit", file, "--out", tmp_path)
+    assert (tmp_path / "fit.csv").read_text() == "mine"
+    (tmp_path / "empty.csv").touch()
+    assert "is empty" in failed("fit", tmp_path / "empty.csv", "--out", tmp_path / "fit")
+
+
+def test_a_full_disk_leaves_no_half_of_a_figure(file, tmp_path, failed, monkeypatch):
+    def full(handle):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    assert "fit.png" in failed("fit", file, "--out", tmp_path / "fit")
+    assert not list((tmp_path / "fit").iterdir())

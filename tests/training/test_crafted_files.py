@@ -12,9 +12,9 @@ import zipfile
 import numpy as np
 import pytest
 import torch
+from helpers import PLANE as ENV
+from helpers import SENSED
 from safetensors.numpy import load_file, save, save_file
-from tasks import PLANE as ENV
-from tasks import SENSED
 
 from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES

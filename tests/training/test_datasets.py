@@ -1,12 +1,11 @@
 """Minari datasets: what was recorded is what the recovered environment does again."""
 
 import sys
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from tasks import JUMPS, MOVING, PLANE, SENSED, STEP
+from helpers import JUMPS, MOVING, PLANE, SENSED, STEP, UR5E
 
 from viapoint.training.cli import entry as cli
 from viapoint.training.datasets import record_dataset
@@ -15,7 +14,6 @@ from viapoint.training.planning.baselines import make_method
 minari = pytest.importorskip("minari")
 
 CUSTOM = "test/TwoPosts-v0"
-UR5E = Path(__file__).parents[2] / "docs" / "ur5e.xml"
 
 
 @pytest.fixture(autouse=True)

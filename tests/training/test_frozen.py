@@ -6,8 +6,8 @@ import dataclasses
 import frozen_scenes as make
 import numpy as np
 import pytest
-from tasks import MOVING, REACH
-from tasks import PLANE as ENV
+from helpers import MOVING, REACH
+from helpers import PLANE as ENV
 
 from viapoint.envs import ENV_IDS, Task
 from viapoint.envs.scenes.scene import check_scenes

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from tasks import JUMPS, MOVING, PANDA, PLANE, REACH, WHOLE
+from helpers import JUMPS, MOVING, PANDA, PLANE, REACH, WHOLE
 
 from viapoint import primitives
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT

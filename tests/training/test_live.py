@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import json
 import socket
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -13,8 +12,8 @@ import pytest
 pytest.importorskip("viser", reason="the extra `live` is not installed")
 pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 
-from tasks import JUMPS, MOVING, PANDA, STEP
-from tasks import PLANE as PLANAR
+from helpers import JUMPS, MOVING, PANDA, STEP, UR5E
+from helpers import PLANE as PLANAR
 from viser import transforms
 
 import viapoint.envs as ve
@@ -287,7 +286,7 @@ def test_an_arm_of_ones_own_is_drawn_from_its_file(asset, tmp_path):
     """The drawn hand is where the arm's hand is, wherever the file puts the arm."""
     names = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
     home = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
-    text = (Path(__file__).parents[2] / "docs" / "ur5e.xml").read_text()
+    text = UR5E.read_text()
     file = tmp_path / "ur5e.xml"
     file.write_text(text.replace("<worldbody>", f"{asset}<worldbody>"))
     arm = ve.load_arm(file, tool="hand", joints=names, home=home, velocity_limit=np.pi)

@@ -11,8 +11,8 @@ pytest.importorskip("viser", reason="the extra `live` is not installed")
 pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 
 from browser import Browser, chromium, wait_for
-from tasks import JUMPS, PANDA
-from tasks import PLANE as PLANAR
+from helpers import JUMPS, PANDA
+from helpers import PLANE as PLANAR
 from viser import transforms
 
 from viapoint.envs import Cylinder

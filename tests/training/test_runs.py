@@ -10,8 +10,8 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from helpers import PLANE, REACH
 from stable_baselines3.common.env_util import make_vec_env
-from tasks import PLANE, REACH
 
 from viapoint.envs import RewardWeights, Sensor, arm_of, register_arm
 from viapoint.envs.arms import registry
@@ -339,14 +339,6 @@ def test_a_run_that_has_lost_files_does_not_go_on(tmp_path, capsys):
     (folder / "final").rename(tmp_path / "final")  # as if it had been killed before the first checkpoint
     assert "48 of 48 decisions" in repr(longer())  # rounds are whole
     assert "begins anew" in capsys.readouterr().err
-
-
-def test_a_run_is_not_made_shorter(tmp_path):
-    """Learning rates fall in the course of all decisions, so a part of a run is no shorter run."""
-    train(tiny(tmp_path / "run", n_timesteps=48))
-    with pytest.raises(BadFileError):
-        train(TrainConfig(out=tmp_path / "run", resume=True, n_timesteps=32))
-    assert Run(tmp_path / "run").config.n_timesteps == 48
 
 
 @pytest.mark.parametrize("name", ["final/notes.txt", "final/thesis/a.tex", "final/model.json", "final"])

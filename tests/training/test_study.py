@@ -13,7 +13,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import yaml
-from tasks import PLANE as ENV
+from helpers import PLANE as ENV
 
 from viapoint.training import Study, run_study
 from viapoint.training.study import COLUMNS, StudyFailedError, _connected, _import_libraries

@@ -13,8 +13,8 @@ import signal
 import numpy as np
 import pytest
 import torch
+from helpers import MOVING, PLANE, STEP
 from stable_baselines3.common.callbacks import BaseCallback
-from tasks import MOVING, PLANE, STEP
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from viapoint.training import Run, TrainConfig, ViaVecEnv, train, trainer
