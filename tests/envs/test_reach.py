@@ -5,7 +5,7 @@ import os
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import ENDS, GOAL, PANDA, PLANE, START, WALL, given, random_shape, same
+from helpers import ENDS, GOAL, PANDA, PLANE, START, WALL, given, post, random_shape, same
 
 from viapoint.envs import Box, HalfSpace, Task
 from viapoint.envs.geometry.obstacles import pack
