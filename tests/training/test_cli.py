@@ -125,8 +125,10 @@ def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, 
         ("validation", "--n-scenes", 40),
     ):
         run("evaluate", trained, "--baselines", "straight", "--scenes", *words)
+    run("evaluate", trained, "--baselines", "random", "--scenes", "validation", "--n-scenes", 4)
     kept = [json.loads(path.read_text()) for path in (trained / "evaluations").glob("validation-*.json")]
     assert sorted(each["methods"]["straight"]["scenes"] for each in kept) == [3, 4, 40]
+    assert ["agent", "straight", "random"] in [list(each["methods"]) for each in kept]
 
 
 def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys, failed):

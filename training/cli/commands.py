@@ -86,7 +86,12 @@ def evaluate(config: EvaluateConfig) -> None:
         partial = ".partial" if result.partial else ""
         name = f"{Path(config.scenes).stem}-{result.sha256[:8]}{partial}"  # the hash is that of the scenes
         kept = run.folder / "evaluations" / f"{name}.json"
-        write_json(kept, record)
+        earlier = read_json(kept) if kept.is_file() else {}
+        together = dict(record)
+        if earlier.get("weights_sha256") == record["weights_sha256"]:  # other methods in the same scenes stay
+            for part in ("methods", "outcomes"):
+                together[part] = {**earlier[part], **record[part]}
+        write_json(kept, together)
         print(f"kept as {kept}", file=_notes(config))
     if config.json is not None:
         write_json(config.json, record)
