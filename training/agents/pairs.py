@@ -12,6 +12,7 @@ distance from the surface is learned, not computed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, place_group, self_clearance
 from viapoint.envs.geometry.compiled import compiled, inner, kernel
 from viapoint.envs.geometry.obstacles import ABSENT, KINDS, Obstacles, bounding_boxes
-from viapoint.envs.geometry.shapes import IN_TABLES
+from viapoint.envs.geometry.shapes import IN_TABLES, PLAIN_KINDS
 from viapoint.envs.task import Task
 from viapoint.training.planning.movements import INSTANTS, Setting, memory_of
 from viapoint.training.planning.problem import Moves, Problem, place_at, setting_of
@@ -308,12 +309,18 @@ def _gather(
 
 
 class PairNetwork(nn.Module):
-    """Network of a pair, whose minimum over the pairs of a movement is the learned margin."""
+    """Network of a pair, whose minimum over the pairs of a movement is the learned margin.
 
-    def __init__(self, kinds: int, width: int) -> None:
+    An obstacle that is larger than all of its kind in training is seen as the largest of them, as far from the sphere:
+    the distance from a box does not depend on where its other side is.
+    """
+
+    largest: Tensor
+
+    def __init__(self, shapes: Sequence[str], width: int) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Linear(LENGTHS + kinds, width),
+            nn.Linear(LENGTHS + len(shapes), width),
             nn.ReLU(),
             nn.Linear(width, width),
             nn.ReLU(),
@@ -322,11 +329,25 @@ class PairNetwork(nn.Module):
         self.nearness = nn.Parameter(torch.tensor([1.0, -2.0]))
         """Slope and offset of a skip connection from the distance of the bounding box. It makes the nearest pair the
         minimum at the start of training."""
+        # Greatest half lengths of each kind in training, 0 where there was none, [m]
+        self.register_buffer("largest", torch.zeros(len(shapes), 3))
+        # Places beside meshes and clouds have signs, so that these kinds stay as they are.
+        self.boxlike = torch.tensor([[float(each in PLAIN_KINDS)] for each in shapes])
+
+    def meet(self, pairs: Pairs) -> None:
+        """Take notice of the sizes of the obstacles in a batch of training."""
+        kind, half = pairs.features[..., LENGTHS:], pairs.features[..., 3:6]
+        sizes = (kind[..., None] * half[..., None, :]).flatten(0, -3).amax(dim=0)
+        self.largest.copy_(torch.maximum(self.largest, sizes * self.boxlike.to(sizes.device)))
 
     def forward(self, pairs: Pairs) -> Tensor:
         """Return the margin of each movement, shape (B, H), [m]; NO_OBSTACLE for scenes without obstacles."""
-        lengths = pairs.features[..., :LENGTHS]
-        kind = pairs.features[..., LENGTHS:]
+        place, half = pairs.features[..., :3], pairs.features[..., 3:6]
+        radius, kind = pairs.features[..., 6:LENGTHS], pairs.features[..., LENGTHS:]
+        limits = torch.where(self.largest > 0.0, self.largest, NOWHERE)
+        spare = (half - kind @ limits).clamp(min=0.0)
+        place = torch.where(spare > 0.0, (place - spare).clamp(min=0.0), place)
+        lengths = torch.cat((place, half - spare, radius), dim=-1)
         values = self.layers(torch.cat((SCALE * lengths, kind), dim=-1))[..., 0]
         values = values + self.nearness[0] * (pairs.distance / UNIT) + self.nearness[1]
         least = torch.where(pairs.present, values * UNIT, NO_OBSTACLE).amin(dim=-1)

@@ -153,6 +153,7 @@ class ViaQ(PlanAlgorithm):
         target = self.policy.critic_target
         if target is not None:
             polyak_update(self.policy.critic.parameters(), target.parameters(), self.tau)
+            target.pairs.largest.copy_(self.policy.critic.pairs.largest)
 
     def _losses(self, batch: OutcomeSamples) -> dict[str, Tensor]:
         """Return the losses of the predictions of the critic by name."""
@@ -164,6 +165,7 @@ class ViaQ(PlanAlgorithm):
             until = until[:, None].astype(np.float64)
         problem = Problem.of_observation(batch.observations, policy.task)
         inputs = policy.inputs(problem, batch.actions[:, None], until)
+        critic.pairs.meet(inputs.pairs)
         values = Values(*(each[:, 0] for each in critic(inputs)))
         following = self._following(batch)
         device = policy.device

@@ -77,7 +77,7 @@ class ViaQCritic(nn.Module):
         dimension, size = task.space.dimension, task.action.size
         ends = (4 * dimension + 3) if task.replanning else (2 * dimension + 1)
         self.replanning = task.replanning
-        self.pairs = PairNetwork(len(task.shapes), width)
+        self.pairs = PairNetwork(task.shapes, width)
         self.arrival = nn.Parameter(torch.tensor(2.0))  # Logit d of arrival of a movement within reach
         self.rest = dense(ends + EFFORT + (0 if task.replanning else size), 64, 64, 2)
         for parameter in self.rest[-1].parameters():
