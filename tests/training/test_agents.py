@@ -25,7 +25,7 @@ from viapoint.envs.geometry.obstacles import BOX, bounding_boxes, no_obstacles, 
 from viapoint.training import GeometrySearch, ViaQ, ViaRank, ViaVecEnv, evaluate, load_agent
 from viapoint.training.agents import viaq_policy
 from viapoint.training.agents.agent import SAC
-from viapoint.training.agents.pairs import CLEAR, NO_OBSTACLE, pairs_of
+from viapoint.training.agents.pairs import CLEAR, LENGTHS, NO_OBSTACLE, pairs_of
 from viapoint.training.agents.viaq import OutcomeReplayBuffer, Outcomes, outcome_of
 from viapoint.training.agents.viaq_critic import Values, _Saturated
 from viapoint.training.agents.viaq_policy import ViaQPolicy
@@ -410,6 +410,21 @@ def test_of_an_obstacle_only_bounding_box_and_kind_are_seen():
     torch.testing.assert_close(after.features[..., :7], before.features[..., :7])
     torch.testing.assert_close(after.distance, before.distance)
     assert (after.features[..., 7:] != before.features[..., 7:]).any()
+
+
+def test_an_obstacle_larger_than_all_in_training_is_seen_as_the_largest_as_far_away(learned):
+    model, _ = learned
+    network = model.policy.critic.pairs
+    task, problem, _, moves = movements(PLANE)
+    usual = pairs_of(task, problem, moves, EVERY)
+    box = usual.features[..., LENGTHS + task.shapes.index("box")]
+    longest = network.largest[task.shapes.index("box"), 0]
+    assert 0.05 < longest <= 0.125  # what was met in training
+    usual.features[..., 3] = torch.where(box > 0.0, longest, usual.features[..., 3])
+    larger = usual._replace(features=usual.features.clone())
+    larger.features[..., 0] += 0.2 * box
+    larger.features[..., 3] += 0.2 * box
+    torch.testing.assert_close(network(larger), network(usual))
 
 
 @pytest.mark.parametrize("env_id", [PLANE, PANDA])
