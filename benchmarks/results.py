@@ -260,6 +260,13 @@ def draw(rows: list[dict[str, Any]]) -> None:
     figure.savefig(PICTURE, dpi=110)
 
 
+def in_order(rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows by their tasks, and those of methods that were there before in the place that they had."""
+    tasks = [*SHIPPED_IDS, LOOKS, *REACHES]
+    methods = list(dict.fromkeys((row["env"], row["method"]) for row in [*before, *rows]))
+    return sorted(rows, key=lambda row: (tasks.index(row["env"]), methods.index((row["env"], row["method"]))))
+
+
 def main() -> None:
     """Measure, and write the file, the tables of the pages and the figure after each task."""
     config = tyro.cli(Config)
@@ -276,8 +283,7 @@ def main() -> None:
                 found += list(rows_of(config, env_id, name))
         measured = {(row["env"], row["method"]) for row in found}
         kept = [row for row in every if (row["env"], row["method"]) not in measured]
-        order = [*SHIPPED_IDS, LOOKS, *REACHES]
-        every = sorted(kept + found, key=lambda row: order.index(row["env"]))
+        every = in_order(kept + found, every)
         with config.out.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, FIELDS)
             writer.writeheader()

@@ -205,6 +205,10 @@ def find_model(source: str | Path) -> Path:
         return folder
     if (folder / "config.json").is_file():
         return best_model(folder)
+    if folder.suffix == ".zip":
+        raise BadFileError(
+            folder, "is an archive of Stable-Baselines3, which may hold code: use `load` of its class"
+        )
     raise BadFileError(
         folder, f"is no run folder or model folder; ids of environments with a shipped agent are {known}"
     )
