@@ -207,7 +207,7 @@ class TrainConfig(Config):
         >>> from viapoint.training import TrainConfig
         >>> config = TrainConfig(env="viapoint/PandaObstacles-v0", seed=1, hyperparameters={"batch_size": 128})
         >>> config.folder.as_posix(), config.total_timesteps
-        ('runs/PandaObstacles-v0-viaq-1', 40000)
+        ('runs/PandaObstacles-v0-viaq-1', 16000)
     """
 
     env: Annotated[str, ENV] = DEFAULT_ENV

@@ -107,6 +107,7 @@ REACH_PRESETS = {"viaq": _changed(PRESETS["viaq"], {}, n_timesteps=8_000)}
 _REVISING = {"gradient_steps": 6, "next_candidates": 4}
 REPLANNING_PRESETS = {"viaq": _changed(PRESETS["viaq"], _REVISING, n_timesteps=24_000)}
 """Presets of replanning tasks."""
+JOINT_DECISIONS = 16_000  # Decisions in joint space, where one costs several times as much
 # Settings of viarank in joint space, where the arm has many more places in a movement
 JOINT_SIGHT: dict[str, Any] = {
     "batch_size": 32,
@@ -131,6 +132,8 @@ def preset_of(task: Task, algo: Algorithm) -> Preset:
         preset = REPLANNING_PRESETS.get(algo, preset)
     elif not task.n_obstacles[1]:
         preset = REACH_PRESETS.get(algo, preset)
+    if algo == "viaq" and not task.space.of_hand:
+        return _changed(preset, {}, n_timesteps=min(preset.n_timesteps, JOINT_DECISIONS))
     if algo == "viarank" and not task.space.of_hand:
-        return _changed(preset, JOINT_SIGHT, n_timesteps=16_000)
+        return _changed(preset, JOINT_SIGHT, n_timesteps=JOINT_DECISIONS)
     return preset
