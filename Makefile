@@ -46,4 +46,4 @@ bench: $(READY)  ## throughput as ratios
 	@$(BIN)/python benchmarks/speed.py
 
 clean:           ## remove the virtual environment, caches and runs
-	rm -rf $(VENV) runs build dist docs/_build docs/api docs/project *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) runs build dist docs/_build docs/api docs/environments docs/project *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -334,8 +334,8 @@ class PairNetwork(nn.Module):
         # Places beside meshes and clouds have signs, so that these kinds stay as they are.
         self.boxlike = torch.tensor([[float(each in PLAIN_KINDS)] for each in shapes])
 
-    def meet(self, pairs: Pairs) -> None:
-        """Take notice of the sizes of the obstacles in a batch of training."""
+    def note_sizes(self, pairs: Pairs) -> None:
+        """Note the sizes of the obstacles in a batch of training."""
         kind, half = pairs.features[..., LENGTHS:], pairs.features[..., 3:6]
         sizes = (kind[..., None] * half[..., None, :]).flatten(0, -3).amax(dim=0)
         self.largest.copy_(torch.maximum(self.largest, sizes * self.boxlike.to(sizes.device)))
@@ -344,7 +344,9 @@ class PairNetwork(nn.Module):
         """Return the margin of each movement, shape (B, H), [m]; NO_OBSTACLE for scenes without obstacles."""
         place, half = pairs.features[..., :3], pairs.features[..., 3:6]
         radius, kind = pairs.features[..., 6:LENGTHS], pairs.features[..., LENGTHS:]
-        limits = torch.where(self.largest > 0.0, self.largest, NOWHERE)
+        limits = torch.where(
+            self.largest > 0.0, self.largest, NOWHERE
+        )  # none where training had no such kind
         spare = (half - kind @ limits).clamp(min=0.0)
         place = torch.where(spare > 0.0, (place - spare).clamp(min=0.0), place)
         lengths = torch.cat((place, half - spare, radius), dim=-1)

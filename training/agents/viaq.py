@@ -165,7 +165,7 @@ class ViaQ(PlanAlgorithm):
             until = until[:, None].astype(np.float64)
         problem = Problem.of_observation(batch.observations, policy.task)
         inputs = policy.inputs(problem, batch.actions[:, None], until)
-        critic.pairs.meet(inputs.pairs)
+        critic.pairs.note_sizes(inputs.pairs)
         values = Values(*(each[:, 0] for each in critic(inputs)))
         following = self._following(batch)
         device = policy.device

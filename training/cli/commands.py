@@ -27,7 +27,7 @@ from viapoint.training.configs import (
 )
 from viapoint.training.datasets import dataset_folder, record_dataset
 from viapoint.training.evaluation import evaluate as measure
-from viapoint.training.files import read_json, write_json
+from viapoint.training.files import BadFileError, read_json, write_json
 from viapoint.training.planning import benchmark
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.search import registered_task
@@ -86,12 +86,7 @@ def evaluate(config: EvaluateConfig) -> None:
         partial = ".partial" if result.partial else ""
         name = f"{Path(config.scenes).stem}-{result.sha256[:8]}{partial}"  # the hash is that of the scenes
         kept = run.folder / "evaluations" / f"{name}.json"
-        earlier = read_json(kept) if kept.is_file() else {}
-        together = dict(record)
-        if earlier.get("weights_sha256") == record["weights_sha256"]:  # other methods in the same scenes stay
-            for part in ("methods", "outcomes"):
-                together[part] = {**earlier[part], **record[part]}
-        write_json(kept, together)
+        write_json(kept, _with_earlier(record, kept))
         print(f"kept as {kept}", file=_notes(config))
     if config.json is not None:
         write_json(config.json, record)
@@ -99,6 +94,18 @@ def evaluate(config: EvaluateConfig) -> None:
     if result.partial:
         print("the results are partial", file=_notes(config))
         raise KeyboardInterrupt  # after all that is there has been written
+
+
+def _with_earlier(record: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return a record with the methods of an earlier one of the same weights in the same scenes, if there is one."""
+    try:
+        earlier = read_json(path)
+        if earlier["weights_sha256"] != record["weights_sha256"]:
+            return record
+        added = {part: {**earlier[part], **record[part]} for part in ("methods", "outcomes")}
+    except (BadFileError, KeyError, TypeError):  # there is none, or it is damaged
+        return record
+    return {**record, **added}
 
 
 def _notes(config: EvaluateConfig) -> TextIO:

@@ -64,8 +64,8 @@ SHORTEST = 0.25  # Shortest duration that is chosen, after which servos come to 
 UNLIMITED = 0.85  # The same for arms without velocity limits, [s]
 # Instants of FINE_INSTANTS at which limits are looked at: every second one, and the last
 LIMIT_INSTANTS = np.append(np.arange(0, FINE_INSTANTS - 1, 2), FINE_INSTANTS - 1)
-ROUNDS = 6  # Greatest number of times that a movement is planned again because it must take longer
-# Duration relative to that of the straight movement with which planning among moving obstacles begins
+ROUNDS = 6  # Number of durations that are tried in motion and among moving obstacles
+# Factor from one of these durations to the next, and from the straight movement to the first
 LONGER = 1.3
 SPARE = 1e-3  # Clearance that movements keep beyond the margin where their ends have it, [m]
 ROUNDING = 1e-6  # Rounding error of clearances, [m]
@@ -95,9 +95,14 @@ class _Problem(NamedTuple):
         return _setting(self.arm, self.space.of_hand)
 
     @property
+    def in_motion(self) -> bool:
+        """True if the movement begins in motion."""
+        return bool(self.velocity.any() or self.acceleration.any())
+
+    @property
     def moves(self) -> bool:
         """True if the clearance of a movement depends on its duration."""
-        return bool(self.velocity.any() or self.acceleration.any() or self.obstacles.velocity.any())
+        return self.in_motion or bool(self.obstacles.velocity.any())
 
     def offsets(self, vias: Float, duration: float) -> Float:
         """Return the offsets of a movement, shape (K + 3, D), from its via-points relative to the start."""
@@ -511,7 +516,7 @@ def _fault(problem: _Problem) -> tuple[str, float]:
             row = int(near.argmax())
             where = "in contact with" if rows[end, row] < 0.0 else "nearer than the margin to"
             return f"the {name} is {where} obstacle {row}, clearance {1e3 * rows[end, row]:.1f} mm", most
-    if problem.velocity.any() or problem.acceleration.any():
+    if problem.in_motion:
         moving = joint_motion(space, ends[:1], problem.velocity[None], problem.acceleration[None])
         torque = motion_torques(arm.chain, *moving)
         for kind, values, limit in (
@@ -536,12 +541,12 @@ def _plan(problem: _Problem, effort: _Effort) -> MotionPlan:
         plan = _result(problem, straight, fault)
         if plan.success or fault or problem.duration is not None:
             return plan
-    # In motion, and among moving obstacles, a longer movement is another one.
-    several = problem.moves and problem.duration is None
     duration = straight.duration
+    # In motion, and among moving obstacles, a longer movement is another one: several durations share the seeds.
+    several = problem.moves and problem.duration is None
     if several:
-        duration = max(duration, LONGER * _shortest(problem))
-        effort = effort._replace(seeds=-(-effort.seeds // ROUNDS))
+        effort = effort._replace(seeds=-(-effort.seeds // ROUNDS))  # rounded up
+        duration *= 1.0 if problem.in_motion else LONGER  # the straight one in motion has it already
     tried, found = 0, straight
     for _ in range(ROUNDS if several else 1):
         best, more = _search(problem, effort, kept, duration)
@@ -563,22 +568,17 @@ def _plan(problem: _Problem, effort: _Effort) -> MotionPlan:
 
 
 def _straight(problem: _Problem) -> _Movement:
-    """Return the straight movement, without via-points."""
-    movement = _Movement(np.zeros((0, len(problem.start))), fine_table(0), 0, 1.0, "straight")
-    if problem.duration is not None:
-        return movement._replace(duration=problem.duration)
-    if not problem.moves:  # its result has the shortest duration
-        return movement
-    in_motion = problem.velocity.any() or problem.acceleration.any()
-    return movement._replace(duration=(LONGER if in_motion else 1.0) * _shortest(problem))
+    """Return the straight movement.
 
-
-def _shortest(problem: _Problem) -> float:
-    """Return the shortest duration of the straight movement from rest, [s]."""
+    Where clearance depends on its duration, it has the shortest one that it would have from rest, in motion LONGER.
+    """
     still = np.zeros_like(problem.start)
-    movement = _Movement(np.zeros((0, len(still))), fine_table(0), 0, 1.0, "straight")
-    duration, _, _ = _timed(problem._replace(velocity=still, acceleration=still), movement, 0.0)
-    return duration
+    nothing = np.zeros((0, len(still)))
+    movement = _Movement(nothing, fine_table(0), 0, problem.duration or 1.0, "straight")
+    if problem.duration is None and problem.moves:
+        duration, _, _ = _timed(problem._replace(velocity=still, acceleration=still), movement, 0.0)
+        movement = movement._replace(duration=(LONGER if problem.in_motion else 1.0) * duration)
+    return movement
 
 
 def _search(problem: _Problem, effort: _Effort, kept: float, duration: float) -> tuple[_Movement | None, int]:
