@@ -664,6 +664,22 @@ def test_places_are_those_of_the_movement() -> None:
     assert np.array_equal(task.sensor.ray_towards(local), np.flatnonzero(sight.hit[0]))
 
 
+def test_what_any_look_saw_to_be_free_is_free() -> None:
+    env = ViaVecEnv(SENSED, 16, seed=0, sensor="hand_rays", decide_at=["horizon"], horizon=0.2)
+    task, observation = env.venv.unwrapped.task, env.reset()
+    for _ in range(3):
+        observation, *_ = env.step(np.zeros((16, task.action.size), np.float32))
+    sight = Sight.of(observation, task)
+    made = np.repeat(sight.made, task.sensor.n_rays, axis=1)
+    assert sight.made[:, 1].any()
+    assert not sight.made.all()
+    # A place on a ray, before what the ray meets
+    places = sight.eyes + 0.8 * (sight.points - sight.eyes)
+    ray, distance = sight.towards(task.sensor, places.astype(np.float32))
+    free = np.take_along_axis(sight.ranges, np.maximum(ray, 0), axis=1) >= distance
+    assert ((ray >= 0) & free)[made].all()
+
+
 def test_full_knowledge_is_the_best_belief() -> None:
     methods = ["known:search512", "seen:search512", "points:search512", "thick:plan_motion"]
     result = evaluate(env=SENSED, scenes="validation", n_scenes=60, baselines=methods, time_decisions=False)

@@ -42,6 +42,7 @@ class PlanPolicy(BasePolicy):
     candidates: int  # Number of Sobol points in the action space
     refinements: int  # Rounds of candidates around the best ones
     per_refinement: int  # Candidates of each round
+    refine: int  # Number of best candidates that the planner refines
 
     def __init__(
         self,
@@ -73,6 +74,17 @@ class PlanPolicy(BasePolicy):
     def _check_candidates(self) -> None:
         """Check the number of candidates of a decision; ValueError if there are too many."""
         whole_number("number of all candidates", self.all_candidates, 1, MOST_CANDIDATES)
+
+    @property
+    def can_refine(self) -> bool:
+        """True for tasks whose movements begin at rest and have via-points, which can be refined."""
+        return not self.replanning and self.task.n_via > 0
+
+    def _check_refine(self) -> None:
+        if self.refine and not self.can_refine:
+            raise ValueError(
+                f"refine must be 0 where plans are revised or have no via-points, got {self.refine}"
+            )
 
     def _own(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self.OWN}

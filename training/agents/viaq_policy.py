@@ -97,17 +97,6 @@ class ViaQPolicy(PlanPolicy):
         """Network that is trained."""
         return self.critic
 
-    @property
-    def can_refine(self) -> bool:
-        """True for tasks whose movements begin at rest and have via-points, which can be refined."""
-        return not self.replanning and self.task.n_via > 0
-
-    def _check_refine(self) -> None:
-        if self.refine and not self.can_refine:
-            raise ValueError(
-                f"refine must be 0 where plans are revised or have no via-points, got {self.refine}"
-            )
-
     def inputs(self, problem: Problem, actions: Numbers, until: Float | None = None) -> PlanInputs:
         """Return the critic's inputs for actions of shape (B, H, m) in B problems.
 

@@ -30,6 +30,7 @@ from torch.nn import functional
 from viapoint.envs.common.arrays import Float, Single
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
 from viapoint.envs.scenes.sampler import SceneSampler
+from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training.agents.model_io import ALGORITHMS
@@ -44,7 +45,7 @@ from viapoint.training.planning.cautious import (
     instants_of,
     places_of,
 )
-from viapoint.training.planning.problem import Numbers, Problem, moves_of, worth_of
+from viapoint.training.planning.problem import Moves, Numbers, Problem, moves_of, worth_of
 from viapoint.training.planning.search import (
     CLEARANCE_MARGIN,
     plan_clearances,
@@ -52,6 +53,7 @@ from viapoint.training.planning.search import (
 )
 
 EFFORT_WEIGHT = 0.05  # Weight of the reward of a successful plan beside its probability of success
+KEEP = 2.0  # Reward by which another plan must be better than the one under way, as each change of plan costs jerk
 # First part of the seeds of scenes for the calibration, far from those of training, and their number
 CALIBRATION, CALIBRATION_SCENES = 3_000_017, 640
 SAME_RAY = 0.02  # Greatest distance of a point from the ray of the sensor, [m]
@@ -112,10 +114,8 @@ class ViaRankPolicy(PlanPolicy):
         self.refine = refine
         self.belief = belief
         self._check_candidates()
-        if self.task.sensor is None or not self.task.whole_movement:
-            raise ValueError(
-                "viarank needs a task with a sensor whose actions are whole movements, such as viapoint/PlanarSensed-v0"
-            )
+        self._check_refine()
+        _check_task(self.task)
         self.network = SightNetwork(self.task.sensor, width=width)
         self._make_optimizer(self.network, lr_schedule)
 
@@ -123,11 +123,6 @@ class ViaRankPolicy(PlanPolicy):
         super()._check_setting(name, value)
         if name == "belief" and value not in BELIEFS:
             raise ValueError(f"belief must be one of {', '.join(BELIEFS)}, got {value!r}")
-
-    @property
-    def can_refine(self) -> bool:
-        """True for tasks whose movements have via-points, which can be refined."""
-        return self.task.n_via > 0
 
     @torch.no_grad()
     def rank(self, problem: Problem, sight: Sight, actions: Numbers) -> Numbers:
@@ -171,6 +166,7 @@ class ViaRankPolicy(PlanPolicy):
 
     def best(self, problem: Problem, sight: Sight) -> tuple[Float, Float]:
         """Return the best actions of B problems, shape (B, m), and probabilities that are too high, shape (B,)."""
+        self._check_refine()  # it may have been set after construction
         chosen, success = [], []
         for first in range(0, len(problem.start), BLOCK):
             rows = slice(first, first + BLOCK)
@@ -186,7 +182,8 @@ class ViaRankPolicy(PlanPolicy):
                 value = np.concatenate((value, rank(refined)), axis=1)
             best = np.arange(len(value)), value.argmax(axis=1)
             taken = actions[best]
-            worth = worth_of(self.task, there, moves_of(self.task, there, taken[:, None]))[:, 0]
+            moves = moves_of(self.task, there, taken[:, None])
+            worth = _worth(self.task, there, taken[:, None], moves)[:, 0]
             chosen.append(taken)
             success.append(value[best] - EFFORT_WEIGHT * worth)
         return np.concatenate(chosen).astype(np.float64), np.concatenate(success).astype(np.float64)
@@ -200,12 +197,27 @@ class ViaRankPolicy(PlanPolicy):
             raise ValueError(
                 f"ranges must be at most {sensor.range:g} m, as in training, got {sight.ranges.max():.3g}"
             )
-        rays = np.einsum("nij,rj->nri", sight.rotation, sensor.directions)
-        apart = np.abs(sight.origin[:, None] + sight.ranges[..., None] * rays - sight.points).max(initial=0.0)
+        rays = np.einsum("nlij,rj->nlri", sight.rotation, sensor.directions).reshape(sight.points.shape)
+        apart = np.abs(sight.eyes + sight.ranges[..., None] * rays - sight.points)
+        apart = apart.reshape(*sight.made.shape, -1)[sight.made].max(initial=0.0)
         if apart > SAME_RAY:
             raise ValueError(
                 f"points must lie on the rays of the sensor of the training, {sensor}, got {apart:.2g} m from them"
             )
+
+
+def _check_task(task: Task | None) -> Task:
+    """Return a task for which this agent is made; ValueError for others."""
+    if task is None or task.sensor is None or task.stepwise or task.moving_obstacles:
+        got = "another one"
+        if task is not None:
+            got = "one with control steps" if task.stepwise else "one with moving obstacles"
+            got = "one without a sensor" if task.sensor is None else got
+        raise ValueError(
+            "viarank needs an environment of this package with a sensor and obstacles at rest, in which an action is a "
+            f"movement, such as viapoint/PlanarSensed-v0; got {got}"
+        )
+    return task
 
 
 class _NoBuffer(ReplayBuffer):
@@ -291,22 +303,17 @@ class ViaRank(PlanAlgorithm):
             raise ValueError(f"labels must be at most explore_candidates, {explore_candidates}, got {labels}")
 
     def _task_of(self, env: VecEnv) -> Task:
-        task = task_in(env)
-        if task is None or task.sensor is None or not task.whole_movement:
-            got = "another one"
-            if task is not None:
-                got = "one without a sensor" if task.sensor is None else "one with several decisions"
-            raise ValueError(
-                "viarank needs an environment of this package with a sensor in which an action is a whole movement, "
-                f"such as viapoint/PlanarSensed-v0; got {got}"
-            )
-        return task
+        return _check_task(task_in(env))
 
     def _candidates(self, number: int) -> NDArray[np.float32]:
         """Return random candidates of some scenes, shape (number, H, m), of as many as a decision compares."""
-        every = candidate_actions(self.policy.task, self.policy.all_candidates, replanning=False)
+        policy = self.policy
+        every = candidate_actions(policy.task, policy.all_candidates, replanning=policy.replanning)
         drawn = np.random.uniform(size=(number, len(every))).argsort(axis=1)  # noqa: NPY002 - seeded by SB3
-        return np.asarray(every[drawn[:, : self.explore_candidates]], np.float32)
+        found = np.array(every[drawn[:, : self.explore_candidates]], np.float32)
+        if policy.replanning:
+            found[:, 0] = 0.0  # the plan under way
+        return found
 
     def _sample_action(
         self, learning_starts: int, action_noise: Any = None, n_envs: int = 1
@@ -329,11 +336,13 @@ class ViaRank(PlanAlgorithm):
 
     def _sampled_losses(self, batch_size: int) -> dict[str, Tensor]:
         policy, task = self.policy, self.policy.task
-        # New scenes for each update: the network cannot learn them by heart.
-        seeds = np.random.randint(0, 2**31, size=batch_size)  # noqa: NPY002 - seeded by SB3
-        truth, believed, sight = self._drawn(list(seeds))
+        if policy.replanning:
+            truth, believed, sight = self._under_way()
+        else:  # new scenes for each update: the network cannot learn them by heart
+            seeds = np.random.randint(0, 2**31, size=batch_size)  # noqa: NPY002 - seeded by SB3
+            truth, believed, sight = self._drawn(list(seeds))
         # Some plans are labelled: those that the network would choose, and others.
-        plans = self._candidates(batch_size)
+        plans = self._candidates(len(sight.ranges))
         inputs, worth = sight_inputs(task, believed, sight, plans, policy.instants, policy.nearest)
         inputs = inputs.to(policy.device)
         chosen = self._chosen(inputs, worth)
@@ -351,6 +360,21 @@ class ViaRank(PlanAlgorithm):
         truth = Problem.of_scenes(scenes, task)
         sight = Sight.of_scenes(scenes, task)
         return truth, truth._replace(obstacles=self.policy.believed(sight, truth.obstacles)), sight
+
+    def _under_way(self) -> tuple[Problem, Problem, Sight]:
+        """Return the scenes of the environment and what has been seen of them so far, as :meth:`_drawn` does."""
+        assert self.env is not None
+        task = self.policy.task
+        observation: Any = self._last_obs
+        scenes = self.env.get_attr("scenes")
+        if len(scenes[0].start) < self.n_envs:  # each environment has one
+            scenes[0] = Scenes.together(scenes)
+        believed = Problem.of_observation(observation, task)
+        sight = Sight.of(observation, task)
+        truth = believed._replace(obstacles=scenes[0].obstacles)
+        if self.policy.belief != DEFAULT_BELIEF:
+            believed = believed._replace(obstacles=self.policy.believed(sight, truth.obstacles))
+        return truth, believed, sight
 
     @torch.no_grad()
     def _chosen(self, inputs: SightInputs, worth: NDArray[Any]) -> NDArray[np.int64]:
@@ -403,9 +427,9 @@ ALGORITHMS["viarank"] = ViaRank
 class SightInputs(NamedTuple):
     """Inputs of the network for H movements in each of B scenes."""
 
-    # Ranges relative to the greatest, hits, and places of the pixels in the image, shape (B, 4, rows, columns)
+    # Ranges relative to the greatest, hits, and places of the pixels, for all looks, shape (M, 4, rows, columns)
     image: Tensor
-    pixel: Tensor  # Pixels in whose direction P places lie, shape (B, H, P), int64
+    pixel: Tensor  # Pixels of all images in whose direction P places lie, shape (B, H, P), int64
     places: Tensor  # Other inputs of these places, shape (B, H, P, FEATURES)
     plans: Tensor  # Inputs of whole movements: clearance by the belief, reach, shape (B, H, 2)
 
@@ -463,33 +487,47 @@ def sight_inputs(
     )
     clearance = plan_clearances(task, problem, actions, CLEAR, -CLEAR)
     plans_in = np.stack((np.clip(clearance / CLEAR, -1.0, 1.0), places.inside), axis=-1)
+    # Pixels are numbered through all looks that were made.
+    made = sight.made
+    image = (np.cumsum(made) - 1).reshape(made.shape)
+    look = np.maximum(pixel, 0) // sensor.n_rays
+    of_image = np.take_along_axis(image, look.reshape(number, -1), axis=1).reshape(look.shape)
     found = SightInputs(
-        _image(sensor, sight),
-        torch.from_numpy(np.maximum(pixel, 0).astype(np.int64)),
+        _image(sensor, sight)[torch.from_numpy(made.ravel())],
+        torch.from_numpy(of_image * sensor.n_rays + np.maximum(pixel, 0) % sensor.n_rays),
         torch.from_numpy(np.stack(inputs, axis=-1).astype(np.float32)),
         torch.from_numpy(plans_in.astype(np.float32)),
     )
-    return found, worth_of(task, problem, moves).astype(np.float32)
+    return found, _worth(task, problem, actions, moves).astype(np.float32)
+
+
+def _worth(task: Task, problem: Problem, actions: Numbers, moves: Moves) -> Numbers:
+    """Return the rewards of plans that succeed, shape (B, H); an action of zero, which keeps the plan, gains KEEP."""
+    worth = worth_of(task, problem, moves)
+    if problem.remaining is not None:
+        worth = worth + KEEP * (actions == 0.0).all(axis=-1)
+    return worth
 
 
 def _nearest_around(sensor: Sensor, sight: Sight) -> Single:
-    """Return the least range around each pixel, shape (B, R), [m]."""
+    """Return the least range around each pixel of each look, shape (B, R), [m]."""
     image = sight.ranges.reshape(-1, sensor.rows, sensor.columns)
     size = 1, min(NEIGHBOURS, sensor.rows), NEIGHBOURS
     return np.asarray(minimum_filter(image, size, mode="nearest").reshape(sight.ranges.shape))
 
 
 def _image(sensor: Sensor, sight: Sight) -> Tensor:
-    """Return the readings as an image, see :class:`SightInputs`."""
-    shape = len(sight.ranges), sensor.rows, sensor.columns
+    """Return the readings as images, one for each look, see :class:`SightInputs`."""
+    shape = -1, sensor.rows, sensor.columns
+    ranges = (sight.ranges / sensor.range).reshape(shape)
     row, column = np.meshgrid(
         np.linspace(-1.0, 1.0, sensor.rows), np.linspace(-1.0, 1.0, sensor.columns), indexing="ij"
     )
     channels = (
-        sight.ranges.reshape(shape) / sensor.range,
+        ranges,
         sight.hit.reshape(shape),
-        np.broadcast_to(row, shape),
-        np.broadcast_to(column, shape),
+        np.broadcast_to(row, ranges.shape),
+        np.broadcast_to(column, ranges.shape),
     )
     return torch.from_numpy(np.stack(channels, axis=1).astype(np.float32))
 
@@ -509,7 +547,7 @@ class SightNetwork(nn.Module):
 
     def __init__(self, sensor: Sensor, *, width: int) -> None:
         super().__init__()
-        self.columns = sensor.columns
+        self.rays, self.columns = sensor.n_rays, sensor.columns
         self.stride = 1 if sensor.rows == 1 else 2
         size = (1, 5) if sensor.rows == 1 else (3, 3)
         margin = size[0] // 2, size[1] // 2
@@ -534,13 +572,12 @@ class SightNetwork(nn.Module):
         for layer in self.layers:
             image = image + functional.relu(layer(image))
         image = self.of_pixel(image)
-        columns = image.shape[-1]
-        features = image.flatten(2).transpose(1, 2)  # (B, pixels, features)
-        row = inputs.pixel // self.columns
-        column = inputs.pixel % self.columns
-        pixel = (row // self.stride) * columns + column // self.stride
-        first = torch.arange(len(pixel), device=pixel.device)[:, None, None] * features.shape[1]
-        there = functional.embedding(first + pixel, features.flatten(0, 1))
+        rows, columns = image.shape[-2:]
+        features = image.flatten(2).transpose(1, 2).flatten(0, 1)  # (all pixels, features)
+        ray = inputs.pixel % self.rays
+        row = ray // self.columns // self.stride
+        column = ray % self.columns // self.stride
+        there = functional.embedding((inputs.pixel // self.rays * rows + row) * columns + column, features)
         hidden = self.each(there + self.of_place(inputs.places))
         pooled = torch.cat((hidden.amax(dim=2), hidden.mean(dim=2), inputs.plans), dim=-1)
         logits: Tensor = self.last(pooled)[..., 0]

@@ -10,16 +10,18 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from viapoint.envs.arms.kinematics import sphere_centres
-from viapoint.envs.common.arrays import Bool, Float
+from viapoint.envs.common.arrays import Bool, Float, Single
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles, pack, quaternions_of
 from viapoint.envs.geometry.shapes import Box, PointCloud, Shape
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 
 ROUNDING = 1e-4  # Distance from the greatest range within which nothing was met, [m]
@@ -37,12 +39,11 @@ CURVED = 0.12  # Depth of a front relative to its width from which on it is beli
 
 
 class Sight(NamedTuple):
-    """Readings of a sensor in B scenes, as an observation tells them."""
+    """Readings of L looks of a sensor in B scenes, as an observation tells them, the newest first."""
 
-    origin: Float  # Present places of the sensor, shape (B, 3), [m]
-    rotation: Float  # Present axes of the sensor as columns, shape (B, 3, 3)
-    # Ranges of R rays, or of all rays of the looks that are remembered, shape (B, R), [m]
-    ranges: Float
+    origin: Float  # Places of the sensor, shape (B, L, 3), [m]
+    rotation: Float  # Axes of the sensor as columns, shape (B, L, 3, 3)
+    ranges: Float  # Ranges of the R rays of all looks, shape (B, R), [m]
     points: Float  # Ends of the rays, shape (B, R, 3), [m]
     eyes: Float  # Places from which they were seen, shape (B, R, 3), [m]
     hit: Bool  # True for rays that met something, shape (B, R)
@@ -55,6 +56,37 @@ class Sight(NamedTuple):
         return self._replace(
             **{name: part[rows] for name, part in self._asdict().items() if name != "free_radius"}
         )
+
+    @property
+    def made(self) -> Bool:
+        """True for looks that were made, shape (B, L): their rays have a length."""
+        number, looks = self.origin.shape[:2]
+        return np.asarray((self.points != self.eyes).reshape(number, looks, -1).any(axis=-1))
+
+    def towards(self, sensor: Sensor, places: Any) -> tuple[NDArray[np.int32], Single]:
+        """Return the rays in whose direction places lie, -1 if out of view, and their distances from the sensor, [m].
+
+        Of several looks it is the one that saw farthest beyond the place. Places have the shape (B, n, 3), and what is
+        returned the shape (B, n).
+        """
+        found = np.full(places.shape[:2], -1, np.int32)
+        distance = np.zeros(found.shape, np.float32)
+        farthest = np.full(found.shape, -np.inf, np.float32)
+        made = self.made
+        for look in np.flatnonzero(made.any(axis=0)):
+            away = places - self.origin[:, None, look].astype(np.float32)
+            local = away @ self.rotation[:, look].astype(np.float32)
+            length = np.sqrt((local**2).sum(axis=-1))
+            ray = sensor.ray_towards(local)
+            first = look * sensor.n_rays
+            seen = np.take_along_axis(self.ranges, first + np.maximum(ray, 0), axis=1)
+            in_view = (ray >= 0) & made[:, look, None]
+            beyond = np.where(in_view, seen - length, -np.inf).astype(np.float32)
+            better = beyond > farthest
+            found = np.where(better, first + ray, found)
+            distance = np.where(better | (look == 0), length, distance)
+            farthest = np.where(better, beyond, farthest)
+        return found, distance
 
     @classmethod
     def of(cls, observation: Mapping[str, Any], task: Task) -> Sight:
@@ -89,8 +121,13 @@ def _sight(
     """
     sensor, spheres = task.sensor, task.arm.spheres
     assert sensor is not None
-    rotation, origin = sensor.pose(task.arm, joints)
-    eyes = np.repeat(origin[:, None] if eyes is None else eyes, sensor.n_rays, axis=1)
+    rotation, origin = (part[:, None] for part in sensor.pose(task.arm, joints))
+    if eyes is not None:
+        origin = eyes
+        rays = points.reshape(*eyes.shape[:2], -1, 3) - eyes[:, :, None]
+        rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-9)
+        rotation = np.concatenate((rotation, _axes(rays[:, 1:], sensor.directions)), axis=1)
+    eyes = np.repeat(origin, sensor.n_rays, axis=1)
     hit = ranges < sensor.range - ROUNDING
     if task.space_name == "hand":
         free = np.stack(ends, axis=1)
@@ -100,6 +137,16 @@ def _sight(
         free = np.concatenate(centres, axis=1)
         radius = np.tile(spheres.radius, 2)
     return Sight(origin, rotation, ranges, points, eyes, hit, free, radius)
+
+
+def _axes(rays: Float, directions: Float) -> Float:
+    """Return the axes of sensors as columns, shape (..., 3, 3), of which rays have the directions in their frames.
+
+    It is the rotation of the least squared error (W. Kabsch, 1976), also for the rays of a fan, which lie in a plane.
+    """
+    left, _, right = np.linalg.svd(np.einsum("...ri,rj->...ij", rays, directions))
+    left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    return np.asarray(left @ right)
 
 
 def thick_points(task: Task, sight: Sight, depth: float | None = None) -> Obstacles:
@@ -127,7 +174,7 @@ def thick_points(task: Task, sight: Sight, depth: float | None = None) -> Obstac
 def fitted_boxes(task: Task, sight: Sight) -> Obstacles:
     """Return one box for each connected group of points, as deep as it is wide."""
     scenes = []
-    for origin, points, hit in zip(sight.origin, sight.points, sight.hit, strict=True):
+    for origin, points, hit in zip(sight.origin[:, 0], sight.points, sight.hit, strict=True):
         seen = points[hit]
         shapes: list[Shape] = []
         if len(seen):

@@ -88,12 +88,8 @@ def places_of(task: Task, problem: Problem, moves: Moves, sight: Sight, instants
     centre = np.zeros((*shape, 3), np.float32)
     inside = np.ones((number, plans), np.bool_)
     _centres(setting, moves, instants, some, centre, inside)
-    sensor = task.sensor
-    assert sensor is not None
-    away = centre.reshape(number, -1, 3) - sight.origin[:, None].astype(np.float32)
-    local = away @ sight.rotation.astype(np.float32)
-    distance = np.sqrt((local**2).sum(axis=-1))
-    ray = sensor.ray_towards(local)
+    assert task.sensor is not None
+    ray, distance = sight.towards(task.sensor, centre.reshape(number, -1, 3))
     radius = setting.spheres.radius[some].astype(np.float32)
     return Places(ray.reshape(shape), distance.reshape(shape), centre, radius, inside)
 
@@ -127,7 +123,7 @@ def _centres(setting: Setting, moves: Moves, instants: Int, some: Int, centre: S
 def seen(task: Task, sight: Sight, truth: Obstacles) -> Obstacles:
     """Return those of the true obstacles that at least one ray meets."""
     sensor = _one_look(task, "seen")
-    hidden = sensor.hidden(sight.rotation, sight.origin, truth)
+    hidden = sensor.hidden(sight.rotation[:, 0], sight.origin[:, 0], truth)
     return truth._replace(kind=np.where(hidden, ABSENT, truth.kind))
 
 
