@@ -4,7 +4,7 @@ python benchmarks/results.py                                  # all tasks; hours
 python benchmarks/results.py --env viapoint/PandaObstacles-v0 # others keep their numbers
 python benchmarks/results.py --only agents                    # only shipped agents, searches and planners
 python benchmarks/results.py --only runs                      # only the trainings of benchmarks/sb3.py
-python benchmarks/results.py --only looking                   # only searches that look again on the way
+python benchmarks/results.py --only looking                   # only searches and agents that look again on the way
 python benchmarks/results.py --only reaches                   # only obstacles on reaches of their own
 """
 
@@ -92,13 +92,15 @@ class Config:
     n_scenes: int | None = None
     """Number of scenes of each set; default: all of them."""
     only: Literal["everything", "agents", "runs", "looking", "reaches"] = "everything"
-    """Part that is measured: shipped agents and their baselines, the trainings in `runs`, searches that look again, or
+    """Part that is measured: shipped agents and their baselines, the trainings in `runs`, looking again on the way, or
     obstacles on reaches of their own; other numbers stay."""
     runs: Path = Path("runs/sb3")
     """Folder of trainings, which get a row each: those of benchmarks/sb3.py, viaq with other seeds, viarank with other
     beliefs."""
     reaches: Path = Path("runs/reaches")
     """Folder of trainings among obstacles on reaches of their own, such as `PlanarMovingObstacles-0` for seed 0."""
+    looks: Path = Path("runs/looks")
+    """Folder of trainings that look again each 0.3 s, such as `PlanarSensed-0` for seed 0."""
 
 
 def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
@@ -119,9 +121,11 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
         yield from reaches_of(config, short, common)
     if config.only in ("everything", "looking") and task.sensor is not None and task.space.of_hand:
         for when, decide_at in LOOKING.items():
-            kwargs = {"sensor": "hand_rays", "decide_at": decide_at}
-            searches = ["thick:search512", "known:search512"]
-            for row in evaluate(**common, env_kwargs=kwargs, baselines=searches).rows:
+            settings = {**common, "env_kwargs": {"sensor": "hand_rays", "decide_at": decide_at}}
+            rows = evaluate(**settings, baselines=["thick:search512", "known:search512"]).rows
+            if "horizon" in decide_at or "clearance" in decide_at:
+                rows += seeds_of(config.looks, short, settings)
+            for row in rows:
                 yield _numbers(LOOKS, name, f"{row['method']}, {when}", row)
     if config.only not in ("everything", "runs"):
         return
@@ -141,15 +145,21 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
 def reaches_of(config: Config, short: str, common: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Yield the numbers of each method among obstacles on reaches of their own, in scenes that are drawn."""
     for interval in INTERVALS.get(short, ()):
-        kwargs = {"courses": "reaches", "horizon": interval}
-        rows = evaluate(**common, env_kwargs=kwargs, baselines=("straight", *PREDICTIONS)).rows
-        for folder in sorted(config.reaches.glob(f"{short}-*")):
-            seed = folder.name.rpartition("-")[2]
-            baselines = ["untrained"] if seed == "0" else []
-            for row in evaluate(load_agent(folder), **common, env_kwargs=kwargs, baselines=baselines).rows:
-                rows.append({**row, "method": row["method"].replace("agent", f"agent, seed {seed}")})
-        for row in rows:
+        settings = {**common, "env_kwargs": {"courses": "reaches", "horizon": interval}}
+        rows = evaluate(**settings, baselines=("straight", *PREDICTIONS)).rows
+        for row in rows + seeds_of(config.reaches, short, settings):
             yield _numbers(f"{short}, reaches", "test", f"{row['method']}, every {interval} s", row)
+
+
+def seeds_of(folder: Path, short: str, settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the numbers of the trainings of a task in a folder, such as `PlanarSensed-0` for seed 0."""
+    rows = []
+    for run in sorted(folder.glob(f"{short}-*")):
+        seed = run.name.rpartition("-")[2]
+        baselines = ["untrained"] if seed == "0" else []
+        for row in evaluate(load_agent(run), **settings, baselines=baselines).rows:
+            rows.append({**row, "method": row["method"].replace("agent", f"agent, seed {seed}")})
+    return rows
 
 
 def _numbers(env_id: str, name: str, method: str, row: dict[str, Any]) -> dict[str, Any]:
