@@ -58,17 +58,12 @@ class Scene(NamedTuple):
 
     def without(self, row: int) -> Scene:
         """Return the scene without an obstacle."""
-        left = (*self.obstacles[:row], *self.obstacles[row + 1 :])
-        return self._replace(
-            obstacles=left,
-            turns=_without(self.turns, row),
-            reaches=_without(self.reaches, row),
-        )
-
-
-def _without(rows: Any, row: int) -> Any:
-    """Return the rows of the other obstacles; obstacles that were added have none."""
-    return np.delete(rows, row, axis=0) if row < len(rows) else rows
+        left: dict[str, Any] = {"obstacles": (*self.obstacles[:row], *self.obstacles[row + 1 :])}
+        for name in ("turns", "reaches"):
+            rows = getattr(self, name)
+            if row < len(rows):  # obstacles that were added have none
+                left[name] = np.delete(rows, row, axis=0)
+        return self._replace(**left)
 
 
 class Proposal(NamedTuple):
