@@ -28,7 +28,7 @@ from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.checks import DEFAULT_ENV, SHIPPED_IDS
 from viapoint.training.configs import env_of_arm
 from viapoint.training.live.arena import MOST_OBSTACLES, Arena
-from viapoint.training.live.decide import decide, describe_outcome, describe_plan, execute, profile, propose
+from viapoint.training.live.decide import decide, describe_outcome, describe_plan, execute, propose
 from viapoint.training.live.drawing import PLANE, SPACE, ArmDrawing, View
 from viapoint.training.live.panels import RESET, Panels
 from viapoint.training.live.state import Scene, State
@@ -139,7 +139,7 @@ class Tab:
         if "scene" in changes:
             state.results = ()
         proposal = decide(self.arena, state)
-        state.proposals, state.picked, state.profile = (proposal,), 0, None
+        state.proposals, state.picked = (proposal,), 0
         self.state = state
         self._say(describe_plan(proposal, state.duration), proposal.motion.success)
         self.client.flush()
@@ -160,7 +160,6 @@ class Tab:
         if index < len(state.proposals):
             state.picked, state.movement, state.playing, state.before = index, None, False, None
             proposal = state.proposals[index]
-            state.profile = profile(self.arena, state.scene, proposal.motion.plan)
             wanted = None if index else state.duration  # the others have durations of their own
             self._say(describe_plan(proposal, wanted), proposal.motion.success)
 

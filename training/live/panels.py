@@ -14,6 +14,7 @@ from matplotlib.colors import to_hex
 from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.common.palette import PALETTE
 from viapoint.training.live.arena import AGENT, MOTION, OMPL, SIZES, Arena
+from viapoint.training.live.decide import profile
 from viapoint.training.live.state import Movement, State
 
 WIDTH = 330  # Width of a panel, [pixels]
@@ -63,9 +64,9 @@ class Panels:
             self._duration.value = float(np.clip(round(plan.duration, 2), low, high))
         self._draw_selection(state)
         self._draw_comparison(state)
-        if state.profile is not None and not state.playing:
+        if plan is not None and state.before is None and not state.playing:
             self._draw_proposals(state)
-            self._draw_plots(state.profile, state.movement)
+            self._draw_plots(profile(self._arena, state.scene, plan.plan), state.movement)
 
     def show_code(self, code: str) -> None:
         """Show Python code with a button that copies it."""

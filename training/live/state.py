@@ -101,8 +101,7 @@ class State:
     turning: bool = False  # True if rings are shown that turn the tool at the goal
     proposals: tuple[Proposal, ...] = ()  # Plans; the one of the method, or by hand, is first
     picked: int = 0  # Index of the proposal that is the plan
-    before: MotionPlan | None = None  # Plan before the last change; pale until a pause
-    profile: Mapping[str, Float] | None = None  # Curves of the plan; None until a pause
+    before: MotionPlan | None = None  # Plan before the last change, which is pale; None from a pause on
     movement: Movement | None = None  # Executed movement so far
     instant: int = 0  # Row of its rollout that is shown
     playing: bool = False  # True while the movement is played

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from viapoint import primitives
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.geometry.obstacles import unpack
-from viapoint.training.files import write_figure
 from viapoint.training.paper import double_step, movements, one_via, point_to_point
 from viapoint.training.paper.movements import TARGETS, Profile, curved, passage_share, simulate, straight
 from viapoint.training.paper.obstacles import ObstacleMovements, features
@@ -24,7 +22,6 @@ from viapoint.training.paper.one_via import ENDS
 from viapoint.training.paper.point_to_point import DIAGONALS, DURATION, diagonals
 
 WIDTH = 8.5  # Width of a column, [cm]
-STYLE = Path(__file__).with_name("paper.mplstyle")  # Matplotlib's style of all figures
 # Style of the model: a wide light line that stays visible beside the arm
 MODEL: dict[str, Any] = {"color": PALETTE.plan, "linewidth": 2.2, "solid_capstyle": "round"}
 # Style of the simulated arm
@@ -45,13 +42,6 @@ def sheet(
     for ax, title in zip(axes.flat, titles, strict=False):
         ax.set_title(title)
     return figure, axes
-
-
-def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write a figure as PNG and SVG."""
-    picture = write_figure(folder / f"{name}.png", figure)
-    figure.set_layout_engine("none")  # the same layout for both files, computed once
-    return [picture, write_figure(folder / f"{name}.svg", figure)]
 
 
 def plane(ax: Axes, *, names: tuple[str, ...] = tuple(TARGETS)) -> None:
@@ -113,7 +103,7 @@ def model() -> Figure:
     label("$d_2$", ((x + goal[0]) / 2, start[1] - 0.8), ha="center", va="top")
     label("$d_3$", (x + 1.0, y + 4.0), ha="left", va="center")
     axes[2, 0].plot(profile.time, profile.curvature, **MODEL)
-    axes[2, 0].axvline(profile.valley, color="0.6", linewidth=0.7, linestyle=":")
+    axes[2, 0].axvline(profile.valley[0], color="0.6", linewidth=0.7, linestyle=":")
     axes[2, 0].set(ylabel="$C$ [1/m]", ylim=(0, 1.15 * profile.bend[1]))
     for values, name, colour in zip(profile.velocity.T, ("$V_x$", "$V_y$"), (SECOND, THIRD), strict=True):
         axes[2, 1].plot(profile.time, values, color=colour, label=name, linewidth=1.6)
@@ -132,7 +122,7 @@ def straight_movements() -> Figure:
     movement = diagonals()
     motion = simulate(movement)
     planned = movement(time, 2)
-    reached = motion.derivative(motion.velocity())
+    reached = motion.derivative(motion.derivative(motion.hand))
     for row, ax in enumerate(axes.T):
         plane(ax[0])
         paths(ax[0], motion.planned[row], motion.hand[row])
@@ -234,7 +224,7 @@ def pair(first: Any, second: Any, texts: Any) -> Figure:
 def around_lights(avoidance: ObstacleMovements) -> Figure:
     """Draw Fig. 8: two movements around rows of lights, and the model through their points of greatest curvature."""
     figure, axes = _two_movements(3, 10.5, "AB")
-    depth = np.array([each.valley_depth for each in avoidance.profiles])
+    depth = np.array([each.valley[1] for each in avoidance.profiles])
     for ax, row in zip(axes.T, np.argsort(depth)[[0, len(depth) // 2]].tolist(), strict=True):
         profile, (start, *_, goal) = avoidance.profiles[row], avoidance.plan.waypoints[row]
         via = profile.place(profile.bend[0])
@@ -268,7 +258,7 @@ def valleys() -> Figure:
     region.set(xlabel="$d_1/(d_1+d_2)$", ylabel="$d_3/(d_1+d_2)$", ylim=(0.1, 0.55), xlim=(0, 1))
     for along, colour in ((0.3, PALETTE.plan), (0.4, THIRD), (0.5, PALETTE.executed)):
         family = movements.model_profiles(curved(*ENDS, along, -heights))
-        late.plot(heights, [100 * (p.bend[0] - p.valley) for p in family], color=colour, label=f"{along}")
+        late.plot(heights, [100 * (p.bend[0] - p.valley[0]) for p in family], color=colour, label=f"{along}")
     late.set(xlabel="$d_3/(d_1+d_2)$", ylabel="curvature peak\nminus valley [% of $t_f$]", xlim=(0.4, 1.0))
     late.legend(title="$d_1/(d_1+d_2)$")
     return figure

@@ -33,7 +33,7 @@ ADULT = Task.of().arm  # Arm of an adult
 PLANE = Task.of().space  # Plane of its hand
 
 
-def straight(first: str, last: str, duration: float = 0.8, *, order: int = 3) -> Trajectory:
+def straight(first: str, last: str, duration: float, *, order: int = 3) -> Trajectory:
     """Return the straight movement between two targets (Eq. 2); order 2, 3, 4 minimises acceleration, jerk, snap."""
     return point_to_point(TARGETS[first], TARGETS[last], duration, order=order)
 
@@ -143,13 +143,9 @@ class SimulatedMovements(NamedTuple):
         """Return the derivative of values, shape (N, T, ...), with respect to time by central differences."""
         return np.asarray(np.gradient(values, self.time, axis=1))
 
-    def velocity(self) -> Float:
-        """Return the velocity of the hand, shape (N, T, 2), [m/s]."""
-        return self.derivative(self.hand)
-
     def speed(self) -> Float:
         """Return the speed of the hand, shape (N, T), [m/s]."""
-        return np.asarray(np.linalg.norm(self.velocity(), axis=-1))
+        return np.asarray(np.linalg.norm(self.derivative(self.hand), axis=-1))
 
     def at(self, fractions: Float) -> Float:
         """Return the hand positions at F fractions of the durations, shape (N, F, 2), [m]."""
@@ -194,9 +190,9 @@ def track(duration: Float, position: Float, velocity: Float, acceleration: Float
     return SimulatedMovements(time, duration, position, PLANE.coordinates(joints), joints, torque)
 
 
-def joint_motion(movement: Trajectory, count: int = 401) -> Motion:
-    """Return angles, rates and accelerations of shoulder and elbow in a plan, shape (..., count, 2)."""
-    return PLANE.joint_motion(Motion(*movement.sample(count)))
+def joint_motion(movement: Trajectory) -> Motion:
+    """Return angles, rates and accelerations of shoulder and elbow in a plan, shape (..., 401, 2)."""
+    return PLANE.joint_motion(Motion(*movement.sample(401)))
 
 
 def required_torque(movement: Trajectory) -> Float:
@@ -245,16 +241,13 @@ class Profile(NamedTuple):
         return found[np.argsort(-height, kind="stable")]
 
     @property
-    def valley(self) -> float:
-        """Time of the least speed between two peaks, as a fraction of the duration; NaN without a valley."""
-        valleys = self.local_maxima(-self.speed)
-        return float(valleys[0, 0]) if len(valleys) else np.nan
-
-    @property
-    def valley_depth(self) -> float:
-        """Speed in the valley relative to the mean of the two highest peaks; 1 without a valley."""
+    def valley(self) -> tuple[float, float]:
+        """Time of the least speed between two peaks, and that speed / the mean of the highest peaks; else NaN and 1."""
         valleys, peaks = self.local_maxima(-self.speed), self.peaks
-        return float(-valleys[0, 1] / peaks[:2, 1].mean()) if len(valleys) and len(peaks) > 1 else 1.0
+        if not len(valleys):
+            return np.nan, 1.0
+        depth = -valleys[0, 1] / peaks[:2, 1].mean() if len(peaks) > 1 else 1.0
+        return float(valleys[0, 0]), float(depth)
 
     @property
     def peaks(self) -> Float:
@@ -281,9 +274,10 @@ def model_profiles(movement: Trajectory) -> list[Profile]:
 
 def arm_profiles(motion: SimulatedMovements) -> list[Profile]:
     """Return the profiles of movements of the simulated arm."""
-    states = (motion.hand, motion.velocity(), motion.derivative(motion.velocity()))
+    velocity = motion.derivative(motion.hand)
+    states = zip(motion.duration, motion.hand, velocity, motion.derivative(velocity), strict=True)
     profiles = []
-    for duration, *state in zip(motion.duration, *states, strict=True):
+    for duration, *state in states:
         within = motion.time <= duration + 1e-9
         profiles.append(Profile(motion.time[within] / duration, *(part[within] for part in state)))
     return profiles
