@@ -117,7 +117,8 @@ class Arena:
     def scenes(self) -> dict[str, Iterator[Scene]]:
         """Return endless scenes by the names of their buttons."""
         task, generator = self.task, np.random.default_rng(self._seed)
-        kinds = {"Random": (self.scene_of(self._sampler([generator])) for _ in itertools.count())}
+        kinds: dict[str, Iterator[Scene]] = {}
+        kinds["Random"] = (self.scene_of(self._sampler([generator])) for _ in itertools.count())
         for name in ("test", "hard"):
             frozen = shipped_set(name, task)
             if frozen is not None:
@@ -233,12 +234,12 @@ class Arena:
         if aside @ middle < 0.0:
             aside = -aside
         shape = self.new_shapes()[name]
-        sides, least, others = [aside, -aside], 0.02, scene.obstacles
-        if name == "wall":  # others may stand in it
-            shape, sides, least, others = ve.HalfSpace.facing(-aside), [aside], 0.17, ()
+        sides, least = [aside, -aside], 0.02
+        if name == "wall":
+            shape, sides, least = ve.HalfSpace.facing(-aside), [aside], 0.17
         for way, side in itertools.product(least + 0.02 * np.arange(20), sides):
             shape = dataclasses.replace(shape, position=middle + way * side)
-            alone = all(other.distance(shape.position, 0.03) > 0.0 for other in others)
+            alone = all(other.distance(shape.position, 0.03) > 0.0 for other in scene.obstacles)
             if alone and self.clearances(ends, [shape])[:, 0].min() > 0.0:
                 break
         return shape

@@ -31,8 +31,6 @@ APART = 0.03  # Distance by which the paths of two proposals differ somewhere, [
 N_CHECKS, REFINEMENTS = 512, 3  # Candidates of the geometry search, and rounds around the best
 NEXT_START = 0.02  # Least way to a goal that begins a new movement, in a coordinate
 
-Decide = Callable[[Observation], Float]  # Action, shape (1, m), for an observation
-
 
 def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Proposal:
     """Return the plan of the method, or by hand; where the scene is impossible, the motion planner says why."""
@@ -63,8 +61,8 @@ def _checked(arena: Arena, scene: Scene, plan: Plan, source: str = "given") -> M
     return checked_motion(arena.task.arm, arena.task.space_name, plan, pack([scene.obstacles]), source)
 
 
-def _chooser(arena: Arena, state: State) -> tuple[str, Task, Decide]:
-    """Return the environment in which a method decides, the task of its actions, and its function."""
+def _chooser(arena: Arena, state: State) -> tuple[str, Task, Callable[[Observation], Float]]:
+    """Return the environment in which a method decides, the task of its actions, and its function of observations."""
     if arena.agent_decides(state) and not arena.stepwise:
         return "own", arena.task, functools.partial(arena.act, checks=state.checks)
     task = dataclasses.replace(arena.env("any").task, n_via=arena.n_via(state))
@@ -170,7 +168,8 @@ def execute(arena: Arena, state: State) -> Iterator[Movement]:
     assert state.plan is not None
     scene, goal, reward = state.scene, state.scene.goal, 0.0
     if arena.stepwise and arena.agent_decides(state) and state.by_hand is None and state.picked == 0:
-        env, decide_ = arena.env("steps"), arena.act
+        env = arena.env("steps")
+        decide_: Callable[[Observation], Float] = arena.act
         decision = env.execute_actions(decide_(begin_episode(env, scene)))
     else:
         name, _, decide_ = _chooser(arena, state)

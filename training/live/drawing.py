@@ -185,18 +185,17 @@ class View:
 
     def _line(self, motion: MotionPlan, strength: float) -> tuple[Float, Any]:
         """Return the path of a plan, and its colour."""
-        return self._arena.path(motion.plan), _rgb(
-            PALETTE.plan if motion.success else PALETTE.contact, strength
-        )
+        colour = PALETTE.plan if motion.success else PALETTE.contact
+        return self._arena.path(motion.plan), _rgb(colour, strength)
 
     def _draw_rings(self, state: State, goal: Float) -> None:
         """Draw rings that turn the selected obstacle or the tool at the goal; obstacles in the plane stay upright."""
         self._rings.visible = state.turning and (state.selected is not None or not self._planar)
-        if self._rings.visible and state.selected is None:
-            self._rings.wxyz, self._rings.position = self._arena.orientation(state.scene.goal), goal
-        elif self._rings.visible:
+        if state.selected is not None:
             shape = state.scene.obstacles[state.selected]
             self._rings.wxyz, self._rings.position = shape.quaternion, shape.position
+        elif not self._planar:
+            self._rings.wxyz, self._rings.position = self._arena.orientation(state.scene.goal), goal
 
     def _draw_arm(self, name: str, joints: Float) -> None:
         for i, (turn, position) in enumerate(self._arm.poses(joints)):
@@ -237,9 +236,7 @@ class View:
     def _draw_paths(self, name: str, paths: list[tuple[Float, Any]], radius: float) -> None:
         """Draw paths, shape (n, 3), [m], with their colours."""
         for i, (path, colour) in enumerate(paths):
-            key = f"/{name}/{i}"
-            self._mesh(key, tube(path, radius), colour)
-            self._nodes[key].flat_shading, self._nodes[key].visible = True, True
+            self._mesh(f"/{name}/{i}", tube(path, radius), colour)
         self._hide(name, len(paths))
 
     def _draw_handles(self, name: str, places: Float | list[Float]) -> None:
@@ -268,18 +265,14 @@ class View:
         _, name, number = key.split("/")
         if key in self._nodes:
             node = self._nodes[key]
-            node.vertices, node.faces, node.color = mesh.vertices, np.uint32(mesh.faces), colour
+            node.vertices, node.faces = mesh.vertices, np.uint32(mesh.faces)
+            node.color, node.visible = colour, True
             return
         shadow = name in ("arm", "obstacle")
         node = self._nodes[key] = self._scene.add_mesh_simple(
-            key,
-            mesh.vertices,
-            mesh.faces,
-            color=colour,
-            opacity=opacity,
-            cast_shadow=shadow,
-            receive_shadow=shadow,
-        )
+            key, mesh.vertices, mesh.faces, color=colour, opacity=opacity, cast_shadow=shadow,
+            receive_shadow=shadow, flat_shading=name in ("done", "plan", "proposal"),
+        )  # fmt: skip
         if name == "proposal":
             node.on_click(lambda _: self._act("pick", int(number)))
         if name == "obstacle":

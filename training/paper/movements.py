@@ -162,8 +162,8 @@ def simulate(movement: Trajectory) -> SimulatedMovements:
     """Simulate planar movements of batch shape () or (N,), each from rest at its start."""
     duration = np.atleast_1d(movement.duration)
     time = instants(float(duration.max()))
-    references = [part.reshape(len(duration), len(time), 2) for part in movement.sample(time)]
-    return track(duration, *references)
+    parts = [part.reshape(len(duration), len(time), 2) for part in movement.sample(time)]
+    return track(time, duration, Motion(*parts))
 
 
 def instants(duration: float) -> Float:
@@ -171,23 +171,21 @@ def instants(duration: float) -> Float:
     return np.asarray(ADULT.timestep * np.arange(int(np.ceil((duration + SETTLING) / ADULT.timestep)) + 1))
 
 
-def track(duration: Float, position: Float, velocity: Float, acceleration: Float) -> SimulatedMovements:
+def track(time: Float, duration: Float, hand: Motion) -> SimulatedMovements:
     """Make the arm follow references, shape (N, T, 2) at every physics step, from rest at the first."""
-    number, count = position.shape[:2]
-    planned = PLANE.joint_motion(Motion(position, velocity, acceleration))
+    planned = PLANE.joint_motion(hand)
     start = planned.position[:, 0]
-    batch = Batch(ADULT.compile(n_obstacles=0), number, 1)
+    batch = Batch(ADULT.compile(n_obstacles=0), len(start), 1)
     batch.bind("qpos")[:] = start
     controls = ADULT.controls(*planned)[:, :-1]
-    ran = batch.rollout(count - 1, controls, record=("qpos", "qvel", "actuator_force"))
+    ran = batch.rollout(len(time) - 1, controls, record=("qpos", "qvel", "actuator_force"))
     joints = np.concatenate((start[:, None], ran["qpos"]), axis=1)
     # The integrator applies the servo's damping at the end of a step; the recorded force is that at its beginning.
     # A force at its limit does not depend on the rates.
     force = ran["actuator_force"]
     damped = force - ADULT.damping * np.diff(ran["qvel"], axis=1, prepend=0.0)
     torque = np.where(np.abs(force) < ADULT.torque_limit, damped, force)
-    time = np.asarray(ADULT.timestep * np.arange(count))
-    return SimulatedMovements(time, duration, position, PLANE.coordinates(joints), joints, torque)
+    return SimulatedMovements(time, duration, hand.position, PLANE.coordinates(joints), joints, torque)
 
 
 def joint_motion(movement: Trajectory) -> Motion:

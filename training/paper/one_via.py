@@ -221,10 +221,10 @@ def arm_shares(along: ArrayLike, height: ArrayLike) -> tuple[Float, float]:
 def isochrony_claims() -> list[Claim]:
     """Return the claims of row 7."""
     half, typical = (passage_share(curved(*ENDS, along, LENGTHS)) for along in (0.5, TYPICAL))
-    (arm_half, half_worst), (arm_typical, typical_worst) = (
-        arm_shares(along, -LENGTHS) for along in (0.5, TYPICAL)
-    )
-    shares, (arm, worst) = passage_share(curved(*ENDS, SHARES, HEIGHT)), arm_shares(SHARES, HEIGHT)
+    arm_half, half_worst = arm_shares(0.5, -LENGTHS)
+    arm_typical, typical_worst = arm_shares(TYPICAL, -LENGTHS)
+    shares = passage_share(curved(*ENDS, SHARES, HEIGHT))
+    arm, worst = arm_shares(SHARES, HEIGHT)
     spread = np.ptp(passage_share(curved(*ENDS, 0.2, [0.1, 0.6])))
     text = "d3/(d1+d2) from .3 to .55"
     return [

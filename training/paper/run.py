@@ -96,7 +96,7 @@ def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], dict[Path, st
         claims += result_of(compute)
     pictures = {}
     for name, (caption, draw) in progress_bar(iterable=DRAWINGS.items(), desc="figures"):
-        with matplotlib.style.context(STYLE):
+        with matplotlib.style.context(str(STYLE)):
             figure = result_of(draw)
             pictures[write_figure(out / f"{name}.png", figure)] = caption
             figure.set_layout_engine("none")  # the same layout for both files, computed once
