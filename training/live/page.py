@@ -74,8 +74,7 @@ class Tab:
         with self._wake:
             self._closed = True
             self._wake.notify()
-        if timeout:
-            self._thread.join(timeout)
+        self._thread.join(timeout)
 
     # The thread
 

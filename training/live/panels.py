@@ -19,6 +19,7 @@ from viapoint.training.live.state import Movement, State
 
 WIDTH = 330  # Width of a panel, [pixels]
 RESET = "Reset"  # Name of the button that undoes all changes of a scene
+CHECKS = {"none": 0, "16": 16, "64": 64}  # Proposals that are checked with computed geometry
 NOTE = '<div style="padding:0.2em 0.9em;font-size:0.8em;color:#6b7078">{}</div>'
 MESSAGE = '<div id="viapoint-message" style="padding:0.2em 0.9em;font-size:0.9em;color:{}">{}</div>'
 CODE = (
@@ -205,8 +206,8 @@ class Panels:
         _on_slide(self._vias, lambda value: act("change", n_via=value, by_hand=None))
         if hasattr(arena.policy, "checks"):
             hint = "Proposals whose clearance is computed"
-            checks = gui.add_dropdown("Exact checks", ("0", "16", "64"), hint=hint)
-            checks.on_update(lambda event: act("change", checks=int(event.target.value)))
+            checks = gui.add_dropdown("Exact checks", tuple(CHECKS), hint=hint)
+            checks.on_update(lambda event: act("change", checks=CHECKS[event.target.value]))
         gui.add_button("Decide anew").on_click(lambda _: act("change", **anew))
 
     def _button(self, label: str, name: str, **kwargs: Any) -> Any:

@@ -106,12 +106,9 @@ def rows_of_lights(
             continue
         along = line / distance
         middle = 0.5 * (start + goal) + (shift[0] * along + shift[1] * left_of(along))
-        turn = 0.5 * (np.arctan2(line[1], line[0]) + 0.5 * np.pi)
-        lights = Box(
-            size=(0.5 * length, radius, half_height),
-            position=(*middle, 0.0),
-            quaternion=(np.cos(turn), 0.0, 0.0, np.sin(turn)),
-        )
+        half = 0.5 * (np.arctan2(line[1], line[0]) + 0.5 * np.pi)
+        turn = (np.cos(half), 0.0, 0.0, np.sin(half))
+        lights = Box((0.5 * length, radius, half_height), position=(*middle, 0.0), quaternion=turn)
         found.append((first, last, lights))
     return found
 
@@ -241,16 +238,11 @@ class Profile(NamedTuple):
     @property
     def valley(self) -> tuple[float, float]:
         """Time of the least speed between two peaks, and that speed / the mean of the highest peaks; else NaN and 1."""
-        valleys, peaks = self.local_maxima(-self.speed), self.peaks
+        valleys, peaks = self.local_maxima(-self.speed), self.local_maxima(self.speed)
         if not len(valleys):
             return np.nan, 1.0
         depth = -valleys[0, 1] / peaks[:2, 1].mean() if len(peaks) > 1 else 1.0
         return float(valleys[0, 0]), float(depth)
-
-    @property
-    def peaks(self) -> Float:
-        """Time and height of the local maxima of the speed, the highest first, shape (n, 2)."""
-        return self.local_maxima(self.speed)
 
     @property
     def bend(self) -> tuple[float, float]:

@@ -131,8 +131,9 @@ def features(along: ArrayLike, height: ArrayLike) -> tuple[pd.DataFrame, float]:
             valley, depth = profile.valley
             bend, curvature = profile.bend
             lead = np.nan
-            if len(profile.peaks) > 1:
-                early, late = sorted(profile.peaks[:2].tolist())
+            peaks = profile.local_maxima(profile.speed)
+            if len(peaks) > 1:
+                early, late = sorted(peaks[:2].tolist())
                 lead = late[1] / early[1] if a < 0.5 else early[1] / late[1]
             lines.append((who, a, h, bend - valley, depth, curvature, lead))
     columns = ["who", "along", "height", "late", "depth", "curvature", "lead"]
