@@ -57,10 +57,9 @@ def light_movements(agent: Path | None) -> ObstacleMovements:
         ValueError: The agent's task is not of the hand in the plane, has no boxes, or needs several decisions for a
             movement; or no movement gets around a row.
     """
-    method: Method
     if agent is None:
         simulation = SceneSimulation(DEFAULT_ENV, 256)
-        method = GeometrySearch(simulation.task)
+        method: Method = GeometrySearch(simulation.task)
     else:
         found = load_agent(agent)
         simulation = SceneSimulation(found.env_id, 256, **found.env_kwargs)
