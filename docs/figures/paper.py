@@ -19,7 +19,7 @@ SHOWN = (
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder, one_thread():
-        for path, _ in reproduce(Path(folder), None)[1]:
+        for path in reproduce(Path(folder), None)[1]:
             if path.stem in SHOWN:
                 small = Image.open(path).convert("RGB").quantize(64, dither=Image.Dither.NONE)
                 small.save(FOLDER / f"paper_{path.name}", optimize=True)

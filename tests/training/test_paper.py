@@ -75,7 +75,7 @@ def test_a_claim_holds_where_every_number_is_as_promised(model, arm, holds):
 
 def test_a_failed_claim_ends_the_command_with_code_1(tmp_path, monkeypatch, capsys):
     claims = [Claim(1, "too much", model=(2.0, at_most(1.0)))]
-    monkeypatch.setattr(run, "reproduce", lambda *_: (claims, []))
+    monkeypatch.setattr(run, "reproduce", lambda *_: (claims, {}))
     with pytest.raises(SystemExit) as end:
         cli.main(["paper", "--out", str(tmp_path)])
     assert end.value.code == 1

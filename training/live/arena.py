@@ -6,7 +6,7 @@ import dataclasses
 import importlib.util
 import itertools
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -16,23 +16,30 @@ import viapoint.envs as ve
 from viapoint.envs.arms.kinematics import forward
 from viapoint.envs.common.arrays import Float, Observation
 from viapoint.envs.geometry.clearance import configuration_clearances
-from viapoint.envs.geometry.obstacles import KINDS, pack, quaternions_of
+from viapoint.envs.geometry.obstacles import pack, quaternions_of
+from viapoint.envs.geometry.shapes import KINDS, PLAIN_KINDS
 from viapoint.envs.scenes.options import scene_options
 from viapoint.training.agents.agent import Agent
 from viapoint.training.live.state import Scene, State
 from viapoint.training.paper.movements import TARGETS, rows_of_lights
 from viapoint.training.planning.baselines import AgentMethod
 from viapoint.training.planning.search import registered_task
+from viapoint.training.rollout import whole_task
 from viapoint.training.scene_sets import shipped_set
 
 MOTION, AGENT, SEARCH = "motion planner", "agent", "geometry search"
 STRAIGHT, OMPL, HAND = "straight movement", "OMPL", "by hand"  # Names of methods
 SAMPLES = 80  # Points of a path
 MOST_OBSTACLES = 24  # Greatest number of obstacles of a scene
-SIMULATED = ("sphere", "capsule", "cylinder", "box", "half_space")  # In every scene
-BOX_SIZES = ("half-depth", "half-width", "half-height")  # Names of the half lengths of a box
-# Bounds of the sliders of obstacles, [m]
-SIZES = {"radius": (0.01, 0.1), "half-length": (0.005, 0.3), **dict.fromkeys(BOX_SIZES, (0.005, 0.5))}
+# Sliders of obstacles by name: parameter, index of the number in it, and bounds, [m]
+SIZES: dict[str, tuple[str, Any, float, float]] = {
+    "radius": ("radius", (), 0.01, 0.1),
+    "half-length": ("half_length", (), 0.005, 0.3),
+    "half-depth": ("size", 0, 0.005, 0.5),
+    "half-width": ("size", 1, 0.005, 0.5),
+    "half-height": ("size", 2, 0.005, 0.5),
+}
+UPRIGHT = ("half-length", "half-height")  # Heights of obstacles in the plane, which have no sliders
 
 _agent_lock = threading.Lock()  # tabs share an agent
 
@@ -43,39 +50,32 @@ class Arena:
     def __init__(
         self, env_id: str, agent: Agent | None, seed: int | None, env_kwargs: Mapping[str, Any]
     ) -> None:
-        self.env_id = env_id
-        self.agent = agent
-        self._seed = seed
-        task = registered_task(env_id, **env_kwargs)
-        self.stepwise = task.stepwise  # True if the agent acts in every control step
-        any_shape = tuple(dict.fromkeys((*SIMULATED, *task.shapes)))
+        self.env_id, self.agent, self._seed = env_id, agent, seed
+        self.policy: Any = getattr(agent, "policy", None)
         own = dict(env_kwargs)
-        others = {**own, "shapes": any_shape, "n_obstacles": (0, MOST_OBSTACLES)}
-        self.arguments = {"own": own, "any": others}  # as a user writes them
-
-        # The page plans whole movements, or revises them.
-        changes: dict[str, Any] = {}
-        never: dict[str, Any] = {}
-        if self.stepwise:
-            task = task.of_movements()
-            changes = {"decide_at": task.decide_at, "reward_weights": task.weights}
-        if task.replanning:
-            never = {"decide_at": (), "horizon": 1e3}
+        task = registered_task(env_id, **own)
+        self.stepwise = task.stepwise  # True if the agent acts in every control step
+        any_shape = tuple(dict.fromkeys((*PLAIN_KINDS, *task.shapes)))
+        more = {"shapes": any_shape, "n_obstacles": (0, MOST_OBSTACLES)}
+        self.arguments = {"own": own, "any": {**own, **more}}  # as a user writes them
+        planned = whole_task(env_id, own)  # the page plans whole movements, or revises them
         self._arguments = {
             "steps": own,  # as the id says
-            "own": {**own, **changes},  # with obstacles as the agent knows them
-            "any": {**others, **changes},  # with obstacles of any number and shape
-            "whole": {**others, **changes, **never},  # the same, with a plan that is never revised
+            "own": planned,  # with obstacles as the agent knows them
+            "any": {**planned, **more},  # with obstacles of any number and shape
+            "whole": {**planned, **more},  # the same, with a plan that is never revised
         }
         self._envs: dict[str, ve.ReachVectorEnv] = {}
         self.task = self.env("own").task
-        self.planar = task.arm.space == "hand"  # True if the arm moves in a horizontal plane
+        if self.task.replanning:
+            self._arguments["whole"].update(decide_at=(), horizon=1e3)
+        self.planar = self.task.arm.space == "hand"  # True if the arm moves in a horizontal plane
         self._sampler = self.task.sampler()
         methods = [SEARCH, STRAIGHT]
         if agent is not None:
-            methods = [AGENT, *methods]
-        if not task.replanning:
-            methods = [MOTION, *methods]
+            methods.insert(0, AGENT)
+        if not self.task.replanning:
+            methods.insert(0, MOTION)
             methods += [OMPL] if importlib.util.find_spec("ompl") else []
         self.methods = tuple(methods)  # those that can be chosen; the first one is the default
 
@@ -98,9 +98,8 @@ class Arena:
 
     def propose(self, problem: Any) -> tuple[Float, Float]:
         """Return the candidates of the agent in one problem, shape (N, m), and its values of them, shape (N,)."""
-        agent: Any = self.agent
         with _agent_lock:
-            actions, values = agent.policy.propose(problem)
+            actions, values = self.policy.propose(problem)
         return actions[0], values[0]
 
     def agent_decides(self, state: State) -> bool:
@@ -110,16 +109,16 @@ class Arena:
 
     def n_via(self, state: State) -> int:
         """Return the number of via-points that the user wants, or that the method has by default."""
-        if state.n_via is not None:
-            return state.n_via
-        return 2 if state.method == MOTION else self.task.n_via
+        usual = 2 if state.method == MOTION else self.task.n_via
+        return usual if state.n_via is None else state.n_via
 
     # Scenes
 
     def scenes(self) -> dict[str, Iterator[Scene]]:
         """Return endless scenes by the names of their buttons."""
-        task = self.task
-        kinds = {"Random": self._random()}
+        task, generator = self.task, np.random.default_rng(self._seed)
+        kinds: dict[str, Iterator[Scene]] = {}
+        kinds["Random"] = (self.scene_of(self._sampler([generator])) for _ in itertools.count())
         for name in ("test", "hard"):
             frozen = shipped_set(name, task)
             if frozen is not None:
@@ -127,11 +126,6 @@ class Arena:
         if task.space.of_hand and task.n_obstacles[1] and not (task.whole_arm or task.replanning):
             kinds["Lights 1985"] = self._lights()
         return kinds
-
-    def _random(self) -> Iterator[Scene]:
-        generator = np.random.default_rng(self._seed)
-        while True:
-            yield self.scene_of(self._sampler([generator]))
 
     def _shipped(self, name: str, scenes: ve.Scenes) -> Iterator[Scene]:
         for row in itertools.cycle(range(len(scenes.start))):
@@ -189,28 +183,27 @@ class Arena:
         """Return the orientation of the tool for joint positions, a quaternion."""
         return quaternions_of(forward(self.task.arm.chain, coordinates)[1])
 
-    def clearances(self, coordinates: Float, obstacles: ve.Obstacles, times: Float | None = None) -> Float:
+    def clearances(self, coordinates: Float, obstacles: Iterable[ve.Shape], times: Any = 0.0) -> Float:
         """Return clearances from obstacles at T times [s] and of the arm from itself, shape (T, 2), [m]."""
         arm = self.task.arm
         joints = self.task.space.joints(coordinates)
-        rows = obstacles.take(np.zeros(len(joints), np.int64))
-        when = np.zeros(len(joints)) if times is None else times
+        rows = pack([obstacles]).take(np.zeros(len(joints), np.int64))
+        when = np.full(len(joints), times)
         return np.asarray(configuration_clearances(arm.chain, arm.spheres, joints, rows, when))
 
-    def moved(self, coordinates: Float, place: Float, scene: Scene | None, turn: Any = None) -> Float:
-        """Return coordinates with the tool at another place, in joint space the nearest ones that are free.
+    def moved(
+        self, coordinates: Float, place: Float, obstacles: Iterable[ve.Shape] = (), turn: Any = None
+    ) -> Float:
+        """Return coordinates with the tool at another place, in joint space the nearest that are free of obstacles.
 
-        `scene` has the obstacles that are avoided, if any; `turn` is a new orientation of the tool. A place out of
-        reach raises ValueError.
+        `turn` is a new orientation of the tool. A place out of reach raises ValueError.
         """
         if self.task.space.of_hand:
             return np.array(place[:2])
         if turn is None and len(coordinates) >= 6:  # with fewer joints, the tool cannot have any orientation
             turn = self.orientation(coordinates)
         found = ve.inverse_kinematics(self.task.arm, place, turn, seed=coordinates, n_seeds=8)
-        if scene is None:
-            return np.asarray(found[0])
-        free = self.clearances(found, pack([scene.obstacles])).min(axis=-1) > 0.0
+        free = self.clearances(found, obstacles).min(axis=-1) > 0.0
         return np.asarray(found[int(free.argmax())])
 
     # Obstacles
@@ -218,13 +211,15 @@ class Arena:
     def new_shapes(self) -> dict[str, ve.Shape]:
         """Return the obstacles that can be added, by name."""
         height = self._sampler.room.height
-        shapes: dict[str, ve.Shape]
+        shapes: dict[str, ve.Shape] = {
+            "sphere": ve.Sphere(0.06),
+            "capsule": ve.Capsule(0.035, 0.1),
+            "box": ve.Box((0.05, 0.05, 0.05)),
+            "cylinder": ve.Cylinder(0.04, 0.08),
+        }
         if self.planar:
             shapes = {"post": ve.Cylinder(0.025, height), "bar": ve.Box((0.09, 0.015, height))}
             shapes["box"] = ve.Box((0.03, 0.03, height))
-        else:
-            shapes = {"sphere": ve.Sphere(0.06), "capsule": ve.Capsule(0.035, 0.1)}
-            shapes |= {"box": ve.Box((0.05, 0.05, 0.05)), "cylinder": ve.Cylinder(0.04, 0.08)}
         return {**shapes, "wall": ve.HalfSpace()}
 
     def new_obstacle(self, scene: Scene, name: str) -> ve.Shape:
@@ -239,32 +234,28 @@ class Arena:
         if aside @ middle < 0.0:
             aside = -aside
         shape = self.new_shapes()[name]
-        sides = [aside, -aside]
-        least = 0.02
-        others = scene.obstacles
-        if name == "wall":  # others may stand in it
-            shape, sides, least, others = ve.HalfSpace.facing(-aside), [aside], 0.17, ()
+        sides, least = [aside, -aside], 0.02
+        if name == "wall":
+            shape, sides, least = ve.HalfSpace.facing(-aside), [aside], 0.17
         for way, side in itertools.product(least + 0.02 * np.arange(20), sides):
             shape = dataclasses.replace(shape, position=middle + way * side)
-            alone = all(other.distance(shape.position, 0.03) > 0.0 for other in others)
-            if alone and self.clearances(ends, pack([[shape]]))[:, 0].min() > 0.0:
+            alone = all(other.distance(shape.position, 0.03) > 0.0 for other in scene.obstacles)
+            if alone and self.clearances(ends, [shape])[:, 0].min() > 0.0:
                 break
         return shape
 
     def sizes_of(self, shape: ve.Shape) -> dict[str, float]:
-        """Return the sizes of an obstacle by the names of their sliders, [m]; in the plane without its height."""
-        if isinstance(shape, ve.Box):
-            sizes = dict(zip(BOX_SIZES, map(float, shape.size), strict=True))
-        else:
-            sizes = {name.replace("_", "-"): getattr(shape, name) for name in shape.sizes}
-        upright = ("half-length", "half-height") if self.planar else ()
-        return {name: value for name, value in sizes.items() if name in SIZES and name not in upright}
+        """Return the sizes of an obstacle by the names of their sliders, [m]."""
+        sizes = {}
+        for name, (parameter, index, *_) in SIZES.items():
+            if parameter in shape.sizes and not (self.planar and name in UPRIGHT):
+                sizes[name] = float(np.asarray(getattr(shape, parameter))[index])
+        return sizes
 
     def resized(self, shape: ve.Shape, name: str, value: float) -> ve.Shape:
         """Return an obstacle with another size, see :meth:`sizes_of`."""
-        if isinstance(shape, ve.Box):
-            size = np.array(shape.size)
-            size[BOX_SIZES.index(name)] = value
-            return dataclasses.replace(shape, size=size)
-        changed: dict[str, Any] = {name.replace("-", "_"): value}
+        parameter, index, *_ = SIZES[name]
+        sizes = np.array(getattr(shape, parameter))
+        sizes[index] = value
+        changed: dict[str, Any] = {parameter: sizes}
         return dataclasses.replace(shape, **changed)

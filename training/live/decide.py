@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from viapoint import primitives
-from viapoint.envs import Plan, ReachVectorEnv, Task
+from viapoint.envs import Plan, ReachVectorEnv, Scenes, Task
 from viapoint.envs.common.arrays import Float, Observation, norm
 from viapoint.envs.geometry.clearance import FAR
 from viapoint.envs.geometry.obstacles import pack
@@ -30,8 +30,6 @@ N_CANDIDATES = 256  # Best candidates among which distinct proposals are looked 
 APART = 0.03  # Distance by which the paths of two proposals differ somewhere, [m]
 N_CHECKS, REFINEMENTS = 512, 3  # Candidates of the geometry search, and rounds around the best
 NEXT_START = 0.02  # Least way to a goal that begins a new movement, in a coordinate
-
-Decide = Callable[[Observation], Float]  # Action, shape (1, m), for an observation
 
 
 def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Proposal:
@@ -59,12 +57,12 @@ def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Propos
     return Proposal(_checked(arena, scene, plan), maker, seconds)
 
 
-def _checked(arena: Arena, scene: Scene, plan: Plan) -> MotionPlan:
-    return checked_motion(arena.task.arm, arena.task.space_name, plan, pack([scene.obstacles]), "given")
+def _checked(arena: Arena, scene: Scene, plan: Plan, source: str = "given") -> MotionPlan:
+    return checked_motion(arena.task.arm, arena.task.space_name, plan, pack([scene.obstacles]), source)
 
 
-def _chooser(arena: Arena, state: State) -> tuple[str, Task, Decide]:
-    """Return the environment in which a method decides, the task of its actions, and its function."""
+def _chooser(arena: Arena, state: State) -> tuple[str, Task, Callable[[Observation], Float]]:
+    """Return the environment in which a method decides, the task of its actions, and its function of observations."""
     if arena.agent_decides(state) and not arena.stepwise:
         return "own", arena.task, functools.partial(arena.act, checks=state.checks)
     task = dataclasses.replace(arena.env("any").task, n_via=arena.n_via(state))
@@ -91,16 +89,11 @@ def _planned(arena: Arena, state: State, time_limit: float) -> Proposal:
             space=task.space_name, ompl=False,
         )  # fmt: skip
     seconds = time.perf_counter() - begin
-    if state.duration is not None:
-        motion = _retimed(motion, state.duration)
+    if state.duration is not None:  # or the shortest that the limits allow; as it is if that fails
+        plan = Plan(motion.waypoints, motion.durations * (state.duration / motion.duration))
+        retimed = _checked(arena, scene, plan, motion.source)
+        motion = retimed if retimed.success else motion
     return Proposal(motion, maker, seconds)
-
-
-def _retimed(motion: MotionPlan, duration: float) -> MotionPlan:
-    """Return a movement in another duration, [s], or the shortest that the limits allow; as it is if that fails."""
-    plan = Plan(motion.waypoints, motion.durations * (duration / motion.duration))
-    other = checked_motion(motion.arm, motion.space, plan, motion.obstacles, motion.source)
-    return other if other.success else motion
 
 
 def _by_hand(arena: Arena, state: State, vias: Float, duration: float) -> Proposal:
@@ -128,97 +121,83 @@ def propose(arena: Arena, state: State) -> tuple[Proposal, ...]:
         return (first,)
     scenes = env.scenes
     assert scenes is not None
-    for each in _distinct(arena, state, first):
+    for each in _distinct(arena, state, scenes):
         env.begin(scenes)
-        outcome = env.execute_plan(_in_batch(each.motion.plan))
+        outcome = env.execute_plan(each.motion.plan.take(np.newaxis))
         success = each.motion.success and outcome.info["is_success"][0]
         found.append(each._replace(reward=float(outcome.reward[0]) if success else None))
     return tuple(found)
 
 
-def _distinct(arena: Arena, state: State, first: Proposal) -> list[Proposal]:
-    """Return a plan and the best candidates whose paths differ from it and from one another."""
-    scene, (name, task, _) = state.scene, _chooser(arena, state)
-    env, by_agent = arena.env(name), name == "own"
-    observation = begin_episode(env, scene)
-    if by_agent and not hasattr(getattr(arena.agent, "policy", None), "propose"):  # it proposes one action
+def _distinct(arena: Arena, state: State, scenes: Scenes) -> list[Proposal]:
+    """Return the plan and the best candidates whose paths differ from it and from one another."""
+    scene, first, (name, task, _) = state.scene, state.proposals[0], _chooser(arena, state)
+    by_agent, maker = name == "own", SEARCH
+    if by_agent and not hasattr(arena.policy, "propose"):  # it proposes one action
         return [first]
     if by_agent:
+        maker = AGENT
+        observation = begin_episode(arena.env(name), scene)
         actions, values = arena.propose(Problem.of_observation(observation, task))
     else:
         actions = candidate_actions(task, N_CHECKS, replanning=False).astype(np.float64)
-        assert env.scenes is not None
         # Merits of several actions in one problem are bounds for all but the best.
-        each_alone = Problem.of_scenes(env.scenes, task).take(np.zeros(len(actions), np.int64))
+        each_alone = Problem.of_scenes(scenes, task).take(np.zeros(len(actions), np.int64))
         values = merits(task, each_alone, actions[:, None])[:, 0]
     order = np.argsort(-values, kind="stable")[:N_CANDIDATES]
-    values = values[order]
-    ends = (np.repeat(end[None], len(order), axis=0) for end in (scene.start, scene.goal))
+    ends = (np.tile(end, (len(order), 1)) for end in (scene.start, scene.goal))
     plans = task.action.decode(np.asarray(actions[order], dtype=np.float64), *ends)
     chosen, paths = first.motion.plan, arena.path(plans, 9)
     apart = norm(paths - arena.path(chosen, 9)).max(axis=-1)
     same = np.flatnonzero((apart < 1e-6) & np.isclose(plans.duration, chosen.duration))
-    maker = SEARCH
-    if by_agent:
-        maker = AGENT
-        first = first._replace(value=float(values[same[0]]) if same.size else None)
-    found = [first]
+    known: list[float | None] = [float(value) if by_agent else None for value in values[order]]
+    found = [first._replace(value=known[same[0]] if same.size else None)]
     while len(found) < N_PROPOSALS and (apart > APART).any():
         i = int((apart > APART).argmax())
-        value = float(values[i]) if by_agent else None
-        found.append(Proposal(_checked(arena, scene, plans.take(i)), maker, value=value))
+        found.append(Proposal(_checked(arena, scene, plans.take(i)), maker, value=known[i]))
         apart = np.minimum(apart, norm(paths - paths[i]).max(axis=-1))
     return found
 
 
-def execute(arena: Arena, state: State, goal_of: Callable[[], Float] | None = None) -> Iterator[Movement]:
-    """Execute the plan, decision by decision where it is revised; `goal_of` returns the goal, shape (D,)."""
-    assert state.plan is not None
-    by_method = state.by_hand is None and state.picked == 0
-    if arena.stepwise and arena.agent_decides(state) and by_method:
-        return play(arena.env("steps"), state.scene, arena.act)
-    name, _, decide_ = _chooser(arena, state)
-    return play(arena.env(name), state.scene, decide_, state.plan.plan, goal_of)
+def execute(arena: Arena, state: State) -> Iterator[Movement]:
+    """Execute the plan, decision by decision where it is revised, and yield the movement so far after each.
 
-
-def play(
-    env: ReachVectorEnv,
-    scene: Scene,
-    decide: Decide,
-    plan: Plan | None = None,
-    goal_of: Callable[[], Float] | None = None,
-) -> Iterator[Movement]:
-    """Play an episode in a batch of one, and yield the movement so far after each decision.
-
-    `plan` replaces the first decision; `goal_of` returns the present goal, shape (D,). When the arm has reached a goal
-    that has been dragged away meanwhile, a new episode begins there.
+    A goal that is dragged meanwhile is followed. When the arm has reached a goal that has been dragged away, a new
+    episode begins there.
     """
-    observation = begin_episode(env, scene)
-    decision = env.execute_actions(decide(observation)) if plan is None else env.execute_plan(_in_batch(plan))
-    goal, reward = scene.goal, 0.0
+    assert state.plan is not None
+    scene, goal, reward = state.scene, state.scene.goal, 0.0
+    if arena.stepwise and arena.agent_decides(state) and state.by_hand is None and state.picked == 0:
+        env = arena.env("steps")
+        decide_: Callable[[Observation], Float] = arena.act
+        decision = env.execute_actions(decide_(begin_episode(env, scene)))
+    else:
+        name, _, decide_ = _chooser(arena, state)
+        env = arena.env(name)
+        begin_episode(env, scene)
+        decision = env.execute_plan(state.plan.plan.take(np.newaxis))
     while True:
         rollout, scenes, plans = env.last_rollout[0], env.scenes, env.last_plan
         assert scenes is not None
         reward += float(decision.reward[0])
-        yield Movement(rollout, scenes, None if plans is None else plans.take(0), decision.info, reward)
-        before, goal = goal, goal if goal_of is None else goal_of()
-        moved = not np.array_equal(goal, before)
-        observation = decision.observation
+        info = {name: value[0] for name, value in decision.info.items()}
+        yield Movement(rollout, scenes, None if plans is None else plans.take(0), info, reward)
+        moved = not np.array_equal(state.scene.goal, goal)
+        observation, goal = decision.observation, state.scene.goal
         if decision.terminated[0] or decision.truncated[0]:
             here = env.task.space.coordinates(rollout.joints[-1])
-            if not moved or not decision.info["is_success"][0] or np.abs(here - goal).max() < NEXT_START:
+            if not moved or not info["is_success"] or np.abs(here - goal).max() < NEXT_START:
                 return
             places = scenes.obstacles_at(rollout.time[-1:]).centre[0]
-            rest = np.zeros(3)
             resting = [
-                dataclasses.replace(shape, position=place, velocity=rest)
+                dataclasses.replace(shape, position=place, velocity=np.zeros(3))
                 for shape, place in zip(scene.obstacles, places, strict=False)
             ]
             scene = Scene(here, goal, tuple(resting))
             observation = begin_episode(env, scene)
         elif moved:
             observation = env.move_goals(goal[None])
-        decision = env.execute_actions(decide(observation))
+        decision = env.execute_actions(decide_(observation))
 
 
 def begin_episode(env: ReachVectorEnv, scene: Scene) -> Observation:
@@ -226,11 +205,6 @@ def begin_episode(env: ReachVectorEnv, scene: Scene) -> Observation:
     jumps = {"jumps": ()} if env.task.n_jumps[1] else {}
     observation, _ = env.reset(options={**jumps, **scene.options()})
     return observation
-
-
-def _in_batch(plan: Plan) -> Plan:
-    """Return a plan as a batch of one."""
-    return Plan(plan.waypoints[None], plan.durations[None])
 
 
 def profile(arena: Arena, scene: Scene, plan: Plan) -> dict[str, Float]:
@@ -242,7 +216,7 @@ def profile(arena: Arena, scene: Scene, plan: Plan) -> dict[str, Float]:
         "time": times,
         "speed": norm(np.gradient(arena.tool(coordinates), times, axis=0)),
         "jerk": norm(np.asarray(trajectory(times, 3))),
-        "clearance": arena.clearances(coordinates, pack([scene.obstacles]), times)[:, 0],
+        "clearance": arena.clearances(coordinates, scene.obstacles, times)[:, 0],
     }
 
 
@@ -253,9 +227,9 @@ def describe_plan(proposal: Proposal, duration: float | None = None) -> str:
         return f"No free movement was found: {motion.reason}. The best one is shown in red."
     if not motion.success:
         return f"This plan fails: {motion.reason}."
-    clear = (
-        "no obstacle near" if motion.clearance >= 0.999 * FAR else f"{1e3 * motion.clearance:.0f} mm clear"
-    )
+    clear = f"{1e3 * motion.clearance:.0f} mm clear"
+    if motion.clearance >= 0.999 * FAR:
+        clear = "no obstacle near"
     jerk = f"{motion.jerk:.1f} times the jerk of the straight line"
     short = duration is not None and motion.duration > duration + 0.005
     limits = ", the shortest time that the limits of the arm allow" if short else ""
@@ -263,14 +237,13 @@ def describe_plan(proposal: Proposal, duration: float | None = None) -> str:
 
 
 def describe_outcome(info: Mapping[str, Any], in_joints: bool) -> str:
-    """Return one sentence on an executed movement of a batch of one."""
-    values = {name: np.asarray(value).reshape(-1)[0] for name, value in info.items()}
-    if values["collision"]:
-        return f"Failure: the arm touches something after {values['first_contact_time']:.2f} s."
-    if not values["reachable"]:
+    """Return one sentence on an executed movement."""
+    if info["collision"]:
+        return f"Failure: the arm touches something after {info['first_contact_time']:.2f} s."
+    if not info["reachable"]:
         return "Failure: the plan leaves the arm's reach."
-    clearance = 1e3 * values["min_clearance"]
-    error = 1e3 * values["goal_error"]
+    clearance = 1e3 * info["min_clearance"]
+    error = 1e3 * info["goal_error"]
     near = "" if clearance >= 999.0 * FAR else f", least clearance {clearance:.0f} mm"
-    state = "Success: at rest" if values["is_success"] else "Failure:"
-    return f"{state} {error:.1f} {'mrad' if in_joints else 'mm'} from the goal after {values['duration']:.2f} s{near}."
+    state = "Success: at rest" if info["is_success"] else "Failure:"
+    return f"{state} {error:.1f} {'mrad' if in_joints else 'mm'} from the goal after {info['duration']:.2f} s{near}."

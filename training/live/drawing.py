@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,20 +28,15 @@ PLAN, PROPOSAL, DONE = 0.0050, 0.0028, 0.0032  # Radii of plan, proposals, execu
 ROD = trimesh.creation.cylinder(1.0, 2.0, sections=8)  # Piece of a tube before it is scaled
 ABOVE = np.array([0.0, 0.0, 0.004])  # Shift of the executed path, so that the plan stays visible, [m]
 RADII = {"start": 0.018, "goal": 0.018, "via": 0.013}  # Radii of the handles, [m]
-# First views: position of the camera, point that it looks at, [m], direction up, and field of view, [degrees]
-PLANE = (-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), 33.0
-SPACE = (2.6, -2.0, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), 38.0
+# First views: position of the camera, point that it looks at, [m], direction up, and field of view, [rad]
+PLANE = (-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), math.radians(33.0)
+SPACE = (2.6, -2.0, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), math.radians(38.0)
 OPACITY, GHOST = 0.45, 0.16  # Of what hides others, and of the arm at the goal
 POINT = 0.005  # Size of the points that a sensor sees, [m]
 LARGE = 0.16  # Greatest size of obstacles in space that are not large, [m]
 LOW, TALL = 0.030, 0.060  # Height of obstacles in the plane, [m]: below links, and as tall as links
+PALE = 0.45  # Strength of pale colours
 FARTHEST = 1.2  # Greatest coordinate to which something can be dragged, [m]
-
-
-def set_first_view(camera: viser.InitialCameraConfig, planar: bool) -> None:
-    """Set the view that a page begins with, and to which the library's button resets it."""
-    camera.position, camera.look_at, camera.up, angle = PLANE if planar else SPACE
-    camera.fov = float(np.radians(angle))
 
 
 def tube(points: Float, radius: float) -> Any:
@@ -73,37 +70,27 @@ def obstacle_mesh(shape: Shape, levels: tuple[float, float] | None = None) -> An
 
 
 class ArmDrawing:
-    """Meshes of an arm, and their poses.
-
-    They are those of a MuJoCo model, or of the visible geoms of the file that the arm was loaded from. A file that
-    cannot be read raises ValueError.
-    """
+    """Meshes of an arm, those of its MuJoCo model or the visible geoms of another file, and their poses."""
 
     def __init__(self, arm: Arm, model: mujoco.MjModel, model_file: str | Path | None = None) -> None:
-        self._offset = np.zeros(3)
-        if model_file is not None:
-            own = _first_anchor(model, arm)
-            try:
-                model = read_model(model_file)
-            except (OSError, ValueError) as error:
-                raise ValueError(f"{model_file} cannot be drawn: {' '.join(str(error).split())}") from None
-            self._offset = own - _first_anchor(model, arm)
-        self._model, self._data = model, mujoco.MjData(model)
-        if model_file is not None and model.nkey:
-            mujoco.mj_resetDataKeyframe(model, self._data, 0)
-        self._joints = np.array([model.joint(name).qposadr[0] for name in arm.joint_names])
+        drawn = model if model_file is None else read_model(model_file)
+        self._offset = _first_anchor(model, arm) - _first_anchor(drawn, arm)
+        self._model, self._data = drawn, mujoco.MjData(drawn)
+        if drawn.nkey:
+            mujoco.mj_resetDataKeyframe(drawn, self._data, 0)
+        self._joints = np.array([drawn.joint(name).qposadr[0] for name in arm.joint_names])
         ground = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-        visible = ~np.isin(model.geom_type, ground) & (model.body_mocapid[model.geom_bodyid] < 0)
-        visible &= model.geom_rgba[:, 3] > 0.0
-        drawn_only = visible & (model.geom_group < 3)  # MuJoCo's viewers hide others, which only collide
+        visible = ~np.isin(drawn.geom_type, ground) & (drawn.body_mocapid[drawn.geom_bodyid] < 0)
+        visible &= drawn.geom_rgba[:, 3] > 0.0
+        plain = visible & (drawn.geom_group < 3)  # MuJoCo's viewers hide others, which only collide
         groups: dict[tuple[int, Any], list[int]] = {}
-        for geom in np.flatnonzero(drawn_only if model_file is not None and drawn_only.any() else visible):
-            material = model.geom_matid[geom]
-            colour = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
-            textured = get_geom_texture_id(model, int(geom)) >= 0
-            key = int(model.geom_bodyid[geom]), None if textured else tuple(colour[:3])
-            groups.setdefault(key, []).append(int(geom))
-        self.parts = [(*key, merge_geoms(model, geoms)) for key, geoms in groups.items()]
+        for geom in np.flatnonzero(plain if plain.any() else visible).tolist():
+            material = drawn.geom_matid[geom]
+            colour = drawn.geom_rgba[geom] if material < 0 else drawn.mat_rgba[material]
+            textured = get_geom_texture_id(drawn, geom) >= 0
+            key = int(drawn.geom_bodyid[geom]), None if textured else tuple(colour[:3])
+            groups.setdefault(key, []).append(geom)
+        self.parts = [(*key, merge_geoms(drawn, geoms)) for key, geoms in groups.items()]
         """Body, colour (None for textures) and mesh of the parts that move alike."""
 
     def poses(self, joints: Float) -> list[tuple[Float, Float]]:
@@ -150,9 +137,9 @@ class View:
             if colour is None and not self._planar:
                 self._nodes[f"/arm/{i}"] = self._scene.add_mesh_trimesh(f"/arm/{i}", mesh)
             else:
-                self._mesh(f"/arm/{i}", mesh, colour or PALETTE.arm, OPACITY if self._planar else None)
+                self._mesh(f"/arm/{i}", mesh, _rgb(colour or PALETTE.arm), OPACITY if self._planar else None)
             if not self._planar:
-                self._mesh(f"/ghost/{i}", mesh, colour or PALETTE.arm, GHOST)
+                self._mesh(f"/ghost/{i}", mesh, _rgb(colour or PALETTE.arm), GHOST)
         axes = (True, True, not self._planar)
         self._rings = self._scene.add_transform_controls(
             "/turn", 0.2, disable_axes=True, disable_sliders=True, visible=False, active_axes=axes
@@ -161,7 +148,7 @@ class View:
 
     def draw(self, state: State) -> None:
         """Draw the scene, the plans and the movement."""
-        arena, scene, movement, plan = self._arena, state.scene, state.movement, state.plan
+        arena, scene, movement = self._arena, state.scene, state.movement
         joints = arena.task.space.joints(scene.start)
         places = [shape.position for shape in scene.obstacles]
         done = []
@@ -171,7 +158,7 @@ class View:
             places = movement.scenes.obstacles_at(rollout.time[now : now + 1]).centre[0]
             rows = np.linspace(0, now, SAMPLES).astype(int)
             colour = PALETTE.contact if rollout.contact[: now + 1].any() else PALETTE.executed
-            done = [(rollout.hand[rows] + ABOVE, colour)]
+            done = [(rollout.hand[rows] + ABOVE, _rgb(colour))]
         self._draw_paths("done", done, DONE)
         self._draw_arm("arm", joints)
         if not self._planar:
@@ -182,33 +169,33 @@ class View:
         self._draw_handles("start", [start])
         self._draw_handles("goal", [goal])
         self._draw_rings(state, goal)
-        if plan is None:
+        if state.plan is None:
             return
-        planned = [self._line(plan)]
-        vias = arena.tool(plan.waypoints[1:-1])
+        vias = arena.tool(state.plan.waypoints[1:-1])
+        planned = [self._line(state.plan, 1.0)]
         if movement is not None and movement.plan is not None and arena.task.replanning:
-            planned = [(arena.path(movement.plan), PALETTE.plan)]
             vias = vias[:0]
-        others = [] if state.before is None else [self._line(state.before, pale=True)]
+            planned = [(arena.path(movement.plan), _rgb(PALETTE.plan))]
+        others = [] if state.before is None else [state.before]
         if len(state.proposals) > 1:
-            others = [self._line(each.motion, pale=True) for each in state.proposals]
+            others = [each.motion for each in state.proposals]
         self._draw_handles("via", vias)
         self._draw_paths("plan", planned, PLAN)
-        self._draw_paths("proposal", others, PROPOSAL)
+        self._draw_paths("proposal", [self._line(motion, PALE) for motion in others], PROPOSAL)
 
-    def _line(self, motion: MotionPlan, *, pale: bool = False) -> tuple[Float, Colour]:
+    def _line(self, motion: MotionPlan, strength: float) -> tuple[Float, Any]:
         """Return the path of a plan, and its colour."""
         colour = PALETTE.plan if motion.success else PALETTE.contact
-        return self._arena.path(motion.plan), _lighter(colour) if pale else colour
+        return self._arena.path(motion.plan), _rgb(colour, strength)
 
     def _draw_rings(self, state: State, goal: Float) -> None:
         """Draw rings that turn the selected obstacle or the tool at the goal; obstacles in the plane stay upright."""
-        shape = None if state.selected is None else state.scene.obstacles[state.selected]
-        self._rings.visible = state.turning and (shape is not None or not self._planar)
-        if self._rings.visible:
-            turn = self._arena.orientation(state.scene.goal) if shape is None else shape.quaternion
-            self._rings.wxyz = turn
-            self._rings.position = goal if shape is None else shape.position
+        self._rings.visible = state.turning and (state.selected is not None or not self._planar)
+        if state.selected is not None:
+            shape = state.scene.obstacles[state.selected]
+            self._rings.wxyz, self._rings.position = shape.quaternion, shape.position
+        elif not self._planar:
+            self._rings.wxyz, self._rings.position = self._arena.orientation(state.scene.goal), goal
 
     def _draw_arm(self, name: str, joints: Float) -> None:
         for i, (turn, position) in enumerate(self._arm.poses(joints)):
@@ -221,12 +208,12 @@ class View:
             form = (shape.kind, *shape.packed_size, *shape.quaternion, id(shape.mesh))
             if self._forms.get(name) != form:  # most stay as they are
                 self._forms[name] = form
-                self._mesh(name, obstacle_mesh(shape, self._levels), PALETTE.obstacle)
+                self._mesh(name, obstacle_mesh(shape, self._levels), _rgb(PALETTE.obstacle))
             node = self._nodes[name]
             node.flat_shading = not isinstance(shape, Sphere | Capsule)
             large = isinstance(shape, HalfSpace) or float(shape.packed_size.max()) > LARGE
             node.opacity = OPACITY if large and not self._planar else None
-            node.color = _rgb(PALETTE.obstacle if i != selected else _lighter(PALETTE.obstacle))
+            node.color = _rgb(PALETTE.obstacle, PALE if i == selected else 1.0)
             node.position, node.visible = place, True
         self._hide("obstacle", len(shapes))
 
@@ -246,12 +233,10 @@ class View:
             )
         self._nodes["/seen"].points = points
 
-    def _draw_paths(self, name: str, paths: list[tuple[Float, Colour]], radius: float) -> None:
+    def _draw_paths(self, name: str, paths: list[tuple[Float, Any]], radius: float) -> None:
         """Draw paths, shape (n, 3), [m], with their colours."""
         for i, (path, colour) in enumerate(paths):
-            key = f"/{name}/{i}"
-            self._mesh(key, tube(path, radius), colour)
-            self._nodes[key].flat_shading, self._nodes[key].visible = True, True
+            self._mesh(f"/{name}/{i}", tube(path, radius), colour)
         self._hide(name, len(paths))
 
     def _draw_handles(self, name: str, places: Float | list[Float]) -> None:
@@ -261,9 +246,9 @@ class View:
             key = f"/{name}/{i}"
             drop = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, self._floor - place[2]]]])
             if key not in self._nodes:
-                self._mesh(key, trimesh.creation.icosphere(3, RADII[name]), colour)
+                self._mesh(key, trimesh.creation.icosphere(3, RADII[name]), _rgb(colour))
                 self._nodes[f"{key}/drop"] = self._scene.add_line_segments(
-                    f"{key}/drop", drop, _rgb(_lighter(colour)), thickness=0.003
+                    f"{key}/drop", drop, _rgb(colour, PALE), thickness=0.003
                 )
             self._nodes[f"{key}/drop"].points = drop
             self._nodes[key].position, self._nodes[key].visible = place, True
@@ -280,34 +265,28 @@ class View:
         _, name, number = key.split("/")
         if key in self._nodes:
             node = self._nodes[key]
-            node.vertices, node.faces, node.color = mesh.vertices, np.uint32(mesh.faces), _rgb(colour)
+            node.vertices, node.faces = mesh.vertices, np.uint32(mesh.faces)
+            node.color, node.visible = colour, True
             return
         shadow = name in ("arm", "obstacle")
         node = self._nodes[key] = self._scene.add_mesh_simple(
-            key, mesh.vertices, mesh.faces, color=_rgb(colour), opacity=opacity,
-            cast_shadow=shadow, receive_shadow=shadow,
+            key, mesh.vertices, mesh.faces, color=colour, opacity=opacity, cast_shadow=shadow,
+            receive_shadow=shadow, flat_shading=name in ("done", "plan", "proposal"),
         )  # fmt: skip
         if name == "proposal":
             node.on_click(lambda _: self._act("pick", int(number)))
         if name == "obstacle":
             node.on_click(lambda _: self._act("show", "selected", int(number)))
         if name == "obstacle" or name in RADII:
-            self._make_draggable(node, name, int(number))
+            dragged = functools.partial(self._dragged, name, int(number))
+            node.on_drag("left")(dragged)
+            if not self._planar:
+                node.on_drag("left", modifier="shift")(dragged)
 
-    def _make_draggable(self, node: Any, kind: str, number: int) -> None:
-        """Make a node draggable: horizontally, or vertically in space while Shift is held."""
-
-        async def dragged(event: Any) -> None:  # asynchronous functions are called in order
-            place = self._dragged_to(event)
-            if place is not None:
-                self._act("drag", kind, number, place)
-
-        node.on_drag("left")(dragged)
-        if not self._planar:
-            node.on_drag("left", modifier="shift")(dragged)
-
-    def _dragged_to(self, event: Any) -> Float | None:
-        """Return the new place of a node: where the pointer's ray meets the plane in which it moves, if it does."""
+    async def _dragged(
+        self, kind: str, number: int, event: Any
+    ) -> None:  # such functions are called in order
+        """Drag a node horizontally, or up and down with Shift, to where the pointer's ray meets its plane."""
         eye = np.asarray(event.client.camera.position)
         place = np.asarray(event.target.position)
         if event.phase == "start":
@@ -318,18 +297,13 @@ class View:
         slope = float(normal @ ray)
         share = float(normal @ (place + self._grab - eye)) / slope if abs(slope) > 1e-6 else 0.0
         if share <= 0.0:
-            return None
+            return
         point = eye + share * ray - self._grab
         if upright:
             point = np.array([*place[:2], max(point[2], self._floor)])
-        return np.asarray(np.clip(point, -FARTHEST, FARTHEST))
+        self._act("drag", kind, number, np.clip(point, -FARTHEST, FARTHEST))
 
 
-def _rgb(colour: Any) -> tuple[int, int, int]:
-    red, green, blue = (round(255 * float(each)) for each in colour)
-    return red, green, blue
-
-
-def _lighter(colour: Colour) -> Colour:
-    red, green, blue = (0.45 * each + 0.55 for each in colour)
-    return red, green, blue
+def _rgb(colour: Colour, strength: float = 1.0) -> Any:
+    """Return a colour in [0, 255], paler for a strength below 1."""
+    return tuple(round(255.0 * (1.0 + strength * (each - 1.0))) for each in colour)

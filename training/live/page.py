@@ -8,7 +8,6 @@ import functools
 import io
 import logging
 import socket
-import sys
 import threading
 import time
 import traceback
@@ -25,13 +24,12 @@ from PIL import Image
 
 from viapoint.envs import Arm
 from viapoint.envs.common.arrays import Float
-from viapoint.envs.registration import check_registered
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.checks import DEFAULT_ENV, SHIPPED_IDS
 from viapoint.training.configs import env_of_arm
 from viapoint.training.live.arena import MOST_OBSTACLES, Arena
-from viapoint.training.live.decide import decide, describe_outcome, describe_plan, execute, profile, propose
-from viapoint.training.live.drawing import ArmDrawing, View, set_first_view
+from viapoint.training.live.decide import decide, describe_outcome, describe_plan, execute, propose
+from viapoint.training.live.drawing import PLANE, SPACE, ArmDrawing, View
 from viapoint.training.live.panels import RESET, Panels
 from viapoint.training.live.state import Scene, State
 
@@ -48,9 +46,9 @@ class Tab:
     def __init__(self, client: viser.ClientHandle, make: Callable[[], tuple[Arena, ArmDrawing]]) -> None:
         self.client, self._make = client, make
         self.latencies: deque[float] = deque(maxlen=200)  # from changes to messages with plans, [s]
-        self._jobs: dict[Any, tuple[float, Callable[[], None]]] = {}  # functions, and when they are due, [s]
-        self._due = time.perf_counter()  # when the present one was due
-        self._wake, self._busy, self._closed = threading.Condition(), True, False
+        self._jobs: dict[Any, tuple[float, Callable[[], None]]] = {}  # when they are due, [s], and functions
+        self._wake, self._busy, self._closed = threading.Condition(), False, False
+        self.act("change")
         self._thread = threading.Thread(target=self._run, name=f"viapoint-{client.client_id}", daemon=True)
         self._thread.start()
 
@@ -76,8 +74,7 @@ class Tab:
         with self._wake:
             self._closed = True
             self._wake.notify()
-        if timeout:
-            self._thread.join(timeout)
+        self._thread.join(timeout)
 
     # The thread
 
@@ -91,31 +88,26 @@ class Tab:
             self._view = View(self.client, self.arena, drawing, self.act)
             scene = next(self._scenes["Random"])
             self.state = State(scene=scene, drawn=scene, method=self.arena.methods[0])
-            self._guarded(self.change)
             while not self._closed:
-                self._guarded(self._next())
+                self._do_next()
         except Exception:
             if not self._closed:
-                traceback.print_exc(file=sys.stderr)
+                traceback.print_exc()
         finally:
             self.arena.close()
 
-    def _next(self) -> Callable[[], None]:
-        """Wait for the job that is due first, and return it; nothing is done in a tab that is closed."""
+    def _do_next(self) -> None:
+        """Wait for the job that is due first, and do it; an error is told in one sentence."""
         with self._wake:
-            self._busy = False
-            while not self._closed:
-                kind = min(self._jobs, key=lambda each: self._jobs[each][0], default=None)
-                patience = None if kind is None else self._jobs[kind][0] - time.perf_counter()
-                if patience is not None and patience <= 0.0:
-                    self._busy = True
-                    self._due, job = self._jobs.pop(kind)
-                    return job
-                self._wake.wait(patience)
-        return lambda: None
-
-    def _guarded(self, job: Callable[[], None]) -> None:
-        """Do a job; an error is told in one sentence."""
+            kind = min(self._jobs, key=lambda each: self._jobs[each][0], default=None)
+            patience = None if kind is None else self._jobs[kind][0] - time.perf_counter()
+            if patience is None or patience > 0.0:
+                self._busy = False
+                if not self._closed:
+                    self._wake.wait(patience)
+                return
+            self._busy = True
+            self._due, job = self._jobs.pop(kind)  # when it was due, [s]
         try:
             job()
         except Exception as error:
@@ -123,7 +115,7 @@ class Tab:
                 return
             sentence = " ".join(str(error).split())
             if not isinstance(error, ValueError | OSError):
-                traceback.print_exc(file=sys.stderr)
+                traceback.print_exc()
                 sentence = f"{type(error).__name__}: {sentence}"
             self.state.playing = False
             self._say(f"{sentence[:1].upper()}{sentence[1:].rstrip('.')}.", good=False)
@@ -146,9 +138,7 @@ class Tab:
         if "scene" in changes:
             state.results = ()
         proposal = decide(self.arena, state)
-        with self._wake:
-            self._jobs.pop(("propose",), None)  # those of the scene before
-        state.proposals, state.picked, state.profile = (proposal,), 0, None
+        state.proposals, state.picked = (proposal,), 0
         self.state = state
         self._say(describe_plan(proposal, state.duration), proposal.motion.success)
         self.client.flush()
@@ -169,7 +159,6 @@ class Tab:
         if index < len(state.proposals):
             state.picked, state.movement, state.playing, state.before = index, None, False, None
             proposal = state.proposals[index]
-            state.profile = profile(self.arena, state.scene, proposal.motion.plan)
             wanted = None if index else state.duration  # the others have durations of their own
             self._say(describe_plan(proposal, wanted), proposal.motion.success)
 
@@ -190,27 +179,29 @@ class Tab:
         """Move start, goal, an obstacle or a via-point to another place, shape (3,), [m]."""
         state, scene, arena = self.state, self.state.scene, self.arena
         if kind == "start":
-            self.change(scene=scene._replace(start=arena.moved(scene.start, place, scene)), by_hand=None)
+            start = arena.moved(scene.start, place, scene.obstacles)
+            self.change(scene=scene._replace(start=start), by_hand=None)
         elif kind == "goal" and state.playing and arena.task.replanning:  # the running movement follows it
-            goal = arena.moved(scene.goal, place, None)
+            goal = arena.moved(scene.goal, place)
             if not arena.task.space.inside(goal):
                 raise ValueError("the goal would be out of the arm's reach")
             state.scene = scene.with_goal(goal)
         elif kind == "goal":
-            self.change(scene=scene.with_goal(arena.moved(scene.goal, place, scene)), by_hand=None)
+            goal = arena.moved(scene.goal, place, scene.obstacles)
+            self.change(scene=scene.with_goal(goal), by_hand=None)
         elif kind == "obstacle" and number < len(scene.obstacles):
             shape = dataclasses.replace(scene.obstacles[number], position=place)
             self.change(scene=scene.with_obstacle(number, shape), selected=number)
         elif kind == "via" and state.plan is not None and number < len(state.plan.durations) - 1:
             vias = state.plan.waypoints[1:-1].copy()
-            vias[number] = arena.moved(vias[number], place, None)
+            vias[number] = arena.moved(vias[number], place)
             self.change(by_hand=vias)
 
     def turn(self, quaternion: Float) -> None:
         """Turn the selected obstacle, or the tool at the goal."""
         scene, arena, row = self.state.scene, self.arena, self.state.selected
         if row is None:
-            goal = arena.moved(scene.goal, arena.tool(scene.goal), scene, quaternion)
+            goal = arena.moved(scene.goal, arena.tool(scene.goal), scene.obstacles, quaternion)
             self.change(scene=scene.with_goal(goal), by_hand=None)
         else:
             shape = dataclasses.replace(scene.obstacles[row], quaternion=quaternion)
@@ -248,7 +239,7 @@ class Tab:
         state = self.state
         state.playing = not state.playing
         if state.playing:
-            self._movements = execute(self.arena, state, lambda: self.state.scene.goal)
+            self._movements = execute(self.arena, state)
             state.movement = None
             self.advance()
         else:
@@ -351,7 +342,6 @@ class LivePage:
         known = None if loaded is None else loaded.env_id
         found, argument = env_of_arm(str(arm) if isinstance(arm, Path) else arm, env or known)
         env = found or DEFAULT_ENV
-        check_registered(env)
         if known not in (None, env):
             raise ValueError(f"the agent decides in {known}, not in {env}")
         if loaded is None and env in SHIPPED_IDS and not env_kwargs and not argument:
@@ -369,7 +359,8 @@ class LivePage:
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         self._server = _serve(port)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        set_first_view(self._server.initial_camera, arena.planar)
+        camera = self._server.initial_camera  # also the view to which the library's button resets
+        camera.position, camera.look_at, camera.up, camera.fov = PLANE if arena.planar else SPACE
         scene = self._server.scene  # lights in which pale colours are not white
         scene.configure_environment_map(None)
         scene.configure_default_lights(enabled=False)
@@ -390,8 +381,7 @@ class LivePage:
 
     def wait(self) -> None:
         """Wait until the page is closed or Ctrl-C is pressed."""
-        while True:
-            time.sleep(3600.0)
+        self._server.sleep_forever()
 
     def close(self) -> None:
         """Close all tabs and the server."""

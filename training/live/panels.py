@@ -14,6 +14,7 @@ from matplotlib.colors import to_hex
 from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.common.palette import PALETTE
 from viapoint.training.live.arena import AGENT, MOTION, OMPL, SIZES, Arena
+from viapoint.training.live.decide import profile
 from viapoint.training.live.state import Movement, State
 
 WIDTH = 330  # Width of a panel, [pixels]
@@ -64,9 +65,9 @@ class Panels:
             self._duration.value = float(np.clip(round(plan.duration, 2), low, high))
         self._draw_selection(state)
         self._draw_comparison(state)
-        if state.profile is not None and not state.playing:
+        if plan is not None and state.before is None and not state.playing:
             self._draw_proposals(state)
-            self._draw_plots(state.profile, state.movement)
+            self._draw_plots(profile(self._arena, state.scene, plan.plan), state.movement)
 
     def show_code(self, code: str) -> None:
         """Show Python code with a button that copies it."""
@@ -99,21 +100,21 @@ class Panels:
         for name, plot in self._plots.items():
             beyond = 0.0 if name == "jerk" else None  # the arm rests after the plan
             planned = np.interp(time, profile["time"], profile[name], right=beyond)
-            other = np.full(len(time), np.nan)
-            other[0] = planned[0]  # a line without numbers would leave the plot empty
-            lines = [planned, executed.get(name, other)]
+            other = executed.get(
+                name, np.where(time > 0.0, np.nan, planned)
+            )  # one number: no line, but a plot
+            lines = np.array([planned, other])
             if name == "clearance":  # in millimetres, where it is small
-                lines = [np.minimum(1e3 * line, 250.0) for line in lines]
+                lines = np.minimum(1e3 * lines, 250.0)
             plot.data = (time, *lines)
 
     def _draw_comparison(self, state: State) -> None:
         rows = []
         for name, seconds, movement in state.results:
-            info = {key: value[0] for key, value in movement.info.items()}
+            info = movement.info
             success = "yes" if info["is_success"] else "no"
-            clearance = _millimetres(info["min_clearance"])
-            jerk = _number(info["jerk_ratio"])
-            rows.append((name, success, _number(movement.reward), clearance, jerk, f"{1e3 * seconds:.0f}"))
+            numbers = _millimetres(info["min_clearance"]), _number(info["jerk_ratio"]), f"{1e3 * seconds:.0f}"
+            rows.append((name, success, _number(movement.reward), *numbers))
         names = "method", "success", "reward", "clearance [mm]", "jerk", "decided in [ms]"
         note = "Each row is simulated. Jerk is relative to the straight movement."
         if 0 < len(rows) < len(self._arena.methods):
@@ -173,7 +174,7 @@ class Panels:
             self._build_decision()
         with gui.add_folder("Obstacles"):
             self._selected, self._sizes = gui.add_html(""), {}
-            for name, (least, most) in SIZES.items():
+            for name, (*_, least, most) in SIZES.items():
                 label = f"{name.capitalize()} [m]"
                 self._sizes[name] = gui.add_slider(label, least, most, 0.001, least, visible=False)
                 _on_slide(self._sizes[name], functools.partial(act, "resize", name))
@@ -203,7 +204,7 @@ class Panels:
         most = action.n_via if arena.task.replanning else max(3, action.n_via)
         self._vias = gui.add_slider("Via-points", 0, most, 1, action.n_via, disabled=most == action.n_via)
         _on_slide(self._vias, lambda value: act("change", n_via=value, by_hand=None))
-        if hasattr(getattr(arena.agent, "policy", None), "checks"):
+        if hasattr(arena.policy, "checks"):
             hint = "Proposals whose clearance is computed"
             checks = gui.add_dropdown("Exact checks", tuple(CHECKS), hint=hint)
             checks.on_update(lambda event: act("change", checks=CHECKS[event.target.value]))

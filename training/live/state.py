@@ -58,17 +58,12 @@ class Scene(NamedTuple):
 
     def without(self, row: int) -> Scene:
         """Return the scene without an obstacle."""
-        left = (*self.obstacles[:row], *self.obstacles[row + 1 :])
-        return self._replace(
-            obstacles=left,
-            turns=_without(self.turns, row),
-            reaches=_without(self.reaches, row),
-        )
-
-
-def _without(rows: Any, row: int) -> Any:
-    """Return the rows of the other obstacles; obstacles that were added have none."""
-    return np.delete(rows, row, axis=0) if row < len(rows) else rows
+        left: dict[str, Any] = {"obstacles": (*self.obstacles[:row], *self.obstacles[row + 1 :])}
+        for name in ("turns", "reaches"):
+            rows = getattr(self, name)
+            if row < len(rows):  # obstacles that were added have none
+                left[name] = np.delete(rows, row, axis=0)
+        return self._replace(**left)
 
 
 class Proposal(NamedTuple):
@@ -106,8 +101,7 @@ class State:
     turning: bool = False  # True if rings are shown that turn the tool at the goal
     proposals: tuple[Proposal, ...] = ()  # Plans; the one of the method, or by hand, is first
     picked: int = 0  # Index of the proposal that is the plan
-    before: MotionPlan | None = None  # Plan before the last change; pale until a pause
-    profile: Mapping[str, Float] | None = None  # Curves of the plan; None until a pause
+    before: MotionPlan | None = None  # Plan before the last change, which is pale; None from a pause on
     movement: Movement | None = None  # Executed movement so far
     instant: int = 0  # Row of its rollout that is shown
     playing: bool = False  # True while the movement is played

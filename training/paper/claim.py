@@ -3,43 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
-
-class Range(NamedTuple):
-    """Range of values that a number may have."""
-
-    low: float = -np.inf
-    high: float = np.inf
-
-    def contains(self, value: float) -> bool:
-        """Return whether a value is in the range; NaN never is."""
-        return bool(self.low <= value <= self.high)
-
-    def __str__(self) -> str:
-        if np.isfinite(self.low) and np.isfinite(self.high):
-            return f"{(self.low + self.high) / 2.0:.6g} ± {(self.high - self.low) / 2.0:.2g}"
-        return f"at most {self.high:.4g}" if np.isfinite(self.high) else f"at least {self.low:.4g}"
+Range: TypeAlias = tuple[float, float]  # Least and greatest value that a number may have
+Number: TypeAlias = tuple[Any, Range]  # Computed number and its expected range
 
 
 def near(value: float, tolerance: float) -> Range:
     """Return the range around a value."""
-    return Range(value - tolerance, value + tolerance)
+    return value - tolerance, value + tolerance
 
 
 def at_most(value: float) -> Range:
     """Return the range up to a value."""
-    return Range(high=value)
+    return -np.inf, value
 
 
 def at_least(value: float) -> Range:
     """Return the range from a value on."""
-    return Range(low=value)
-
-
-Number: TypeAlias = tuple[Any, Range]  # Computed number and its expected range
+    return value, np.inf
 
 
 @dataclass(frozen=True)
@@ -57,9 +41,9 @@ class Claim:
 
     @property
     def holds(self) -> bool:
-        """True if every number is in its expected range."""
+        """True if every number is in its expected range, which NaN never is."""
         numbers = [number for number in (self.model, self.arm) if number is not None]
-        return all(expected.contains(value) for value, expected in numbers)
+        return all(low <= value <= high for value, (low, high) in numbers)
 
     @property
     def verdict(self) -> str:
@@ -68,13 +52,13 @@ class Claim:
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values for JSON; open ends of a range are null."""
-        record: dict[str, Any] = {
-            name: getattr(self, name) for name in ("row", "claim", "figure", "paper", "unit")
-        }
+        names = ("row", "claim", "figure", "paper", "unit")
+        record: dict[str, Any] = {name: getattr(self, name) for name in names}
         for name, number in (("model", self.model), ("arm", self.arm)):
-            record[name] = number and float(number[0])
-            record[f"{name}_expected"] = number and [
-                float(end) if np.isfinite(end) else None for end in number[1]
-            ]
+            value = expected = None
+            if number is not None:
+                value = float(number[0])
+                expected = [float(end) if np.isfinite(end) else None for end in number[1]]
+            record[name], record[f"{name}_expected"] = value, expected
         record["deviation_mm"] = None if self.deviation is None else float(self.deviation)
         return {**record, "verdict": self.verdict}

@@ -23,6 +23,7 @@ from numpy.polynomial.polynomial import polyder, polyval
 from scipy.interpolate import BPoly
 
 from viapoint.envs.common.arrays import Float
+from viapoint.envs.plans import Motion
 from viapoint.primitives import Trajectory, minimum_jerk_coefficients, point_to_point, retarget
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, instants, straight, track
@@ -66,11 +67,6 @@ class DoubleStep(NamedTuple):
             total += (high - low) / 4.0 * float(weights @ (jerk**2).sum(axis=-1))
         return total
 
-    @property
-    def ratio(self) -> float:
-        """Jerk cost of the sum relative to that of the plan."""
-        return self.cost("superposed") / self.cost("planned")
-
 
 def double_step(
     moment: float, *, goal: Any = None, duration: float = STEP_DURATION, remaining: float = STEP_DURATION
@@ -90,8 +86,8 @@ def simulate_double(movement: DoubleStep) -> SimulatedMovements:
     """Simulate the sum and the plan, in this order, on the arm."""
     time = instants(movement.arrival)
     both = (movement.superposed, movement.planned)
-    references = (np.stack([way(time, nu) for way in both]) for nu in (0, 1, 2))
-    return track(np.full(2, movement.arrival), *references)
+    parts = [np.stack([way(time, nu) for way in both]) for nu in (0, 1, 2)]
+    return track(time, np.full(2, movement.arrival), Motion(*parts))
 
 
 def peak_speed(movement: DoubleStep, way: str) -> float:
@@ -139,7 +135,8 @@ def double_step_claims() -> list[Claim]:
 def _claims_at(movement: DoubleStep) -> list[Claim]:
     """Return the claims of one moment of revision; the second movement takes as long as the first."""
     when = f"Revised at {1e3 * movement.moment:.0f} ms"
-    expected = 1.0 + excess_cost(movement) / movement.cost("planned")
+    planned = movement.cost("planned")
+    expected = 1.0 + excess_cost(movement) / planned
     distance = 1e3 * greatest_distance(movement)
     to_T2 = 1e3 * greatest_distance(double_step(movement.moment, goal=TARGETS["T2"]))
     found = peak_speed(movement, "superposed") / peak_speed(movement, "planned")
@@ -147,7 +144,7 @@ def _claims_at(movement: DoubleStep) -> list[Claim]:
     arm = motion.speed().max(axis=1)
     return [
         Claim(13, f"{when}: jerk cost of the sum / of the plan, from there on",
-              model=(movement.ratio, near(expected, 1e-9))),
+              model=(movement.cost("superposed") / planned, near(expected, 1e-9))),
         Claim(13, f"{when}: peak speed of the sum / of the plan", model=(found, at_least(1.0 - 1e-12)),
               arm=(arm[0] / arm[1], near(found, 0.01)), deviation=motion.worst),
         Claim(13, f"{when}: greatest distance between sum and plan, the same for a jump to T2",

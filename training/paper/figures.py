@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from viapoint import primitives
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.geometry.obstacles import unpack
-from viapoint.training.files import write_figure
 from viapoint.training.paper import double_step, movements, one_via, point_to_point
 from viapoint.training.paper.movements import TARGETS, Profile, curved, passage_share, simulate, straight
 from viapoint.training.paper.obstacles import ObstacleMovements, features
@@ -24,7 +22,6 @@ from viapoint.training.paper.one_via import ENDS
 from viapoint.training.paper.point_to_point import DIAGONALS, DURATION, diagonals
 
 WIDTH = 8.5  # Width of a column, [cm]
-STYLE = Path(__file__).with_name("paper.mplstyle")  # Matplotlib's style of all figures
 # Style of the model: a wide light line that stays visible beside the arm
 MODEL: dict[str, Any] = {"color": PALETTE.plan, "linewidth": 2.2, "solid_capstyle": "round"}
 # Style of the simulated arm
@@ -45,13 +42,6 @@ def sheet(
     for ax, title in zip(axes.flat, titles, strict=False):
         ax.set_title(title)
     return figure, axes
-
-
-def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write a figure as PNG and SVG."""
-    picture = write_figure(folder / f"{name}.png", figure)
-    figure.set_layout_engine("none")  # the same layout for both files, computed once
-    return [picture, write_figure(folder / f"{name}.svg", figure)]
 
 
 def plane(ax: Axes, *, names: tuple[str, ...] = tuple(TARGETS)) -> None:
@@ -113,7 +103,7 @@ def model() -> Figure:
     label("$d_2$", ((x + goal[0]) / 2, start[1] - 0.8), ha="center", va="top")
     label("$d_3$", (x + 1.0, y + 4.0), ha="left", va="center")
     axes[2, 0].plot(profile.time, profile.curvature, **MODEL)
-    axes[2, 0].axvline(profile.valley, color="0.6", linewidth=0.7, linestyle=":")
+    axes[2, 0].axvline(profile.valley[0], color="0.6", linewidth=0.7, linestyle=":")
     axes[2, 0].set(ylabel="$C$ [1/m]", ylim=(0, 1.15 * profile.bend[1]))
     for values, name, colour in zip(profile.velocity.T, ("$V_x$", "$V_y$"), (SECOND, THIRD), strict=True):
         axes[2, 1].plot(profile.time, values, color=colour, label=name, linewidth=1.6)
@@ -132,7 +122,7 @@ def straight_movements() -> Figure:
     movement = diagonals()
     motion = simulate(movement)
     planned = movement(time, 2)
-    reached = motion.derivative(motion.velocity())
+    reached = motion.derivative(motion.derivative(motion.hand))
     for row, ax in enumerate(axes.T):
         plane(ax[0])
         paths(ax[0], motion.planned[row], motion.hand[row])
@@ -145,9 +135,8 @@ def straight_movements() -> Figure:
             each.set(xlim=(0, 0.9), ylim=(-4.2, 4.2))
             zero(each)
         ax[3].set_xlabel("$t$ [s]")
-    for ax, text in zip(
-        axes[1:, 0], ("speed [m/s]", r"$\ddot{y}$ [m/s²]", r"$\ddot{x}$ [m/s²]"), strict=True
-    ):
+    texts = ("speed [m/s]", r"$\ddot{y}$ [m/s²]", r"$\ddot{x}$ [m/s²]")
+    for ax, text in zip(axes[1:, 0], texts, strict=True):
         ax.set_ylabel(text)
     axes[1, 1].legend(loc="upper right")
     return figure
@@ -185,9 +174,8 @@ def joints() -> Figure:
 def _two_movements(rows: int, height: float, titles: Sequence[str]) -> tuple[Figure, Any]:
     """Return a sheet for the paths of two movements and for `profiles`, with one scale in each row of these."""
     figure, axes = sheet(rows, 2, height, titles)
-    for row, text in zip(
-        axes[1:], ("speed [m/s]", "curvature [1/m]", "$V_x$ [m/s]", "$V_y$ [m/s]"), strict=False
-    ):
+    texts = ("speed [m/s]", "curvature [1/m]", "$V_x$ [m/s]", "$V_y$ [m/s]")
+    for row, text in zip(axes[1:], texts, strict=False):
         row[1].sharey(row[0])
         row[0].set_ylabel(text)
     return figure, axes
@@ -234,7 +222,7 @@ def pair(first: Any, second: Any, texts: Any) -> Figure:
 def around_lights(avoidance: ObstacleMovements) -> Figure:
     """Draw Fig. 8: two movements around rows of lights, and the model through their points of greatest curvature."""
     figure, axes = _two_movements(3, 10.5, "AB")
-    depth = np.array([each.valley_depth for each in avoidance.profiles])
+    depth = np.array([each.valley[1] for each in avoidance.profiles])
     for ax, row in zip(axes.T, np.argsort(depth)[[0, len(depth) // 2]].tolist(), strict=True):
         profile, (start, *_, goal) = avoidance.profiles[row], avoidance.plan.waypoints[row]
         via = profile.place(profile.bend[0])
@@ -268,7 +256,7 @@ def valleys() -> Figure:
     region.set(xlabel="$d_1/(d_1+d_2)$", ylabel="$d_3/(d_1+d_2)$", ylim=(0.1, 0.55), xlim=(0, 1))
     for along, colour in ((0.3, PALETTE.plan), (0.4, THIRD), (0.5, PALETTE.executed)):
         family = movements.model_profiles(curved(*ENDS, along, -heights))
-        late.plot(heights, [100 * (p.bend[0] - p.valley) for p in family], color=colour, label=f"{along}")
+        late.plot(heights, [100 * (p.bend[0] - p.valley[0]) for p in family], color=colour, label=f"{along}")
     late.set(xlabel="$d_3/(d_1+d_2)$", ylabel="curvature peak\nminus valley [% of $t_f$]", xlim=(0.4, 1.0))
     late.legend(title="$d_1/(d_1+d_2)$")
     return figure
@@ -301,15 +289,13 @@ def isochrony(avoidance: ObstacleMovements) -> Figure:
     residual = arm - passage_share(curved(*ENDS, shares, one_via.HEIGHT))
     place_residual.plot(shares, residual, label="arm, via-points", **DOTS)
     for along, colour in ((0.5, SECOND), (one_via.TYPICAL, PALETTE.plan), (0.2, THIRD)):
-        over_height.plot(
-            heights, passage_share(curved(*ENDS, along, heights)), color=colour, label=f"{along:g}"
-        )
+        share = passage_share(curved(*ENDS, along, heights))
+        over_height.plot(heights, share, color=colour, label=f"{along:g}")
         arm, _ = one_via.arm_shares(along, -lengths)
         over_height.plot(lengths, arm, **DOTS)
         height_residual.plot(lengths, arm - passage_share(curved(*ENDS, along, -lengths)), **DOTS)
-    for row, text, (mean, deviation) in zip(
-        axes, ("$d_1/(d_1+d_2)$", "$d_3/(d_1+d_2)$"), SUBJECTS, strict=True
-    ):
+    texts = ("$d_1/(d_1+d_2)$", "$d_3/(d_1+d_2)$")
+    for row, text, (mean, deviation) in zip(axes, texts, SUBJECTS, strict=True):
         row[0].set(xlabel=text, ylabel="$t_1/(t_1+t_2)$", xlim=(0, 1))
         row[1].set(xlabel=text, ylabel="residual", xlim=(0, 1), ylim=(-0.04, 0.04))
         row[1].axhspan(mean - deviation, mean + deviation, color="0.92", zorder=0)
@@ -339,10 +325,8 @@ def orders_and_spaces() -> Figure:
     axes[0, 1].set(ylabel=r"$\ddot{x}\;t_f^2/A$", xlabel="$t/t_f$", xlim=(0, 1), ylim=(-9, 19))
     zero(axes[0, 1])
     axes[0, 1].legend(title="least", loc="upper right", handlelength=1.2)
-    for ax, motion in (
-        (axes[1, 0], simulate(diagonals())),
-        (axes[1, 1], point_to_point.joint_space(DIAGONALS)),
-    ):
+    motions = (simulate(diagonals()), point_to_point.joint_space(DIAGONALS))
+    for ax, motion in zip(axes[1], motions, strict=True):
         plane(ax)
         for planned, hand in zip(motion.planned, motion.hand, strict=True):
             paths(ax, planned, hand)
@@ -355,8 +339,8 @@ def limits() -> Figure:
     (repetitive, both), torques = axes
     motion = simulate(point_to_point.swings())
     cycles = np.linspace(3.0, 5.0, 201)
-    relative = point_to_point.relative_swing_speed(motion)
-    repetitive.plot(motion.time / point_to_point.SWING, relative, **MODEL, label="least jerk, arm")
+    speed = motion.speed()[0] * (point_to_point.SWING / point_to_point.LENGTHS[0])
+    repetitive.plot(motion.time / point_to_point.SWING, speed, **MODEL, label="least jerk, arm")
     repetitive.plot(cycles, np.pi / 2 * np.abs(np.sin(np.pi * cycles)), label="sinusoid", **ARM)
     repetitive.set(xlabel="half cycles", ylabel=r"$T\;t_f/A$", xlim=(0, point_to_point.SWINGS), ylim=(0, 2.5))
     repetitive.legend(loc="upper right", ncols=1)
@@ -403,9 +387,8 @@ def paths_and_speeds() -> Figure:
         right.plot(time, np.hypot(*movement.superposed(time, 1).T), label="sum", **SUM)
         for begins, each in ((0.0, movement.first), (moment, movement.second)):
             own = np.linspace(0.0, float(each.duration), 201)
-            right.plot(
-                begins + own, primitives.speed(each, own), label=None if begins else "its parts", **PART
-            )
+            label = None if begins else "its parts"
+            right.plot(begins + own, primitives.speed(each, own), label=label, **PART)
         right.axvline(moment, **NOW)
         left.set(xlim=(-36.0, 13.0), ylim=(36.0, 63.0), yticks=[40, 50, 60], xlabel="")
         right.set(xlim=(0.0, 1.05), xticks=[0.0, 0.5, 1.0], ylim=(0.0, 1.2), yticks=[0.0, 0.5, 1.0])
@@ -437,7 +420,7 @@ def comparison() -> Figure:
         every = [double_step.double_step(float(moment), remaining=remaining) for moment in moments]
         apart = [100.0 * double_step.greatest_distance(each) for each in every]
         style = {"color": PALETTE.contact, "linewidth": width, "label": f"{remaining:g} s"}
-        cost.plot(moments, [each.ratio for each in every], **style)
+        cost.plot(moments, [each.cost("superposed") / each.cost("planned") for each in every], **style)
         distance.plot(moments, apart, **style)
         if remaining == usual:
             for way, line, name in (("planned", MODEL, "plan revised"), ("superposed", SUM, "sum")):

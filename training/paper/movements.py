@@ -33,7 +33,7 @@ ADULT = Task.of().arm  # Arm of an adult
 PLANE = Task.of().space  # Plane of its hand
 
 
-def straight(first: str, last: str, duration: float = 0.8, *, order: int = 3) -> Trajectory:
+def straight(first: str, last: str, duration: float, *, order: int = 3) -> Trajectory:
     """Return the straight movement between two targets (Eq. 2); order 2, 3, 4 minimises acceleration, jerk, snap."""
     return point_to_point(TARGETS[first], TARGETS[last], duration, order=order)
 
@@ -106,12 +106,9 @@ def rows_of_lights(
             continue
         along = line / distance
         middle = 0.5 * (start + goal) + (shift[0] * along + shift[1] * left_of(along))
-        turn = 0.5 * (np.arctan2(line[1], line[0]) + 0.5 * np.pi)
-        lights = Box(
-            size=(0.5 * length, radius, half_height),
-            position=(*middle, 0.0),
-            quaternion=(np.cos(turn), 0.0, 0.0, np.sin(turn)),
-        )
+        half = 0.5 * (np.arctan2(line[1], line[0]) + 0.5 * np.pi)
+        turn = (np.cos(half), 0.0, 0.0, np.sin(half))
+        lights = Box((0.5 * length, radius, half_height), position=(*middle, 0.0), quaternion=turn)
         found.append((first, last, lights))
     return found
 
@@ -143,13 +140,9 @@ class SimulatedMovements(NamedTuple):
         """Return the derivative of values, shape (N, T, ...), with respect to time by central differences."""
         return np.asarray(np.gradient(values, self.time, axis=1))
 
-    def velocity(self) -> Float:
-        """Return the velocity of the hand, shape (N, T, 2), [m/s]."""
-        return self.derivative(self.hand)
-
     def speed(self) -> Float:
         """Return the speed of the hand, shape (N, T), [m/s]."""
-        return np.asarray(np.linalg.norm(self.velocity(), axis=-1))
+        return np.asarray(np.linalg.norm(self.derivative(self.hand), axis=-1))
 
     def at(self, fractions: Float) -> Float:
         """Return the hand positions at F fractions of the durations, shape (N, F, 2), [m]."""
@@ -166,8 +159,8 @@ def simulate(movement: Trajectory) -> SimulatedMovements:
     """Simulate planar movements of batch shape () or (N,), each from rest at its start."""
     duration = np.atleast_1d(movement.duration)
     time = instants(float(duration.max()))
-    references = [part.reshape(len(duration), len(time), 2) for part in movement.sample(time)]
-    return track(duration, *references)
+    parts = [part.reshape(len(duration), len(time), 2) for part in movement.sample(time)]
+    return track(time, duration, Motion(*parts))
 
 
 def instants(duration: float) -> Float:
@@ -175,28 +168,26 @@ def instants(duration: float) -> Float:
     return np.asarray(ADULT.timestep * np.arange(int(np.ceil((duration + SETTLING) / ADULT.timestep)) + 1))
 
 
-def track(duration: Float, position: Float, velocity: Float, acceleration: Float) -> SimulatedMovements:
+def track(time: Float, duration: Float, hand: Motion) -> SimulatedMovements:
     """Make the arm follow references, shape (N, T, 2) at every physics step, from rest at the first."""
-    number, count = position.shape[:2]
-    planned = PLANE.joint_motion(Motion(position, velocity, acceleration))
+    planned = PLANE.joint_motion(hand)
     start = planned.position[:, 0]
-    batch = Batch(ADULT.compile(n_obstacles=0), number, 1)
+    batch = Batch(ADULT.compile(n_obstacles=0), len(start), 1)
     batch.bind("qpos")[:] = start
     controls = ADULT.controls(*planned)[:, :-1]
-    ran = batch.rollout(count - 1, controls, record=("qpos", "qvel", "actuator_force"))
+    ran = batch.rollout(len(time) - 1, controls, record=("qpos", "qvel", "actuator_force"))
     joints = np.concatenate((start[:, None], ran["qpos"]), axis=1)
     # The integrator applies the servo's damping at the end of a step; the recorded force is that at its beginning.
     # A force at its limit does not depend on the rates.
     force = ran["actuator_force"]
     damped = force - ADULT.damping * np.diff(ran["qvel"], axis=1, prepend=0.0)
     torque = np.where(np.abs(force) < ADULT.torque_limit, damped, force)
-    time = np.asarray(ADULT.timestep * np.arange(count))
-    return SimulatedMovements(time, duration, position, PLANE.coordinates(joints), joints, torque)
+    return SimulatedMovements(time, duration, hand.position, PLANE.coordinates(joints), joints, torque)
 
 
-def joint_motion(movement: Trajectory, count: int = 401) -> Motion:
-    """Return angles, rates and accelerations of shoulder and elbow in a plan, shape (..., count, 2)."""
-    return PLANE.joint_motion(Motion(*movement.sample(count)))
+def joint_motion(movement: Trajectory) -> Motion:
+    """Return angles, rates and accelerations of shoulder and elbow in a plan, shape (..., 401, 2)."""
+    return PLANE.joint_motion(Motion(*movement.sample(401)))
 
 
 def required_torque(movement: Trajectory) -> Float:
@@ -245,21 +236,13 @@ class Profile(NamedTuple):
         return found[np.argsort(-height, kind="stable")]
 
     @property
-    def valley(self) -> float:
-        """Time of the least speed between two peaks, as a fraction of the duration; NaN without a valley."""
-        valleys = self.local_maxima(-self.speed)
-        return float(valleys[0, 0]) if len(valleys) else np.nan
-
-    @property
-    def valley_depth(self) -> float:
-        """Speed in the valley relative to the mean of the two highest peaks; 1 without a valley."""
-        valleys, peaks = self.local_maxima(-self.speed), self.peaks
-        return float(-valleys[0, 1] / peaks[:2, 1].mean()) if len(valleys) and len(peaks) > 1 else 1.0
-
-    @property
-    def peaks(self) -> Float:
-        """Time and height of the local maxima of the speed, the highest first, shape (n, 2)."""
-        return self.local_maxima(self.speed)
+    def valley(self) -> tuple[float, float]:
+        """Time of the least speed between two peaks, and that speed / the mean of the highest peaks; else NaN and 1."""
+        valleys, peaks = self.local_maxima(-self.speed), self.local_maxima(self.speed)
+        if not len(valleys):
+            return np.nan, 1.0
+        depth = -valleys[0, 1] / peaks[:2, 1].mean() if len(peaks) > 1 else 1.0
+        return float(valleys[0, 0]), float(depth)
 
     @property
     def bend(self) -> tuple[float, float]:
@@ -281,9 +264,10 @@ def model_profiles(movement: Trajectory) -> list[Profile]:
 
 def arm_profiles(motion: SimulatedMovements) -> list[Profile]:
     """Return the profiles of movements of the simulated arm."""
-    states = (motion.hand, motion.velocity(), motion.derivative(motion.velocity()))
+    velocity = motion.derivative(motion.hand)
+    states = zip(motion.duration, motion.hand, velocity, motion.derivative(velocity), strict=True)
     profiles = []
-    for duration, *state in zip(motion.duration, *states, strict=True):
+    for duration, *state in states:
         within = motion.time <= duration + 1e-9
         profiles.append(Profile(motion.time[within] / duration, *(part[within] for part in state)))
     return profiles

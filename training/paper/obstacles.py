@@ -57,10 +57,9 @@ def light_movements(agent: Path | None) -> ObstacleMovements:
         ValueError: The agent's task is not of the hand in the plane, has no boxes, or needs several decisions for a
             movement; or no movement gets around a row.
     """
-    method: Method
     if agent is None:
         simulation = SceneSimulation(DEFAULT_ENV, 256)
-        method = GeometrySearch(simulation.task)
+        method: Method = GeometrySearch(simulation.task)
     else:
         found = load_agent(agent)
         simulation = SceneSimulation(found.env_id, 256, **found.env_kwargs)
@@ -82,9 +81,8 @@ def light_movements(agent: Path | None) -> ObstacleMovements:
     kept = scenes.take(success)
     plan = task.action.decode(action[success], PLANE.coordinates(kept.start), PLANE.coordinates(kept.goal))
     motion = simulate(plan.trajectory())
-    return ObstacleMovements(
-        method.name, kept, plan, motion, len(scenes.start), movements.arm_profiles(motion)
-    )
+    profiles = movements.arm_profiles(motion)
+    return ObstacleMovements(method.name, kept, plan, motion, len(scenes.start), profiles)
 
 
 def features(profiles: list[Profile], plan: Plan) -> pd.DataFrame:
@@ -96,7 +94,7 @@ def features(profiles: list[Profile], plan: Plan) -> pd.DataFrame:
     """
     lines = []
     for profile, (start, *_, goal) in zip(profiles, plan.waypoints, strict=True):
-        line: dict[str, Any] = {"valley": profile.valley, "bend": profile.bend[0], "agrees": False}
+        line: dict[str, Any] = {"valley": profile.valley[0], "bend": profile.bend[0], "agrees": False}
         lines.append(line)
         if np.isfinite(line["bend"]):
             points = np.stack((start, profile.place(line["bend"]), goal))
@@ -118,9 +116,7 @@ def obstacle_claims(avoidance: ObstacleMovements) -> list[Claim]:
     apart, arm_apart, scaled = slow_and_fast(avoidance.plan.trajectory(), 101)
     who = f"{avoidance.name}, {number} movements"
 
-    def claim(
-        text: str, paper: str, value: Callable[[pd.DataFrame], float], expected: Range, unit: str = ""
-    ) -> Claim:
+    def claim(text: str, paper: str, value: Callable[..., float], expected: Range, unit: str = "") -> Claim:
         numbers = (value(model), expected), (value(arm), expected)
         return Claim(12, f"{text} ({who})", "8", paper, *numbers, worst, unit)
 

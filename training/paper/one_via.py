@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,16 +19,15 @@ from viapoint.training.paper.claim import Claim, at_least, at_most, near
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, curved, passage_share, simulate
 
 
-def passage_polynomial(via: Sequence[Fraction], goal: Sequence[Fraction]) -> Poly:
-    """Return the polynomial in tau1 of Eq. C16; its root in (0, 1) is t1 / tf, with the start as the origin.
+def passage_polynomial(via: Any, goal: Any) -> Poly:
+    """Return the polynomial in tau1 of Eq. C16 for fractions; its root in (0, 1) is t1 / tf, with the start as origin.
 
     With E = x1 - x0, D = xf - x0, a = E.D, b = D.D, c = E.E, Eq. C16 (pi . u = 0) is, but for a factor that never
     vanishes, F(tau1) = c - 2 c tau1 - 8 a tau1^3 + 34 a tau1^4 - 36 a tau1^5 + (12 a - 20 b) tau1^6 + 40 b tau1^7
     - 27 b tau1^8 + 6 b tau1^9: the terms of degree 10 and 11 cancel.
     """
-    a = sum((e * d for e, d in zip(via, goal, strict=True)), Fraction(0))
-    b = sum((d * d for d in goal), Fraction(0))
-    c = sum((e * e for e in via), Fraction(0))
+    via, goal = np.array(via), np.array(goal)
+    a, b, c = via @ goal, goal @ goal, via @ via
     return Poly([6 * b, -27 * b, 40 * b, 12 * a - 20 * b, -36 * a, 34 * a, -8 * a, 0, -2 * c, c], tau1)
 
 
@@ -124,18 +124,18 @@ def features(along: ArrayLike, height: ArrayLike) -> tuple[pd.DataFrame, float]:
     alongs, heights = np.atleast_1d(*np.broadcast_arrays(along, height))
     movement = curved(*ENDS, alongs, heights)
     motion = simulate(movement)
+    profiles = {"model": movements.model_profiles(movement), "arm": movements.arm_profiles(motion)}
     lines = []
-    for who, profiles in (
-        ("model", movements.model_profiles(movement)),
-        ("arm", movements.arm_profiles(motion)),
-    ):
-        for a, h, profile in zip(alongs, heights, profiles, strict=True):
+    for who, family in profiles.items():
+        for a, h, profile in zip(alongs, heights, family, strict=True):
+            valley, depth = profile.valley
             bend, curvature = profile.bend
             lead = np.nan
-            if len(profile.peaks) > 1:
-                early, late = sorted(profile.peaks[:2].tolist())
+            peaks = profile.local_maxima(profile.speed)
+            if len(peaks) > 1:
+                early, late = sorted(peaks[:2].tolist())
                 lead = late[1] / early[1] if a < 0.5 else early[1] / late[1]
-            lines.append((who, a, h, bend - profile.valley, profile.valley_depth, curvature, lead))
+            lines.append((who, a, h, bend - valley, depth, curvature, lead))
     columns = ["who", "along", "height", "late", "depth", "curvature", "lead"]
     return pd.DataFrame(lines, columns=columns), motion.worst
 
@@ -163,9 +163,9 @@ def valley_claims() -> list[Claim]:
 def _threshold_claim(along: float, exact: str, expected: float, tolerance: float) -> Claim:
     def arm_has_valley(height: float) -> bool:
         (profile,) = movements.arm_profiles(simulate(curved(*ENDS, along, -height)))
-        return bool(np.isfinite(profile.valley))
+        return bool(np.isfinite(profile.valley[0]))
 
-    arm = _first_place(arm_has_valley, 0.2, 0.5, halvings=12)
+    arm = _first_height(arm_has_valley, halvings=12)
     return Claim(
         5, f"Not every curved movement has a valley: for d1/(d1+d2) = {along} only if d3/(d1+d2) exceeds", "1B",
         f"two peaks and a valley{exact}", (valley_threshold(along), near(expected, tolerance)),
@@ -175,13 +175,12 @@ def _threshold_claim(along: float, exact: str, expected: float, tolerance: float
 
 def valley_threshold(along: float) -> float:
     """Return the least d3 / (d1 + d2) for which the model's speed has a valley."""
-    return _first_place(
-        lambda d3: speed_valleys(curved(*ENDS, along, -d3)).time.size > 0, 0.2, 0.5, halvings=30
-    )
+    return _first_height(lambda d3: speed_valleys(curved(*ENDS, along, -d3)).time.size > 0, halvings=30)
 
 
-def _first_place(holds: Callable[[float], bool], low: float, high: float, halvings: int) -> float:
-    """Return where in an interval a condition begins to hold, by bisection; it holds at `high`, not at `low`."""
+def _first_height(holds: Callable[[float], bool], halvings: int) -> float:
+    """Return the d3 / (d1 + d2) from which a condition holds, by bisection; it holds at .5, not at .2."""
+    low, high = 0.2, 0.5
     for _ in range(halvings):
         middle = (low + high) / 2.0
         low, high = (low, middle) if holds(middle) else (middle, high)
@@ -223,10 +222,10 @@ def arm_shares(along: ArrayLike, height: ArrayLike) -> tuple[Float, float]:
 def isochrony_claims() -> list[Claim]:
     """Return the claims of row 7."""
     half, typical = (passage_share(curved(*ENDS, along, LENGTHS)) for along in (0.5, TYPICAL))
-    (arm_half, half_worst), (arm_typical, typical_worst) = (
-        arm_shares(along, -LENGTHS) for along in (0.5, TYPICAL)
-    )
-    shares, (arm, worst) = passage_share(curved(*ENDS, SHARES, HEIGHT)), arm_shares(SHARES, HEIGHT)
+    arm_half, half_worst = arm_shares(0.5, -LENGTHS)
+    arm_typical, typical_worst = arm_shares(TYPICAL, -LENGTHS)
+    shares = passage_share(curved(*ENDS, SHARES, HEIGHT))
+    arm, worst = arm_shares(SHARES, HEIGHT)
     spread = np.ptp(passage_share(curved(*ENDS, 0.2, [0.1, 0.6])))
     text = "d3/(d1+d2) from .3 to .55"
     return [

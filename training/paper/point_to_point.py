@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from viapoint import primitives
 from viapoint.envs.common.arrays import Float
+from viapoint.envs.plans import Motion
 from viapoint.primitives import FREE, Trajectory, minimum_duration, point_to_point, through
 from viapoint.training.paper import movements
 from viapoint.training.paper.claim import Claim, at_least, at_most, near
@@ -113,9 +114,8 @@ def joint_claims() -> list[Claim]:
     movement = diagonals()
     motion = simulate(movement)
     time = np.linspace(0.0, DURATION, 401)
-    hand, arm_hand = (
-        _differences(speed).max() for speed in (primitives.speed(movement, time), motion.speed())
-    )
+    hand = _differences(primitives.speed(movement, time)).max()
+    arm_hand = _differences(motion.speed()).max()
     rates = movements.joint_motion(movement).velocity
     arm_rates = motion.derivative(motion.joints)
     joints, arm_joints = (_differences(each).min() for each in (rates, arm_rates))
@@ -162,8 +162,8 @@ def joint_space(ends: Float) -> SimulatedMovements:
     angles = np.asarray(point_to_point(joints[:, 0], joints[:, 1], DURATION)(time))
     position = movements.PLANE.coordinates(angles)
     velocity = np.gradient(position, time, axis=1)
-    acceleration = np.gradient(velocity, time, axis=1)
-    return movements.track(np.full(len(ends), DURATION), position, velocity, acceleration)
+    hand = Motion(position, velocity, np.gradient(velocity, time, axis=1))
+    return movements.track(time, np.full(len(ends), DURATION), hand)
 
 
 def alternative_claims() -> list[Claim]:
@@ -241,31 +241,15 @@ def _tour_claims() -> list[Claim]:
     ]  # fmt: skip
 
 
-def _free_acceleration() -> float:
-    """Return the start acceleration of minimum jerk between two reversals, in A / t_f^2; that at the end is free."""
-    none, one, two = (_swing(acceleration).cost() for acceleration in (0.0, 1.0, 2.0))
-    square = (two - 2.0 * one + none) / 2.0  # the cost is a parabola in the acceleration
-    return float(-(one - none - square) / (2.0 * square))
-
-
-def _swing(acceleration: float) -> Trajectory:
-    """Return the movement by 1 in 1 s with a given acceleration at the start and a free one at its end."""
-    return point_to_point([0.0], [1.0], 1.0, start_acceleration=[acceleration], goal_acceleration=FREE)
-
-
 def swings() -> Trajectory:
     """Return a repetitive movement between T3 and T6 with free acceleration at every reversal."""
     points = DIAGONALS[0, np.arange(SWINGS + 1) % 2]
     return through(points, np.full(SWINGS, SWING), via_velocities=np.zeros((SWINGS - 1, 2)))
 
 
-def relative_swing_speed(motion: SimulatedMovements) -> Float:
-    """Return the speed of simulated swings in units of amplitude / duration of a swing, shape (T,)."""
-    return np.asarray(motion.speed()[0] * (SWING / LENGTHS[0]))
-
-
 def _repetitive_claims() -> list[Claim]:
-    swing = _swing(_free_acceleration())
+    # The acceleration at the start is that of least jerk, too: the jerk is zero there.
+    swing = point_to_point([0.0], [1.0], 1.0, start_acceleration=[5.0], goal_acceleration=FREE)
     rest = point_to_point([0.0], [1.0], 1.0)
     hit = point_to_point([0.0], [1.0], 1.0, goal_velocity=FREE, goal_acceleration=FREE)
     motion = simulate(swings())
@@ -274,7 +258,7 @@ def _repetitive_claims() -> list[Claim]:
         Claim(10, "Repetitive movement, accelerations free: peak speed t_f/A per half cycle (a sinusoid has 1.571; "
               "from rest to rest 1.875)", "text", "an excellent fit to repetitive movements",
               (swing.peak(1), near(1.5625, 1e-9)),
-              (relative_swing_speed(motion)[middle].max(), near(1.5625, 0.02)), motion.worst),
+              ((motion.speed()[0] * (SWING / LENGTHS[0]))[middle].max(), near(1.5625, 0.02)), motion.worst),
         Claim(10, "Its jerk cost / that from rest to rest", "text",
               model=(swing.cost() / rest.cost(), near(1.0 / 6.0, 1e-9))),
         Claim(10, "Hitting: final velocity and acceleration free: final speed t_f/A",

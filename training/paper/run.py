@@ -5,21 +5,22 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import matplotlib.style
+import numpy as np
 import pandas as pd
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from viapoint.training.configs import PaperConfig
 from viapoint.training.evaluation import one_thread
-from viapoint.training.files import MARK, check_ours, versions, write_bytes, write_json
+from viapoint.training.files import MARK, check_ours, versions, write_bytes, write_figure, write_json
 from viapoint.training.paper import double_step, figures, obstacles, one_via, point_to_point
 from viapoint.training.paper.claim import Claim, Number
 from viapoint.training.paper.one_via import ENDS, FAST, SLOW, THREE_POINTS
+from viapoint.training.plots import STYLE
 from viapoint.training.progress import progress_bar
 
 # Titles and functions of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991
@@ -83,11 +84,8 @@ DRAWINGS: dict[str, tuple[str, Callable[..., Figure]]] = {
 AROUND_LIGHTS = (obstacles.obstacle_claims, figures.around_lights, figures.isochrony)
 
 
-Pictures = list[tuple[Path, str]]  # Figures (PNG) and their captions
-
-
-def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], Pictures]:
-    """Compute every row, row 12 with an agent or a search, and draw every figure."""
+def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], dict[Path, str]]:
+    """Compute every row, row 12 with an agent or a search, and draw every figure; return captions by PNG, too."""
     avoidance = obstacles.light_movements(agent)
 
     def result_of(function: Callable[..., Any]) -> Any:
@@ -96,11 +94,13 @@ def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], Pictures]:
     claims: list[Claim] = []
     for _, compute in progress_bar(iterable=ROWS.values(), desc="rows"):
         claims += result_of(compute)
-    pictures: Pictures = []
+    pictures = {}
     for name, (caption, draw) in progress_bar(iterable=DRAWINGS.items(), desc="figures"):
-        with matplotlib.style.context(figures.STYLE):
-            picture, _ = figures.save(result_of(draw), out, name)
-        pictures.append((picture, caption))
+        with matplotlib.style.context(str(STYLE)):
+            figure = result_of(draw)
+            pictures[write_figure(out / f"{name}.png", figure)] = caption
+            figure.set_layout_engine("none")  # the same layout for both files, computed once
+            write_figure(out / f"{name}.svg", figure)
     return claims, pictures
 
 
@@ -118,34 +118,28 @@ NOTE = (
 )
 
 
-def _summary_of(claims: list[Claim]) -> str:
-    """Return a sentence with the number of claims that hold."""
-    return f"{sum(claim.holds for claim in claims)} of {len(claims)} claims hold."
-
-
-def write(claims: list[Claim], pictures: Pictures, out: Path) -> None:
-    """Write the tables and the page to a folder."""
-    summary = _summary_of(claims)
+def write(claims: list[Claim], pictures: dict[Path, str], out: Path) -> str:
+    """Write the tables and the page to a folder; return a sentence with the number of claims that hold."""
+    summary = f"{sum(claim.holds for claim in claims)} of {len(claims)} claims hold."
     table = pd.DataFrame([cells(claim) for claim in claims], columns=HEADINGS)
     aligned = ["left"] * 4 + ["right"] * 5 + ["left"]
     text = table.replace("|", r"\|").to_markdown(index=False, disable_numparse=True, colalign=aligned)
     markdown = f"# {TITLE}\n\n{summary} {NOTE}\n\n{text}\n\n<!-- {MARK.decode()} -->\n"
-    record = {
-        "viapoint": versions()["viapoint"],
-        "title": TITLE,
-        "holds": all(claim.holds for claim in claims),
-    }
-    page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = page.from_string(
-        (files("viapoint.training") / "paper/templates/page.html.j2").read_text("utf-8")
-    )
-    html = template.render(
-        title=TITLE, note=NOTE, summary=summary, headings=HEADINGS[1:], claims=claims, cells=cells, rows=ROWS,
-        figures=[(base64.b64encode(path.read_bytes()).decode(), caption) for path, caption in pictures],
+    pages = Environment(
+        loader=PackageLoader("viapoint.training.paper"), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
+    html = pages.get_template("page.html.j2").render(
+        title=TITLE, note=NOTE, summary=summary, headings=HEADINGS[1:], claims=claims, cells=cells, rows=ROWS,
+        figures=[(base64.b64encode(path.read_bytes()).decode(), caption) for path, caption in pictures.items()],
+    )  # fmt: skip
+    record: dict[str, Any] = {"viapoint": versions()["viapoint"], "title": TITLE}
+    record["holds"] = all(claim.holds for claim in claims)
+    record["claims"] = [claim.as_json() for claim in claims]
     write_bytes(out / "table.md", markdown.encode())
-    write_json(out / "table.json", {**record, "claims": [claim.as_json() for claim in claims]})
+    write_json(out / "table.json", record)
     write_bytes(out / "index.html", html.encode())
+    return summary
 
 
 def cells(claim: Claim) -> list[str]:
@@ -158,9 +152,14 @@ def cells(claim: Claim) -> list[str]:
 def _number_and_range(number: Number | None, unit: str) -> tuple[str, str]:
     if number is None:
         return "-", "-"
-    value, expected = number
+    value, (low, high) = number
     text = f"{value:.1e}" if value != 0 and abs(value) < 1e-3 else f"{value:.4g}"
-    return f"{text} {unit}".rstrip(), str(expected)
+    expected = f"{(low + high) / 2.0:.6g} ± {(high - low) / 2.0:.2g}"
+    if np.isinf(low):
+        expected = f"at most {high:.4g}"
+    if np.isinf(high):
+        expected = f"at least {low:.4g}"
+    return f"{text} {unit}".rstrip(), expected
 
 
 class ClaimsFailedError(Exception):
@@ -176,8 +175,8 @@ def run(config: PaperConfig) -> None:
         check_ours(config.out / name)
     with one_thread():
         claims, pictures = reproduce(config.out, config.agent)
-    write(claims, pictures, config.out)
+    summary = write(claims, pictures, config.out)
     failed = [f"row {claim.row}, {claim.claim}" for claim in claims if not claim.holds]
-    print(f"{_summary_of(claims)} The page: {config.out / PAGES[-1]}")
+    print(f"{summary} The page: {config.out / PAGES[-1]}")
     if failed:
         raise ClaimsFailedError(f"{len(failed)} of {len(claims)} claims fail: {'; '.join(failed)}")
