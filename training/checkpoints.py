@@ -7,6 +7,7 @@ is one file of `torch.save`, written whole or not at all, and read with `weights
 from __future__ import annotations
 
 import io
+import json
 import random
 import zipfile
 from collections import deque
@@ -91,18 +92,18 @@ def read_checkpoint(model: BaseAlgorithm, path: Path) -> dict[str, Any]:
     return extra
 
 
-def _with_any_file(value: Any) -> Any:
+def _with_any_file(record: Any) -> Any:
     """Return a description of a model, in which all arms of files have the same name.
 
     A run goes on with the copy of its arm where the file is gone, and with the file where it is there again.
     """
-    if not isinstance(value, Mapping):
-        return value
-    found = {name: _with_any_file(each) for name, each in value.items()}
-    arm = found.get("arm")
-    if isinstance(arm, str) and arm.endswith(ARM_FILES):
-        found["arm"] = COPY
-    return found
+
+    def renamed(part: dict[str, Any]) -> dict[str, Any]:
+        if str(part.get("arm")).endswith(ARM_FILES):
+            part["arm"] = COPY
+        return part
+
+    return json.loads(json.dumps(record), object_hook=renamed)
 
 
 def read_state(path: Path) -> dict[str, Any]:
@@ -133,11 +134,10 @@ def _restore(model: BaseAlgorithm, state: dict[str, Any], arrays: dict[str, Any]
         setattr(model, name, arrays["last"][name])
     for name in DEQUES:
         setattr(model, name, deque(arrays["recent"][name], maxlen=model._stats_window_size))
-    buffer = getattr(model, "replay_buffer", None)
-    saved = arrays["buffer"]
+    buffer: Any = getattr(model, "replay_buffer", None)
     if buffer is not None:
-        _fill(_buffer_arrays(buffer), saved["arrays"])
-        buffer.pos, buffer.full = saved["pos"], saved["full"]
+        _fill(_buffer_arrays(buffer), arrays["buffer"]["arrays"])
+        buffer.pos, buffer.full = arrays["buffer"]["pos"], arrays["buffer"]["full"]
     env: Any = model.get_env()
     env.restore(arrays["env"])
     # Last: nothing may be drawn after it.

@@ -32,7 +32,7 @@ from viapoint.training.checks import check_env_kwargs, check_folder, check_whole
 from viapoint.training.configs import StudyConfig, TrainConfig
 from viapoint.training.evaluation import evaluate_methods
 from viapoint.training.extras import explain_import_error
-from viapoint.training.files import BadFileError, read_json, read_yaml, write_bytes, write_json
+from viapoint.training.files import BadFileError, as_plain, read_json, read_yaml, write_bytes, write_json
 from viapoint.training.planning.baselines import Method, agent_method, factory, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plots import success_of_rows
@@ -43,24 +43,25 @@ from viapoint.training.statistics import across_seeds, wilson
 from viapoint.training.trainer import train_or_resume
 
 Values = Mapping[str, Any]
+Record = dict[str, Any]
+# Types of the fields of a file
+Entries = list[str] | dict[str, dict[str, Any] | None]  # Names, or options by name
+Names = list[str] | tuple[str, ...]
+Numbers = list[int] | tuple[int, ...]
 # Fields of a training that an agent may set
 TRAINING_FIELDS = {each.name for each in dataclasses.fields(TrainConfig)}
 TRAINING_FIELDS -= {"env", "seed", "out", "resume", "progress"}
-MEASURED = (
-    "test",
-    "hard",
-    "uniform",
-)  # Sets that are measured by default; models are selected on `validation`
+MEASURED = ("test", "hard", "uniform")  # Sets by default; models are selected on `validation`
 
 RETRIES = 2  # Number of times that a trial whose worker died is begun again
 # Environment variables of Ray, which reads them when it is imported
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",  # Ray sends nothing to its authors
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # otherwise it takes another address than 127.0.0.1
     "RAY_AIR_NEW_OUTPUT": "0",  # Ray Tune's own tables
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
     "TUNE_GLOBAL_CHECKPOINT_S": "5",  # a killed search loses at most its last seconds
 }
-Record = dict[str, Any]
 KEYS = ["environment", "set", "method"]
 # Columns that are medians over seeds; `decisions` are those of a training
 MEDIANS = ["collision", "jerk_ratio", "movement_s", "decision_ms", "decisions"]
@@ -202,32 +203,31 @@ def _study(
     name: str,
     folder: Path,
     *,
-    environments: Any,
+    environments: Entries,
     out: str = "",
-    seeds: list[int] | None = None,
-    agents: Any = None,
-    baselines: Any = None,
-    searches: Any = None,
-    scenes: list[str] | None = None,
+    seeds: Numbers = (0,),
+    agents: Entries | None = None,
+    baselines: Entries | None = None,
+    searches: Entries | None = None,
+    scenes: Names = MEASURED,
     n_scenes: int | None = None,
 ) -> Study:
     """Return a study; the fields are those of the file."""
     known = {}
-    for env, fields in _entries("environments", environments):
+    for env, fields in _entries(environments):
         fields = {"scenes": scenes, "n_scenes": n_scenes, **fields}
         known[env] = _made(f"environments.{env}", _environment, fields, env, folder)
     found: list[Trial] = []
     rows: set[str] = set()
-    kinds = (("agents", _agent, agents), ("baselines", _baseline, baselines), ("searches", _search, searches))
-    for kind, make, given in kinds:
-        for row, fields in _entries(kind, given or {}):
+    for make, given in ((_agent, agents), (_baseline, baselines), (_search, searches)):
+        for row, fields in _entries(given or {}):
             if row in rows:
                 raise ValueError(f"rows must have different names, {row} is there twice")
             rows.add(row)  # rows are folders, which must not be shared
-            for env in _names(f"{row}: environments", fields.pop("environments", list(known))):
+            for env in fields.pop("environments", known):
                 if env not in known:
                     raise ValueError(unknown_name(f"{row}: environments", env, known))
-                shared = {} if make is _baseline else {"seeds": seeds or [0]}
+                shared = {} if make is _baseline else {"seeds": seeds}
                 found += _made(row, make, {**shared, **fields}, known[env], row)
     if not found:
         raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
@@ -240,16 +240,12 @@ def _study(
     )
 
 
-def _entries(where: str, given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+def _entries(given: Entries) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield name and fields of each entry of a list or mapping, one for each point of its grid."""
-    if not isinstance(given, list | Mapping):
-        raise ValueError(f"{where} must be a list of names, or values by name, got {given!r}")
-    entries = given if isinstance(given, Mapping) else dict.fromkeys(_names(where, given))
+    entries = given if isinstance(given, dict) else dict.fromkeys(given)
     for name, fields in entries.items():
-        if not str(name).strip("/. ") or ".." in str(name) or str(name).startswith("/"):
+        if not name.strip("/. ") or ".." in name or name.startswith("/"):
             raise ValueError(f"names must be words, got {name!r}")
-        if not isinstance(fields, Mapping | None):
-            raise ValueError(f"{name} must be values by name, got {fields!r}")
         rest = dict(fields or {})
         grid = rest.pop("grid", {})
         if not isinstance(grid, Mapping) or not all(isinstance(values, list) for values in grid.values()):
@@ -258,18 +254,6 @@ def _entries(where: str, given: list[str] | Mapping[str, Any]) -> Iterator[tuple
             point = dict(zip(grid, values, strict=True))
             ends = [f"-{path.rpartition('.')[2]}={value}" for path, value in point.items()]
             yield f"{name}{''.join(ends)}", _with(rest, point)
-
-
-def _names(where: str, given: Any) -> list[str]:
-    """Return a list of names; something else raises ValueError."""
-    if not isinstance(given, list):
-        raise ValueError(f"{where} must be a list of names, got {given!r}")
-    for each in given:
-        if not isinstance(each, str):
-            raise ValueError(
-                f"{where} must be names, or a mapping from names to values, got {each!r} in a list"
-            )
-    return given
 
 
 def _with(fields: Values, changes: Values) -> dict[str, Any]:
@@ -287,17 +271,22 @@ def _environment(
     *,
     id: str = "",  # noqa: A002 - the name in the file
     env_kwargs: dict[str, Any] | None = None,
-    scenes: list[str] | None = None,
-    n_scenes: int | None = None,
+    scenes: Names,
+    n_scenes: int | None,
 ) -> Values:
-    """Return the fields of trials in an environment; its sets of scenes are by default those shipped for it."""
-    env_id = id or name
-    kwargs = env_kwargs or {}
-    check_env_kwargs(kwargs)
-    task = registered_task(env_id, **kwargs)
-    check_whole("n_scenes", 1 if n_scenes is None else n_scenes)
+    """Return the fields of trials in an environment, which leaves out sets of scenes that it lacks."""
+    env: Record = {
+        "environment": name,
+        "env_id": id or name,
+        "env_kwargs": env_kwargs or {},
+        "n_scenes": n_scenes,
+    }
+    check_env_kwargs(env["env_kwargs"])
+    task = registered_task(env["env_id"], **env["env_kwargs"])
+    if n_scenes is not None:
+        check_whole("n_scenes", n_scenes)
     places = []
-    for each in MEASURED if scenes is None else scenes:
+    for each in scenes:
         if each in SETS:
             if each in SEEDS or shipped_set(each, task) is not None:  # the others cannot be drawn
                 places.append(each)
@@ -306,40 +295,34 @@ def _environment(
         else:
             raise ValueError(f"{unknown_name('scenes', each, SETS)}; or the path of a file of scenes")
     if not places:
-        raise ValueError(f"none of {', '.join(scenes or ())} is shipped for {env_id}")
-    return {
-        "environment": name,
-        "env_id": env_id,
-        "env_kwargs": kwargs,
-        "scenes": tuple(places),
-        "n_scenes": n_scenes,
-    }
+        raise ValueError(f"none of {', '.join(scenes)} is shipped for {env['env_id']}")
+    return {**env, "scenes": tuple(places)}
 
 
 def _agent(
     env: Values,
     row: str,
     *,
-    seeds: list[int],
-    checks: list[int] | None = None,
-    refine: list[int] | None = None,
+    seeds: Numbers,
+    checks: Numbers = (0,),
+    refine: Numbers = (),
     untrained: bool = False,
     **training: Any,
 ) -> list[Trial]:
     """Return a trial for each seed of an agent whose configuration is allowed in its environment."""
-    numbers = tuple(check_whole("checks", number) for number in checks or [0])
-    refined = tuple(check_whole("refine", number) for number in refine or [])
-    if (any(numbers) or refined) and training.get("algo", "viaq") != "viaq":
+    for name, numbers in (("checks", checks), ("refine", refine)):
+        for number in numbers:
+            check_whole(name, number)
+    if (any(checks) or refine) and training.get("algo", "viaq") != "viaq":
         raise ValueError(f"checks and refine are for the proposals of viaq, got algo {training['algo']}")
-    if refined and registered_task(env["env_id"], **env["env_kwargs"]).replanning:
+    if refine and registered_task(env["env_id"], **env["env_kwargs"]).replanning:
         raise ValueError(f"refine is for tasks with one decision for a movement, {env['env_id']} has several")
     if not seeds or len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must hold at least one number and none twice, got {seeds}")
+    rows = {"row": row, "checks": tuple(checks) or (0,), "refine": tuple(refine), "untrained": untrained}
     trials = []
     for seed in seeds:
-        trial = Trial(
-            **env, row=row, seed=seed, training=training, checks=numbers, refine=refined, untrained=untrained
-        )
+        trial = Trial(**env, **rows, seed=seed, training=training)
         config = trial.config(Path())
         check_hyperparameters(config.algorithm, config.hyperparameters)
         trials.append(trial)
@@ -356,10 +339,10 @@ def _search(
     env: Values,
     row: str,
     *,
-    seeds: list[int],
+    seeds: Numbers,
     parameters: dict[str, Any],
     trials: int = 20,
-    first: list[dict[str, Any]] | None = None,
+    first: list[dict[str, Any]] | tuple[()] = (),
     **training: Any,
 ) -> list[Search]:
     """Return a search whose values, or whose lowest and highest ones, are allowed."""
@@ -368,19 +351,15 @@ def _search(
         raise ValueError("parameters must hold at least one list or range")
     if not trial.config(Path()).evaluation_interval:
         raise ValueError("eval_every must be 1 or more in a search, which compares success in validation")
-    for path in itertools.chain(*(first or [])):
+    for path in itertools.chain(*first):
         if path not in parameters:
             raise ValueError(unknown_name("first", path, parameters))
     for path, values in parameters.items():
         for value in _ends(path, values):  # an impossible value is an error now, and not in the last trial
             _made("parameters", _agent, {"seeds": [0], **_with(training, {path: value})}, env, row)
     check_whole("trials", trials)
-    return [
-        Search(
-            **env, row=row, seed=trial.seed, training=training, parameters=parameters, trials=trials,
-            first=tuple(first or ()),
-        )
-    ]  # fmt: skip
+    about = {"row": row, "seed": trial.seed, "training": training}
+    return [Search(**env, **about, parameters=parameters, trials=trials, first=tuple(first))]
 
 
 def _ends(path: str, given: Any) -> list[Any]:
@@ -449,10 +428,10 @@ def run_study(
     check_folder(f"out {folder}", folder)
     mark = folder / "study.json"
     if not mark.is_file() or read_json(mark).get("viapoint") != "study":
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and any(folder.iterdir()):
             raise BadFileError(folder, "holds something else than a study; name another folder")
         write_json(mark, {"viapoint": "study", "name": study.name})
-    missing = [trial for trial in study.trials if _finished_record(trial, folder) is None]
+    missing = [trial for trial in study.trials if not _finished_record(trial, folder)]
     searches = [search for search in study.searches if not search.is_finished(folder)]
     failed = []
     if missing or searches:
@@ -473,15 +452,15 @@ def run_study(
 
 def _run_trial(trial: Trial, out: Path) -> Record:
     """Train if needed, or go on with an interrupted training, measure, and return the record of a trial."""
-    record: Record = {"viapoint": "study", "asked": _asked(trial)}
-    env_kwargs, decisions = dict(trial.env_kwargs), None
+    record: Record = {"viapoint": "study", "asked": _asked(trial), "rows": []}
+    env_kwargs = dict(trial.env_kwargs)
     methods: dict[str, Method] = {}
     if trial.method:
         methods[trial.row] = make_method(trial.method, trial.env_id, **env_kwargs, threads=1)
     else:
         config = trial.config(trial.folder(out))
         run = train_or_resume(config)
-        models: dict[str, Any] = {trial.row: load_model(run.best)}
+        models = {trial.row: load_model(run.best)}
         if trial.untrained:
             models[f"{trial.row}/untrained"] = untrained(models[trial.row], trial.seed)
         for name, model in models.items():
@@ -490,28 +469,23 @@ def _run_trial(trial: Trial, out: Path) -> Record:
             for refine in trial.refine:
                 methods[f"{name}/refine{refine}"] = agent_method("agent", model, 0, refine)
         env_kwargs = whole_task(config.env, config.env_kwargs)
-        decisions = run.decisions
         record["curve"] = [[each["decisions"], each["success"]["rate"]] for each in run.curve]
-        record["seconds"] = run.curve[-1]["seconds"] if run.curve else None
-    record["rows"] = []
     env_kwargs["threads"] = 1  # other trials have the other cores
     for row, method in methods.items():
         for name, frozen in _sets(trial).items():
             line = {"method": row, "set": name, **_measured(method, frozen, trial.env_id, env_kwargs)}
-            if decisions is not None:
-                line["decisions"] = 0 if "/untrained" in row else decisions
+            if not trial.method:
+                line["decisions"] = 0 if "/untrained" in row else run.decisions
             record["rows"].append(line)
     write_json(trial.folder(out) / "result.json", record)
     return record
 
 
-def _finished_record(trial: Trial, out: Path) -> Record | None:
-    """Return the record of a trial that is complete, or None; a record of other settings is obsolete."""
+def _finished_record(trial: Trial, out: Path) -> Record:
+    """Return the record of a trial that is complete, otherwise an empty one; that of other settings is obsolete."""
     path = trial.folder(out) / "result.json"
-    if not path.is_file():
-        return None
-    record = read_json(path)
-    return record if record.get("asked") == _asked(trial) else None
+    record = read_json(path) if path.is_file() else {}
+    return record if record.get("asked") == _asked(trial) else {}
 
 
 def _write_results(study: Study, folder: Path) -> pd.DataFrame:
@@ -519,8 +493,8 @@ def _write_results(study: Study, folder: Path) -> pd.DataFrame:
     lines = []
     curves: dict[str, dict[str, list[Any]]] = {}
     for trial in study.trials:
-        record = _finished_record(trial, folder) or {"rows": []}
-        lines += [{"environment": trial.environment, **line} for line in record["rows"]]
+        record = _finished_record(trial, folder)
+        lines += [{"environment": trial.environment, **line} for line in record.get("rows", [])]
         if "curve" in record:
             of_rows = curves.setdefault(trial.environment, {})
             of_rows.setdefault(trial.row, []).append(record["curve"])
@@ -537,12 +511,11 @@ def _table(lines: list[Record]) -> pd.DataFrame:
     """Return one line for each environment, set of scenes and row, over all its seeds."""
     rows = []
     for keys, runs in pd.DataFrame(lines, columns=[*COLUMNS, "solved", "band"]).groupby(KEYS, sort=False):
-        solved = np.array([[bit == "1" for bit in each] for each in runs["solved"]], dtype=float)
+        solved = np.array([list(each) for each in runs["solved"]]) == "1"
         if len(runs) == 1:
             success, low, high = wilson(int(solved.sum()), solved.size)
         else:
-            band = np.array(runs["band"].iloc[0])
-            success, low, high = across_seeds(solved, band, np.random.default_rng(0))
+            success, low, high = across_seeds(solved, runs["band"].iloc[0], np.random.default_rng(0))
         row = dict(zip(KEYS, keys, strict=True))
         row |= {"seeds": len(runs), "scenes": solved.shape[1], "success": success, "low": low, "high": high}
         rows.append({**row, **runs[MEDIANS].astype(float).median()})
@@ -567,19 +540,15 @@ def markdown(table: pd.DataFrame, title: str) -> str:
 
 def _asked(trial: Trial) -> Record:
     """Return what identifies a trial as plain values."""
-    values = dataclasses.asdict(trial)
-    values["scenes"] = {name: frozen.sha256 for name, frozen in _sets(trial).items()}
-    plain: Record = json.loads(json.dumps(values))
+    hashes = {name: frozen.sha256 for name, frozen in _sets(trial).items()}
+    plain: Record = as_plain({**dataclasses.asdict(trial), "scenes": hashes})
     return plain
 
 
 def _sets(trial: Trial) -> dict[str, FrozenScenes]:
     """Return the sets of scenes of a trial by name."""
     task = registered_task(trial.env_id, **trial.env_kwargs)
-    found = {}
-    for name in trial.scenes:
-        found[Path(name).stem] = scenes_for(name, task, trial.n_scenes)
-    return found
+    return {Path(name).stem: scenes_for(name, task, trial.n_scenes) for name in trial.scenes}
 
 
 def _measured(method: Method, frozen: FrozenScenes, env_id: str, env_kwargs: Record) -> Record:
@@ -601,7 +570,8 @@ def _measured(method: Method, frozen: FrozenScenes, env_id: str, env_kwargs: Rec
 
 def _import_libraries() -> tuple[Any, Any]:
     """Import Ray and Ray Tune, which take seconds, and Optuna only when a study runs."""
-    os.environ.update({name: os.environ.get(name, value) for name, value in SETTINGS.items()})
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
     try:
         import optuna
         import ray
@@ -615,23 +585,18 @@ def _import_libraries() -> tuple[Any, Any]:
 @contextmanager
 def _connected(workers: int | None) -> Iterator[None]:
     """Start a Ray of this machine that listens on 127.0.0.1 alone and ends with the study, if there is none."""
-    # Otherwise Ray replaces 127.0.0.1 by another address of the machine.
-    os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     ray, _ = _import_libraries()
     if ray.is_initialized():
         yield
         return
-    try:
-        ray.init(
-            address="local",
-            num_cpus=workers,
-            include_dashboard=False,
-            log_to_driver=False,
-            logging_level="ERROR",
-            _node_ip_address="127.0.0.1",
-        )
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ValueError(f"Ray cannot be started: {_one_line(error)}") from None
+    ray.init(
+        address="local",
+        num_cpus=workers,
+        include_dashboard=False,
+        log_to_driver=False,
+        logging_level="ERROR",
+        _node_ip_address="127.0.0.1",
+    )
     try:
         yield
     finally:
@@ -663,14 +628,12 @@ class ReportCallback(BaseCallback):
     def __init__(self, folder: Path, report: Callable[[dict[str, Any]], None]) -> None:
         super().__init__()
         self.folder, self.report = folder, report
-        self._reported = 0
+        self._reported = 1  # the validation before training says nothing about it
 
     def _on_rollout_start(self) -> None:
-        curve = Run(self.folder).curve
-        for each in curve[self._reported :]:
-            if each["decisions"]:  # the validation before training says nothing about it
-                self.report({"success": each["success"]["rate"], "decisions": each["decisions"]})
-        self._reported = len(curve)
+        for each in Run(self.folder).curve[self._reported :]:
+            self.report({"success": each["success"]["rate"], "decisions": each["decisions"]})
+            self._reported += 1
 
     def _on_step(self) -> bool:
         return True
@@ -699,8 +662,6 @@ def _run_search(search: Search, folder: Path, workers: int | None, told: Told) -
     if tune.Tuner.can_restore(path):
         tuner = tune.Tuner.restore(str(path), work, resume_unfinished=True, restart_errored=True)
     else:
-        # Trainings end by themselves, before max_t.
-        scheduler = ASHAScheduler(time_attr="decisions", max_t=2 * total, grace_period=max(total // 4, 1))
         first = [dict(each) for each in search.first] or None
         tuner = tune.Tuner(
             work,
@@ -711,7 +672,8 @@ def _run_search(search: Search, folder: Path, workers: int | None, told: Told) -
                 num_samples=search.trials,
                 max_concurrent_trials=workers,
                 search_alg=OptunaSearch(points_to_evaluate=first, seed=0),
-                scheduler=scheduler,
+                # Trainings end by themselves, before max_t.
+                scheduler=ASHAScheduler("decisions", max_t=2 * total, grace_period=max(total // 4, 1)),
             ),
             run_config=tune.RunConfig(
                 name=path.name,
@@ -738,8 +700,7 @@ def _domain(tune: Any, given: Any) -> Any:
     """Return the domain of a parameter: one of a list, or a range of whole numbers or of real ones."""
     if isinstance(given, list):
         return tune.choice(given)
-    low = given["low"]
-    high = given["high"]
+    low, high = given["low"], given["high"]
     log = given.get("log", False)
     if isinstance(low, int) and isinstance(high, int):
         return (tune.lograndint if log else tune.randint)(low, high + 1)
@@ -757,7 +718,7 @@ def _write_search(search: Search, results: Any, folder: Path) -> str:
     chosen = search.with_parameters({path: best[path] for path in search.parameters}, folder)
     config = dataclasses.replace(chosen, out=None)
     record = {"viapoint": "search", "key": search.key, "success": best["success"], "command": config.command}
-    write_json(search.folder(folder) / "best.json", {**record, "training": config.as_json()})
+    write_json(search.folder(folder) / "best.json", {**record, "training": as_plain(config)})
     return f"best of {search.row}, {100.0 * best['success']:.1f} %: {config.command}"
 
 
