@@ -290,13 +290,23 @@ class TrainConfig(Config):
         return preset_of(self.task, self.algorithm)
 
     @property
-    def all_hyperparameters(self) -> dict[str, Any]:
-        """Hyperparameters with those of the preset; a short training begins to learn sooner in proportion."""
-        usual = self.preset.arguments()
+    def resolved(self) -> TrainConfig:
+        """Configuration in which the values of the preset replace None, as a run stores it.
+
+        A short training begins to learn sooner in proportion.
+        """
+        usual = dict(self.preset.hyperparameters)
         if "learning_starts" in usual:
             share = min(1.0, self.total_timesteps / self.preset.n_timesteps)
             usual["learning_starts"] = round(share * usual["learning_starts"])
-        return {**usual, **self.hyperparameters}
+        return dataclasses.replace(
+            self,
+            n_timesteps=self.total_timesteps,
+            n_envs=self.n_envs or self.preset.n_envs,
+            eval_every=self.evaluation_interval,
+            checkpoint_every=self.checkpoint_every or self.preset.checkpoint_every,
+            hyperparameters={**usual, **self.hyperparameters},
+        )
 
     @property
     def total_timesteps(self) -> int:
@@ -327,10 +337,6 @@ class TrainConfig(Config):
         """Run folder."""
         usual = Path("runs") / f"{self.env.rpartition('/')[2]}-{self.algo}-{self.seed}"
         return Path(self.out) if self.out else usual
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the configuration as plain values, which are arguments of an equal one."""
-        return {**dataclasses.asdict(self), "out": None if self.out is None else str(self.out)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -448,7 +454,7 @@ class PlanConfig(Config):
     Example: viapoint plan --arm panda --position 0.5 0.3 0.4 --out plan.csv
     """
 
-    arm: str = "panda"  # Name of an arm, or MJCF or URDF file of one.
+    arm: Annotated[str, ARM] = "panda"
     start: tuple[float, ...] = ()
     """Joint positions at the start, [rad]; by default those of the scene file, or home."""
     goal: tuple[float, ...] = ()  # Joint positions at the goal, [rad]; by default those of the scene file.
@@ -456,13 +462,6 @@ class PlanConfig(Config):
     """Place of the tool at the goal, x y z, [m], in place of joint positions."""
     quaternion: tuple[float, ...] = ()  # Orientation of the tool there, w x y z; any if not given.
     scene: Path | None = None  # JSON file of a scene, or of a list of obstacles.
-    tool: str = ""
-    """Site or body of the tool of an arm of a file; by default one with a usual name, or the tip."""
-    joints: tuple[str, ...] = ()
-    """Names of its joints from the base to the tool; by default all of the chain."""
-    base: str = ""  # Body that the chain begins at, where a file has two arms.
-    packages: tuple[Path, ...] = ()  # Folders for package:// in a URDF.
-    velocity_limit: float | None = None  # Velocity limit of its joints, [rad/s]; by default that of the file.
     n_via: int = 2  # Number of via-points, 1 to 3.
     margin: float = 0.0  # Least clearance, [m].
     duration: float | None = None  # Duration, [s]; by default the shortest that the limits allow.

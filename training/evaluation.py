@@ -377,7 +377,7 @@ def _decision_times(method: Method, scenes: Scenes, simulation: SceneSimulation,
             one = scenes.take(slice(row, row + 1))
             decided = decide(simulation.observe(one), one)
             if replanning:
-                alone.episodes(one, decided, decide)
+                alone(one, decided, decide)
             usual = float(np.median(times[1:] or [times[0] / 20.0]))  # the first may warm up
             if usual > SLOW_DECISION:  # a look at each scene would take too long
                 return np.array([in_batch])

@@ -59,24 +59,19 @@ class SceneSimulation:
             pieces.append({name: part[: len(rows)] for name, part in seen.items()})
         return _joined(pieces)
 
-    def __call__(self, scenes: Scenes, actions: Float) -> SimulationResults:
-        """Simulate episodes that begin with one action in each of N scenes; all later actions are zero."""
-        return self.episodes(scenes, actions, None)
+    def __call__(self, scenes: Scenes, actions: Float, decide: Decide | None = None) -> SimulationResults:
+        """Simulate one episode in each of N scenes, from first actions (N, m); later ones are decided, or zero."""
+        pieces = []
+        for rows, _, env, _ in self._begun(scenes):
+            pieces.append(_episodes(env, scenes.take(rows), actions[rows], decide))
+        return SimulationResults.concatenate(pieces)
 
     def play(self, method: Any, scenes: Scenes, decisions: Float) -> SimulationResults:
         """Simulate episodes that begin with decisions of a method; it makes all others or has its own `execute`."""
         if hasattr(method, "execute"):
             results: SimulationResults = method.execute(scenes, decisions)
             return results
-        return self.episodes(scenes, decisions, method.decide)
-
-    def episodes(self, scenes: Scenes, actions: Float, decide: Decide | None) -> SimulationResults:
-        """Simulate one episode in each of N scenes, from first actions (N, m); later ones are decided, or zero."""
-        pieces = []
-        for rows, _, env, _ in self._begun(scenes):
-            some = scenes.take(rows)
-            pieces.append(_episodes(env, some, actions[rows], decide))
-        return SimulationResults.concatenate(pieces)
+        return self(scenes, decisions, method.decide)
 
     def execute_plan(self, scenes: Scenes, plan: Plan) -> SimulationResults:
         """Simulate one plan in each of N scenes, N at least 1; plans may have any number of via-points."""

@@ -101,7 +101,7 @@ class Trial:
         own = config.hyperparameters.get("policy_kwargs")
         if own is None:
             return config
-        usual = config.preset.arguments().get("policy_kwargs", {})
+        usual = config.preset.hyperparameters.get("policy_kwargs", {})
         hyperparameters = {**config.hyperparameters, "policy_kwargs": {**usual, **own}}
         return dataclasses.replace(config, hyperparameters=hyperparameters)
 

@@ -30,7 +30,7 @@ SMALL = {"learning_starts": 8, "batch_size": 8, "buffer_size": 64, "policy_kwarg
 
 def new(env):
     preset = PRESETS["sac"]
-    return build("sac", preset.policy, env, {**preset.arguments(), **SMALL}, seed=1)
+    return build("sac", preset.policy, env, {**preset.hyperparameters, **SMALL}, seed=1)
 
 
 @pytest.fixture(scope="module")

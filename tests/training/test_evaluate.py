@@ -409,7 +409,7 @@ def test_what_a_method_carries_out_is_what_the_single_environment_does():
 @pytest.mark.parametrize("env_id", [STEP, MOVING_STEP])
 def test_an_agent_of_steps_stands_in_one_table_with_the_others(env_id):
     preset = STEP_PRESETS["sac"]
-    settings = {**preset.arguments(), "buffer_size": 10}
+    settings = {**preset.hyperparameters, "buffer_size": 10}
     agent = agent_method("agent", build("sac", preset.policy, ViaVecEnv(env_id, 4), settings, seed=0))
     assert isinstance(agent, StepAgentMethod)
     env_kwargs = whole_task(env_id, {})

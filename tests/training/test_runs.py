@@ -29,7 +29,7 @@ from viapoint.training.video import record_video
 
 def new(algo, env, **hyperparameters):
     preset = PRESETS[algo]
-    return build(algo, preset.policy, env, {**preset.arguments(), **hyperparameters}, seed=1)
+    return build(algo, preset.policy, env, {**preset.hyperparameters, **hyperparameters}, seed=1)
 
 
 @pytest.mark.filterwarnings(
@@ -114,18 +114,18 @@ def run(tmp_path):
 def test_a_folder_in_use_is_refused_and_a_dead_process_holds_nothing(run, monkeypatch):
     monkeypatch.setattr(runs, "PATIENCE", 0.0)
     script = (
-        "import sys; from pathlib import Path; from viapoint.training.runs import Run\n"
-        f"with Run(Path({str(run.folder)!r})).locked():\n    print('in', flush=True); sys.stdin.read()"
+        "import sys; from pathlib import Path; from viapoint.training.runs import locked\n"
+        f"with locked(Path({str(run.folder)!r})):\n    print('in', flush=True); sys.stdin.read()"
     )
     other = subprocess.Popen(
         [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     assert other.stdout.readline() == "in\n"
-    with pytest.raises(BadFileError, match="in use"), run.locked():
+    with pytest.raises(BadFileError, match="in use"), runs.locked(run.folder):
         pass
     other.kill()
     other.communicate()
-    with run.locked():
+    with runs.locked(run.folder):
         pass
 
 

@@ -183,7 +183,7 @@ class StepAgentMethod:
 
     def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
         """Play every episode to its end, beginning with the given actions."""
-        return self._simulation.episodes(scenes, decisions, self.decide)
+        return self._simulation(scenes, decisions, self.decide)
 
 
 def agent_method(name: str, model: Any, checks: int | None = None, refine: int | None = None) -> Method:

@@ -125,9 +125,7 @@ class PredictedSearch:
         """Play every episode to its end, beginning with the given decisions, and remember what is seen."""
         memory: dict[bytes, Seen] = {}
         self._look(self._simulation.observe(scenes), scenes, memory)
-        return self._simulation.episodes(
-            scenes, decisions, lambda seen, some: self._decide(seen, some, memory)
-        )
+        return self._simulation(scenes, decisions, lambda seen, some: self._decide(seen, some, memory))
 
     def _decide(self, observation: Observation, scenes: Scenes, memory: dict[bytes, Seen]) -> Float:
         problem = Problem.of_observation(observation, self._search.task)
