@@ -10,8 +10,8 @@ import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
@@ -50,9 +50,9 @@ KINDS = {
 @REGISTRY.primitive_rule
 def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     """Return the form of a number, path or text, or of one that may be left out."""
-    kinds = get_args(info.type) if info.type_origin in (Union, UnionType) else (info.type,)
+    kinds = set(get_args(info.type)) or {info.type}
     kind: Any = next((each for each in KINDS if each in kinds), None)  # a path before a text
-    if kind is None or not set(kinds) <= {NoneType, *KINDS}:
+    if kind is None or not kinds <= {NoneType, *KINDS}:
         return None
     metavar, what = KINDS[kind]
 
@@ -129,12 +129,13 @@ ARM_ENVS = {"planar": DEFAULT_ENV, "panda": "viapoint/PandaObstacles-v0"}
 
 def _plain(name: str, values: Any) -> Any:
     """Return values as JSON has them; a file of an arm is named by its whole path, as runs go on in other folders."""
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{name} must be values by name, got {values!r}")
     try:
         plain = as_plain(values)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: {error}") from None
-    arm = plain.get("arm") if isinstance(plain, dict) else None
-    given = values["arm"] if isinstance(arm, str) else None
+    arm, given = plain.get("arm"), values.get("arm")
     if isinstance(given, Arm) and not given.file and arm_of(arm) is not given:
         raise ValueError(
             f"{name}: register_arm makes arm {arm!r} known by its name, which is that of another one"
@@ -180,14 +181,15 @@ class Config:
     def __post_init__(self) -> None:
         """Check the values."""
         for each in dataclasses.fields(self):
-            value = getattr(self, each.name)
+            name, value = each.name, getattr(self, each.name)
             if isinstance(value, str) and "Path" in str(each.type):
-                object.__setattr__(self, each.name, named_path(each.name, value))
-            if str(each.type) == "NamedValues":
-                object.__setattr__(self, each.name, _plain(each.name, value))
-            optional = value is None and each.default is None
-            if each.name in RANGES and not optional and not isinstance(value, tuple | list):
-                object.__setattr__(self, each.name, check_whole(each.name, value))
+                value = named_path(name, value)
+            elif str(each.type) == "NamedValues":
+                value = _plain(name, value)
+            elif name in RANGES and not isinstance(value, tuple | list):
+                optional = value is each.default is None
+                value = value if optional else check_whole(name, value)
+            object.__setattr__(self, name, value)
         self._check()
 
     def _check(self) -> None:
@@ -259,8 +261,6 @@ class TrainConfig(Config):
                 f"{self.algo} decides on whole movements; for {self.env} algo must be one of "
                 f"{', '.join(STEP_PRESETS)}"
             )
-        if not isinstance(self.hyperparameters, Mapping):
-            raise ValueError(f"hyperparameters must be values by name, got {self.hyperparameters!r}")
         share = self.stop_when_stalled
         if share is None:
             return

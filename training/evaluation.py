@@ -24,11 +24,7 @@ from viapoint.training.agents.agent import load_agent
 from viapoint.training.agents.model_io import check_same_task, untrained
 from viapoint.training.checks import check_whole
 from viapoint.training.files import versions
-from viapoint.training.planning.baselines import (
-    Method,
-    agent_method,
-    make_method,
-)
+from viapoint.training.planning.baselines import Method, agent_method, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation, SimulationResults, whole_task
 from viapoint.training.scene_sets import BANDS, DRAWN, SETS, FrozenScenes, scenes_for
@@ -55,8 +51,7 @@ class MethodResult:
     family: NDArray[np.str_]  # Scene family of each scene, '' for the training distribution, shape (n,)
     distance: Float
     """Distance from start to goal, shape (n,), [m]; NaN if the target jumps, as the shortest path is unknown."""
-    interrupted: bool  # True if Ctrl-C ended it; then decision times may be missing
-    partial: bool  # True if it ended before the last scene
+    partial: bool  # True if Ctrl-C ended it: scenes or decision times are missing
 
     @property
     def success(self) -> NDArray[np.bool_]:
@@ -110,8 +105,11 @@ class EvaluationResult:
     """Hash of the scene set."""
     results: tuple[MethodResult, ...]
     """Outcomes of each method, the agent first."""
-    partial: bool = False
-    """Mark of an evaluation that was interrupted before the end."""
+
+    @property
+    def partial(self) -> bool:
+        """Mark of an evaluation that was interrupted before the end."""
+        return self.results[-1].partial
 
     @property
     def success_rate(self) -> float:
@@ -232,7 +230,6 @@ def evaluate(
             methods += _rows_of(untrained(agent), settings, each)
         else:
             methods.append(make_method(each, env_id, **kwargs))
-    _check_methods(methods)
     chosen = scenes_for(scenes, task, n_scenes)
     if n_scenes is not None and n_scenes > len(chosen.share):
         print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
@@ -278,23 +275,6 @@ def evaluate_methods(
     progress: Progress | None = None,
 ) -> EvaluationResult:
     """Evaluate one or more methods in the same scenes, `batch` at a time; the rest is as for :func:`evaluate`."""
-    _check_methods(methods)
-    results: list[MethodResult] = []
-    opened = SceneSimulation(env_id, min(batch, len(frozen.share)), **(env_kwargs or {}))
-    with one_thread(), closing(opened) as simulation:
-        for method in methods:
-            result = _evaluate_one(method, frozen, simulation, batch, time_decisions, progress)
-            results.append(result)
-            if result.interrupted:
-                break
-    partial = len(results) < len(methods) or results[-1].partial
-    return EvaluationResult(
-        env_id=env_id, scenes=frozen.name, sha256=frozen.sha256, results=tuple(results), partial=partial
-    )
-
-
-def _check_methods(methods: Sequence[Any]) -> None:
-    """Check that there are methods, with names that tell them apart in the results."""
     if not methods:
         raise ValueError("there is nothing to evaluate: give an agent or baselines")
     for each in methods:
@@ -303,6 +283,15 @@ def _check_methods(methods: Sequence[Any]) -> None:
     names = [each.name for each in methods]
     if len(set(names)) < len(names):
         raise ValueError(f"methods must have different names, got {', '.join(names)}")
+    results: list[MethodResult] = []
+    opened = SceneSimulation(env_id, min(batch, len(frozen.share)), **(env_kwargs or {}))
+    with one_thread(), closing(opened) as simulation:
+        for method in methods:
+            result = _evaluate_one(method, frozen, simulation, batch, time_decisions, progress)
+            results.append(result)
+            if result.partial:
+                break
+    return EvaluationResult(env_id=env_id, scenes=frozen.name, sha256=frozen.sha256, results=tuple(results))
 
 
 def _evaluate_one(
@@ -352,8 +341,7 @@ def _evaluate_one(
         band=frozen.band[:done],
         family=frozen.family[:done],
         distance=away[:done],
-        interrupted=interrupted,
-        partial=done < number,
+        partial=interrupted,
     )
 
 

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import ConvertCallback
 
 from viapoint.envs.common.validation import is_number
 from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
@@ -554,7 +554,7 @@ def _sets(trial: Trial) -> dict[str, FrozenScenes]:
 def _measured(method: Method, frozen: FrozenScenes, env_id: str, env_kwargs: Record) -> Record:
     """Return what a line of a table says about a method in a set of scenes."""
     (result,) = evaluate_methods([method], frozen, env_id, env_kwargs=env_kwargs).results
-    if result.interrupted:
+    if result.partial:
         raise KeyboardInterrupt
     summary = result.summary()
     seconds = summary["decision_time"]
@@ -568,24 +568,23 @@ def _measured(method: Method, frozen: FrozenScenes, env_id: str, env_kwargs: Rec
     }
 
 
-def _import_libraries() -> tuple[Any, Any]:
-    """Import Ray and Ray Tune, which take seconds, and Optuna only when a study runs."""
+def _import_ray() -> Any:
+    """Import Ray with Ray Tune, which take seconds, and Optuna only when a study runs."""
     for name, value in SETTINGS.items():
         os.environ.setdefault(name, value)
     try:
         import optuna
-        import ray
-        from ray import tune
+        import ray.tune
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(explain_import_error(error, "a study"), name=error.name) from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    return ray, tune
+    return ray
 
 
 @contextmanager
 def _connected(workers: int | None) -> Iterator[None]:
     """Start a Ray of this machine that listens on 127.0.0.1 alone and ends with the study, if there is none."""
-    ray, _ = _import_libraries()
+    ray = _import_ray()
     if ray.is_initialized():
         yield
         return
@@ -605,7 +604,7 @@ def _connected(workers: int | None) -> Iterator[None]:
 
 def _run_trials(trials: list[Trial], folder: Path, told: Told) -> list[str]:
     """Run trials as tasks of Ray, and return a line for each that failed."""
-    ray, _ = _import_libraries()
+    ray = _import_ray()
     task = ray.remote(num_cpus=1, max_retries=RETRIES)(_run_trial)  # each trial computes on one core
     running: dict[Any, Trial] = {task.remote(trial, folder): trial for trial in trials}
     failed = []
@@ -622,38 +621,30 @@ def _run_trials(trials: list[Trial], folder: Path, told: Told) -> list[str]:
     return failed
 
 
-class ReportCallback(BaseCallback):
-    """Callback that reports the validations of a run, each once, to a function that may raise to end the training."""
-
-    def __init__(self, folder: Path, report: Callable[[dict[str, Any]], None]) -> None:
-        super().__init__()
-        self.folder, self.report = folder, report
-        self._reported = 1  # the validation before training says nothing about it
-
-    def _on_rollout_start(self) -> None:
-        for each in Run(self.folder).curve[self._reported :]:
-            self.report({"success": each["success"]["rate"], "decisions": each["decisions"]})
-            self._reported += 1
-
-    def _on_step(self) -> bool:
-        return True
-
-
 def _run_search(search: Search, folder: Path, workers: int | None, told: Told) -> list[str]:
     """Search for hyperparameters, write the best ones, and return a line for each trial if all of them failed.
 
     Optuna chooses the parameters, and successive halving (ASHA) stops trainings that are behind in validation.
     """
-    _, tune = _import_libraries()
+    tune = _import_ray().tune
     from ray.tune.schedulers import ASHAScheduler
     from ray.tune.search.optuna import OptunaSearch
 
     total = search.config(folder).total_timesteps
 
     def work(config: Values) -> None:
+        reported = 1  # the validation before training says nothing about it
+
+        def report(*_: object) -> bool:
+            nonlocal reported
+            for each in Run(settings.folder).curve[reported:]:
+                tune.report({"success": each["success"]["rate"], "decisions": each["decisions"]})
+                reported += 1
+            return True
+
         try:
             settings = search.with_parameters(config, Path(tune.get_context().get_trial_dir()) / "run")
-            run = train_or_resume(settings, ReportCallback(settings.folder, tune.report))
+            run = train_or_resume(settings, ConvertCallback(report))
             tune.report({"success": run.curve[-1]["success"]["rate"], "decisions": run.decisions})
         except Exception as error:  # settings that cannot be trained do not end a search
             tune.report({"success": 0.0, "decisions": total, "error": _one_line(error)})

@@ -133,7 +133,6 @@ def fake(success, **changes):
         "family": np.full(n, ""),
         "distance": np.full(n, 0.4),
         "partial": False,
-        "interrupted": False,
     }
     return MethodResult(**{**values, **changes})
 

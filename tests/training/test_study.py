@@ -16,7 +16,7 @@ import yaml
 from helpers import PLANE as ENV
 
 from viapoint.training import Study, run_study
-from viapoint.training.study import COLUMNS, StudyFailedError, _connected, _import_libraries
+from viapoint.training.study import COLUMNS, StudyFailedError, _connected, _import_ray
 
 FEW = {"learning_starts": 64, "gradient_steps": 1}
 TRAINING = {
@@ -54,9 +54,8 @@ def of_viaq(results):
 @pytest.fixture(scope="module")
 def ray():
     """One Ray for all studies of this process, as each start takes seconds."""
-    ray, _ = _import_libraries()
     with _connected(2):
-        yield ray
+        yield _import_ray()
 
 
 @pytest.fixture(scope="module")

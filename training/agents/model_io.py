@@ -11,6 +11,7 @@ import functools
 import hashlib
 import importlib.metadata
 import inspect
+import json
 import math
 import typing
 import warnings
@@ -97,14 +98,7 @@ SPARE_PARAMETERS = 100_000
 
 
 def save_model(model: BaseAlgorithm, folder: Path) -> None:
-    """Write a model as JSON and safetensors, for decisions and for further training from its weights.
-
-    Raises:
-        ValueError: Its class is not in ALGORITHMS, or it has no environment of this package.
-
-    Warns:
-        UserWarning: Observations are normalised by `VecNormalize`, whose statistics are no part of the folder.
-    """
+    """Write a model as JSON and safetensors, for decisions and for further training from its weights."""
     normalize = model.get_vec_normalize_env()
     if normalize is not None and normalize.norm_obs:
         warnings.warn(
@@ -121,9 +115,8 @@ def save_model(model: BaseAlgorithm, folder: Path) -> None:
 def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
     """Load a model to train it on `env`, or to decide, with an environment and a small replay buffer of its own.
 
-    Raises:
-        BadFileError: A file is missing, torn, foreign, or says something that is not allowed.
-        ValueError: The environment is another one than the agent needs.
+    Files that are missing, torn, foreign, or say something that is not allowed raise BadFileError, another environment
+    than the agent needs ValueError.
     """
     path = folder / "model.json"
     tensors = folder / "weights.safetensors"
@@ -135,10 +128,10 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
         raise BadFileError(path, f"{found}; it {writer} and this is {mine}")
     arrays = read_arrays(tensors, LARGEST_WEIGHTS)
     try:
+        # An arm file that is gone is replaced by its copy; ViaQ's networks know the task, too.
+        kept = functools.partial(with_kept_arm, folder=folder)
+        record = json.loads(json.dumps(record), object_hook=kept)
         hyperparameters = dict(record["hyperparameters"])
-        policy = hyperparameters.get("policy_kwargs", {})
-        if isinstance(policy, dict) and isinstance(policy.get("task"), dict):  # ViaQ's networks know the task
-            hyperparameters["policy_kwargs"] = {**policy, "task": with_kept_arm(policy["task"], folder)}
         with warnings.catch_warnings(), _parameter_budget(arrays):
             warnings.simplefilter("ignore", UserWarning)  # PPO's batches do not fill one environment
             own = _own_environment(record["env"], folder)
@@ -172,10 +165,7 @@ def _task_of(env: Any) -> Task:
 def check_same_task(mine: Task, theirs: Task) -> None:
     """Check that observations and actions mean the same in two tasks, so that an agent of one can decide in the other.
 
-    Scenes, rewards, and noise of a sensor may differ.
-
-    Raises:
-        ValueError: They do not; the message names the parts that differ.
+    Scenes, rewards, and noise of a sensor may differ; ValueError names the parts that differ otherwise.
     """
     before, after = _meaning(mine), _meaning(theirs)
     if mine.arm.xml == theirs.arm.xml:  # one arm may be in several files
@@ -356,8 +346,8 @@ def _digest(path: Path) -> str:
 def _own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
     """Return one copy of the environment that a file names by `id` and `kwargs`, or by its `task` alone.
 
-    An arm file that is gone is replaced by its copy in the folder. The id of a user's own environment need not be
-    registered where the model is loaded; one that stands for another task here raises BadFileError.
+    The id of a user's own environment need not be registered where the model is loaded; one of another task raises
+    BadFileError.
     """
     env_id, kwargs = record["id"], record["kwargs"]
     if env_id not in gym.registry:  # never lets Gymnasium import a module named in a file
@@ -371,10 +361,10 @@ def _own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
         value = np.max(kwargs.get(name) or 0)
         if value > most:
             raise ValueError(f"{name} may be at most {most} in a file, got {value}")
-    env = ViaVecEnv(env_id, 1, **with_kept_arm(kwargs, folder))
+    env = ViaVecEnv(env_id, 1, **kwargs)
     if "task" in record:
         try:
-            check_same_task(Task.from_dict(with_kept_arm(record["task"], folder)), _task_of(env))
+            check_same_task(Task.from_dict(record["task"]), _task_of(env))
         except ValueError as error:
             raise BadFileError(
                 folder, f"holds an agent for another {env_id} than is registered: {error}"
