@@ -75,13 +75,13 @@ Told = Callable[[str], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One row of the results for one seed: what a worker trains and measures."""
+    """One row of the results for one seed: what a worker trains and measures; or a search for its hyperparameters."""
 
     environment: str  # Name of the environment in folders and tables
     env_id: str  # Id of the registered environment
-    env_kwargs: Values = field(default_factory=dict)  # Arguments of the environment
-    scenes: tuple[str, ...] = ()  # Names of the measured sets, or files of scenes
-    n_scenes: int | None = None  # Number of scenes of each set, evenly spread over it; None for all
+    env_kwargs: Values  # Arguments of the environment
+    scenes: tuple[str, ...]  # Names of the measured sets, or files of scenes
+    n_scenes: int | None  # Number of scenes of each set, evenly spread over it; None for all
     row: str  # Name of the row, which is also that of its folder
     seed: int = 0
     training: Values = field(default_factory=dict)  # Fields of TrainConfig; empty for a baseline
@@ -89,14 +89,22 @@ class Trial:
     refine: tuple[int, ...] = ()  # Numbers of proposals that the planner refines, a row each
     untrained: bool = False  # True to measure the network before training, too
     method: str = ""  # Name of a baseline; empty for an agent
+    parameters: Values = field(default_factory=dict)  # Of a search: ranges or values by the path of a field
+    trials: int = 0  # Of a search
+    first: tuple[Values, ...] = ()  # Parameters of the first trials of a search
 
     def folder(self, out: Path) -> Path:
-        """Return the folder of the trial."""
-        return out / self.environment.rpartition("/")[2] / self.row / f"seed-{self.seed}"
+        """Return the folder of the trial, or of the search."""
+        row = out / self.environment.rpartition("/")[2] / self.row
+        return row if self.parameters else row / f"seed-{self.seed}"
 
-    def config(self, folder: Path) -> TrainConfig:
-        """Return the configuration of a training in a folder; `policy_kwargs` are merged with those of the preset."""
-        given = {**self.training, "env_kwargs": {**self.env_kwargs, **self.training.get("env_kwargs", {})}}
+    def config(self, folder: Path, values: Values | None = None) -> TrainConfig:
+        """Return the configuration of a training in a folder, in a search with values of the parameters.
+
+        Its `policy_kwargs` are merged with those of the preset.
+        """
+        given = _with(self.training, values or {})
+        given["env_kwargs"] = {**self.env_kwargs, **given.get("env_kwargs", {})}
         config = TrainConfig(env=self.env_id, seed=self.seed, out=folder, progress=False, **given)
         own = config.hyperparameters.get("policy_kwargs")
         if own is None:
@@ -105,33 +113,11 @@ class Trial:
         hyperparameters = {**config.hyperparameters, "policy_kwargs": {**usual, **own}}
         return dataclasses.replace(config, hyperparameters=hyperparameters)
 
-
-@dataclass(frozen=True, kw_only=True)
-class Search(Trial):
-    """Search for hyperparameters of one algorithm in one environment; fields of Trial hold for every training."""
-
-    parameters: Values  # range or list of values by the path of a field
-    trials: int = 20
-    first: tuple[Values, ...] = ()  # parameters of the first trials
-
-    def with_parameters(self, values: Values, folder: Path) -> TrainConfig:
-        """Return the configuration of a training with these parameters."""
-        return dataclasses.replace(self, training=_with(self.training, values)).config(folder)
-
     @property
     def key(self) -> str:
-        """Name that changes with the description of the search."""
+        """Name of a search that changes with its description."""
         plain = json.dumps(dataclasses.asdict(self), sort_keys=True)
         return f"{self.row}-{hashlib.sha256(plain.encode()).hexdigest()[:10]}"
-
-    def folder(self, out: Path) -> Path:
-        """Return the folder of the search."""
-        return super().folder(out).parent
-
-    def is_finished(self, out: Path) -> bool:
-        """Return True if the best parameters of this very search are there."""
-        path = self.folder(out) / "best.json"
-        return path.is_file() and read_json(path).get("key") == self.key
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +135,7 @@ class Study:
     name: str
     out: Path  # Folder of all runs and results
     trials: tuple[Trial, ...]
-    searches: tuple[Search, ...] = ()
+    searches: tuple[Trial, ...] = ()
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Study:
@@ -231,12 +217,11 @@ def _study(
                 found += _made(row, make, {**shared, **fields}, known[env], row)
     if not found:
         raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
-    trials = [each for each in found if not isinstance(each, Search)]
     return Study(
         name=name,
         out=Path(out or f"runs/{name}").expanduser(),
-        trials=tuple(sorted(trials, key=lambda trial: trial.seed)),
-        searches=tuple(each for each in found if isinstance(each, Search)),
+        trials=tuple(sorted((each for each in found if not each.parameters), key=lambda trial: trial.seed)),
+        searches=tuple(each for each in found if each.parameters),
     )
 
 
@@ -319,10 +304,15 @@ def _agent(
         raise ValueError(f"refine is for tasks with one decision for a movement, {env['env_id']} has several")
     if not seeds or len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must hold at least one number and none twice, got {seeds}")
-    rows = {"row": row, "checks": tuple(checks) or (0,), "refine": tuple(refine), "untrained": untrained}
+    fields: Record = {
+        "row": row,
+        "checks": tuple(checks) or (0,),
+        "refine": tuple(refine),
+        "untrained": untrained,
+    }
     trials = []
     for seed in seeds:
-        trial = Trial(**env, **rows, seed=seed, training=training)
+        trial = Trial(**env, **fields, seed=seed, training=training)
         config = trial.config(Path())
         check_hyperparameters(config.algorithm, config.hyperparameters)
         trials.append(trial)
@@ -344,7 +334,7 @@ def _search(
     trials: int = 20,
     first: list[dict[str, Any]] | tuple[()] = (),
     **training: Any,
-) -> list[Search]:
+) -> list[Trial]:
     """Return a search whose values, or whose lowest and highest ones, are allowed."""
     (trial,) = _agent(env, row, seeds=seeds[:1], **training)
     if not parameters:
@@ -358,8 +348,7 @@ def _search(
         for value in _ends(path, values):  # an impossible value is an error now, and not in the last trial
             _made("parameters", _agent, {"seeds": [0], **_with(training, {path: value})}, env, row)
     check_whole("trials", trials)
-    about = {"row": row, "seed": trial.seed, "training": training}
-    return [Search(**env, **about, parameters=parameters, trials=trials, first=tuple(first))]
+    return [dataclasses.replace(trial, parameters=parameters, trials=trials, first=tuple(first))]
 
 
 def _ends(path: str, given: Any) -> list[Any]:
@@ -432,7 +421,7 @@ def run_study(
             raise BadFileError(folder, "holds something else than a study; name another folder")
         write_json(mark, {"viapoint": "study", "name": study.name})
     missing = [trial for trial in study.trials if not _finished_record(trial, folder)]
-    searches = [search for search in study.searches if not search.is_finished(folder)]
+    searches = [search for search in study.searches if not _is_finished(search, folder)]
     failed = []
     if missing or searches:
         told(
@@ -488,6 +477,12 @@ def _finished_record(trial: Trial, out: Path) -> Record:
     return record if record.get("asked") == _asked(trial) else {}
 
 
+def _is_finished(search: Trial, out: Path) -> bool:
+    """Return True if the best parameters of this very search are there."""
+    path = search.folder(out) / "best.json"
+    return path.is_file() and read_json(path).get("key") == search.key
+
+
 def _write_results(study: Study, folder: Path) -> pd.DataFrame:
     """Write `results.csv`, `results.md` and a figure for each environment from all records, and return the table."""
     lines = []
@@ -540,8 +535,10 @@ def markdown(table: pd.DataFrame, title: str) -> str:
 
 def _asked(trial: Trial) -> Record:
     """Return what identifies a trial as plain values."""
-    hashes = {name: frozen.sha256 for name, frozen in _sets(trial).items()}
-    plain: Record = as_plain({**dataclasses.asdict(trial), "scenes": hashes})
+    plain: Record = as_plain(trial)
+    plain["scenes"] = {name: frozen.sha256 for name, frozen in _sets(trial).items()}
+    for name in ("parameters", "trials", "first"):  # of searches
+        del plain[name]
     return plain
 
 
@@ -621,7 +618,7 @@ def _run_trials(trials: list[Trial], folder: Path, told: Told) -> list[str]:
     return failed
 
 
-def _run_search(search: Search, folder: Path, workers: int | None, told: Told) -> list[str]:
+def _run_search(search: Trial, folder: Path, workers: int | None, told: Told) -> list[str]:
     """Search for hyperparameters, write the best ones, and return a line for each trial if all of them failed.
 
     Optuna chooses the parameters, and successive halving (ASHA) stops trainings that are behind in validation.
@@ -643,7 +640,7 @@ def _run_search(search: Search, folder: Path, workers: int | None, told: Told) -
             return True
 
         try:
-            settings = search.with_parameters(config, Path(tune.get_context().get_trial_dir()) / "run")
+            settings = search.config(Path(tune.get_context().get_trial_dir()) / "run", config)
             run = train_or_resume(settings, ConvertCallback(report))
             tune.report({"success": run.curve[-1]["success"]["rate"], "decisions": run.decisions})
         except Exception as error:  # settings that cannot be trained do not end a search
@@ -698,7 +695,7 @@ def _domain(tune: Any, given: Any) -> Any:
     return (tune.loguniform if log else tune.uniform)(low, high)
 
 
-def _write_search(search: Search, results: Any, folder: Path) -> str:
+def _write_search(search: Trial, results: Any, folder: Path) -> str:
     """Write all trials of a search as CSV and the best one as JSON, and return a line about it."""
     lines = [{**each.config, **each.metrics} for each in results if each.error is None]
     table = pd.DataFrame(lines)[[*search.parameters, "success", "decisions"]]
@@ -706,7 +703,7 @@ def _write_search(search: Search, results: Any, folder: Path) -> str:
     table = table.sort_values(["decisions", "success"], ascending=False)
     write_bytes(search.folder(folder) / "trials.csv", table.to_csv(index=False).encode())
     best = table.to_dict("records")[0]
-    chosen = search.with_parameters({path: best[path] for path in search.parameters}, folder)
+    chosen = search.config(folder, {path: best[path] for path in search.parameters})
     config = dataclasses.replace(chosen, out=None)
     record = {"viapoint": "search", "key": search.key, "success": best["success"], "command": config.command}
     write_json(search.folder(folder) / "best.json", {**record, "training": as_plain(config)})

@@ -23,7 +23,7 @@ from viapoint.training.configs import TrainConfig
 from viapoint.training.evaluation import MethodResult, evaluate, one_thread
 from viapoint.training.files import BadFileError, read_json, versions, write_json
 from viapoint.training.progress import progress_bar
-from viapoint.training.runs import Run, check_free, check_unchanged, locked
+from viapoint.training.runs import Run, check_unchanged, locked
 from viapoint.training.scene_sets import FrozenScenes, scenes_for
 from viapoint.training.vec_env import LOGGED, ViaVecEnv
 
@@ -98,11 +98,10 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
                 with _untrained_model(run.config) as model:
                     _continue_training(run, model, callbacks)
             return run
-        check_free(config.folder)
         begun = config.resolved
-        _warn(begun)
         with _untrained_model(begun) as model:  # before there is a folder: what cannot be built leaves none
             run = Run.create(begun)
+            _warn(begun)
             with locked(run.folder):
                 _continue_training(run, model, callbacks)
         return run
@@ -122,8 +121,9 @@ def train_or_resume(config: TrainConfig, callback: Callbacks = None) -> Run:
     check_unchanged(run, dataclasses.replace(config, n_timesteps=run.config.total_timesteps).resolved)
     if run.ended and run.config.total_timesteps == config.total_timesteps:
         return run
-    changes = {"out": config.folder, "resume": True, "progress": config.progress}
-    again = dataclasses.replace(run.config, n_timesteps=config.total_timesteps, **changes)
+    again = TrainConfig(
+        out=config.folder, resume=True, progress=config.progress, n_timesteps=config.total_timesteps
+    )
     return train(again, callback)
 
 
