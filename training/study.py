@@ -26,6 +26,7 @@ import pandas as pd
 from stable_baselines3.common.callbacks import ConvertCallback
 
 from viapoint.envs.common.validation import is_number
+from viapoint.envs.task import Task
 from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
 from viapoint.training.agents.model_io import check_arguments, check_hyperparameters, load_model, untrained
 from viapoint.training.checks import check_env_kwargs, check_folder, check_whole, named_path, unknown_name
@@ -80,9 +81,9 @@ class Trial:
     environment: str  # Name of the environment in folders and tables
     env_id: str  # Id of the registered environment
     env_kwargs: Values  # Arguments of the environment
-    scenes: tuple[str, ...]  # Names of the measured sets, or files of scenes
+    scenes: tuple[str, ...] = ()  # Names of the measured sets, or files of scenes
     n_scenes: int | None  # Number of scenes of each set, evenly spread over it; None for all
-    row: str  # Name of the row, which is also that of its folder
+    row: str = ""  # Name of the row, which is also that of its folder
     seed: int = 0
     training: Values = field(default_factory=dict)  # Fields of TrainConfig; empty for a baseline
     checks: tuple[int, ...] = (0,)  # Numbers of proposals that the agent checks, a row each
@@ -92,6 +93,11 @@ class Trial:
     parameters: Values = field(default_factory=dict)  # Of a search: ranges or values by the path of a field
     trials: int = 0  # Of a search
     first: tuple[Values, ...] = ()  # Parameters of the first trials of a search
+
+    @property
+    def task(self) -> Task:
+        """Task of the environment."""
+        return registered_task(self.env_id, **self.env_kwargs)
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the trial, or of the search."""
@@ -135,7 +141,7 @@ class Study:
     name: str
     out: Path  # Folder of all runs and results
     trials: tuple[Trial, ...]
-    searches: tuple[Trial, ...] = ()
+    searches: tuple[Trial, ...]
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Study:
@@ -217,12 +223,10 @@ def _study(
                 found += _made(row, make, {**shared, **fields}, known[env], row)
     if not found:
         raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
-    return Study(
-        name=name,
-        out=Path(out or f"runs/{name}").expanduser(),
-        trials=tuple(sorted((each for each in found if not each.parameters), key=lambda trial: trial.seed)),
-        searches=tuple(each for each in found if each.parameters),
-    )
+    found.sort(key=lambda trial: trial.seed)
+    trials = tuple(each for each in found if not each.parameters)
+    searches = tuple(each for each in found if each.parameters)
+    return Study(name=name, out=Path(out or f"runs/{name}").expanduser(), trials=trials, searches=searches)
 
 
 def _entries(given: Entries) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -258,16 +262,11 @@ def _environment(
     env_kwargs: dict[str, Any] | None = None,
     scenes: Names,
     n_scenes: int | None,
-) -> Values:
-    """Return the fields of trials in an environment, which leaves out sets of scenes that it lacks."""
-    env: Record = {
-        "environment": name,
-        "env_id": id or name,
-        "env_kwargs": env_kwargs or {},
-        "n_scenes": n_scenes,
-    }
-    check_env_kwargs(env["env_kwargs"])
-    task = registered_task(env["env_id"], **env["env_kwargs"])
+) -> Trial:
+    """Return the trial of no row in an environment, which leaves out sets of scenes that it lacks."""
+    env = Trial(environment=name, env_id=id or name, env_kwargs=env_kwargs or {}, n_scenes=n_scenes)
+    check_env_kwargs(env.env_kwargs)
+    task = env.task
     if n_scenes is not None:
         check_whole("n_scenes", n_scenes)
     places = []
@@ -280,12 +279,12 @@ def _environment(
         else:
             raise ValueError(f"{unknown_name('scenes', each, SETS)}; or the path of a file of scenes")
     if not places:
-        raise ValueError(f"none of {', '.join(scenes)} is shipped for {env['env_id']}")
-    return {**env, "scenes": tuple(places)}
+        raise ValueError(f"none of {', '.join(scenes)} is shipped for {env.env_id}")
+    return dataclasses.replace(env, scenes=tuple(places))
 
 
 def _agent(
-    env: Values,
+    env: Trial,
     row: str,
     *,
     seeds: Numbers,
@@ -300,33 +299,27 @@ def _agent(
             check_whole(name, number)
     if (any(checks) or refine) and training.get("algo", "viaq") != "viaq":
         raise ValueError(f"checks and refine are for the proposals of viaq, got algo {training['algo']}")
-    if refine and registered_task(env["env_id"], **env["env_kwargs"]).replanning:
-        raise ValueError(f"refine is for tasks with one decision for a movement, {env['env_id']} has several")
+    if refine and env.task.replanning:
+        raise ValueError(f"refine is for tasks with one decision for a movement, {env.env_id} has several")
     if not seeds or len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must hold at least one number and none twice, got {seeds}")
-    fields: Record = {
-        "row": row,
-        "checks": tuple(checks) or (0,),
-        "refine": tuple(refine),
-        "untrained": untrained,
-    }
-    trials = []
-    for seed in seeds:
-        trial = Trial(**env, **fields, seed=seed, training=training)
+    agent = dataclasses.replace(env, row=row, training=training, untrained=untrained)
+    agent = dataclasses.replace(agent, checks=tuple(checks) or (0,), refine=tuple(refine))
+    trials = [dataclasses.replace(agent, seed=seed) for seed in seeds]
+    for trial in trials:
         config = trial.config(Path())
         check_hyperparameters(config.algorithm, config.hyperparameters)
-        trials.append(trial)
     return trials
 
 
-def _baseline(env: Values, row: str, *, method: str = "") -> list[Trial]:
+def _baseline(env: Trial, row: str, *, method: str = "") -> list[Trial]:
     """Return the trial of a baseline that exists in its environment."""
-    factory(method or row, registered_task(env["env_id"], **env["env_kwargs"]))  # an unknown name is told now
-    return [Trial(**env, row=row, method=method or row)]
+    factory(method or row, env.task)  # an unknown name is told now
+    return [dataclasses.replace(env, row=row, method=method or row)]
 
 
 def _search(
-    env: Values,
+    env: Trial,
     row: str,
     *,
     seeds: Numbers,
@@ -355,9 +348,8 @@ def _ends(path: str, given: Any) -> list[Any]:
     """Return all values of a list, or the lowest and the highest of a range."""
     if isinstance(given, list) and given:
         return given
-    ends = given if isinstance(given, Mapping) else {}
-    low: Any = ends.get("low")
-    high: Any = ends.get("high")
+    ends: Values = given if isinstance(given, Mapping) else {}
+    low, high = ends.get("low"), ends.get("high")
     if not (is_number(low) and is_number(high) and low < high) or (ends.get("log") and low <= 0):
         raise ValueError(
             f"{path} must be a list, or a range such as {{low: 1e-4, high: 1e-2, log: true}}, got {given!r}"
@@ -544,8 +536,7 @@ def _asked(trial: Trial) -> Record:
 
 def _sets(trial: Trial) -> dict[str, FrozenScenes]:
     """Return the sets of scenes of a trial by name."""
-    task = registered_task(trial.env_id, **trial.env_kwargs)
-    return {Path(name).stem: scenes_for(name, task, trial.n_scenes) for name in trial.scenes}
+    return {Path(name).stem: scenes_for(name, trial.task, trial.n_scenes) for name in trial.scenes}
 
 
 def _measured(method: Method, frozen: FrozenScenes, env_id: str, env_kwargs: Record) -> Record:
