@@ -495,20 +495,19 @@ class FitConfig(Config):
     """
 
     file: tyro.conf.Positional[Path]  # CSV file with one sample in each line, [s] and [m].
-    n_via: tuple[int, ...] = ()
-    """Number of via-points, or the fewest and the most to choose among; by default 0 to 3."""
+    n_via: tuple[int, ...] = USUAL_RANGE
+    """Number of via-points, or the fewest and the most to choose among."""
     free_ends: bool = True
     """Fit onset and end, too; otherwise a movement begins with its first sample and ends with its last."""
     out: Path = Path("fit")  # Folder for the table fit.csv and the figure fit.png.
 
     @property
-    def numbers(self) -> tuple[int, int] | None:
-        """Fewest and most via-points; None for the usual ones."""
-        return (self.n_via[0], self.n_via[-1]) if self.n_via else None
+    def numbers(self) -> tuple[int, int]:
+        """Fewest and most via-points."""
+        return self.n_via[0], self.n_via[-1]
 
     def _check(self) -> None:
-        fewest, most = self.numbers or USUAL_RANGE
-        if len(self.n_via) > 2 or not 0 <= fewest <= most <= MOST_VIA_POINTS:
+        if len(self.n_via) not in (1, 2) or not 0 <= self.n_via[0] <= self.n_via[-1] <= MOST_VIA_POINTS:
             raise ValueError(
                 f"n_via must be one number, or the fewest and the most, from 0 to {MOST_VIA_POINTS}, got {self.n_via}"
             )

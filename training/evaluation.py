@@ -26,7 +26,7 @@ from viapoint.training.checks import check_whole
 from viapoint.training.files import versions
 from viapoint.training.planning.baselines import Method, agent_method, make_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.rollout import SceneSimulation, SimulationResults, whole_task
+from viapoint.training.rollout import Outcomes, SceneSimulation, joined, whole_task
 from viapoint.training.scene_sets import BANDS, DRAWN, SETS, FrozenScenes, scenes_for
 from viapoint.training.statistics import mcnemar, success_weighted_path_length, wilson
 from viapoint.training.vec_env import env_arguments
@@ -303,7 +303,7 @@ def _evaluate_one(
     progress: Progress | None,
 ) -> MethodResult:
     number = len(frozen.share)
-    pieces: list[SimulationResults] = []
+    pieces: list[Outcomes] = []
     times: Float = np.zeros(0)
     seconds, interrupted = 0.0, False
     try:
@@ -316,7 +316,7 @@ def _evaluate_one(
                 shape = len(scenes.start), len(simulation.task.action_names)
                 decided = finite_array(f"decisions of {method.name}", decided, shape)
             outcome = simulation.play(method, scenes, decided)
-            outcome.info["action"] = np.asarray(decided, dtype=np.float64)
+            outcome["action"] = np.asarray(decided, dtype=np.float64)
             pieces.append(outcome)
             if progress is not None:
                 progress(method.name, min(first + batch, number), number)
@@ -324,11 +324,8 @@ def _evaluate_one(
             times = _decision_times(method, frozen.scenes, simulation, seconds / number)
     except KeyboardInterrupt:
         interrupted = True
-    if pieces:
-        joined = SimulationResults.concatenate(pieces)
-        outcomes = {**joined.info, "reward": joined.reward}
-    else:
-        outcomes = {name: np.zeros(0) for name in (*Outcome._fields, "action")}
+    nothing = {name: np.zeros(0) for name in (*Outcome._fields, "action")}
+    outcomes = joined(pieces) if pieces else nothing
     done = len(outcomes["is_success"])
     arm, scenes = simulation.task.arm, frozen.scenes
     away = np.linalg.norm(arm.hand(scenes.goal) - arm.hand(scenes.start), axis=-1)

@@ -595,7 +595,7 @@ def test_where_there_is_no_way_it_gives_up(monkeypatch):
     scenes = draw_given(given, simulation.task.sampler(), [np.random.default_rng(0)])
     method = make_method("ompl", PLANE)
     assert not method.plan(scenes).success
-    assert not method.execute(scenes, method.decide({}, scenes)).success.any()
+    assert not method.execute(scenes, method.decide({}, scenes))["is_success"].any()
 
 
 @pytest.mark.parametrize("env_id", [PLANE, WHOLE, PANDA_TASK])

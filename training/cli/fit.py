@@ -13,7 +13,6 @@ import pandas as pd
 
 from viapoint.envs.common.arrays import Float
 from viapoint.primitives import ViaPointFit, fit_via_points
-from viapoint.primitives.fitting import USUAL_RANGE
 from viapoint.training.configs import FitConfig
 from viapoint.training.files import BadFileError, check_ours, read_bytes, write_bytes
 from viapoint.training.plots import fitted_movements
@@ -89,7 +88,7 @@ def read_movements(path: Path) -> Movements:
 
 def _warn(movements: Movements, fits: Fits, config: FitConfig) -> None:
     """Print what looks like other units than seconds and metres, or like several movements in one."""
-    fewest, most = config.numbers or USUAL_RANGE
+    fewest, most = config.numbers
     for name, (time, position) in movements.items():
         gap, extent = float(np.ptp(time)) / len(time), float(np.ptp(position, axis=0).max())
         if gap > SLOW:
