@@ -41,8 +41,8 @@ DEQUES = ("ep_info_buffer", "ep_success_buffer")
 MAY_DIFFER = ("num_timesteps", "viapoint")  # Entries that do not tell models apart
 
 
-def write_checkpoint(model: BaseAlgorithm, path: Path, extra: Mapping[str, Any]) -> None:
-    """Write the complete state of a training run; :func:`read_checkpoint` returns `extra`."""
+def write_checkpoint(model: BaseAlgorithm, path: Path, seconds: float) -> None:
+    """Write the complete state of a training run that has taken a time, [s]."""
     env = model.get_env()
     assert isinstance(env, ViaVecEnv)
     arrays = {
@@ -64,18 +64,17 @@ def write_checkpoint(model: BaseAlgorithm, path: Path, extra: Mapping[str, Any])
         "variables": {name: variable.detach() for name, variable in _variables(model).items()},
         "torch_random": torch.get_rng_state(),
         "arrays": _mapped(arrays, (np.ndarray, np.generic), _to_torch),
-        "extra": dict(extra),
+        "extra": {"seconds": seconds},
     }
     content = io.BytesIO()
     torch.save(state, content)
     write_bytes(path, content.getvalue())
 
 
-def read_checkpoint(model: BaseAlgorithm, path: Path) -> dict[str, Any]:
-    """Set a newly built model of the same kind and its environment to the state of a checkpoint, and return `extra`.
+def read_checkpoint(model: BaseAlgorithm, path: Path) -> float:
+    """Set a newly built model and its environment to the state of a checkpoint, and return the time so far, [s].
 
-    Raises:
-        BadFileError: The checkpoint is torn, foreign, or of another model.
+    A checkpoint that is torn, foreign, or of another model raises BadFileError.
     """
     state = read_state(path)
     written_by = f"was written by viapoint {state['model'].get('viapoint')} and"
@@ -85,11 +84,10 @@ def read_checkpoint(model: BaseAlgorithm, path: Path) -> dict[str, Any]:
         raise BadFileError(path, f"{written_by} is of another model: {', '.join(others)}")
     try:
         _restore(model, state, _mapped(state["arrays"], torch.Tensor, torch.Tensor.numpy))
-        extra: dict[str, Any] = dict(state["extra"])
+        return float(state["extra"]["seconds"])
     except Exception as error:  # of a library, for content that does not fit the model
         reason = f"{written_by} does not fit the model ({type(error).__name__}: {error})"
         raise BadFileError(path, reason) from None
-    return extra
 
 
 def _with_any_file(record: Any) -> Any:

@@ -86,11 +86,7 @@ def from_words(words: list[str]) -> dict[str, Any]:
 
 def to_words(values: Mapping[str, Any]) -> list[str]:
     """Return a dictionary as NAME=VALUE words; :func:`from_words` is the inverse."""
-    words = []
-    for name, value in values.items():
-        plain = isinstance(value, str) and parse_yaml(value) == value
-        words.append(f"{name}={value if plain else json.dumps(value)}")
-    return words
+    return [f"{name}={json.dumps(value)}" for name, value in values.items()]
 
 
 # tyro reads a dictionary of one type of values only.

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -158,9 +158,9 @@ class Run:
         """Write a model as `best` or `final`; a folder with other files is kept as `best.1`, as training must go on."""
         write_folder(self.folder / name, lambda temporary: save_model(model, temporary), move_foreign=True)
 
-    def checkpoint(self, model: BaseAlgorithm, extra: Mapping[str, Any]) -> None:
-        """Write a checkpoint and remove outdated ones."""
-        write_checkpoint(model, self.folder / "checkpoints" / f"{model.num_timesteps:010d}.pt", extra)
+    def checkpoint(self, model: BaseAlgorithm, seconds: float) -> None:
+        """Write a checkpoint of a training that has taken a time, [s], and remove outdated ones."""
+        write_checkpoint(model, self.folder / "checkpoints" / f"{model.num_timesteps:010d}.pt", seconds)
         for outdated in self.checkpoints()[:-KEPT_CHECKPOINTS]:
             outdated.unlink()
 
@@ -169,11 +169,11 @@ class Run:
         found = (self.folder / "checkpoints").glob(10 * "[0-9]" + ".pt")
         return sorted(path for path in found if path.is_file())
 
-    def restore(self, model: BaseAlgorithm) -> dict[str, Any] | None:
+    def restore(self, model: BaseAlgorithm) -> float | None:
         """Set a model to the state of the newest intact checkpoint, and print why newer ones were skipped.
 
-        The result is the content of `extra`, or None without any checkpoint. Where none is whole, BadFileError is about
-        the newest; it is raised, too, where those of a training that has ended are gone.
+        The result is the time of the training so far, [s], or None without any checkpoint. Where none is whole,
+        BadFileError is about the newest; it is raised, too, where those of a training that has ended are gone.
         """
         newest = None
         for path in reversed(self.checkpoints()):

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from types import FrameType
 from typing import Any
@@ -162,10 +162,10 @@ def _continue_training(run: Run, model: BaseAlgorithm, callbacks: list[BaseCallb
     """Train from the last checkpoint of the run to its end."""
     folder = str(run.folder / "tensorboard")
     try:
-        restored = run.restore(model)
+        seconds = run.restore(model)
         with (
             closing(Logger(folder, [TensorBoardOutputFormat(folder)])) as logger,
-            RunCallback(run, callbacks, restored, model.num_timesteps) as monitor,
+            RunCallback(run, callbacks, seconds, model.num_timesteps) as monitor,
         ):
             model.set_logger(logger)
             run.write_curve(monitor.curve)  # without validations after the checkpoint
@@ -174,7 +174,7 @@ def _continue_training(run: Run, model: BaseAlgorithm, callbacks: list[BaseCallb
             write_json(path, {**read_json(path), "n_timesteps": run.config.total_timesteps})
             remaining = run.config.total_timesteps - model.num_timesteps
             if remaining > 0 and not run.stalled:
-                _learn(model, remaining, monitor, fresh=restored is None)
+                _learn(model, remaining, monitor, fresh=seconds is None)
             run.save("final", model)
             if monitor.interrupted:  # also after the last decision
                 raise TrainingStoppedError(
@@ -235,16 +235,16 @@ class RunCallback(CallbackList):
     """
 
     def __init__(
-        self, run: Run, callbacks: list[BaseCallback], restored: Mapping[str, Any] | None, decisions: int
+        self, run: Run, callbacks: list[BaseCallback], seconds: float | None, decisions: int
     ) -> None:
         super().__init__(callbacks)
         self.run, self.config = run, run.config
         self.curve: list[dict[str, Any]] = []  # one record for each evaluation so far
         self._began = time.monotonic()  # if it had not been interrupted, and without the time of validations
         self._before = decisions  # Decisions when it was last decided what is due
-        if restored is not None:
+        if seconds is not None:
             self.curve = [record for record in run.curve if record["decisions"] <= decisions]
-            self._began -= float(restored["seconds"])
+            self._began -= seconds
         self._validation: FrozenScenes | None = None
         if self.config.evaluation_interval:
             self._validation = scenes_for("validation", self.config.task, self.config.eval_scenes)
@@ -288,7 +288,7 @@ class RunCallback(CallbackList):
     def _on_rollout_start(self) -> None:
         self._run_due_actions(final=self.stopped)
         if self.interrupted or self.stopped or self.run.stalled:
-            self.run.checkpoint(self.model, {"seconds": self.seconds})
+            self.run.checkpoint(self.model, self.seconds)
             raise _TrainingEnds
         super()._on_rollout_start()
 
@@ -308,7 +308,7 @@ class RunCallback(CallbackList):
         saves = final or self._is_due(config.checkpoint_every or config.preset.checkpoint_every)
         self._before = self.num_timesteps
         if saves:
-            self.run.checkpoint(self.model, {"seconds": self.seconds})
+            self.run.checkpoint(self.model, self.seconds)
 
     def _is_due(self, interval: int) -> bool:
         """Return whether decisions have passed a multiple of an interval."""
@@ -318,24 +318,20 @@ class RunCallback(CallbackList):
         """Evaluate the policy, extend the learning curve, and save the model if it is the best so far."""
         if self._validation is None or (self.curve and self.curve[-1]["decisions"] == self.num_timesteps):
             return
-        seconds = self.seconds  # before the validation, which is no training
         began = time.monotonic()
         if hasattr(self.model, "calibrate"):  # of agents that predict their success
             self.model.calibrate()
         (result,) = evaluate(self.model, scenes=self._validation, time_decisions=False).results
         if result.partial:  # Ctrl-C has ended it: some scenes say nothing of all
             return
-        record = self._record(result, seconds)
+        record = self._record(result, began - self._began)
         self.curve.append(record)
         self.run.write_curve(self.curve)
         if self.config.progress and self._bar.disable:
             rate = 100.0 * record["success"]["rate"]
             total = max(self.num_timesteps, self.config.total_timesteps)  # rounds are whole
-            print(
-                f"{self.num_timesteps} of {total} decisions: success {rate:.1f} % in validation",
-                file=sys.stderr,
-                flush=True,
-            )
+            told = f"{self.num_timesteps} of {total} decisions: success {rate:.1f} % in validation"
+            print(told, file=sys.stderr)
         # A validation is better with more success, then with less jerk.
         best = max(self.curve, key=lambda each: (each["success"]["rate"], -(each["jerk_ratio"] or 0.0)))
         if record is best:

@@ -149,17 +149,17 @@ def test_checkpoints_are_kept_two_deep_and_torn_ones_passed_over(env, run, capsy
     model._setup_learn(100)
     for number in (4, 8, 12):
         model.num_timesteps = number
-        run.checkpoint(model, {"number": number})
+        run.checkpoint(model, float(number))
     assert [int(path.stem) for path in run.checkpoints()] == [8, 12]
     torn = run.checkpoints()[-1]
     content = torn.read_bytes()
     middle = len(content) // 2
     torn.write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
-    assert run.restore(new("td3", env)) == {"number": 8}
+    assert run.restore(new("td3", env)) == 8.0
     assert capsys.readouterr().err.count("passed over") == 1
     model.num_timesteps = 12
-    run.checkpoint(model, {"number": 12})  # the damaged one is written again
-    assert run.restore(new("td3", env)) == {"number": 12}
+    run.checkpoint(model, 12.0)  # the damaged one is written again
+    assert run.restore(new("td3", env)) == 12.0
     for path in run.checkpoints():
         path.write_text("{}")
     with pytest.raises(BadFileError):
