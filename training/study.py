@@ -16,7 +16,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -569,14 +569,12 @@ def _import_ray() -> Any:
     return ray
 
 
-@contextmanager
-def _connected(workers: int | None) -> Iterator[None]:
-    """Start a Ray of this machine that listens on 127.0.0.1 alone and ends with the study, if there is none."""
+def _connected(workers: int | None) -> Any:
+    """Return a context with a Ray of this machine that listens on 127.0.0.1 alone; nothing where there is a Ray."""
     ray = _import_ray()
     if ray.is_initialized():
-        yield
-        return
-    ray.init(
+        return nullcontext()
+    return ray.init(
         address="local",
         num_cpus=workers,
         include_dashboard=False,
@@ -584,10 +582,6 @@ def _connected(workers: int | None) -> Iterator[None]:
         logging_level="ERROR",
         _node_ip_address="127.0.0.1",
     )
-    try:
-        yield
-    finally:
-        ray.shutdown()
 
 
 def _run_trials(trials: list[Trial], folder: Path, told: Told) -> list[str]:

@@ -283,11 +283,10 @@ def _to_decide(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
 
 def describe(model: BaseAlgorithm) -> dict[str, Any]:
     """Return everything but the weights as JSON values."""
-    names = [name for name, kind in ALGORITHMS.items() if issubclass(kind, type(model))]
-    if len(names) != 1:
+    name = next((each for each, kind in ALGORITHMS.items() if issubclass(kind, type(model))), None)
+    if name is None:
         known = ", ".join(kind.__name__ for kind in ALGORITHMS.values())
         raise ValueError(f"only agents of {known} can be saved, got {type(model).__name__}")
-    (name,) = names
     env_id, env_kwargs = env_arguments(model.get_env())
     policies = {kind: each for each, kind in ALGORITHMS[name].policy_aliases.items()}
     stored = sorted(each for each in _argument_names(type(model)) if hasattr(model, each))
