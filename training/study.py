@@ -350,7 +350,8 @@ def _ends(path: str, given: Any) -> list[Any]:
         return given
     ends: Values = given if isinstance(given, Mapping) else {}
     low, high = ends.get("low"), ends.get("high")
-    if not (is_number(low) and is_number(high) and low < high) or (ends.get("log") and low <= 0):
+    ordered = is_number(low) and is_number(high) and low < high and not (ends.get("log") and low <= 0)
+    if not ordered or set(ends) - {"low", "high", "log"}:
         raise ValueError(
             f"{path} must be a list, or a range such as {{low: 1e-4, high: 1e-2, log: true}}, got {given!r}"
         )
@@ -635,16 +636,16 @@ def _run_search(search: Trial, folder: Path, workers: int | None, told: Told) ->
     if tune.Tuner.can_restore(path):
         tuner = tune.Tuner.restore(str(path), work, resume_unfinished=True, restart_errored=True)
     else:
+        space = {name: _distribution(given) for name, given in search.parameters.items()}
         first = [dict(each) for each in search.first] or None
+        goal = {"metric": "success", "mode": "max"}
         tuner = tune.Tuner(
             work,
-            param_space={name: _domain(tune, given) for name, given in search.parameters.items()},
             tune_config=tune.TuneConfig(
-                metric="success",
-                mode="max",
+                **goal,
                 num_samples=search.trials,
                 max_concurrent_trials=workers,
-                search_alg=OptunaSearch(points_to_evaluate=first, seed=0),
+                search_alg=OptunaSearch(space, points_to_evaluate=first, seed=0, **goal),
                 # Trainings end by themselves, before max_t.
                 scheduler=ASHAScheduler("decisions", max_t=2 * total, grace_period=max(total // 4, 1)),
             ),
@@ -669,15 +670,14 @@ def _run_search(search: Trial, folder: Path, workers: int | None, told: Told) ->
     return [f"{search.row}: {reason}" for reason in failed]
 
 
-def _domain(tune: Any, given: Any) -> Any:
-    """Return the domain of a parameter: one of a list, or a range of whole numbers or of real ones."""
+def _distribution(given: Any) -> Any:
+    """Return the distribution of a parameter: one of a list, or a range of whole numbers or of real ones."""
+    from optuna import distributions
+
     if isinstance(given, list):
-        return tune.choice(given)
-    low, high = given["low"], given["high"]
-    log = given.get("log", False)
-    if isinstance(low, int) and isinstance(high, int):
-        return (tune.lograndint if log else tune.randint)(low, high + 1)
-    return (tune.loguniform if log else tune.uniform)(low, high)
+        return distributions.CategoricalDistribution(given)
+    whole = isinstance(given["low"], int) and isinstance(given["high"], int)
+    return (distributions.IntDistribution if whole else distributions.FloatDistribution)(**given)
 
 
 def _write_search(search: Trial, results: Any, folder: Path) -> str:

@@ -201,6 +201,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
         {"searches": {"a": {"parameters": {}}}},
         {"searches": {"a": {"parameters": {"hyperparameters.gamma": {"low": 2.0, "high": 1.5}}}}},
         {"searches": {"a": {"parameters": {"hyperparameters.gamma": {"low": 0.5, "high": 1.5}}}}},
+        {"searches": {"a": {"parameters": {"hyperparameters.gamma": {"low": 0.5, "high": 0.9, "step": 1}}}}},
         {"searches": {"a": {"parameters": {"speed": [1, 2]}}}},
         *({"searches": {"a": {**GAMMA, **other}}} for other in ({"trials": 0}, {"eval_every": 0})),
         {"searches": {"a": {**GAMMA, "first": [{"gamma": 0.9}]}}},
