@@ -43,8 +43,8 @@ class MethodResult:
     """Outcomes of one method in the first n of N scenes."""
 
     name: str
-    outcomes: Mapping[str, NDArray[Any]]  # Scalars of the environment's info by name, shape (n,) each
-    actions: Float  # Actions, shape (n, m)
+    outcomes: Outcomes
+    """Scalars of the environment's info and `reward` by name, shape (n,) each, and `action`, shape (n, m)."""
     decision_times: Float
     """Wall times of single decisions, [s]; one number, the mean of a batch, for a slow method."""
     band: NDArray[np.int64]  # Index into BANDS of each scene, -1 if the share is unknown, shape (n,)
@@ -145,8 +145,7 @@ class EvaluationResult:
             compared[each.name] = mcnemar(*pairs) if number else None
         outcomes = {}
         for result in self.results:
-            arrays = {"action": result.actions, **result.outcomes}
-            outcomes[result.name] = {name: _rounded(values) for name, values in arrays.items()}
+            outcomes[result.name] = {name: _rounded(values) for name, values in result.outcomes.items()}
         return {
             "viapoint": versions()["viapoint"],
             "env": self.env_id,
@@ -332,7 +331,6 @@ def _evaluate_one(
     away[(scenes.jump_times < NEVER).any(axis=-1)] = np.nan  # the shortest path is unknown
     return MethodResult(
         name=method.name,
-        actions=outcomes.pop("action"),
         outcomes=outcomes,
         decision_times=times,
         band=frozen.band[:done],

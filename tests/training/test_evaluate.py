@@ -126,7 +126,6 @@ def fake(success, **changes):
     values = {
         "name": "fake",
         "outcomes": outcomes,
-        "actions": np.zeros((n, 3)),
         "decision_times": np.linspace(0.001, 0.003, 101),
         "band": np.arange(n) % 4,
         "family": np.full(n, ""),

@@ -577,8 +577,9 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
     summary = result.summary()
     assert summary["success"]["rate"] >= 0.9
     assert summary["collision"]["rate"] <= 0.1
-    counts = result.actions[:, 0].astype(int)
-    durations = [row[1 : 2 + count].sum() for row, count in zip(result.actions, counts, strict=True)]
+    actions = result.outcomes["action"]
+    counts = actions[:, 0].astype(int)
+    durations = [row[1 : 2 + count].sum() for row, count in zip(actions, counts, strict=True)]
     np.testing.assert_allclose(result.outcomes["duration"], durations)
 
 
