@@ -224,9 +224,12 @@ def _study(
     if not found:
         raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
     found.sort(key=lambda trial: trial.seed)
-    trials = tuple(each for each in found if not each.parameters)
-    searches = tuple(each for each in found if each.parameters)
-    return Study(name=name, out=Path(out or f"runs/{name}").expanduser(), trials=trials, searches=searches)
+    return Study(
+        name=name,
+        out=Path(out or f"runs/{name}").expanduser(),
+        trials=tuple(each for each in found if not each.parameters),
+        searches=tuple(each for each in found if each.parameters),
+    )
 
 
 def _entries(given: Entries) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -348,7 +351,7 @@ def _ends(path: str, given: Any) -> list[Any]:
     """Return all values of a list, or the lowest and the highest of a range."""
     if isinstance(given, list) and given:
         return given
-    ends: Values = given if isinstance(given, Mapping) else {}
+    ends: Any = given if isinstance(given, Mapping) else {}
     low, high = ends.get("low"), ends.get("high")
     ordered = is_number(low) and is_number(high) and low < high and not (ends.get("log") and low <= 0)
     if not ordered or set(ends) - {"low", "high", "log"}:
