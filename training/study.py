@@ -641,7 +641,7 @@ def _run_search(search: Trial, folder: Path, workers: int | None, told: Told) ->
     else:
         space = {name: _distribution(given) for name, given in search.parameters.items()}
         first = [dict(each) for each in search.first] or None
-        goal = {"metric": "success", "mode": "max"}
+        goal: dict[str, Any] = {"metric": "success", "mode": "max"}
         tuner = tune.Tuner(
             work,
             tune_config=tune.TuneConfig(
