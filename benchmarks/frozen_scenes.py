@@ -173,7 +173,7 @@ class Maker:
                 decided = self._search.solve(Problem.of_scenes(scenes, self.task))
             else:
                 decided = self._search.decide(self._simulation.observe(scenes))
-            solved[rows] = self._simulation.play(self._search, scenes, decided).success
+            solved[rows] = self._simulation.play(self._search, scenes, decided)["is_success"]
             if self.task.whole_movement:
                 problem = Problem.of_scenes(scenes, self.task)
                 clearance = plan_clearances(self.task, problem, decided[:, None], 0.0, 0.0, exact=True)

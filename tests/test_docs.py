@@ -94,7 +94,7 @@ def understand(words):
         cli.parse(words)
     except SystemExit:
         return  # help was asked for
-    except cli.UsageError as error:
+    except ValueError as error:
         pytest.fail(f"{shlex.join(words)}: {error}")
 
 

@@ -7,6 +7,7 @@ is one file of `torch.save`, written whole or not at all, and read with `weights
 from __future__ import annotations
 
 import io
+import json
 import random
 import zipfile
 from collections import deque
@@ -40,8 +41,8 @@ DEQUES = ("ep_info_buffer", "ep_success_buffer")
 MAY_DIFFER = ("num_timesteps", "viapoint")  # Entries that do not tell models apart
 
 
-def write_checkpoint(model: BaseAlgorithm, path: Path, extra: Mapping[str, Any]) -> None:
-    """Write the complete state of a training run; :func:`read_checkpoint` returns `extra`."""
+def write_checkpoint(model: BaseAlgorithm, path: Path, seconds: float) -> None:
+    """Write the complete state of a training run that has taken a time, [s]."""
     env = model.get_env()
     assert isinstance(env, ViaVecEnv)
     arrays = {
@@ -63,18 +64,17 @@ def write_checkpoint(model: BaseAlgorithm, path: Path, extra: Mapping[str, Any])
         "variables": {name: variable.detach() for name, variable in _variables(model).items()},
         "torch_random": torch.get_rng_state(),
         "arrays": _mapped(arrays, (np.ndarray, np.generic), _to_torch),
-        "extra": dict(extra),
+        "extra": {"seconds": seconds},
     }
     content = io.BytesIO()
     torch.save(state, content)
     write_bytes(path, content.getvalue())
 
 
-def read_checkpoint(model: BaseAlgorithm, path: Path) -> dict[str, Any]:
-    """Set a newly built model of the same kind and its environment to the state of a checkpoint, and return `extra`.
+def read_checkpoint(model: BaseAlgorithm, path: Path) -> float:
+    """Set a newly built model and its environment to the state of a checkpoint, and return the time so far, [s].
 
-    Raises:
-        BadFileError: The checkpoint is torn, foreign, or of another model.
+    A checkpoint that is torn, foreign, or of another model raises BadFileError.
     """
     state = read_state(path)
     written_by = f"was written by viapoint {state['model'].get('viapoint')} and"
@@ -84,25 +84,24 @@ def read_checkpoint(model: BaseAlgorithm, path: Path) -> dict[str, Any]:
         raise BadFileError(path, f"{written_by} is of another model: {', '.join(others)}")
     try:
         _restore(model, state, _mapped(state["arrays"], torch.Tensor, torch.Tensor.numpy))
-        extra: dict[str, Any] = dict(state["extra"])
+        return float(state["extra"]["seconds"])
     except Exception as error:  # of a library, for content that does not fit the model
         reason = f"{written_by} does not fit the model ({type(error).__name__}: {error})"
         raise BadFileError(path, reason) from None
-    return extra
 
 
-def _with_any_file(value: Any) -> Any:
+def _with_any_file(record: Any) -> Any:
     """Return a description of a model, in which all arms of files have the same name.
 
     A run goes on with the copy of its arm where the file is gone, and with the file where it is there again.
     """
-    if not isinstance(value, Mapping):
-        return value
-    found = {name: _with_any_file(each) for name, each in value.items()}
-    arm = found.get("arm")
-    if isinstance(arm, str) and arm.endswith(ARM_FILES):
-        found["arm"] = COPY
-    return found
+
+    def renamed(part: dict[str, Any]) -> dict[str, Any]:
+        if str(part.get("arm")).endswith(ARM_FILES):
+            part["arm"] = COPY
+        return part
+
+    return json.loads(json.dumps(record), object_hook=renamed)
 
 
 def read_state(path: Path) -> dict[str, Any]:
@@ -133,11 +132,10 @@ def _restore(model: BaseAlgorithm, state: dict[str, Any], arrays: dict[str, Any]
         setattr(model, name, arrays["last"][name])
     for name in DEQUES:
         setattr(model, name, deque(arrays["recent"][name], maxlen=model._stats_window_size))
-    buffer = getattr(model, "replay_buffer", None)
-    saved = arrays["buffer"]
+    buffer: Any = getattr(model, "replay_buffer", None)
     if buffer is not None:
-        _fill(_buffer_arrays(buffer), saved["arrays"])
-        buffer.pos, buffer.full = saved["pos"], saved["full"]
+        _fill(_buffer_arrays(buffer), arrays["buffer"]["arrays"])
+        buffer.pos, buffer.full = arrays["buffer"]["pos"], arrays["buffer"]["full"]
     env: Any = model.get_env()
     env.restore(arrays["env"])
     # Last: nothing may be drawn after it.

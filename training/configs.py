@@ -10,8 +10,8 @@ import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
@@ -50,9 +50,9 @@ KINDS = {
 @REGISTRY.primitive_rule
 def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     """Return the form of a number, path or text, or of one that may be left out."""
-    kinds = get_args(info.type) if info.type_origin in (Union, UnionType) else (info.type,)
+    kinds = set(get_args(info.type)) or {info.type}
     kind: Any = next((each for each in KINDS if each in kinds), None)  # a path before a text
-    if kind is None or not set(kinds) <= {NoneType, *KINDS}:
+    if kind is None or not kinds <= {NoneType, *KINDS}:
         return None
     metavar, what = KINDS[kind]
 
@@ -86,11 +86,7 @@ def from_words(words: list[str]) -> dict[str, Any]:
 
 def to_words(values: Mapping[str, Any]) -> list[str]:
     """Return a dictionary as NAME=VALUE words; :func:`from_words` is the inverse."""
-    words = []
-    for name, value in values.items():
-        plain = isinstance(value, str) and parse_yaml(value) == value
-        words.append(f"{name}={value if plain else json.dumps(value)}")
-    return words
+    return [f"{name}={json.dumps(value)}" for name, value in values.items()]
 
 
 # tyro reads a dictionary of one type of values only.
@@ -129,12 +125,13 @@ ARM_ENVS = {"planar": DEFAULT_ENV, "panda": "viapoint/PandaObstacles-v0"}
 
 def _plain(name: str, values: Any) -> Any:
     """Return values as JSON has them; a file of an arm is named by its whole path, as runs go on in other folders."""
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{name} must be values by name, got {values!r}")
     try:
         plain = as_plain(values)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: {error}") from None
-    arm = plain.get("arm") if isinstance(plain, dict) else None
-    given = values["arm"] if isinstance(arm, str) else None
+    arm, given = plain.get("arm"), values.get("arm")
     if isinstance(given, Arm) and not given.file and arm_of(arm) is not given:
         raise ValueError(
             f"{name}: register_arm makes arm {arm!r} known by its name, which is that of another one"
@@ -180,14 +177,15 @@ class Config:
     def __post_init__(self) -> None:
         """Check the values."""
         for each in dataclasses.fields(self):
-            value = getattr(self, each.name)
+            name, value = each.name, getattr(self, each.name)
             if isinstance(value, str) and "Path" in str(each.type):
-                object.__setattr__(self, each.name, named_path(each.name, value))
-            if str(each.type) == "NamedValues":
-                object.__setattr__(self, each.name, _plain(each.name, value))
-            optional = value is None and each.default is None
-            if each.name in RANGES and not optional and not isinstance(value, tuple | list):
-                object.__setattr__(self, each.name, check_whole(each.name, value))
+                value = named_path(name, value)
+            elif str(each.type) == "NamedValues":
+                value = _plain(name, value)
+            elif name in RANGES and not isinstance(value, tuple | list):
+                optional = value is each.default is None
+                value = value if optional else check_whole(name, value)
+            object.__setattr__(self, name, value)
         self._check()
 
     def _check(self) -> None:
@@ -259,8 +257,6 @@ class TrainConfig(Config):
                 f"{self.algo} decides on whole movements; for {self.env} algo must be one of "
                 f"{', '.join(STEP_PRESETS)}"
             )
-        if not isinstance(self.hyperparameters, Mapping):
-            raise ValueError(f"hyperparameters must be values by name, got {self.hyperparameters!r}")
         share = self.stop_when_stalled
         if share is None:
             return
@@ -290,13 +286,23 @@ class TrainConfig(Config):
         return preset_of(self.task, self.algorithm)
 
     @property
-    def all_hyperparameters(self) -> dict[str, Any]:
-        """Hyperparameters with those of the preset; a short training begins to learn sooner in proportion."""
-        usual = self.preset.arguments()
+    def resolved(self) -> TrainConfig:
+        """Configuration in which the values of the preset replace None, as a run stores it.
+
+        A short training begins to learn sooner in proportion.
+        """
+        usual = dict(self.preset.hyperparameters)
         if "learning_starts" in usual:
             share = min(1.0, self.total_timesteps / self.preset.n_timesteps)
             usual["learning_starts"] = round(share * usual["learning_starts"])
-        return {**usual, **self.hyperparameters}
+        return dataclasses.replace(
+            self,
+            n_timesteps=self.total_timesteps,
+            n_envs=self.n_envs or self.preset.n_envs,
+            eval_every=self.evaluation_interval,
+            checkpoint_every=self.checkpoint_every or self.preset.checkpoint_every,
+            hyperparameters={**usual, **self.hyperparameters},
+        )
 
     @property
     def total_timesteps(self) -> int:
@@ -327,10 +333,6 @@ class TrainConfig(Config):
         """Run folder."""
         usual = Path("runs") / f"{self.env.rpartition('/')[2]}-{self.algo}-{self.seed}"
         return Path(self.out) if self.out else usual
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the configuration as plain values, which are arguments of an equal one."""
-        return {**dataclasses.asdict(self), "out": None if self.out is None else str(self.out)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -448,7 +450,7 @@ class PlanConfig(Config):
     Example: viapoint plan --arm panda --position 0.5 0.3 0.4 --out plan.csv
     """
 
-    arm: str = "panda"  # Name of an arm, or MJCF or URDF file of one.
+    arm: Annotated[str, ARM] = "panda"
     start: tuple[float, ...] = ()
     """Joint positions at the start, [rad]; by default those of the scene file, or home."""
     goal: tuple[float, ...] = ()  # Joint positions at the goal, [rad]; by default those of the scene file.
@@ -456,13 +458,6 @@ class PlanConfig(Config):
     """Place of the tool at the goal, x y z, [m], in place of joint positions."""
     quaternion: tuple[float, ...] = ()  # Orientation of the tool there, w x y z; any if not given.
     scene: Path | None = None  # JSON file of a scene, or of a list of obstacles.
-    tool: str = ""
-    """Site or body of the tool of an arm of a file; by default one with a usual name, or the tip."""
-    joints: tuple[str, ...] = ()
-    """Names of its joints from the base to the tool; by default all of the chain."""
-    base: str = ""  # Body that the chain begins at, where a file has two arms.
-    packages: tuple[Path, ...] = ()  # Folders for package:// in a URDF.
-    velocity_limit: float | None = None  # Velocity limit of its joints, [rad/s]; by default that of the file.
     n_via: int = 2  # Number of via-points, 1 to 3.
     margin: float = 0.0  # Least clearance, [m].
     duration: float | None = None  # Duration, [s]; by default the shortest that the limits allow.
@@ -496,20 +491,19 @@ class FitConfig(Config):
     """
 
     file: tyro.conf.Positional[Path]  # CSV file with one sample in each line, [s] and [m].
-    n_via: tuple[int, ...] = ()
-    """Number of via-points, or the fewest and the most to choose among; by default 0 to 3."""
+    n_via: tuple[int, ...] = USUAL_RANGE
+    """Number of via-points, or the fewest and the most to choose among."""
     free_ends: bool = True
     """Fit onset and end, too; otherwise a movement begins with its first sample and ends with its last."""
     out: Path = Path("fit")  # Folder for the table fit.csv and the figure fit.png.
 
     @property
-    def numbers(self) -> tuple[int, int] | None:
-        """Fewest and most via-points; None for the usual ones."""
-        return (self.n_via[0], self.n_via[-1]) if self.n_via else None
+    def numbers(self) -> tuple[int, int]:
+        """Fewest and most via-points."""
+        return self.n_via[0], self.n_via[-1]
 
     def _check(self) -> None:
-        fewest, most = self.numbers or USUAL_RANGE
-        if len(self.n_via) > 2 or not 0 <= fewest <= most <= MOST_VIA_POINTS:
+        if len(self.n_via) not in (1, 2) or not 0 <= self.n_via[0] <= self.n_via[-1] <= MOST_VIA_POINTS:
             raise ValueError(
                 f"n_via must be one number, or the fewest and the most, from 0 to {MOST_VIA_POINTS}, got {self.n_via}"
             )

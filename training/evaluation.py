@@ -24,13 +24,9 @@ from viapoint.training.agents.agent import load_agent
 from viapoint.training.agents.model_io import check_same_task, untrained
 from viapoint.training.checks import check_whole
 from viapoint.training.files import versions
-from viapoint.training.planning.baselines import (
-    Method,
-    agent_method,
-    make_method,
-)
+from viapoint.training.planning.baselines import Method, agent_method, make_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.rollout import SceneSimulation, SimulationResults, whole_task
+from viapoint.training.rollout import Outcomes, SceneSimulation, joined, whole_task
 from viapoint.training.scene_sets import BANDS, DRAWN, SETS, FrozenScenes, scenes_for
 from viapoint.training.statistics import mcnemar, success_weighted_path_length, wilson
 from viapoint.training.vec_env import env_arguments
@@ -47,16 +43,15 @@ class MethodResult:
     """Outcomes of one method in the first n of N scenes."""
 
     name: str
-    outcomes: Mapping[str, NDArray[Any]]  # Scalars of the environment's info by name, shape (n,) each
-    actions: Float  # Actions, shape (n, m)
+    outcomes: Outcomes
+    """Scalars of the environment's info and `reward` by name, shape (n,) each, and `action`, shape (n, m)."""
     decision_times: Float
     """Wall times of single decisions, [s]; one number, the mean of a batch, for a slow method."""
     band: NDArray[np.int64]  # Index into BANDS of each scene, -1 if the share is unknown, shape (n,)
     family: NDArray[np.str_]  # Scene family of each scene, '' for the training distribution, shape (n,)
     distance: Float
     """Distance from start to goal, shape (n,), [m]; NaN if the target jumps, as the shortest path is unknown."""
-    interrupted: bool  # True if Ctrl-C ended it; then decision times may be missing
-    partial: bool  # True if it ended before the last scene
+    partial: bool  # True if Ctrl-C ended it: scenes or decision times are missing
 
     @property
     def success(self) -> NDArray[np.bool_]:
@@ -110,8 +105,11 @@ class EvaluationResult:
     """Hash of the scene set."""
     results: tuple[MethodResult, ...]
     """Outcomes of each method, the agent first."""
-    partial: bool = False
-    """Mark of an evaluation that was interrupted before the end."""
+
+    @property
+    def partial(self) -> bool:
+        """Mark of an evaluation that was interrupted before the end."""
+        return self.results[-1].partial
 
     @property
     def success_rate(self) -> float:
@@ -147,8 +145,7 @@ class EvaluationResult:
             compared[each.name] = mcnemar(*pairs) if number else None
         outcomes = {}
         for result in self.results:
-            arrays = {"action": result.actions, **result.outcomes}
-            outcomes[result.name] = {name: _rounded(values) for name, values in arrays.items()}
+            outcomes[result.name] = {name: _rounded(values) for name, values in result.outcomes.items()}
         return {
             "viapoint": versions()["viapoint"],
             "env": self.env_id,
@@ -232,7 +229,6 @@ def evaluate(
             methods += _rows_of(untrained(agent), settings, each)
         else:
             methods.append(make_method(each, env_id, **kwargs))
-    _check_methods(methods)
     chosen = scenes_for(scenes, task, n_scenes)
     if n_scenes is not None and n_scenes > len(chosen.share):
         print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
@@ -278,23 +274,6 @@ def evaluate_methods(
     progress: Progress | None = None,
 ) -> EvaluationResult:
     """Evaluate one or more methods in the same scenes, `batch` at a time; the rest is as for :func:`evaluate`."""
-    _check_methods(methods)
-    results: list[MethodResult] = []
-    opened = SceneSimulation(env_id, min(batch, len(frozen.share)), **(env_kwargs or {}))
-    with one_thread(), closing(opened) as simulation:
-        for method in methods:
-            result = _evaluate_one(method, frozen, simulation, batch, time_decisions, progress)
-            results.append(result)
-            if result.interrupted:
-                break
-    partial = len(results) < len(methods) or results[-1].partial
-    return EvaluationResult(
-        env_id=env_id, scenes=frozen.name, sha256=frozen.sha256, results=tuple(results), partial=partial
-    )
-
-
-def _check_methods(methods: Sequence[Any]) -> None:
-    """Check that there are methods, with names that tell them apart in the results."""
     if not methods:
         raise ValueError("there is nothing to evaluate: give an agent or baselines")
     for each in methods:
@@ -303,6 +282,15 @@ def _check_methods(methods: Sequence[Any]) -> None:
     names = [each.name for each in methods]
     if len(set(names)) < len(names):
         raise ValueError(f"methods must have different names, got {', '.join(names)}")
+    results: list[MethodResult] = []
+    opened = SceneSimulation(env_id, min(batch, len(frozen.share)), **(env_kwargs or {}))
+    with one_thread(), closing(opened) as simulation:
+        for method in methods:
+            result = _evaluate_one(method, frozen, simulation, batch, time_decisions, progress)
+            results.append(result)
+            if result.partial:
+                break
+    return EvaluationResult(env_id=env_id, scenes=frozen.name, sha256=frozen.sha256, results=tuple(results))
 
 
 def _evaluate_one(
@@ -314,7 +302,7 @@ def _evaluate_one(
     progress: Progress | None,
 ) -> MethodResult:
     number = len(frozen.share)
-    pieces: list[SimulationResults] = []
+    pieces: list[Outcomes] = []
     times: Float = np.zeros(0)
     seconds, interrupted = 0.0, False
     try:
@@ -327,7 +315,7 @@ def _evaluate_one(
                 shape = len(scenes.start), len(simulation.task.action_names)
                 decided = finite_array(f"decisions of {method.name}", decided, shape)
             outcome = simulation.play(method, scenes, decided)
-            outcome.info["action"] = np.asarray(decided, dtype=np.float64)
+            outcome["action"] = np.asarray(decided, dtype=np.float64)
             pieces.append(outcome)
             if progress is not None:
                 progress(method.name, min(first + batch, number), number)
@@ -335,25 +323,20 @@ def _evaluate_one(
             times = _decision_times(method, frozen.scenes, simulation, seconds / number)
     except KeyboardInterrupt:
         interrupted = True
-    if pieces:
-        joined = SimulationResults.concatenate(pieces)
-        outcomes = {**joined.info, "reward": joined.reward}
-    else:
-        outcomes = {name: np.zeros(0) for name in (*Outcome._fields, "action")}
+    nothing = {name: np.zeros(0) for name in (*Outcome._fields, "action")}
+    outcomes = joined(pieces) if pieces else nothing
     done = len(outcomes["is_success"])
     arm, scenes = simulation.task.arm, frozen.scenes
     away = np.linalg.norm(arm.hand(scenes.goal) - arm.hand(scenes.start), axis=-1)
     away[(scenes.jump_times < NEVER).any(axis=-1)] = np.nan  # the shortest path is unknown
     return MethodResult(
         name=method.name,
-        actions=outcomes.pop("action"),
         outcomes=outcomes,
         decision_times=times,
         band=frozen.band[:done],
         family=frozen.family[:done],
         distance=away[:done],
-        interrupted=interrupted,
-        partial=done < number,
+        partial=interrupted,
     )
 
 
@@ -377,7 +360,7 @@ def _decision_times(method: Method, scenes: Scenes, simulation: SceneSimulation,
             one = scenes.take(slice(row, row + 1))
             decided = decide(simulation.observe(one), one)
             if replanning:
-                alone.episodes(one, decided, decide)
+                alone(one, decided, decide)
             usual = float(np.median(times[1:] or [times[0] / 20.0]))  # the first may warm up
             if usual > SLOW_DECISION:  # a look at each scene would take too long
                 return np.array([in_batch])

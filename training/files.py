@@ -73,11 +73,7 @@ def check_ours(path: Path) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically, so that readers see the old content or the new, even after a crash; create its folder.
-
-    Raises:
-        OSError: For example of a full disk; what was there is still there.
-    """
+    """Write a file and its folder; readers see the old content or the new, even after a crash."""
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -97,13 +93,8 @@ def write_bytes(path: Path, content: bytes) -> None:
 def write_folder(path: Path, fill: Callable[[Path], None], *, move_foreign: bool = False) -> None:
     """Create a folder, or replace one that this package wrote, atomically; `fill` writes its content.
 
-    Args:
-        path: Folder to write; one with further files, or whose JSON lacks the mark of this package, is not replaced.
-        fill: Function that writes the content to a temporary folder.
-        move_foreign: True to rename what would not be replaced, with a line that says so, in place of an error.
-
-    Raises:
-        BadFileError: There is something else, which stays as it is.
+    One with further files, or whose JSON lacks the mark of this package, stays as it is with BadFileError; with
+    `move_foreign`, it is renamed, and a line says so.
     """
     path = Path(os.path.realpath(path))  # a link to a folder stays a link
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
@@ -145,17 +136,16 @@ def _check_replaceable(path: Path, names: set[str]) -> None:
 def _move_aside(path: Path) -> None:
     """Rename a file or folder, so that another one can be written in its place."""
     numbered = (path.with_name(f"{path.name}.{number}") for number in itertools.count(1))
-    aside = next(each for each in numbered if not os.path.lexists(each))
-    path.rename(aside)
+    aside = path.rename(next(each for each in numbered if not os.path.lexists(each)))
     print(f"{path} holds what was not written by viapoint: it is kept as {aside}", file=sys.stderr)
 
 
 def write_figure(path: Path, figure: Any, **options: Any) -> Path:
     """Write a figure of Matplotlib in the format of the suffix; options are those of `savefig`."""
     content = io.BytesIO()
-    metadata = (
-        {"Creator": MARK.decode(), "Date": None} if path.suffix == ".svg" else {"Software": MARK.decode()}
-    )
+    metadata: dict[str, Any] = {"Creator": MARK.decode(), "Date": None}
+    if path.suffix != ".svg":
+        metadata = {"Software": MARK.decode()}
     figure.savefig(content, format=path.suffix[1:], metadata=metadata, **options)
     write_bytes(path, content.getvalue())
     return path
@@ -203,10 +193,8 @@ def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
 def read_bytes(path: Path, largest: int | None = None) -> bytes:
     """Return the content of a regular file; what is missing, too large [bytes] or unreadable raises BadFileError."""
     try:
-        if not path.exists():
-            raise BadFileError(path, "is missing")
         if not path.is_file():  # reading a pipe or a device may never end
-            raise BadFileError(path, "is no regular file")
+            raise BadFileError(path, "is no regular file" if path.exists() else "is missing")
         size = path.stat().st_size
         if largest is not None and size > largest:
             raise BadFileError(path, f"must have at most {largest} bytes, has {size}")

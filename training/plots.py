@@ -156,20 +156,13 @@ def style_axes(ax: Any) -> None:
 
 
 def _bar_style(name: str, names: Sequence[str]) -> dict[str, Any]:
-    """Return the colour of a method; a variant, such as an agent with checks, has the hatched colour of its method.
-
-    Of searches with different numbers of checks, the first ones are paler.
-    """
-    digits = "0123456789"
-    method = name.rstrip(digits)
-    if method in METHOD_COLOURS:
-        same = [each for each in names if each.rstrip(digits) == method]
-        return {"color": METHOD_COLOURS[method], "alpha": (1 + same.index(name)) / len(same)}
-    for known, colour in METHOD_COLOURS.items():
-        if name.startswith(known):
-            return {"color": colour, "hatch": "///", "edgecolor": "white"}
-    others = [each for each in names if not each.startswith(tuple(METHOD_COLOURS))]
-    return {"color": OTHER_COLOURS[others.index(name) % len(OTHER_COLOURS)]}
+    """Return the colour of a method; of its variants, such as numbers of checks, the first ones are paler."""
+    kind = next((known for known in METHOD_COLOURS if name.startswith(known)), None)
+    if kind is None:
+        others = [each for each in names if not each.startswith(tuple(METHOD_COLOURS))]
+        return {"color": OTHER_COLOURS[others.index(name) % len(OTHER_COLOURS)]}
+    variants = [each for each in names if each.startswith(kind)]
+    return {"color": METHOD_COLOURS[kind], "alpha": (1 + variants.index(name)) / len(variants)}
 
 
 def _percent(rates: Sequence[Mapping[str, float]]) -> tuple[Float, Float, Float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,10 +22,6 @@ class Preset:
     eval_every: int = 1_000  # Decisions between two evaluations on the validation scenes
     checkpoint_every: int = 5_000  # Decisions between two checkpoints
     hyperparameters: Mapping[str, Any]  # As :mod:`~.agents.model_io` writes them
-
-    def arguments(self) -> dict[str, Any]:
-        """Return the hyperparameters as a new dictionary."""
-        return copy.deepcopy(dict(self.hyperparameters))
 
 
 def _changed(preset: Preset, hyperparameters: Mapping[str, Any], **fields: Any) -> Preset:
@@ -103,7 +98,7 @@ STEP_PRESETS: dict[str, Preset] = {
 }
 
 # Presets of tasks without obstacles, which need fewer decisions
-REACH_PRESETS = {"viaq": _changed(PRESETS["viaq"], {}, n_timesteps=8_000)}
+REACH_PRESETS = {"viaq": dataclasses.replace(PRESETS["viaq"], n_timesteps=8_000)}
 _REVISING = {"gradient_steps": 6, "next_candidates": 4}
 REPLANNING_PRESETS = {"viaq": _changed(PRESETS["viaq"], _REVISING, n_timesteps=24_000)}
 """Presets of replanning tasks."""
@@ -132,8 +127,10 @@ def preset_of(task: Task, algo: Algorithm) -> Preset:
         preset = REPLANNING_PRESETS.get(algo, preset)
     elif not task.n_obstacles[1]:
         preset = REACH_PRESETS.get(algo, preset)
-    if algo == "viaq" and not task.space.of_hand:
-        return _changed(preset, {}, n_timesteps=min(preset.n_timesteps, JOINT_DECISIONS))
-    if algo == "viarank" and not task.space.of_hand:
+    if task.space.of_hand:
+        return preset
+    if algo == "viaq":
+        return dataclasses.replace(preset, n_timesteps=min(preset.n_timesteps, JOINT_DECISIONS))
+    if algo == "viarank":
         return _changed(preset, JOINT_SIGHT, n_timesteps=JOINT_DECISIONS)
     return preset

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -21,22 +21,8 @@ if TYPE_CHECKING:
 Decide = Callable[[Observation, Scenes], Float]
 
 
-class SimulationResults(NamedTuple):
-    """Results of N simulated actions or episodes, shape (N,) each."""
-
-    reward: Float
-    info: dict[str, NDArray[Any]]
-
-    @property
-    def success(self) -> NDArray[np.bool_]:
-        """Mask of the successful ones."""
-        return np.asarray(self.info["is_success"], dtype=bool)
-
-    @classmethod
-    def concatenate(cls, pieces: Sequence[SimulationResults]) -> SimulationResults:
-        """Join the results of several batches."""
-        reward = np.concatenate([piece.reward for piece in pieces])
-        return cls(reward, _joined([piece.info for piece in pieces]))
+# Metrics of N simulated actions or episodes by name, `reward` among them, shape (N,) each
+Outcomes = dict[str, NDArray[Any]]
 
 
 class SceneSimulation:
@@ -57,35 +43,30 @@ class SceneSimulation:
         pieces = []
         for rows, _, _, seen in self._begun(scenes):
             pieces.append({name: part[: len(rows)] for name, part in seen.items()})
-        return _joined(pieces)
+        return joined(pieces)
 
-    def __call__(self, scenes: Scenes, actions: Float) -> SimulationResults:
-        """Simulate episodes that begin with one action in each of N scenes; all later actions are zero."""
-        return self.episodes(scenes, actions, None)
-
-    def play(self, method: Any, scenes: Scenes, decisions: Float) -> SimulationResults:
-        """Simulate episodes that begin with decisions of a method; it makes all others or has its own `execute`."""
-        if hasattr(method, "execute"):
-            results: SimulationResults = method.execute(scenes, decisions)
-            return results
-        return self.episodes(scenes, decisions, method.decide)
-
-    def episodes(self, scenes: Scenes, actions: Float, decide: Decide | None) -> SimulationResults:
+    def __call__(self, scenes: Scenes, actions: Float, decide: Decide | None = None) -> Outcomes:
         """Simulate one episode in each of N scenes, from first actions (N, m); later ones are decided, or zero."""
         pieces = []
         for rows, _, env, _ in self._begun(scenes):
-            some = scenes.take(rows)
-            pieces.append(_episodes(env, some, actions[rows], decide))
-        return SimulationResults.concatenate(pieces)
+            pieces.append(_episodes(env, scenes.take(rows), actions[rows], decide))
+        return joined(pieces)
 
-    def execute_plan(self, scenes: Scenes, plan: Plan) -> SimulationResults:
+    def play(self, method: Any, scenes: Scenes, decisions: Float) -> Outcomes:
+        """Simulate episodes that begin with decisions of a method; it makes all others or has its own `execute`."""
+        if hasattr(method, "execute"):
+            results: Outcomes = method.execute(scenes, decisions)
+            return results
+        return self(scenes, decisions, method.decide)
+
+    def execute_plan(self, scenes: Scenes, plan: Plan) -> Outcomes:
         """Simulate one plan in each of N scenes, N at least 1; plans may have any number of via-points."""
         pieces = []
         for rows, filled, env, _ in self._begun(scenes):
             decision = env.execute_plan(plan.take(filled))
-            info = {name: value[: len(rows)] for name, value in decision.info.items()}
-            pieces.append(SimulationResults(decision.reward[: len(rows)], info))
-        return SimulationResults.concatenate(pieces)
+            outcomes = {**decision.info, "reward": decision.reward}
+            pieces.append({name: values[: len(rows)] for name, values in outcomes.items()})
+        return joined(pieces)
 
     def close(self) -> None:
         """Close the environments."""
@@ -111,19 +92,19 @@ class SceneSimulation:
             yield rows, filled, env, env.begin(scenes.take(filled))
 
 
-def _joined(pieces: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+def joined(pieces: Sequence[Mapping[str, NDArray[Any]]]) -> Outcomes:
     """Return arrays by name, joined over batches."""
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
-def _episodes(env: ReachVectorEnv, scenes: Scenes, first: Float, decide: Decide | None) -> SimulationResults:
+def _episodes(env: ReachVectorEnv, scenes: Scenes, first: Float, decide: Decide | None) -> Outcomes:
     """Play one episode in each scene; environments beyond them do not take part."""
     number, size = len(first), env.num_envs
     actions = np.zeros((size, first.shape[1]))
     actions[:number] = first
     running = np.arange(size) < number
     reward, decisions = np.zeros(number), np.zeros(number)
-    last: dict[str, NDArray[Any]] = {}
+    last: Outcomes = {}
     while running.any():
         now = running[:number].copy()
         decision = env.execute_actions(actions, running)
@@ -137,10 +118,10 @@ def _episodes(env: ReachVectorEnv, scenes: Scenes, first: Float, decide: Decide 
         if decide is not None and rows.size:
             seen = {name: part[rows] for name, part in decision.observation.items()}
             actions[rows] = decide(seen, scenes.take(rows))
-    last["decisions"] = decisions
+    last |= {"reward": reward, "decisions": decisions}
     if not env.task.whole_movement:
         last["duration"] = last["time"]  # of the episode, not of its last decision
-    return SimulationResults(reward, last)
+    return last
 
 
 def whole_task(env_id: str, kwargs: Mapping[str, Any]) -> dict[str, Any]:

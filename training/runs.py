@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from viapoint.training.files import (
     LARGEST_JSON,
     UNFINISHED,
     BadFileError,
+    as_plain,
     check_ours,
     read_bytes,
     read_json,
@@ -99,20 +100,16 @@ class Run:
 
     @classmethod
     def create(cls, config: TrainConfig) -> Run:
-        """Create the folder of a new run.
-
-        Raises:
-            BadFileError: There is a run in it already, or something else.
-        """
+        """Create the folder of a new run; one with a run or something else raises BadFileError."""
         folder = config.folder
         check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        with _locked(folder):
+        with locked(folder):
             check_free(folder)  # another process may have been faster
             write_json(folder / "versions.json", versions())
             keep_arm(folder, config.task.arm)
             # The file that makes a folder a run comes last; it does not hold the arguments of one call.
-            write_json(folder / "config.json", {**config.as_json(), "out": None, "resume": False})
+            write_json(folder / "config.json", {**as_plain(config), "out": None, "resume": False})
         return cls(folder)
 
     @property
@@ -149,11 +146,7 @@ class Run:
 
     @property
     def best(self) -> Path:
-        """Folder of the best model on the validation scenes, or of the last model if training did not validate.
-
-        Raises:
-            BadFileError: There is no model yet.
-        """
+        """Folder of the best model on the validation scenes, or of the last model if training did not validate."""
         return best_model(self.folder)
 
     @property
@@ -165,9 +158,9 @@ class Run:
         """Write a model as `best` or `final`; a folder with other files is kept as `best.1`, as training must go on."""
         write_folder(self.folder / name, lambda temporary: save_model(model, temporary), move_foreign=True)
 
-    def checkpoint(self, model: BaseAlgorithm, extra: Mapping[str, Any]) -> None:
-        """Write a checkpoint and remove outdated ones."""
-        write_checkpoint(model, self.folder / "checkpoints" / f"{model.num_timesteps:010d}.pt", extra)
+    def checkpoint(self, model: BaseAlgorithm, seconds: float) -> None:
+        """Write a checkpoint of a training that has taken a time, [s], and remove outdated ones."""
+        write_checkpoint(model, self.folder / "checkpoints" / f"{model.num_timesteps:010d}.pt", seconds)
         for outdated in self.checkpoints()[:-KEPT_CHECKPOINTS]:
             outdated.unlink()
 
@@ -176,15 +169,11 @@ class Run:
         found = (self.folder / "checkpoints").glob(10 * "[0-9]" + ".pt")
         return sorted(path for path in found if path.is_file())
 
-    def restore(self, model: BaseAlgorithm) -> dict[str, Any] | None:
+    def restore(self, model: BaseAlgorithm) -> float | None:
         """Set a model to the state of the newest intact checkpoint, and print why newer ones were skipped.
 
-        Returns:
-            Content of `extra`; None without any checkpoint.
-
-        Raises:
-            BadFileError: There are checkpoints, but none is whole; the message is about the newest. Or those of a
-                training that has ended are gone.
+        The result is the time of the training so far, [s], or None without any checkpoint. Where none is whole,
+        BadFileError is about the newest; it is raised, too, where those of a training that has ended are gone.
         """
         newest = None
         for path in reversed(self.checkpoints()):
@@ -218,20 +207,13 @@ class Run:
         enough = self.stalled or self.decisions >= self.config.total_timesteps
         return enough and (self.final / "model.json").is_file()
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Lock the folder for this process; the operating system unlocks it when the process ends.
-
-        Raises:
-            BadFileError: Another process trains in the folder.
-        """
-        with _locked(self.folder):
-            yield
-
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Lock a folder for this process, and tidy up what a crash left in it."""
+def locked(folder: Path) -> Iterator[None]:
+    """Lock a run folder for this process, and tidy up what a crash left in it; in use, it raises BadFileError.
+
+    The operating system unlocks it when the process ends.
+    """
     try:
         held = FileLock(folder / "lock").acquire(timeout=PATIENCE)
     except Timeout:
@@ -276,7 +258,7 @@ def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = N
 
 def _settings(config: TrainConfig) -> dict[str, Any]:
     """Return the settings that may not change, those in fields with several by their own names."""
-    values = config.as_json()
+    values = as_plain(config)
     for name in MAY_CHANGE:
         del values[name]
     env_kwargs = values.pop("env_kwargs")

@@ -23,6 +23,7 @@ from viapoint.envs.scenes.scene import NEVER, Scenes, check_scenes, resting
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import COURSES, Task
 
+SHIPPED = Path(str(files("viapoint.training") / "scenes"))  # Sets of the package
 SETS = ("validation", "test", "hard", "uniform")  # Names of the sets; a task need not have all
 BANDS = ("> 20 %", "5-20 %", "1-5 %", "< 1 %")  # Bands of the solution share, from easy to hard
 BAND_EDGES = (0.2, 0.05, 0.01)
@@ -129,11 +130,7 @@ def _place(name: str, part: str) -> str:
 
 def shipped_path(env_id: str) -> Path:
     """Return the path of the file that holds the shipped sets of an environment."""
-    return _shipped() / f"{env_id.removeprefix('viapoint/')}.npz"
-
-
-def _shipped() -> Path:
-    return Path(str(files("viapoint.training") / "scenes"))
+    return SHIPPED / f"{env_id.removeprefix('viapoint/')}.npz"
 
 
 def shipped_sets(path: Path) -> dict[str, FrozenScenes]:
@@ -145,7 +142,7 @@ def shipped_sets(path: Path) -> dict[str, FrozenScenes]:
 
 def shipped_set(name: str, task: Task) -> FrozenScenes | None:
     """Return the shipped set whose scenes are those of a task, or None if there is none."""
-    for path in sorted(_shipped().glob("*.npz")):
+    for path in sorted(SHIPPED.glob("*.npz")):
         with np.load(path, allow_pickle=False) as archive:
             text = archive.get(_place(name, "task"))
         if text is None:

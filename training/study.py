@@ -16,23 +16,24 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import ConvertCallback
 
 from viapoint.envs.common.validation import is_number
+from viapoint.envs.task import Task
 from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
 from viapoint.training.agents.model_io import check_arguments, check_hyperparameters, load_model, untrained
 from viapoint.training.checks import check_env_kwargs, check_folder, check_whole, named_path, unknown_name
 from viapoint.training.configs import StudyConfig, TrainConfig
 from viapoint.training.evaluation import evaluate_methods
 from viapoint.training.extras import explain_import_error
-from viapoint.training.files import BadFileError, read_json, read_yaml, write_bytes, write_json
+from viapoint.training.files import BadFileError, as_plain, read_json, read_yaml, write_bytes, write_json
 from viapoint.training.planning.baselines import Method, agent_method, factory, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plots import success_of_rows
@@ -43,24 +44,25 @@ from viapoint.training.statistics import across_seeds, wilson
 from viapoint.training.trainer import train_or_resume
 
 Values = Mapping[str, Any]
+Record = dict[str, Any]
+# Types of the fields of a file
+Entries = list[str] | dict[str, dict[str, Any] | None]  # Names, or options by name
+Names = list[str] | tuple[str, ...]
+Numbers = list[int] | tuple[int, ...]
 # Fields of a training that an agent may set
 TRAINING_FIELDS = {each.name for each in dataclasses.fields(TrainConfig)}
 TRAINING_FIELDS -= {"env", "seed", "out", "resume", "progress"}
-MEASURED = (
-    "test",
-    "hard",
-    "uniform",
-)  # Sets that are measured by default; models are selected on `validation`
+MEASURED = ("test", "hard", "uniform")  # Sets by default; models are selected on `validation`
 
 RETRIES = 2  # Number of times that a trial whose worker died is begun again
 # Environment variables of Ray, which reads them when it is imported
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",  # Ray sends nothing to its authors
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # otherwise it takes another address than 127.0.0.1
     "RAY_AIR_NEW_OUTPUT": "0",  # Ray Tune's own tables
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
     "TUNE_GLOBAL_CHECKPOINT_S": "5",  # a killed search loses at most its last seconds
 }
-Record = dict[str, Any]
 KEYS = ["environment", "set", "method"]
 # Columns that are medians over seeds; `decisions` are those of a training
 MEDIANS = ["collision", "jerk_ratio", "movement_s", "decision_ms", "decisions"]
@@ -74,63 +76,54 @@ Told = Callable[[str], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One row of the results for one seed: what a worker trains and measures."""
+    """One row of the results for one seed: what a worker trains and measures; or a search for its hyperparameters."""
 
     environment: str  # Name of the environment in folders and tables
     env_id: str  # Id of the registered environment
-    env_kwargs: Values = field(default_factory=dict)  # Arguments of the environment
+    env_kwargs: Values  # Arguments of the environment
     scenes: tuple[str, ...] = ()  # Names of the measured sets, or files of scenes
-    n_scenes: int | None = None  # Number of scenes of each set, evenly spread over it; None for all
-    row: str  # Name of the row, which is also that of its folder
+    n_scenes: int | None  # Number of scenes of each set, evenly spread over it; None for all
+    row: str = ""  # Name of the row, which is also that of its folder
     seed: int = 0
     training: Values = field(default_factory=dict)  # Fields of TrainConfig; empty for a baseline
     checks: tuple[int, ...] = (0,)  # Numbers of proposals that the agent checks, a row each
     refine: tuple[int, ...] = ()  # Numbers of proposals that the planner refines, a row each
     untrained: bool = False  # True to measure the network before training, too
     method: str = ""  # Name of a baseline; empty for an agent
+    parameters: Values = field(default_factory=dict)  # Of a search: ranges or values by the path of a field
+    trials: int = 0  # Of a search
+    first: tuple[Values, ...] = ()  # Parameters of the first trials of a search
+
+    @property
+    def task(self) -> Task:
+        """Task of the environment."""
+        return registered_task(self.env_id, **self.env_kwargs)
 
     def folder(self, out: Path) -> Path:
-        """Return the folder of the trial."""
-        return out / self.environment.rpartition("/")[2] / self.row / f"seed-{self.seed}"
+        """Return the folder of the trial, or of the search."""
+        row = out / self.environment.rpartition("/")[2] / self.row
+        return row if self.parameters else row / f"seed-{self.seed}"
 
-    def config(self, folder: Path) -> TrainConfig:
-        """Return the configuration of a training in a folder; `policy_kwargs` are merged with those of the preset."""
-        given = {**self.training, "env_kwargs": {**self.env_kwargs, **self.training.get("env_kwargs", {})}}
+    def config(self, folder: Path, values: Values | None = None) -> TrainConfig:
+        """Return the configuration of a training in a folder, in a search with values of the parameters.
+
+        Its `policy_kwargs` are merged with those of the preset.
+        """
+        given = _with(self.training, values or {})
+        given["env_kwargs"] = {**self.env_kwargs, **given.get("env_kwargs", {})}
         config = TrainConfig(env=self.env_id, seed=self.seed, out=folder, progress=False, **given)
         own = config.hyperparameters.get("policy_kwargs")
         if own is None:
             return config
-        usual = config.preset.arguments().get("policy_kwargs", {})
+        usual = config.preset.hyperparameters.get("policy_kwargs", {})
         hyperparameters = {**config.hyperparameters, "policy_kwargs": {**usual, **own}}
         return dataclasses.replace(config, hyperparameters=hyperparameters)
 
-
-@dataclass(frozen=True, kw_only=True)
-class Search(Trial):
-    """Search for hyperparameters of one algorithm in one environment; fields of Trial hold for every training."""
-
-    parameters: Values  # range or list of values by the path of a field
-    trials: int = 20
-    first: tuple[Values, ...] = ()  # parameters of the first trials
-
-    def with_parameters(self, values: Values, folder: Path) -> TrainConfig:
-        """Return the configuration of a training with these parameters."""
-        return dataclasses.replace(self, training=_with(self.training, values)).config(folder)
-
     @property
     def key(self) -> str:
-        """Name that changes with the description of the search."""
+        """Name of a search that changes with its description."""
         plain = json.dumps(dataclasses.asdict(self), sort_keys=True)
         return f"{self.row}-{hashlib.sha256(plain.encode()).hexdigest()[:10]}"
-
-    def folder(self, out: Path) -> Path:
-        """Return the folder of the search."""
-        return super().folder(out).parent
-
-    def is_finished(self, out: Path) -> bool:
-        """Return True if the best parameters of this very search are there."""
-        path = self.folder(out) / "best.json"
-        return path.is_file() and read_json(path).get("key") == self.key
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +141,7 @@ class Study:
     name: str
     out: Path  # Folder of all runs and results
     trials: tuple[Trial, ...]
-    searches: tuple[Search, ...] = ()
+    searches: tuple[Trial, ...]
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Study:
@@ -202,54 +195,49 @@ def _study(
     name: str,
     folder: Path,
     *,
-    environments: Any,
+    environments: Entries,
     out: str = "",
-    seeds: list[int] | None = None,
-    agents: Any = None,
-    baselines: Any = None,
-    searches: Any = None,
-    scenes: list[str] | None = None,
+    seeds: Numbers = (0,),
+    agents: Entries | None = None,
+    baselines: Entries | None = None,
+    searches: Entries | None = None,
+    scenes: Names = MEASURED,
     n_scenes: int | None = None,
 ) -> Study:
     """Return a study; the fields are those of the file."""
     known = {}
-    for env, fields in _entries("environments", environments):
+    for env, fields in _entries(environments):
         fields = {"scenes": scenes, "n_scenes": n_scenes, **fields}
         known[env] = _made(f"environments.{env}", _environment, fields, env, folder)
     found: list[Trial] = []
     rows: set[str] = set()
-    kinds = (("agents", _agent, agents), ("baselines", _baseline, baselines), ("searches", _search, searches))
-    for kind, make, given in kinds:
-        for row, fields in _entries(kind, given or {}):
+    for make, given in ((_agent, agents), (_baseline, baselines), (_search, searches)):
+        for row, fields in _entries(given or {}):
             if row in rows:
                 raise ValueError(f"rows must have different names, {row} is there twice")
             rows.add(row)  # rows are folders, which must not be shared
-            for env in _names(f"{row}: environments", fields.pop("environments", list(known))):
+            for env in fields.pop("environments", known):
                 if env not in known:
                     raise ValueError(unknown_name(f"{row}: environments", env, known))
-                shared = {} if make is _baseline else {"seeds": seeds or [0]}
+                shared = {} if make is _baseline else {"seeds": seeds}
                 found += _made(row, make, {**shared, **fields}, known[env], row)
     if not found:
         raise ValueError("there is nothing to do: give environments, and agents, baselines or searches")
-    trials = [each for each in found if not isinstance(each, Search)]
+    found.sort(key=lambda trial: trial.seed)
     return Study(
         name=name,
         out=Path(out or f"runs/{name}").expanduser(),
-        trials=tuple(sorted(trials, key=lambda trial: trial.seed)),
-        searches=tuple(each for each in found if isinstance(each, Search)),
+        trials=tuple(each for each in found if not each.parameters),
+        searches=tuple(each for each in found if each.parameters),
     )
 
 
-def _entries(where: str, given: list[str] | Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+def _entries(given: Entries) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield name and fields of each entry of a list or mapping, one for each point of its grid."""
-    if not isinstance(given, list | Mapping):
-        raise ValueError(f"{where} must be a list of names, or values by name, got {given!r}")
-    entries = given if isinstance(given, Mapping) else dict.fromkeys(_names(where, given))
+    entries = given if isinstance(given, dict) else dict.fromkeys(given)
     for name, fields in entries.items():
-        if not str(name).strip("/. ") or ".." in str(name) or str(name).startswith("/"):
+        if not name.strip("/. ") or ".." in name or name.startswith("/"):
             raise ValueError(f"names must be words, got {name!r}")
-        if not isinstance(fields, Mapping | None):
-            raise ValueError(f"{name} must be values by name, got {fields!r}")
         rest = dict(fields or {})
         grid = rest.pop("grid", {})
         if not isinstance(grid, Mapping) or not all(isinstance(values, list) for values in grid.values()):
@@ -258,18 +246,6 @@ def _entries(where: str, given: list[str] | Mapping[str, Any]) -> Iterator[tuple
             point = dict(zip(grid, values, strict=True))
             ends = [f"-{path.rpartition('.')[2]}={value}" for path, value in point.items()]
             yield f"{name}{''.join(ends)}", _with(rest, point)
-
-
-def _names(where: str, given: Any) -> list[str]:
-    """Return a list of names; something else raises ValueError."""
-    if not isinstance(given, list):
-        raise ValueError(f"{where} must be a list of names, got {given!r}")
-    for each in given:
-        if not isinstance(each, str):
-            raise ValueError(
-                f"{where} must be names, or a mapping from names to values, got {each!r} in a list"
-            )
-    return given
 
 
 def _with(fields: Values, changes: Values) -> dict[str, Any]:
@@ -287,17 +263,17 @@ def _environment(
     *,
     id: str = "",  # noqa: A002 - the name in the file
     env_kwargs: dict[str, Any] | None = None,
-    scenes: list[str] | None = None,
-    n_scenes: int | None = None,
-) -> Values:
-    """Return the fields of trials in an environment; its sets of scenes are by default those shipped for it."""
-    env_id = id or name
-    kwargs = env_kwargs or {}
-    check_env_kwargs(kwargs)
-    task = registered_task(env_id, **kwargs)
-    check_whole("n_scenes", 1 if n_scenes is None else n_scenes)
+    scenes: Names,
+    n_scenes: int | None,
+) -> Trial:
+    """Return the trial of no row in an environment, which leaves out sets of scenes that it lacks."""
+    env = Trial(environment=name, env_id=id or name, env_kwargs=env_kwargs or {}, n_scenes=n_scenes)
+    check_env_kwargs(env.env_kwargs)
+    task = env.task
+    if n_scenes is not None:
+        check_whole("n_scenes", n_scenes)
     places = []
-    for each in MEASURED if scenes is None else scenes:
+    for each in scenes:
         if each in SETS:
             if each in SEEDS or shipped_set(each, task) is not None:  # the others cannot be drawn
                 places.append(each)
@@ -306,91 +282,79 @@ def _environment(
         else:
             raise ValueError(f"{unknown_name('scenes', each, SETS)}; or the path of a file of scenes")
     if not places:
-        raise ValueError(f"none of {', '.join(scenes or ())} is shipped for {env_id}")
-    return {
-        "environment": name,
-        "env_id": env_id,
-        "env_kwargs": kwargs,
-        "scenes": tuple(places),
-        "n_scenes": n_scenes,
-    }
+        raise ValueError(f"none of {', '.join(scenes)} is shipped for {env.env_id}")
+    return dataclasses.replace(env, scenes=tuple(places))
 
 
 def _agent(
-    env: Values,
+    env: Trial,
     row: str,
     *,
-    seeds: list[int],
-    checks: list[int] | None = None,
-    refine: list[int] | None = None,
+    seeds: Numbers,
+    checks: Numbers = (0,),
+    refine: Numbers = (),
     untrained: bool = False,
     **training: Any,
 ) -> list[Trial]:
     """Return a trial for each seed of an agent whose configuration is allowed in its environment."""
-    numbers = tuple(check_whole("checks", number) for number in checks or [0])
-    refined = tuple(check_whole("refine", number) for number in refine or [])
-    if (any(numbers) or refined) and training.get("algo", "viaq") != "viaq":
+    for name, numbers in (("checks", checks), ("refine", refine)):
+        for number in numbers:
+            check_whole(name, number)
+    if (any(checks) or refine) and training.get("algo", "viaq") != "viaq":
         raise ValueError(f"checks and refine are for the proposals of viaq, got algo {training['algo']}")
-    if refined and registered_task(env["env_id"], **env["env_kwargs"]).replanning:
-        raise ValueError(f"refine is for tasks with one decision for a movement, {env['env_id']} has several")
+    if refine and env.task.replanning:
+        raise ValueError(f"refine is for tasks with one decision for a movement, {env.env_id} has several")
     if not seeds or len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must hold at least one number and none twice, got {seeds}")
-    trials = []
-    for seed in seeds:
-        trial = Trial(
-            **env, row=row, seed=seed, training=training, checks=numbers, refine=refined, untrained=untrained
-        )
+    agent = dataclasses.replace(env, row=row, training=training, untrained=untrained)
+    agent = dataclasses.replace(agent, checks=tuple(checks) or (0,), refine=tuple(refine))
+    trials = [dataclasses.replace(agent, seed=seed) for seed in seeds]
+    for trial in trials:
         config = trial.config(Path())
         check_hyperparameters(config.algorithm, config.hyperparameters)
-        trials.append(trial)
     return trials
 
 
-def _baseline(env: Values, row: str, *, method: str = "") -> list[Trial]:
+def _baseline(env: Trial, row: str, *, method: str = "") -> list[Trial]:
     """Return the trial of a baseline that exists in its environment."""
-    factory(method or row, registered_task(env["env_id"], **env["env_kwargs"]))  # an unknown name is told now
-    return [Trial(**env, row=row, method=method or row)]
+    factory(method or row, env.task)  # an unknown name is told now
+    return [dataclasses.replace(env, row=row, method=method or row)]
 
 
 def _search(
-    env: Values,
+    env: Trial,
     row: str,
     *,
-    seeds: list[int],
+    seeds: Numbers,
     parameters: dict[str, Any],
     trials: int = 20,
-    first: list[dict[str, Any]] | None = None,
+    first: list[dict[str, Any]] | tuple[()] = (),
     **training: Any,
-) -> list[Search]:
+) -> list[Trial]:
     """Return a search whose values, or whose lowest and highest ones, are allowed."""
     (trial,) = _agent(env, row, seeds=seeds[:1], **training)
     if not parameters:
         raise ValueError("parameters must hold at least one list or range")
     if not trial.config(Path()).evaluation_interval:
         raise ValueError("eval_every must be 1 or more in a search, which compares success in validation")
-    for path in itertools.chain(*(first or [])):
+    for path in itertools.chain(*first):
         if path not in parameters:
             raise ValueError(unknown_name("first", path, parameters))
     for path, values in parameters.items():
         for value in _ends(path, values):  # an impossible value is an error now, and not in the last trial
             _made("parameters", _agent, {"seeds": [0], **_with(training, {path: value})}, env, row)
     check_whole("trials", trials)
-    return [
-        Search(
-            **env, row=row, seed=trial.seed, training=training, parameters=parameters, trials=trials,
-            first=tuple(first or ()),
-        )
-    ]  # fmt: skip
+    return [dataclasses.replace(trial, parameters=parameters, trials=trials, first=tuple(first))]
 
 
 def _ends(path: str, given: Any) -> list[Any]:
     """Return all values of a list, or the lowest and the highest of a range."""
     if isinstance(given, list) and given:
         return given
-    ends = given if isinstance(given, Mapping) else {}
-    low: Any = ends.get("low")
-    high: Any = ends.get("high")
-    if not (is_number(low) and is_number(high) and low < high) or (ends.get("log") and low <= 0):
+    ends: Any = given if isinstance(given, Mapping) else {}
+    low, high = ends.get("low"), ends.get("high")
+    ordered = is_number(low) and is_number(high) and low < high and not (ends.get("log") and low <= 0)
+    if not ordered or set(ends) - {"low", "high", "log"}:
         raise ValueError(
             f"{path} must be a list, or a range such as {{low: 1e-4, high: 1e-2, log: true}}, got {given!r}"
         )
@@ -449,11 +413,11 @@ def run_study(
     check_folder(f"out {folder}", folder)
     mark = folder / "study.json"
     if not mark.is_file() or read_json(mark).get("viapoint") != "study":
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and any(folder.iterdir()):
             raise BadFileError(folder, "holds something else than a study; name another folder")
         write_json(mark, {"viapoint": "study", "name": study.name})
-    missing = [trial for trial in study.trials if _finished_record(trial, folder) is None]
-    searches = [search for search in study.searches if not search.is_finished(folder)]
+    missing = [trial for trial in study.trials if not _finished_record(trial, folder)]
+    searches = [search for search in study.searches if not _is_finished(search, folder)]
     failed = []
     if missing or searches:
         told(
@@ -473,15 +437,15 @@ def run_study(
 
 def _run_trial(trial: Trial, out: Path) -> Record:
     """Train if needed, or go on with an interrupted training, measure, and return the record of a trial."""
-    record: Record = {"viapoint": "study", "asked": _asked(trial)}
-    env_kwargs, decisions = dict(trial.env_kwargs), None
+    record: Record = {"viapoint": "study", "asked": _asked(trial), "rows": []}
+    env_kwargs = dict(trial.env_kwargs)
     methods: dict[str, Method] = {}
     if trial.method:
         methods[trial.row] = make_method(trial.method, trial.env_id, **env_kwargs, threads=1)
     else:
         config = trial.config(trial.folder(out))
         run = train_or_resume(config)
-        models: dict[str, Any] = {trial.row: load_model(run.best)}
+        models = {trial.row: load_model(run.best)}
         if trial.untrained:
             models[f"{trial.row}/untrained"] = untrained(models[trial.row], trial.seed)
         for name, model in models.items():
@@ -490,28 +454,29 @@ def _run_trial(trial: Trial, out: Path) -> Record:
             for refine in trial.refine:
                 methods[f"{name}/refine{refine}"] = agent_method("agent", model, 0, refine)
         env_kwargs = whole_task(config.env, config.env_kwargs)
-        decisions = run.decisions
         record["curve"] = [[each["decisions"], each["success"]["rate"]] for each in run.curve]
-        record["seconds"] = run.curve[-1]["seconds"] if run.curve else None
-    record["rows"] = []
     env_kwargs["threads"] = 1  # other trials have the other cores
     for row, method in methods.items():
         for name, frozen in _sets(trial).items():
             line = {"method": row, "set": name, **_measured(method, frozen, trial.env_id, env_kwargs)}
-            if decisions is not None:
-                line["decisions"] = 0 if "/untrained" in row else decisions
+            if not trial.method:
+                line["decisions"] = 0 if "/untrained" in row else run.decisions
             record["rows"].append(line)
     write_json(trial.folder(out) / "result.json", record)
     return record
 
 
-def _finished_record(trial: Trial, out: Path) -> Record | None:
-    """Return the record of a trial that is complete, or None; a record of other settings is obsolete."""
+def _finished_record(trial: Trial, out: Path) -> Record:
+    """Return the record of a trial that is complete, otherwise an empty one; that of other settings is obsolete."""
     path = trial.folder(out) / "result.json"
-    if not path.is_file():
-        return None
-    record = read_json(path)
-    return record if record.get("asked") == _asked(trial) else None
+    record = read_json(path) if path.is_file() else {}
+    return record if record.get("asked") == _asked(trial) else {}
+
+
+def _is_finished(search: Trial, out: Path) -> bool:
+    """Return True if the best parameters of this very search are there."""
+    path = search.folder(out) / "best.json"
+    return path.is_file() and read_json(path).get("key") == search.key
 
 
 def _write_results(study: Study, folder: Path) -> pd.DataFrame:
@@ -519,8 +484,8 @@ def _write_results(study: Study, folder: Path) -> pd.DataFrame:
     lines = []
     curves: dict[str, dict[str, list[Any]]] = {}
     for trial in study.trials:
-        record = _finished_record(trial, folder) or {"rows": []}
-        lines += [{"environment": trial.environment, **line} for line in record["rows"]]
+        record = _finished_record(trial, folder)
+        lines += [{"environment": trial.environment, **line} for line in record.get("rows", [])]
         if "curve" in record:
             of_rows = curves.setdefault(trial.environment, {})
             of_rows.setdefault(trial.row, []).append(record["curve"])
@@ -537,12 +502,11 @@ def _table(lines: list[Record]) -> pd.DataFrame:
     """Return one line for each environment, set of scenes and row, over all its seeds."""
     rows = []
     for keys, runs in pd.DataFrame(lines, columns=[*COLUMNS, "solved", "band"]).groupby(KEYS, sort=False):
-        solved = np.array([[bit == "1" for bit in each] for each in runs["solved"]], dtype=float)
+        solved = np.array([list(each) for each in runs["solved"]]) == "1"
         if len(runs) == 1:
             success, low, high = wilson(int(solved.sum()), solved.size)
         else:
-            band = np.array(runs["band"].iloc[0])
-            success, low, high = across_seeds(solved, band, np.random.default_rng(0))
+            success, low, high = across_seeds(solved, runs["band"].iloc[0], np.random.default_rng(0))
         row = dict(zip(KEYS, keys, strict=True))
         row |= {"seeds": len(runs), "scenes": solved.shape[1], "success": success, "low": low, "high": high}
         rows.append({**row, **runs[MEDIANS].astype(float).median()})
@@ -567,25 +531,22 @@ def markdown(table: pd.DataFrame, title: str) -> str:
 
 def _asked(trial: Trial) -> Record:
     """Return what identifies a trial as plain values."""
-    values = dataclasses.asdict(trial)
-    values["scenes"] = {name: frozen.sha256 for name, frozen in _sets(trial).items()}
-    plain: Record = json.loads(json.dumps(values))
+    plain: Record = as_plain(trial)
+    plain["scenes"] = {name: frozen.sha256 for name, frozen in _sets(trial).items()}
+    for name in ("parameters", "trials", "first"):  # of searches
+        del plain[name]
     return plain
 
 
 def _sets(trial: Trial) -> dict[str, FrozenScenes]:
     """Return the sets of scenes of a trial by name."""
-    task = registered_task(trial.env_id, **trial.env_kwargs)
-    found = {}
-    for name in trial.scenes:
-        found[Path(name).stem] = scenes_for(name, task, trial.n_scenes)
-    return found
+    return {Path(name).stem: scenes_for(name, trial.task, trial.n_scenes) for name in trial.scenes}
 
 
 def _measured(method: Method, frozen: FrozenScenes, env_id: str, env_kwargs: Record) -> Record:
     """Return what a line of a table says about a method in a set of scenes."""
     (result,) = evaluate_methods([method], frozen, env_id, env_kwargs=env_kwargs).results
-    if result.interrupted:
+    if result.partial:
         raise KeyboardInterrupt
     summary = result.summary()
     seconds = summary["decision_time"]
@@ -599,48 +560,37 @@ def _measured(method: Method, frozen: FrozenScenes, env_id: str, env_kwargs: Rec
     }
 
 
-def _import_libraries() -> tuple[Any, Any]:
-    """Import Ray and Ray Tune, which take seconds, and Optuna only when a study runs."""
-    os.environ.update({name: os.environ.get(name, value) for name, value in SETTINGS.items()})
+def _import_ray() -> Any:
+    """Import Ray with Ray Tune, which take seconds, and Optuna only when a study runs."""
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
     try:
         import optuna
-        import ray
-        from ray import tune
+        import ray.tune
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(explain_import_error(error, "a study"), name=error.name) from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    return ray, tune
+    return ray
 
 
-@contextmanager
-def _connected(workers: int | None) -> Iterator[None]:
-    """Start a Ray of this machine that listens on 127.0.0.1 alone and ends with the study, if there is none."""
-    # Otherwise Ray replaces 127.0.0.1 by another address of the machine.
-    os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
-    ray, _ = _import_libraries()
+def _connected(workers: int | None) -> Any:
+    """Return a context with a Ray of this machine that listens on 127.0.0.1 alone; nothing where there is a Ray."""
+    ray = _import_ray()
     if ray.is_initialized():
-        yield
-        return
-    try:
-        ray.init(
-            address="local",
-            num_cpus=workers,
-            include_dashboard=False,
-            log_to_driver=False,
-            logging_level="ERROR",
-            _node_ip_address="127.0.0.1",
-        )
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ValueError(f"Ray cannot be started: {_one_line(error)}") from None
-    try:
-        yield
-    finally:
-        ray.shutdown()
+        return nullcontext()
+    return ray.init(
+        address="local",
+        num_cpus=workers,
+        include_dashboard=False,
+        log_to_driver=False,
+        logging_level="ERROR",
+        _node_ip_address="127.0.0.1",
+    )
 
 
 def _run_trials(trials: list[Trial], folder: Path, told: Told) -> list[str]:
     """Run trials as tasks of Ray, and return a line for each that failed."""
-    ray, _ = _import_libraries()
+    ray = _import_ray()
     task = ray.remote(num_cpus=1, max_retries=RETRIES)(_run_trial)  # each trial computes on one core
     running: dict[Any, Trial] = {task.remote(trial, folder): trial for trial in trials}
     failed = []
@@ -657,40 +607,30 @@ def _run_trials(trials: list[Trial], folder: Path, told: Told) -> list[str]:
     return failed
 
 
-class ReportCallback(BaseCallback):
-    """Callback that reports the validations of a run, each once, to a function that may raise to end the training."""
-
-    def __init__(self, folder: Path, report: Callable[[dict[str, Any]], None]) -> None:
-        super().__init__()
-        self.folder, self.report = folder, report
-        self._reported = 0
-
-    def _on_rollout_start(self) -> None:
-        curve = Run(self.folder).curve
-        for each in curve[self._reported :]:
-            if each["decisions"]:  # the validation before training says nothing about it
-                self.report({"success": each["success"]["rate"], "decisions": each["decisions"]})
-        self._reported = len(curve)
-
-    def _on_step(self) -> bool:
-        return True
-
-
-def _run_search(search: Search, folder: Path, workers: int | None, told: Told) -> list[str]:
+def _run_search(search: Trial, folder: Path, workers: int | None, told: Told) -> list[str]:
     """Search for hyperparameters, write the best ones, and return a line for each trial if all of them failed.
 
     Optuna chooses the parameters, and successive halving (ASHA) stops trainings that are behind in validation.
     """
-    _, tune = _import_libraries()
+    tune = _import_ray().tune
     from ray.tune.schedulers import ASHAScheduler
     from ray.tune.search.optuna import OptunaSearch
 
     total = search.config(folder).total_timesteps
 
     def work(config: Values) -> None:
+        reported = 1  # the validation before training says nothing about it
+
+        def report(*_: object) -> bool:
+            nonlocal reported
+            for each in Run(settings.folder).curve[reported:]:
+                tune.report({"success": each["success"]["rate"], "decisions": each["decisions"]})
+                reported += 1
+            return True
+
         try:
-            settings = search.with_parameters(config, Path(tune.get_context().get_trial_dir()) / "run")
-            run = train_or_resume(settings, ReportCallback(settings.folder, tune.report))
+            settings = search.config(Path(tune.get_context().get_trial_dir()) / "run", config)
+            run = train_or_resume(settings, ConvertCallback(report))
             tune.report({"success": run.curve[-1]["success"]["rate"], "decisions": run.decisions})
         except Exception as error:  # settings that cannot be trained do not end a search
             tune.report({"success": 0.0, "decisions": total, "error": _one_line(error)})
@@ -699,19 +639,18 @@ def _run_search(search: Search, folder: Path, workers: int | None, told: Told) -
     if tune.Tuner.can_restore(path):
         tuner = tune.Tuner.restore(str(path), work, resume_unfinished=True, restart_errored=True)
     else:
-        # Trainings end by themselves, before max_t.
-        scheduler = ASHAScheduler(time_attr="decisions", max_t=2 * total, grace_period=max(total // 4, 1))
+        space = {name: _distribution(given) for name, given in search.parameters.items()}
         first = [dict(each) for each in search.first] or None
+        goal: dict[str, Any] = {"metric": "success", "mode": "max"}
         tuner = tune.Tuner(
             work,
-            param_space={name: _domain(tune, given) for name, given in search.parameters.items()},
             tune_config=tune.TuneConfig(
-                metric="success",
-                mode="max",
+                **goal,
                 num_samples=search.trials,
                 max_concurrent_trials=workers,
-                search_alg=OptunaSearch(points_to_evaluate=first, seed=0),
-                scheduler=scheduler,
+                search_alg=OptunaSearch(space, points_to_evaluate=first, seed=0, **goal),
+                # Trainings end by themselves, before max_t.
+                scheduler=ASHAScheduler("decisions", max_t=2 * total, grace_period=max(total // 4, 1)),
             ),
             run_config=tune.RunConfig(
                 name=path.name,
@@ -734,19 +673,17 @@ def _run_search(search: Search, folder: Path, workers: int | None, told: Told) -
     return [f"{search.row}: {reason}" for reason in failed]
 
 
-def _domain(tune: Any, given: Any) -> Any:
-    """Return the domain of a parameter: one of a list, or a range of whole numbers or of real ones."""
+def _distribution(given: Any) -> Any:
+    """Return the distribution of a parameter: one of a list, or a range of whole numbers or of real ones."""
+    from optuna import distributions
+
     if isinstance(given, list):
-        return tune.choice(given)
-    low = given["low"]
-    high = given["high"]
-    log = given.get("log", False)
-    if isinstance(low, int) and isinstance(high, int):
-        return (tune.lograndint if log else tune.randint)(low, high + 1)
-    return (tune.loguniform if log else tune.uniform)(low, high)
+        return distributions.CategoricalDistribution(given)
+    whole = isinstance(given["low"], int) and isinstance(given["high"], int)
+    return (distributions.IntDistribution if whole else distributions.FloatDistribution)(**given)
 
 
-def _write_search(search: Search, results: Any, folder: Path) -> str:
+def _write_search(search: Trial, results: Any, folder: Path) -> str:
     """Write all trials of a search as CSV and the best one as JSON, and return a line about it."""
     lines = [{**each.config, **each.metrics} for each in results if each.error is None]
     table = pd.DataFrame(lines)[[*search.parameters, "success", "decisions"]]
@@ -754,10 +691,10 @@ def _write_search(search: Search, results: Any, folder: Path) -> str:
     table = table.sort_values(["decisions", "success"], ascending=False)
     write_bytes(search.folder(folder) / "trials.csv", table.to_csv(index=False).encode())
     best = table.to_dict("records")[0]
-    chosen = search.with_parameters({path: best[path] for path in search.parameters}, folder)
+    chosen = search.config(folder, {path: best[path] for path in search.parameters})
     config = dataclasses.replace(chosen, out=None)
     record = {"viapoint": "search", "key": search.key, "success": best["success"], "command": config.command}
-    write_json(search.folder(folder) / "best.json", {**record, "training": config.as_json()})
+    write_json(search.folder(folder) / "best.json", {**record, "training": as_plain(config)})
     return f"best of {search.row}, {100.0 * best['success']:.1f} %: {config.command}"
 
 

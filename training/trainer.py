@@ -23,7 +23,7 @@ from viapoint.training.configs import TrainConfig
 from viapoint.training.evaluation import MethodResult, evaluate, one_thread
 from viapoint.training.files import BadFileError, read_json, versions, write_json
 from viapoint.training.progress import progress_bar
-from viapoint.training.runs import Run, check_free, check_unchanged
+from viapoint.training.runs import Run, check_unchanged, locked
 from viapoint.training.scene_sets import FrozenScenes, scenes_for
 from viapoint.training.vec_env import LOGGED, ViaVecEnv
 
@@ -93,56 +93,38 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
     with one_thread():
         if config.resume:
             run = Run(config.folder)
-            with run.locked():
+            with locked(run.folder):
                 _restore_settings(run, config)
                 with _untrained_model(run.config) as model:
                     _continue_training(run, model, callbacks)
             return run
-        check_free(config.folder)
-        begun = resolved(config)
-        _warn(begun)
+        begun = config.resolved
         with _untrained_model(begun) as model:  # before there is a folder: what cannot be built leaves none
             run = Run.create(begun)
-            with run.locked():
+            _warn(begun)
+            with locked(run.folder):
                 _continue_training(run, model, callbacks)
         return run
 
 
 def train_or_resume(config: TrainConfig, callback: Callbacks = None) -> Run:
-    """Train, go on with a training of these settings that was interrupted, or return one that has ended.
-
-    Raises:
-        BadFileError: The folder holds a training with other settings, or something else.
-        ValueError, TrainingStoppedError, TrainingFailedError: As for :func:`train`.
-    """
+    """Train, go on with a training of these settings that was interrupted, or return one that has ended."""
     begun = config.folder / "config.json"
-    if not begun.is_file():
-        try:
+    try:
+        if not begun.is_file():
             return train(config, callback)
-        except BadFileError:
-            if not begun.is_file():
-                raise
-            # A worker of a study that was killed has begun it meanwhile; it ends soon.
+    except BadFileError:
+        if not begun.is_file():
+            raise
+        # A worker of a study that was killed has begun it meanwhile; it ends soon.
     run = Run(config.folder)
-    check_unchanged(run, resolved(dataclasses.replace(config, n_timesteps=run.config.total_timesteps)))
+    check_unchanged(run, dataclasses.replace(config, n_timesteps=run.config.total_timesteps).resolved)
     if run.ended and run.config.total_timesteps == config.total_timesteps:
         return run
     again = TrainConfig(
         out=config.folder, resume=True, progress=config.progress, n_timesteps=config.total_timesteps
     )
     return train(again, callback)
-
-
-def resolved(config: TrainConfig) -> TrainConfig:
-    """Return a configuration in which the values of the preset replace None, as a run stores it."""
-    return dataclasses.replace(
-        config,
-        n_timesteps=config.total_timesteps,
-        n_envs=config.n_envs or config.preset.n_envs,
-        eval_every=config.evaluation_interval,
-        checkpoint_every=config.checkpoint_every or config.preset.checkpoint_every,
-        hyperparameters=config.all_hyperparameters,
-    )
 
 
 def _warn(config: TrainConfig) -> None:
@@ -168,7 +150,7 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
                 config.algorithm, config.preset.policy, env, config.hyperparameters, seed=config.seed
             )
         except Exception as error:  # of a library, for networks or buffers that cannot be built
-            usual = config.preset.arguments()
+            usual = config.preset.hyperparameters
             others = {name: each for name, each in config.hyperparameters.items() if usual.get(name) != each}
             raise ValueError(
                 f"{config.algo} cannot be made for {config.env} with {others}: {error}"
@@ -180,21 +162,19 @@ def _continue_training(run: Run, model: BaseAlgorithm, callbacks: list[BaseCallb
     """Train from the last checkpoint of the run to its end."""
     folder = str(run.folder / "tensorboard")
     try:
+        seconds = run.restore(model)
         with (
             closing(Logger(folder, [TensorBoardOutputFormat(folder)])) as logger,
-            RunCallback(run, callbacks) as monitor,
+            RunCallback(run, callbacks, seconds, model.num_timesteps) as monitor,
         ):
             model.set_logger(logger)
-            restored = run.restore(model)
-            if restored is not None:
-                monitor.restore(float(restored["seconds"]), model.num_timesteps)
             run.write_curve(monitor.curve)  # without validations after the checkpoint
             # All else stays as it was written: an arm is named by its file, also while its copy takes its place.
             path = run.folder / "config.json"
             write_json(path, {**read_json(path), "n_timesteps": run.config.total_timesteps})
             remaining = run.config.total_timesteps - model.num_timesteps
             if remaining > 0 and not run.stalled:
-                _learn(model, remaining, monitor, fresh=restored is None)
+                _learn(model, remaining, monitor, fresh=seconds is None)
             run.save("final", model)
             if monitor.interrupted:  # also after the last decision
                 raise TrainingStoppedError(
@@ -221,15 +201,15 @@ def _learn(model: BaseAlgorithm, steps: int, monitor: RunCallback, *, fresh: boo
 def _restore_settings(run: Run, config: TrainConfig) -> None:
     """Take over a run's own configuration, except for fields that may change."""
     check_unchanged(run, config, TrainConfig())
-    if config.n_timesteps is not None and config.n_timesteps != run.config.total_timesteps:
-        if config.n_timesteps < run.config.total_timesteps:
-            raise BadFileError(
-                run.folder,
-                f"holds a run of {run.config.total_timesteps} decisions, whose settings change in its course; "
-                f"n_timesteps must be as many or more, got {config.n_timesteps}",
-            )
-        run.config = dataclasses.replace(run.config, n_timesteps=config.n_timesteps)
-    run.config = dataclasses.replace(run.config, progress=config.progress)
+    begun = run.config.total_timesteps
+    number = config.n_timesteps or begun
+    if number < begun:
+        raise BadFileError(
+            run.folder,
+            f"holds a run of {begun} decisions, whose settings change in its course; n_timesteps must be as many or "
+            f"more, got {number}",
+        )
+    run.config = dataclasses.replace(run.config, n_timesteps=number, progress=config.progress)
     began = run.versions
     others = [
         f"{name} {began[name]} (now {now})" for name, now in versions().items() if began.get(name, now) != now
@@ -254,27 +234,27 @@ class RunCallback(CallbackList):
     Stable-Baselines3 drops the step that it has just made, and no run could go on from there to the same result.
     """
 
-    def __init__(self, run: Run, callbacks: list[BaseCallback]) -> None:
+    def __init__(
+        self, run: Run, callbacks: list[BaseCallback], seconds: float | None, decisions: int
+    ) -> None:
         super().__init__(callbacks)
         self.run, self.config = run, run.config
         self.curve: list[dict[str, Any]] = []  # one record for each evaluation so far
-        self._seconds_before, self._began = 0.0, time.monotonic()
-        self._before = 0  # Decisions when it was last decided what is due
+        self._began = time.monotonic()  # if it had not been interrupted, and without the time of validations
+        self._before = decisions  # Decisions when it was last decided what is due
+        if seconds is not None:
+            self.curve = [record for record in run.curve if record["decisions"] <= decisions]
+            self._began -= seconds
         self._validation: FrozenScenes | None = None
         if self.config.evaluation_interval:
             self._validation = scenes_for("validation", self.config.task, self.config.eval_scenes)
         self.interrupted = False  # True once Ctrl-C was pressed
         self.stopped = False  # True once a callback of the user has asked for the end of the training
 
-    def restore(self, seconds: float, decisions: int) -> None:
-        """Continue a training that took a time [s] for a number of decisions."""
-        self.curve = [record for record in self.run.curve if record["decisions"] <= decisions]
-        self._seconds_before, self._before = seconds, decisions
-
     @property
     def seconds(self) -> float:
         """Wall time of training, with earlier parts of the run and without validation, [s]."""
-        return self._seconds_before + time.monotonic() - self._began
+        return time.monotonic() - self._began
 
     def __enter__(self) -> RunCallback:
         task = self.config.env.rpartition("/")[2]
@@ -299,11 +279,6 @@ class RunCallback(CallbackList):
         self.interrupted = True
         self._bar.write("saving and leaving; Ctrl-C again leaves at once", file=sys.stderr)
 
-    def _on_training_start(self) -> None:
-        self._began = time.monotonic()
-        self._show_progress()
-        super()._on_training_start()
-
     def _on_step(self) -> bool:
         self._show_progress()
         if not super()._on_step():
@@ -313,7 +288,7 @@ class RunCallback(CallbackList):
     def _on_rollout_start(self) -> None:
         self._run_due_actions(final=self.stopped)
         if self.interrupted or self.stopped or self.run.stalled:
-            self.run.checkpoint(self.model, {"seconds": self.seconds})
+            self.run.checkpoint(self.model, self.seconds)
             raise _TrainingEnds
         super()._on_rollout_start()
 
@@ -333,7 +308,7 @@ class RunCallback(CallbackList):
         saves = final or self._is_due(config.checkpoint_every or config.preset.checkpoint_every)
         self._before = self.num_timesteps
         if saves:
-            self.run.checkpoint(self.model, {"seconds": self.seconds})
+            self.run.checkpoint(self.model, self.seconds)
 
     def _is_due(self, interval: int) -> bool:
         """Return whether decisions have passed a multiple of an interval."""
@@ -343,24 +318,20 @@ class RunCallback(CallbackList):
         """Evaluate the policy, extend the learning curve, and save the model if it is the best so far."""
         if self._validation is None or (self.curve and self.curve[-1]["decisions"] == self.num_timesteps):
             return
-        seconds = self.seconds  # before the validation, which is no training
         began = time.monotonic()
         if hasattr(self.model, "calibrate"):  # of agents that predict their success
             self.model.calibrate()
         (result,) = evaluate(self.model, scenes=self._validation, time_decisions=False).results
         if result.partial:  # Ctrl-C has ended it: some scenes say nothing of all
             return
-        record = self._record(result, seconds)
+        record = self._record(result, began - self._began)
         self.curve.append(record)
         self.run.write_curve(self.curve)
         if self.config.progress and self._bar.disable:
             rate = 100.0 * record["success"]["rate"]
             total = max(self.num_timesteps, self.config.total_timesteps)  # rounds are whole
-            print(
-                f"{self.num_timesteps} of {total} decisions: success {rate:.1f} % in validation",
-                file=sys.stderr,
-                flush=True,
-            )
+            told = f"{self.num_timesteps} of {total} decisions: success {rate:.1f} % in validation"
+            print(told, file=sys.stderr)
         # A validation is better with more success, then with less jerk.
         best = max(self.curve, key=lambda each: (each["success"]["rate"], -(each["jerk_ratio"] or 0.0)))
         if record is best:

@@ -83,9 +83,9 @@ def shown(env_id: str, number: int) -> Shown:
     scenes = scenes_for("validation", task).scenes.take(slice(0, TRIED))
     observation = simulation.observe(scenes)
     found = simulation.play(method, scenes, method.decide(observation, scenes))
-    passes = found.success & (found.info["min_clearance"] > CLEAREST)
+    passes = found["is_success"] & (found["min_clearance"] > CLEAREST)
     if task.n_obstacles[1]:
-        passes &= ~simulation(scenes, plain.decide(observation, scenes)).success
+        passes &= ~simulation(scenes, plain.decide(observation, scenes))["is_success"]
     simulation.close()
     rows = np.flatnonzero(passes)[:number]
     if len(rows) < number:

@@ -80,7 +80,7 @@ def draw_calibration(axes: Axes, env_id: str, agent: Any) -> None:
     scenes = task.sampler()([np.random.default_rng((DRAWN, each)) for each in range(N_DRAWN)])
     simulation = SceneSimulation(env_id)
     actions, predicted = agent.policy.assess(simulation.observe(scenes))
-    success = simulation(scenes, actions).success
+    success = simulation(scenes, actions)["is_success"]
     order = np.argsort(predicted)
     bins = np.array_split(order, BINS)
     x = np.array([predicted[rows].mean() for rows in bins])

@@ -48,7 +48,7 @@ def small_scenes():
     generator = np.random.default_rng(0)
     scenes = simulation.task.sampler()([generator] * 40)
     actions = generator.uniform(-1.0, 1.0, (32, 40, simulation.task.action.size))
-    success = np.array([simulation(scenes, each).success for each in actions])
+    success = np.array([simulation(scenes, each)["is_success"] for each in actions])
     simulation.close()
     return FrozenScenes(
         name="small", task=simulation.task.as_dict(), scenes=scenes, share=success.mean(axis=0)

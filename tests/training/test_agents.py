@@ -286,15 +286,15 @@ def test_it_learns_within_seconds_what_chance_does_not():
     scenes = scenes_of(simulation.task, 256, 10_000)
     observation = simulation.observe(scenes)
     random = np.random.default_rng(0).uniform(-1.0, 1.0, (256, simulation.task.action.size))
-    chance = simulation(scenes, random).success.mean()
+    chance = simulation(scenes, random)["is_success"].mean()
     env = ViaVecEnv(PLANE, 64, seed=0)
     few = {"candidates": 128, "refinements": 1, "per_refinement": 32}
     model = ViaQ("ViaQPolicy", env, seed=0, learning_starts=512, gradient_steps=16, policy_kwargs=few)
-    untrained = simulation(scenes, model.predict(observation)[0].astype(np.float64)).success.mean()
+    untrained = simulation(scenes, model.predict(observation)[0].astype(np.float64))["is_success"].mean()
     model.learn(64 * 24)
-    alone = simulation(scenes, model.predict(observation)[0].astype(np.float64)).success.mean()
+    alone = simulation(scenes, model.predict(observation)[0].astype(np.float64))["is_success"].mean()
     model.policy.checks = 16
-    checked = simulation(scenes, model.predict(observation)[0].astype(np.float64)).success.mean()
+    checked = simulation(scenes, model.predict(observation)[0].astype(np.float64))["is_success"].mean()
     assert alone > max(2.0 * chance, untrained)
     assert checked > 0.7
     env.close()
@@ -338,7 +338,7 @@ def test_one_of_many_good_plans_out_of_reach_is_not_taken():
     scenes = scenes_of(agent.policy.task, 175, seed=78).take([103, 114, 174])
     simulation = SceneSimulation(PLANE, 3)
     actions = agent.predict(simulation.observe(scenes))[0]
-    assert (simulation(scenes, actions).info["duration"] > 0.0).all()
+    assert (simulation(scenes, actions)["duration"] > 0.0).all()
 
 
 KNOW_OBSTACLES = (
@@ -633,7 +633,7 @@ def test_predicted_success_is_calibrated(agent) -> None:
     simulation = SceneSimulation(SENSED)
     scenes = scenes_of(simulation.task, 300, 9)
     actions, predicted = agent.policy.assess(simulation.observe(scenes))
-    assert abs(predicted.mean() - simulation(scenes, actions).success.mean()) < 0.08
+    assert abs(predicted.mean() - simulation(scenes, actions)["is_success"].mean()) < 0.08
 
 
 def test_rounds_of_candidates_never_lower_the_best_value(agent) -> None:

@@ -27,6 +27,7 @@ from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
 from viapoint.training.cli import demo, doctor
 from viapoint.training.cli import entry as cli
 from viapoint.training.configs import DemoConfig, EvaluateConfig, from_words, to_words
+from viapoint.training.files import as_plain
 from viapoint.training.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
 from viapoint.training.trainer import RunCallback, TrainingStoppedError
 from viapoint.training.video import gallery, record_video
@@ -159,7 +160,7 @@ def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys, failed):
 def test_the_configuration_of_a_training_survives_json():
     given = {"env_kwargs": {"n_via": 2}, "hyperparameters": {"batch_size": 3}}
     config = TrainConfig(algo="ppo", out=Path("x"), **given)
-    assert TrainConfig(**json.loads(json.dumps(config.as_json()))) == config
+    assert TrainConfig(**as_plain(config)) == config
 
 
 @pytest.mark.parametrize(
@@ -188,13 +189,13 @@ def test_words_become_a_configuration():
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_a_short_training_begins_to_learn_in_proportion(algo):
-    usual = TrainConfig(algo=algo)
-    short = TrainConfig(algo=algo, n_timesteps=usual.total_timesteps // 8)
-    if "learning_starts" in usual.all_hyperparameters:
-        ratio = short.all_hyperparameters["learning_starts"] / usual.all_hyperparameters["learning_starts"]
+    usual = TrainConfig(algo=algo).resolved
+    short = TrainConfig(algo=algo, n_timesteps=usual.n_timesteps // 8).resolved
+    if "learning_starts" in usual.hyperparameters:
+        ratio = short.hyperparameters["learning_starts"] / usual.hyperparameters["learning_starts"]
         assert ratio == pytest.approx(1 / 8)
     given = TrainConfig(algo="sac", n_timesteps=64, hyperparameters={"learning_starts": 100})
-    assert given.all_hyperparameters["learning_starts"] == 100
+    assert given.resolved.hyperparameters["learning_starts"] == 100
 
 
 def test_every_algorithm_has_presets_that_fit():
@@ -202,7 +203,7 @@ def test_every_algorithm_has_presets_that_fit():
     for presets in (PRESETS, STEP_PRESETS, REACH_PRESETS, REPLANNING_PRESETS):
         for algo, preset in presets.items():
             assert preset.policy in ALGORITHMS[algo].policy_aliases
-            check_hyperparameters(algo, preset.arguments())
+            check_hyperparameters(algo, preset.hyperparameters)
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ SMALL = {"learning_starts": 8, "batch_size": 8, "buffer_size": 64, "policy_kwarg
 
 def new(env):
     preset = PRESETS["sac"]
-    return build("sac", preset.policy, env, {**preset.arguments(), **SMALL}, seed=1)
+    return build("sac", preset.policy, env, {**preset.hyperparameters, **SMALL}, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +210,7 @@ def checkpoint(env, tmp_path_factory):
     model = new(env)
     model.learn(16)
     path = tmp_path_factory.mktemp("checkpoint") / "16.pt"
-    write_checkpoint(model, path, {"curve": []})
+    write_checkpoint(model, path, 5.0)
     return path
 
 
@@ -236,7 +236,7 @@ def test_a_checkpoint_with_code_is_not_opened(env, checkpoint, tmp_path):
 def test_a_forged_checkpoint_is_refused(change, env, checkpoint, tmp_path):
     path, state = tmp_path / "forged.pt", read_state(checkpoint)
     torch.save(state, path)
-    assert read_checkpoint(new(env), path) == {"curve": []}
+    assert read_checkpoint(new(env), path) == 5.0
     change(state)
     torch.save(state, path)
     with pytest.raises(BadFileError):

@@ -67,9 +67,8 @@ def test_every_method_meets_the_same_scenes(small_scenes, solutions):
         np.testing.assert_allclose(np.concatenate(method.observed), hands, atol=1e-6)
     for result, method in zip(evaluation.results, methods, strict=True):
         direct = simulation(small_scenes.scenes, method.actions)
-        for name, values in direct.info.items():
+        for name, values in direct.items():
             np.testing.assert_array_equal(result.outcomes[name], values, err_msg=name)
-        np.testing.assert_array_equal(result.outcomes["reward"], direct.reward)
     simulation.close()
     record = evaluation.to_dict()
     assert record["sha256"] == small_scenes.sha256
@@ -127,13 +126,11 @@ def fake(success, **changes):
     values = {
         "name": "fake",
         "outcomes": outcomes,
-        "actions": np.zeros((n, 3)),
         "decision_times": np.linspace(0.001, 0.003, 101),
         "band": np.arange(n) % 4,
         "family": np.full(n, ""),
         "distance": np.full(n, 0.4),
         "partial": False,
-        "interrupted": False,
     }
     return MethodResult(**{**values, **changes})
 
@@ -362,7 +359,7 @@ def test_episodes_with_the_same_ends_are_not_mixed_up():
     for row in range(6):
         one = scenes.take([row])
         alone = method.execute(one, method.decide(simulation.observe(one), one))
-        assert alone.reward[0] == together.reward[row]
+        assert alone["reward"][0] == together["reward"][row]
 
 
 class Forwards:
@@ -398,18 +395,18 @@ def test_what_a_method_carries_out_is_what_the_single_environment_does():
             action, _ = method._model.predict(observation, deterministic=True)
             observation, reward, terminated, truncated, info = env.step(action)
             total, over = total + reward, terminated or truncated
-        assert together.reward[i] == pytest.approx(total, abs=1e-3)
+        assert together["reward"][i] == pytest.approx(total, abs=1e-3)
         for name in ("is_success", "collision", "reachable"):
-            assert together.info[name][i] == info[name]
+            assert together[name][i] == info[name]
         for name in ("goal_error", "path_length", "min_clearance"):
-            assert together.info[name][i] == pytest.approx(info[name], abs=1e-3), name
-    assert len(np.unique(together.info["duration"])) > 1
+            assert together[name][i] == pytest.approx(info[name], abs=1e-3), name
+    assert len(np.unique(together["duration"])) > 1
 
 
 @pytest.mark.parametrize("env_id", [STEP, MOVING_STEP])
 def test_an_agent_of_steps_stands_in_one_table_with_the_others(env_id):
     preset = STEP_PRESETS["sac"]
-    settings = {**preset.arguments(), "buffer_size": 10}
+    settings = {**preset.hyperparameters, "buffer_size": 10}
     agent = agent_method("agent", build("sac", preset.policy, ViaVecEnv(env_id, 4), settings, seed=0))
     assert isinstance(agent, StepAgentMethod)
     env_kwargs = whole_task(env_id, {})

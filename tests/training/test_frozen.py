@@ -86,7 +86,7 @@ def test_scenes_are_of_the_kind_asked_for_and_can_be_solved(simulation, monkeypa
     for each in (test, hard, uniform):
         assert len(each.share) == len(each.scenes.start) == make.NUMBERS[each.name]
         done = simulation(each.scenes, method.decide(simulation.observe(each.scenes), each.scenes))
-        assert done.success.mean() > 0.8
+        assert done["is_success"].mean() > 0.8
 
 
 def test_the_stated_share_is_what_one_measures(simulation):
@@ -95,7 +95,7 @@ def test_the_stated_share_is_what_one_measures(simulation):
     few = frozen.take(np.flatnonzero(frozen.share > 0.1)[:12])
     draws = np.random.default_rng(123).uniform(-1.0, 1.0, (200, 3))
     rows = np.repeat(np.arange(12), 200)
-    success = simulation(few.scenes.take(rows), np.tile(draws, (12, 1))).success
+    success = simulation(few.scenes.take(rows), np.tile(draws, (12, 1)))["is_success"]
     measured = success.reshape(12, 200).mean(axis=-1)
     spread = np.sqrt(few.share * (1.0 - few.share) * (1.0 / 200 + 1.0 / 512))
     assert (np.abs(measured - few.share) < 4.0 * spread + 0.03).all()

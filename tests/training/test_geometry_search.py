@@ -154,7 +154,7 @@ def test_the_search_succeeds(env_id, name, number, least):
     scenes = every.take(np.linspace(0, len(every.start) - 1, number).astype(int))
     method = make_method(name, env_id)
     done = simulation.play(method, scenes, method.decide(simulation.observe(scenes), scenes))
-    assert done.success.mean() >= least
+    assert done["is_success"].mean() >= least
 
 
 def test_exactly_the_stated_number_of_plans_is_checked(monkeypatch):

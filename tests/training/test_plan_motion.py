@@ -577,8 +577,9 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
     summary = result.summary()
     assert summary["success"]["rate"] >= 0.9
     assert summary["collision"]["rate"] <= 0.1
-    counts = result.actions[:, 0].astype(int)
-    durations = [row[1 : 2 + count].sum() for row, count in zip(result.actions, counts, strict=True)]
+    actions = result.outcomes["action"]
+    counts = actions[:, 0].astype(int)
+    durations = [row[1 : 2 + count].sum() for row, count in zip(actions, counts, strict=True)]
     np.testing.assert_allclose(result.outcomes["duration"], durations)
 
 
@@ -595,7 +596,7 @@ def test_where_there_is_no_way_it_gives_up(monkeypatch):
     scenes = draw_given(given, simulation.task.sampler(), [np.random.default_rng(0)])
     method = make_method("ompl", PLANE)
     assert not method.plan(scenes).success
-    assert not method.execute(scenes, method.decide({}, scenes)).success.any()
+    assert not method.execute(scenes, method.decide({}, scenes))["is_success"].any()
 
 
 @pytest.mark.parametrize("env_id", [PLANE, WHOLE, PANDA_TASK])

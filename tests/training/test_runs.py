@@ -29,7 +29,7 @@ from viapoint.training.video import record_video
 
 def new(algo, env, **hyperparameters):
     preset = PRESETS[algo]
-    return build(algo, preset.policy, env, {**preset.arguments(), **hyperparameters}, seed=1)
+    return build(algo, preset.policy, env, {**preset.hyperparameters, **hyperparameters}, seed=1)
 
 
 @pytest.mark.filterwarnings(
@@ -114,18 +114,18 @@ def run(tmp_path):
 def test_a_folder_in_use_is_refused_and_a_dead_process_holds_nothing(run, monkeypatch):
     monkeypatch.setattr(runs, "PATIENCE", 0.0)
     script = (
-        "import sys; from pathlib import Path; from viapoint.training.runs import Run\n"
-        f"with Run(Path({str(run.folder)!r})).locked():\n    print('in', flush=True); sys.stdin.read()"
+        "import sys; from pathlib import Path; from viapoint.training.runs import locked\n"
+        f"with locked(Path({str(run.folder)!r})):\n    print('in', flush=True); sys.stdin.read()"
     )
     other = subprocess.Popen(
         [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     assert other.stdout.readline() == "in\n"
-    with pytest.raises(BadFileError, match="in use"), run.locked():
+    with pytest.raises(BadFileError, match="in use"), runs.locked(run.folder):
         pass
     other.kill()
     other.communicate()
-    with run.locked():
+    with runs.locked(run.folder):
         pass
 
 
@@ -149,17 +149,17 @@ def test_checkpoints_are_kept_two_deep_and_torn_ones_passed_over(env, run, capsy
     model._setup_learn(100)
     for number in (4, 8, 12):
         model.num_timesteps = number
-        run.checkpoint(model, {"number": number})
+        run.checkpoint(model, float(number))
     assert [int(path.stem) for path in run.checkpoints()] == [8, 12]
     torn = run.checkpoints()[-1]
     content = torn.read_bytes()
     middle = len(content) // 2
     torn.write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
-    assert run.restore(new("td3", env)) == {"number": 8}
+    assert run.restore(new("td3", env)) == 8.0
     assert capsys.readouterr().err.count("passed over") == 1
     model.num_timesteps = 12
-    run.checkpoint(model, {"number": 12})  # the damaged one is written again
-    assert run.restore(new("td3", env)) == {"number": 12}
+    run.checkpoint(model, 12.0)  # the damaged one is written again
+    assert run.restore(new("td3", env)) == 12.0
     for path in run.checkpoints():
         path.write_text("{}")
     with pytest.raises(BadFileError):

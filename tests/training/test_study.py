@@ -16,7 +16,7 @@ import yaml
 from helpers import PLANE as ENV
 
 from viapoint.training import Study, run_study
-from viapoint.training.study import COLUMNS, StudyFailedError, _connected, _import_libraries
+from viapoint.training.study import COLUMNS, StudyFailedError, _connected, _import_ray
 
 FEW = {"learning_starts": 64, "gradient_steps": 1}
 TRAINING = {
@@ -54,9 +54,8 @@ def of_viaq(results):
 @pytest.fixture(scope="module")
 def ray():
     """One Ray for all studies of this process, as each start takes seconds."""
-    ray, _ = _import_libraries()
     with _connected(2):
-        yield ray
+        yield _import_ray()
 
 
 @pytest.fixture(scope="module")
@@ -202,6 +201,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
         {"searches": {"a": {"parameters": {}}}},
         {"searches": {"a": {"parameters": {"hyperparameters.gamma": {"low": 2.0, "high": 1.5}}}}},
         {"searches": {"a": {"parameters": {"hyperparameters.gamma": {"low": 0.5, "high": 1.5}}}}},
+        {"searches": {"a": {"parameters": {"hyperparameters.gamma": {"low": 0.5, "high": 0.9, "step": 1}}}}},
         {"searches": {"a": {"parameters": {"speed": [1, 2]}}}},
         *({"searches": {"a": {**GAMMA, **other}}} for other in ({"trials": 0}, {"eval_every": 0})),
         {"searches": {"a": {**GAMMA, "first": [{"gamma": 0.9}]}}},

@@ -11,6 +11,7 @@ import functools
 import hashlib
 import importlib.metadata
 import inspect
+import json
 import math
 import typing
 import warnings
@@ -28,7 +29,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn.modules.module import register_module_parameter_registration_hook
-from typeguard import TypeCheckError, check_type
+from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
 from viapoint.envs.arms.stored import keep_arm, with_kept_arm
 from viapoint.envs.common.validation import is_number
@@ -64,23 +65,21 @@ NOT_STORED = frozenset(
 
 # Hyperparameters that must be greater than zero
 POSITIVE = frozenset({"learning_rate", "temperature", "clip_range", "max_grad_norm"})
-SHARES = frozenset({"gamma", "gae_lambda", "tau", "explore_uniformly"})  # From 0 to 1
-# Least values of hyperparameters; -1 gradient steps are as many as there were steps of the environment
-LEAST: dict[str, float] = {
-    "gradient_steps": -1,
-    **dict.fromkeys(("learning_starts", "target_policy_noise", "target_noise_clip", "ent_coef"), 0),
-    **dict.fromkeys(("vf_coef", "top_quantiles_to_drop_per_net", "refinements", "checks", "refine"), 0),
-    **dict.fromkeys(("buffer_size", "batch_size", "train_freq", "n_steps", "n_epochs"), 1),
-    **dict.fromkeys(("policy_delay", "target_update_interval", "next_candidates", "nearest"), 1),
-    **dict.fromkeys(("width", "candidates", "per_refinement"), 1),
-    **dict.fromkeys(("explore_candidates", "labels", "instants"), 2),
-}
-# Greatest values of hyperparameters that time and memory of a decision grow with
-MOST: dict[str, int] = {
-    **dict.fromkeys(("candidates", "per_refinement", "explore_candidates"), MOST_CANDIDATES),
-    **dict.fromkeys(("next_candidates", "labels", "refine"), MOST_CANDIDATES),
-    **dict.fromkeys(("instants", "nearest"), 1024),
-    "refinements": MOST_ROUNDS,
+# Least and greatest values of others
+LIMITS: dict[str, tuple[float, float]] = {
+    "gradient_steps": (-1, math.inf),  # -1: as many as there were steps of the environment
+    **dict.fromkeys(("gamma", "gae_lambda", "tau", "explore_uniformly"), (0, 1)),
+    **dict.fromkeys(("learning_starts", "target_policy_noise", "target_noise_clip"), (0, math.inf)),
+    **dict.fromkeys(("ent_coef", "vf_coef", "top_quantiles_to_drop_per_net", "checks"), (0, math.inf)),
+    **dict.fromkeys(("buffer_size", "batch_size", "train_freq", "n_steps", "n_epochs"), (1, math.inf)),
+    **dict.fromkeys(("policy_delay", "target_update_interval", "width"), (1, math.inf)),
+    # Time and memory of a decision grow with these
+    **dict.fromkeys(("candidates", "per_refinement", "next_candidates"), (1, MOST_CANDIDATES)),
+    **dict.fromkeys(("explore_candidates", "labels"), (2, MOST_CANDIDATES)),
+    "refine": (0, MOST_CANDIDATES),
+    "refinements": (0, MOST_ROUNDS),
+    "instants": (2, 1024),
+    "nearest": (1, 1024),
 }
 
 LARGEST_MODEL_JSON = 1 << 20  # Greatest size of `model.json`, [bytes]
@@ -99,14 +98,7 @@ SPARE_PARAMETERS = 100_000
 
 
 def save_model(model: BaseAlgorithm, folder: Path) -> None:
-    """Write a model as JSON and safetensors, for decisions and for further training from its weights.
-
-    Raises:
-        ValueError: Its class is not in ALGORITHMS, or it has no environment of this package.
-
-    Warns:
-        UserWarning: Observations are normalised by `VecNormalize`, whose statistics are no part of the folder.
-    """
+    """Write a model as JSON and safetensors, for decisions and for further training from its weights."""
     normalize = model.get_vec_normalize_env()
     if normalize is not None and normalize.norm_obs:
         warnings.warn(
@@ -116,31 +108,30 @@ def save_model(model: BaseAlgorithm, folder: Path) -> None:
         )
     path = folder / "weights.safetensors"
     write_arrays(path, weights(model))
-    keep_arm(folder, model.get_env().get_attr("task", [0])[0].arm)  # type: ignore[union-attr]
+    keep_arm(folder, _task_of(model.get_env()).arm)
     write_json(folder / "model.json", {**describe(model), "weights_sha256": _digest(path)})
 
 
 def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
     """Load a model to train it on `env`, or to decide, with an environment and a small replay buffer of its own.
 
-    Raises:
-        BadFileError: A file is missing, torn, foreign, or says something that is not allowed.
-        ValueError: The environment is another one than the agent needs.
+    Files that are missing, torn, foreign, or say something that is not allowed raise BadFileError, another environment
+    than the agent needs ValueError.
     """
     path = folder / "model.json"
     tensors = folder / "weights.safetensors"
     record = read_json(path, LARGEST_MODEL_JSON)
+    writer = f"was written by viapoint {record.get('viapoint')}"
     if record.get("format") != FORMAT:
-        found = record.get("format")
         mine = importlib.metadata.version("viapoint")
-        writer = f"was written by viapoint {record.get('viapoint')} and this is {mine}"
-        raise BadFileError(path, f"must have format {FORMAT}, got {found!r}; it {writer}")
+        found = f"must have format {FORMAT}, got {record.get('format')!r}"
+        raise BadFileError(path, f"{found}; it {writer} and this is {mine}")
     arrays = read_arrays(tensors, LARGEST_WEIGHTS)
     try:
+        # An arm file that is gone is replaced by its copy; ViaQ's networks know the task, too.
+        kept = functools.partial(with_kept_arm, folder=folder)
+        record = json.loads(json.dumps(record), object_hook=kept)
         hyperparameters = dict(record["hyperparameters"])
-        policy = hyperparameters.get("policy_kwargs", {})
-        if isinstance(policy, dict) and isinstance(policy.get("task"), dict):  # ViaQ's networks know the task
-            hyperparameters["policy_kwargs"] = {**policy, "task": with_kept_arm(policy["task"], folder)}
         with warnings.catch_warnings(), _parameter_budget(arrays):
             warnings.simplefilter("ignore", UserWarning)  # PPO's batches do not fill one environment
             own = _own_environment(record["env"], folder)
@@ -148,7 +139,7 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
                 hyperparameters = _to_decide(hyperparameters)
             else:
                 check_spaces(own, env)
-                check_same_task(*(each.get_attr("task", [0])[0] for each in (own, env)))
+                check_same_task(_task_of(own), _task_of(env))
             model = build(record["algorithm"], record["policy"], env or own, hyperparameters)
         model.num_timesteps = int(record["num_timesteps"])
     except BadFileError:
@@ -158,20 +149,23 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
             load_model(folder)  # raises the error of the file if that is to blame
             raise ValueError(f"env does not fit the agent in {folder}: {error}") from None
         reason = f"does not describe a model of this version of viapoint ({type(error).__name__}: {error})"
-        raise BadFileError(path, f"was written by viapoint {record.get('viapoint')} and {reason}") from None
+        raise BadFileError(path, f"{writer} and {reason}") from None
     _put_weights(model, arrays, tensors)
     if record.get("weights_sha256", "") not in ("", _digest(tensors)):
         raise BadFileError(tensors, "is damaged: its hash is not the one that model.json states")
     return model
 
 
+def _task_of(env: Any) -> Task:
+    """Return the task of a vector environment."""
+    task: Task = env.get_attr("task", [0])[0]
+    return task
+
+
 def check_same_task(mine: Task, theirs: Task) -> None:
     """Check that observations and actions mean the same in two tasks, so that an agent of one can decide in the other.
 
-    Scenes, rewards, and noise of a sensor may differ.
-
-    Raises:
-        ValueError: They do not; the message names the parts that differ.
+    Scenes, rewards, and noise of a sensor may differ; ValueError names the parts that differ otherwise.
     """
     before, after = _meaning(mine), _meaning(theirs)
     if mine.arm.xml == theirs.arm.xml:  # one arm may be in several files
@@ -209,13 +203,7 @@ def build(
     *,
     seed: int | None = None,
 ) -> BaseAlgorithm:
-    """Build a new model from the names of an algorithm and its policy, and hyperparameters as JSON values.
-
-    Schedules, noise and activations are as :func:`describe` writes them.
-
-    Raises:
-        ValueError: There is no such algorithm, policy or hyperparameter.
-    """
+    """Build a new model; hyperparameters are JSON values, as :func:`describe` writes them, checked here."""
     if algorithm not in ALGORITHMS:
         raise ValueError(f"algorithm must be one of {', '.join(ALGORITHMS)}, got {algorithm!r}")
     kind = ALGORITHMS[algorithm]
@@ -229,11 +217,7 @@ def build(
 
 
 def check_hyperparameters(algorithm: str, hyperparameters: Mapping[str, Any]) -> None:
-    """Check hyperparameters against the signature of an algorithm.
-
-    Raises:
-        ValueError: A name is unknown, or a value has another type or is out of range.
-    """
+    """Check the names, types and ranges of hyperparameters of an algorithm; ValueError otherwise."""
     kind = ALGORITHMS[algorithm]
     allowed = _argument_names(kind)
     for name in sorted(set(hyperparameters) - allowed):
@@ -251,7 +235,7 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
         number = value.item() if isinstance(value, np.generic) else value
         hint = hints.get(name, Any)
         try:
-            check_type(number, hint)
+            check_type(number, hint, collection_check_strategy=CollectionCheckStrategy.ALL_ITEMS)
         except TypeCheckError as error:
             raise ValueError(f"{name} has a wrong type: {error}, got {value!r}") from None
         if isinstance(number, bool) and bool not in (hint, *typing.get_args(hint)):
@@ -266,12 +250,9 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
             raise ValueError(f"{name} must be finite, got {value!r}")
         if name in POSITIVE and number <= 0:
             raise ValueError(f"{name} must be greater than 0, got {value!r}")
-        if name in SHARES and not 0 <= number <= 1:
-            raise ValueError(f"{name} must be from 0 to 1, got {value!r}")
-        if number < LEAST.get(name, -math.inf):
-            raise ValueError(f"{name} must be {LEAST[name]:g} or more, got {value!r}")
-        if number > MOST.get(name, math.inf):
-            raise ValueError(f"{name} must be {MOST[name]} or less, got {value!r}")
+        least, most = LIMITS.get(name, (-math.inf, math.inf))
+        if not least <= number <= most:
+            raise ValueError(f"{name} must be from {least:g} to {most:g}, got {value!r}")
 
 
 @functools.cache
@@ -302,13 +283,13 @@ def _to_decide(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
 
 def describe(model: BaseAlgorithm) -> dict[str, Any]:
     """Return everything but the weights as JSON values."""
-    names = [name for name, kind in ALGORITHMS.items() if issubclass(kind, type(model))]
-    if len(names) != 1:
+    name = next((each for each, kind in ALGORITHMS.items() if issubclass(kind, type(model))), None)
+    if name is None:
         known = ", ".join(kind.__name__ for kind in ALGORITHMS.values())
         raise ValueError(f"only agents of {known} can be saved, got {type(model).__name__}")
-    (name,), (env_id, env_kwargs) = names, env_arguments(model.get_env())
+    env_id, env_kwargs = env_arguments(model.get_env())
     policies = {kind: each for each, kind in ALGORITHMS[name].policy_aliases.items()}
-    stored = sorted(name for name in _argument_names(type(model)) if hasattr(model, name))
+    stored = sorted(each for each in _argument_names(type(model)) if hasattr(model, each))
     limit = gym.spec(env_id).max_episode_steps  # of an id of one's own
     return {
         "format": FORMAT,
@@ -318,11 +299,11 @@ def describe(model: BaseAlgorithm) -> dict[str, Any]:
         "env": {
             "id": env_id,
             "kwargs": _encode(env_kwargs),
-            "task": model.get_env().get_attr("task", [0])[0].as_dict(),  # type: ignore[union-attr]
+            "task": _task_of(model.get_env()).as_dict(),
             **({} if limit is None else {"max_episode_steps": limit}),
         },
         "num_timesteps": model.num_timesteps,
-        "hyperparameters": {name: _encode(getattr(model, name)) for name in stored},
+        "hyperparameters": {each: _encode(getattr(model, each)) for each in stored},
     }
 
 
@@ -338,27 +319,23 @@ def _tensors(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
 
 
 def _put_weights(model: BaseAlgorithm, arrays: Mapping[str, Any], path: Path) -> None:
-    """Set the tensors of :func:`_tensors` after checking all of them.
-
-    Raises:
-        BadFileError: Names, shapes or types differ, or a value is not finite.
-    """
+    """Set the tensors of :func:`_tensors` after checking names, shapes, types and values of all of them."""
     wanted = _tensors(model)
-    if set(arrays) != set(wanted):
-        name = sorted(set(arrays) ^ set(wanted))[0]
-        raise BadFileError(
-            path, f"tensor {name!r} is {'missing' if name in wanted else 'unknown to the model'}"
-        )
-    for name, array in arrays.items():
-        expected = wanted[name].detach().cpu().numpy()
-        if array.shape != expected.shape or array.dtype != expected.dtype:
-            got, must = (f"{a.dtype} {a.shape}" for a in (array, expected))
-            raise BadFileError(path, f"tensor {name!r} must be {must}, is {got}")
-        if not np.isfinite(array).all():
+    there, needed = _shapes(arrays), _shapes(weights(model))
+    for name in sorted({*there, *needed}):
+        found, must = there.get(name, "absent"), needed.get(name, "absent")
+        if found != must:
+            raise BadFileError(path, f"tensor {name!r} must be {must}, is {found}")
+        if not np.isfinite(arrays[name]).all():
             raise BadFileError(path, f"tensor {name!r} holds values that are not finite")
     with torch.no_grad():
         for name, array in arrays.items():
             wanted[name].copy_(torch.from_numpy(array))
+
+
+def _shapes(arrays: Mapping[str, Any]) -> dict[str, str]:
+    """Return types and shapes of arrays as text."""
+    return {name: f"{array.dtype} {array.shape}" for name, array in arrays.items()}
 
 
 def _digest(path: Path) -> str:
@@ -368,35 +345,25 @@ def _digest(path: Path) -> str:
 def _own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
     """Return one copy of the environment that a file names by `id` and `kwargs`, or by its `task` alone.
 
-    An arm file that is gone is replaced by its copy in the folder.
-
-    The id of a user's own environment need not be registered where the model is loaded.
-
-    Raises:
-        ValueError: There is neither, or an argument is not one that files may give.
-        BadFileError: The id stands for another task here.
+    The id of a user's own environment need not be registered where the model is loaded; one of another task raises
+    BadFileError.
     """
     env_id, kwargs = record["id"], record["kwargs"]
     if env_id not in gym.registry:  # never lets Gymnasium import a module named in a file
         if "task" not in record:
             raise ValueError(f"environment {env_id!r} is not known")
         limit = kwargs.get("max_episode_steps", record.get("max_episode_steps"))
-        env_id, kwargs = (
-            ANY_TASK,
-            {**record["task"], **({} if limit is None else {"max_episode_steps": limit})},
-        )
-    kwargs = with_kept_arm(kwargs, folder)
+        env_id, kwargs = ANY_TASK, {**record["task"]}
+        if limit is not None:
+            kwargs["max_episode_steps"] = limit
     for name, most in LARGEST_ARGUMENTS.items():
-        value = kwargs.get(name, 0)
-        for each in value if isinstance(value, list | tuple) else (value,):
-            if isinstance(each, int | float) and each > most:
-                raise ValueError(f"{name} may be at most {most} in a file, got {each}")
+        value = np.max(kwargs.get(name) or 0)
+        if value > most:
+            raise ValueError(f"{name} may be at most {most} in a file, got {value}")
     env = ViaVecEnv(env_id, 1, **kwargs)
     if "task" in record:
         try:
-            check_same_task(
-                Task.from_dict(with_kept_arm(record["task"], folder)), env.get_attr("task", [0])[0]
-            )
+            check_same_task(Task.from_dict(record["task"]), _task_of(env))
         except ValueError as error:
             raise BadFileError(
                 folder, f"holds an agent for another {env_id} than is registered: {error}"
@@ -406,23 +373,18 @@ def _own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
 
 @contextmanager
 def _parameter_budget(arrays: Mapping[str, Any]) -> Iterator[None]:
-    """Limit the parameters of new networks to the number in the weights, plus a few.
+    """Limit the parameters of new networks to the number in the weights, plus a few; ValueError otherwise.
 
     Torch reserves memory for a layer before it touches it, and the check comes between the two.
-
-    Raises:
-        ValueError: A network with more parameters is built.
     """
-    there = sum(int(np.prod(array.shape)) for array in arrays.values())
+    there = sum(array.size for array in arrays.values())
     left = there + SPARE_PARAMETERS
 
     def count(module: torch.nn.Module, name: str, parameter: torch.nn.Parameter | None) -> None:
         nonlocal left
         left -= parameter.numel() if parameter is not None else 0
         if left < 0:
-            raise ValueError(
-                f"it describes larger networks than the {there} parameters in the weights can fill"
-            )
+            raise ValueError(f"it describes larger networks than the {there} parameters in the weights")
 
     handle = register_module_parameter_registration_hook(count)
     try:

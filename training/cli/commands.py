@@ -132,8 +132,7 @@ def _measure_planners(config: EvaluateConfig) -> None:
     refused = table[table.refused != ""].drop_duplicates(["set", "number"])
     faults += [f"{each.set} {each.number}: {each.refused}" for each in refused.itertuples()]
     if faults:
-        told = [*faults[:MOST_FAULTS], "..."] if len(faults) > MOST_FAULTS else faults
-        print(f"problems left out: {len(faults)}", *told, sep="\n  ", file=sys.stderr)
+        print(f"problems left out: {len(faults)}", *faults[:MOST_FAULTS], sep="\n  ", file=sys.stderr)
     if config.format == "csv":
         print(table.to_csv(index=False).rstrip())
     elif config.format == "json":

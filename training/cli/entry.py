@@ -19,10 +19,6 @@ if TYPE_CHECKING:
     from viapoint.training.configs import TrainConfig
 
 
-class UsageError(ValueError):
-    """Error of an invalid command line; the message is one line."""
-
-
 # Module and function of each subcommand, whose configuration is `TrainConfig`, `EvaluateConfig` and so on
 COMMANDS = {
     "train": "cli.commands:train",
@@ -87,7 +83,7 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
 
     Raises:
         SystemExit: Help was asked for; code 0.
-        UsageError: A word is not understood or not allowed.
+        ValueError: A word is not understood or not allowed.
     """
     import tyro
 
@@ -99,10 +95,10 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
         print(OVERVIEW.format(commands="\n".join(lines)))
         raise SystemExit(0)
     if not words:
-        raise UsageError(f"name a command: {', '.join(COMMANDS)} (viapoint --help)")
+        raise ValueError(f"name a command: {', '.join(COMMANDS)} (viapoint --help)")
     command, *options = words
     if command not in COMMANDS:
-        raise UsageError(checks.unknown_name("command", command, COMMANDS))
+        raise ValueError(checks.unknown_name("command", command, COMMANDS))
     kind = kinds[command]
     default = {} if usual is None else {"default": usual}
     complaint = io.StringIO()
@@ -114,7 +110,7 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
     except SystemExit as end:
         if not end.code:
             raise
-        raise UsageError(_complaint(complaint.getvalue(), command, kind)) from None
+        raise ValueError(_complaint(complaint.getvalue(), command, kind)) from None
 
 
 def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:

@@ -13,14 +13,12 @@ import pandas as pd
 
 from viapoint.envs.common.arrays import Float
 from viapoint.primitives import ViaPointFit, fit_via_points
-from viapoint.primitives.fitting import USUAL_RANGE
 from viapoint.training.configs import FitConfig
 from viapoint.training.files import BadFileError, check_ours, read_bytes, write_bytes
 from viapoint.training.plots import fitted_movements
 
 REQUIRED = ("time", "x", "y")  # Columns that a file of movements must have
 COORDINATES = ("x", "y", "z")  # Names of the coordinates; z may be left out
-TABLE, FIGURE = "fit.csv", "fit.png"  # Files that are written
 # Distances of samples, [s], and extents of movements, [m], above which the units are probably others
 SLOW, WIDE = 0.5, 5.0
 DRAWN = 6  # Greatest number of movements in the figure
@@ -32,8 +30,8 @@ Movements = dict[str, tuple[Float, Float]]
 
 def run(config: FitConfig) -> None:
     """Fit the movements of a file, print a table, and write it with a figure."""
-    table = config.out / TABLE
-    figure = config.out / FIGURE
+    table = config.out / "fit.csv"
+    figure = config.out / "fit.png"
     check_ours(figure)
     if table.exists() and not figure.exists():
         raise BadFileError(table, "exists and was not written by viapoint; name another folder")
@@ -59,21 +57,16 @@ def read_movements(path: Path) -> Movements:
     if missing:
         found = ", ".join(map(str, table.columns))
         advice = "separate columns by commas" if len(table.columns) == 1 else "names must be the same"
-        raise BadFileError(
-            path,
-            f"has no column {', '.join(missing)}; its first line names the columns {found}; {advice}",
-        )
+        reason = f"has no column {', '.join(missing)}; its first line names the columns {found}"
+        raise BadFileError(path, f"{reason}; {advice}")
     names = [name for name in ("time", *COORDINATES) if name in table]
     numbers = table[names].apply(pd.to_numeric, errors="coerce")
     wrong = np.argwhere(~np.isfinite(numbers.to_numpy(dtype=float)))
     if len(wrong):
         row, column = wrong[0]
         entry = table[names].fillna("nothing").iloc[row, column]
-        raise BadFileError(
-            path,
-            f"has no number in line {table.index[row]}, column {names[column]}: {entry}; "
-            "leave out lines of units, and those that were not measured",
-        )
+        reason = f"has no number in line {table.index[row]}, column {names[column]}: {entry}"
+        raise BadFileError(path, f"{reason}; leave out lines of units, and those that were not measured")
     labels = table["movement"].str.strip() if "movement" in table else pd.Series("1", index=table.index)
     if labels.isna().any():
         raise BadFileError(path, f"names no movement in line {labels.isna().idxmax()}")
@@ -82,11 +75,11 @@ def read_movements(path: Path) -> Movements:
         values = rows.to_numpy(dtype=float)
         back = np.flatnonzero(np.diff(values[:, 0]) < 0.0)
         if back.size:
-            raise BadFileError(
-                path,
-                f"goes back in time in line {rows.index[back[0] + 1]}; if another movement begins there, "
-                "add a column `movement` with the name of the movement of each line, otherwise sort the lines",
+            reason = f"goes back in time in line {rows.index[back[0] + 1]}; if another movement begins there"
+            advice = (
+                "add a column `movement` with the name of the movement of each line, otherwise sort the lines"
             )
+            raise BadFileError(path, f"{reason}, {advice}")
         movements[str(label)] = values[:, 0], values[:, 1:]
     if not movements:
         raise BadFileError(path, "holds no samples")
@@ -95,7 +88,7 @@ def read_movements(path: Path) -> Movements:
 
 def _warn(movements: Movements, fits: Fits, config: FitConfig) -> None:
     """Print what looks like other units than seconds and metres, or like several movements in one."""
-    fewest, most = config.numbers or USUAL_RANGE
+    fewest, most = config.numbers
     for name, (time, position) in movements.items():
         gap, extent = float(np.ptp(time)) / len(time), float(np.ptp(position, axis=0).max())
         if gap > SLOW:
@@ -145,8 +138,7 @@ def _printed(fits: Fits) -> str:
             "R^2": f"{float(fit.r_squared):.5f}",
         }
         rows.append(row)
-    printed: Any = pd.DataFrame(rows).to_markdown(index=False, tablefmt="simple", disable_numparse=True)
-    return str(printed)
+    return str(pd.DataFrame(rows).to_markdown(index=False, tablefmt="simple", disable_numparse=True))
 
 
 def _written(fits: Fits) -> pd.DataFrame:

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.load import load_arm
-from viapoint.envs.arms.registry import arm_names, arm_of
+from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.geometry.shapes import obstacles_from_json
 from viapoint.envs.scenes.options import Pose, scene_from_json
 from viapoint.training.configs import PlanConfig
@@ -24,7 +23,7 @@ def run(config: PlanConfig) -> None:
     """Plan a movement, print what is known of it, and write it."""
     if config.out is not None:
         _check_replaceable(config.out)
-    arm = _arm_for(config)
+    arm = arm_of(config.arm)
     scene = _scene(config.scene, arm)
     start = config.start or scene.get("start")
     if start is None:
@@ -62,27 +61,6 @@ def _check_replaceable(path: Path) -> None:
         raise BadFileError(
             path, "exists and was not written by viapoint; name another file, or move it away"
         ) from None
-
-
-def _arm_for(config: PlanConfig) -> Arm:
-    """Return the arm of a name or of a file."""
-    if config.arm in arm_names():
-        for flag in ("tool", "joints", "base", "packages", "velocity_limit"):
-            if getattr(config, flag):
-                raise ValueError(
-                    f"--{flag.replace('_', '-')} is for an arm of a file, got --arm {config.arm}"
-                )
-        return arm_of(config.arm)
-    if not Path(config.arm).expanduser().is_file():
-        raise ValueError(f"there is no arm or file {config.arm!r}; arms are {', '.join(arm_names())}")
-    return load_arm(
-        Path(config.arm).expanduser(),
-        tool=config.tool or None,
-        joints=config.joints or None,
-        base=config.base or None,
-        packages=config.packages,
-        velocity_limit=config.velocity_limit,
-    )
 
 
 def _scene(path: Path | None, arm: Arm) -> dict[str, Any]:

@@ -74,7 +74,7 @@ def light_movements(agent: Path | None) -> ObstacleMovements:
     scenes = light_scenes(task.observation.n_rows)
     check_scenes(scenes, task.arm)
     action = method.decide(simulation.observe(scenes), scenes)
-    success = simulation(scenes, action).success
+    success = simulation(scenes, action)["is_success"]
     simulation.close()
     if not success.any():
         raise ValueError(f"{method.name} gets around none of {len(scenes.start)} rows of lights")

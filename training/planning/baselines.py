@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from viapoint.envs.common.arrays import Float, Observation
 from viapoint.envs.common.validation import whole_number
@@ -28,7 +27,7 @@ from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl
 from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
 from viapoint.training.planning.predictions import PREDICTIONS, PredictedSearch
 from viapoint.training.planning.search import GeometrySearch, registered_task
-from viapoint.training.rollout import SceneSimulation, SimulationResults
+from viapoint.training.rollout import Outcomes, SceneSimulation
 from viapoint.training.vec_env import env_arguments, predicted_actions
 
 
@@ -36,7 +35,7 @@ class Method(Protocol):
     """Decision maker that chooses a movement in each of N scenes.
 
     A method whose movements are no actions of the environment has `execute(scenes, decisions)` as well, which simulates
-    them and returns :class:`~viapoint.training.rollout.SimulationResults`.
+    them and returns what :class:`~viapoint.training.rollout.SceneSimulation` does.
     """
 
     @property
@@ -103,12 +102,11 @@ class PlannerMethod:
             row[2 + len(vias) : 2 + len(vias) + vias.size] = vias.ravel()
         return rows
 
-    def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
+    def execute(self, scenes: Scenes, decisions: Float) -> Outcomes:
         """Simulate the plans; those with equally many via-points run together."""
         space = self._simulation.task.space
         counts = decisions[:, 0].astype(np.int64)
-        reward = np.zeros(len(decisions))
-        info = dict[str, NDArray[Any]]()
+        outcomes: Outcomes = {}
         for count in np.unique(counts):
             rows = np.flatnonzero(counts == count)
             some = scenes.take(rows)
@@ -119,10 +117,9 @@ class PlannerMethod:
             result = self._simulation.execute_plan(
                 some, Plan.at_rest(waypoints, decisions[rows, 1 : 2 + count])
             )
-            reward[rows] = result.reward
-            for name, values in result.info.items():
-                info.setdefault(name, np.zeros(len(decisions), dtype=values.dtype))[rows] = values
-        return SimulationResults(reward, info)
+            for name, values in result.items():
+                outcomes.setdefault(name, np.zeros(len(decisions), dtype=values.dtype))[rows] = values
+        return outcomes
 
 
 def _ompl_method(simulation: SceneSimulation) -> PlannerMethod:
@@ -181,9 +178,9 @@ class StepAgentMethod:
         actions = predicted_actions(self._model, observation)
         return np.asarray(actions, dtype=np.float64)
 
-    def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
+    def execute(self, scenes: Scenes, decisions: Float) -> Outcomes:
         """Play every episode to its end, beginning with the given actions."""
-        return self._simulation.episodes(scenes, decisions, self.decide)
+        return self._simulation(scenes, decisions, self.decide)
 
 
 def agent_method(name: str, model: Any, checks: int | None = None, refine: int | None = None) -> Method:

@@ -18,7 +18,7 @@ from viapoint.envs.scenes.motions import REACH_LENGTH, REACH_TIME
 from viapoint.envs.scenes.scene import CHORD, Scenes, reached
 from viapoint.envs.task import Task
 from viapoint.training.planning.problem import Problem
-from viapoint.training.rollout import SceneSimulation, SimulationResults
+from viapoint.training.rollout import Outcomes, SceneSimulation
 
 HORIZON = 40  # Number of intervals of a prediction; obstacles keep the last velocity
 MOVING = 1e-3  # Speed above which an obstacle moves, [m/s]
@@ -121,13 +121,11 @@ class PredictedSearch:
         """Return first decisions, see :class:`~viapoint.training.planning.baselines.Method`."""
         return self._decide(observation, scenes, {})
 
-    def execute(self, scenes: Scenes, decisions: Float) -> SimulationResults:
+    def execute(self, scenes: Scenes, decisions: Float) -> Outcomes:
         """Play every episode to its end, beginning with the given decisions, and remember what is seen."""
         memory: dict[bytes, Seen] = {}
         self._look(self._simulation.observe(scenes), scenes, memory)
-        return self._simulation.episodes(
-            scenes, decisions, lambda seen, some: self._decide(seen, some, memory)
-        )
+        return self._simulation(scenes, decisions, lambda seen, some: self._decide(seen, some, memory))
 
     def _decide(self, observation: Observation, scenes: Scenes, memory: dict[bytes, Seen]) -> Float:
         problem = Problem.of_observation(observation, self._search.task)
