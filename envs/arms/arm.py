@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -10,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.kinematics import Chain, FirstTwo, Spheres, forward, inverse_dynamics
+from viapoint.envs.arms.kinematics import Chain, Spheres, forward, inverse_dynamics
 from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, overlapping, touching_at_home
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.geometry.compiled import compiled
@@ -312,7 +313,14 @@ def _chain(
         armature=model.dof_armature[dofs].copy(),
         damping=model.dof_damping[dofs].reshape(len(joints), -1)[:, 0].copy(),
         gravity=model.opt.gravity.copy(),
-        first_two=FirstTwo.of(origin, rotation, tool_origin),
+        first_two=(
+            math.atan2(origin[1, 1], origin[1, 0]),
+            math.atan2(tool_origin[1], tool_origin[0]),
+            math.atan2(rotation[1, 1, 0], rotation[1, 0, 0]),
+            math.atan2(rotation[0, 1, 0], rotation[0, 0, 0]),
+            math.hypot(origin[1, 0], origin[1, 1]),
+            math.hypot(tool_origin[0], tool_origin[1]),
+        ),
     )
     return chain, links, frames
 

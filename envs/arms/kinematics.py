@@ -23,29 +23,6 @@ LEAST_TORQUE_SHARE = 0.01
 TORQUE_STRIDE = 2  # Torques are looked at in every second configuration: they change slowly
 
 
-class FirstTwo(NamedTuple):
-    """Angles and lengths of an arm of two hinges with vertical axes."""
-
-    upper_angle: float  # Angle of the upper arm in the frame of the shoulder, [rad]
-    fore_angle: float  # Angle of the forearm in the frame of the elbow, [rad]
-    elbow: float  # Angle of the frame of the elbow in that of the shoulder, [rad]
-    base: float  # Angle of the frame of the shoulder in the world, [rad]
-    upper: float  # Length of the upper arm, [m]
-    fore: float  # Length of the forearm, [m]
-
-    @classmethod
-    def of(cls, origin: Float, rotation: Float, tool_origin: Float) -> FirstTwo:
-        """Return the numbers of a chain; see :class:`Chain` for the arguments."""
-        return cls(
-            upper_angle=math.atan2(origin[1, 1], origin[1, 0]),
-            fore_angle=math.atan2(tool_origin[1], tool_origin[0]),
-            elbow=math.atan2(rotation[1, 1, 0], rotation[1, 0, 0]),
-            base=math.atan2(rotation[0, 1, 0], rotation[0, 0, 0]),
-            upper=math.hypot(origin[1, 0], origin[1, 1]),
-            fore=math.hypot(tool_origin[0], tool_origin[1]),
-        )
-
-
 class Chain(NamedTuple):
     """Serial chain of J joints with one link each.
 
@@ -66,8 +43,9 @@ class Chain(NamedTuple):
     armature: Float  # Inertia of the motors seen at the joints, shape (J,), [kg m^2] or [kg]
     damping: Float  # Viscous friction of the joints, shape (J,), [N m s/rad] or [N s/m]
     gravity: Float  # Gravitational acceleration, shape (3,), [m/s^2]
-    # Angles and lengths of the first two links, for the inverse kinematics of an arm in the plane
-    first_two: FirstTwo
+    # Of an arm in the plane: angles of the upper arm in the frame of the shoulder, of the forearm in that of the elbow,
+    # of the latter in the former, and of the former in the world, [rad], and the lengths of both, [m]
+    first_two: tuple[float, float, float, float, float, float]
 
 
 class Spheres(NamedTuple):
@@ -356,32 +334,23 @@ def slowdowns(
 
 @compiled
 def _all_frames(chain: Chain, joints: Float) -> tuple[Float, Float]:
-    """Return the frames of the links for N configurations, see :func:`link_poses`."""
-    number, links = len(joints), len(chain.mass) + 1
-    rotation = np.empty((number, links, 3, 3))
-    origin = np.empty((number, links, 3))
-    for n in range(number):
-        link_frames(chain, joints[n], rotation[n], origin[n])
-    return rotation, origin
-
-
-@compiled
-def _all_tools(chain: Chain, joints: Float) -> tuple[Float, Float]:
-    """Return places and axes of the tool for N configurations, see :func:`forward`."""
+    """Return the frames of the links for N configurations, see :func:`link_poses`, and after them that of the tool."""
     number, last = joints.shape
-    rotation = np.empty((last + 1, 3, 3))
-    origin = np.empty((last + 1, 3))
-    places, axes = np.empty((number, 3)), np.empty((number, 3, 3))
+    rotation = np.empty((number, last + 2, 3, 3))
+    origin = np.empty((number, last + 2, 3))
     for n in range(number):
-        places[n, 0], places[n, 1], places[n, 2] = tool_position(chain, joints[n], rotation, origin)
+        turn, place = rotation[n], origin[n]
+        place[last + 1, 0], place[last + 1, 1], place[last + 1, 2] = tool_position(
+            chain, joints[n], turn, place
+        )
         for row in range(3):
             for column in range(3):
-                axes[n, row, column] = (
-                    rotation[last, row, 0] * chain.tool_rotation[0, column]
-                    + rotation[last, row, 1] * chain.tool_rotation[1, column]
-                    + rotation[last, row, 2] * chain.tool_rotation[2, column]
+                turn[last + 1, row, column] = (
+                    turn[last, row, 0] * chain.tool_rotation[0, column]
+                    + turn[last, row, 1] * chain.tool_rotation[1, column]
+                    + turn[last, row, 2] * chain.tool_rotation[2, column]
                 )
-    return places, axes
+    return rotation, origin
 
 
 @compiled
@@ -402,14 +371,15 @@ def _flat(name: str, chain: Chain, joints: Float) -> tuple[Float, tuple[int, ...
 def forward(chain: Chain, joints: Float) -> tuple[Float, Float]:
     """Return places of the tool, (..., 3), [m], and its axes as columns, (..., 3, 3), for joints (..., J)."""
     flat, batch = _flat("joints", chain, joints)
-    places, axes = _all_tools(chain, flat)
+    rotation, origin = _all_frames(chain, flat)
+    places, axes = np.ascontiguousarray(origin[:, -1]), np.ascontiguousarray(rotation[:, -1])
     return places.reshape(*batch, 3), axes.reshape(*batch, 3, 3)
 
 
 def link_poses(chain: Chain, joints: Float) -> tuple[Float, Float]:
     """Return the frames of links 0 to J: axes as columns, (..., J + 1, 3, 3), and origins (..., J + 1, 3), [m]."""
     flat, batch = _flat("joints", chain, joints)
-    rotation, origin = _all_frames(chain, flat)
+    rotation, origin = (np.ascontiguousarray(part[:, :-1]) for part in _all_frames(chain, flat))
     return rotation.reshape(*batch, *rotation.shape[1:]), origin.reshape(*batch, *origin.shape[1:])
 
 
