@@ -48,23 +48,17 @@ def solve_symmetric(matrix: Float, vector: Float, number: int) -> None:
 
 @compiled
 def descend(
-    chain: Chain,
-    joint_range: Float,
-    position: Float,
-    axes: Float,
-    oriented: bool,
-    joints: Float,
-    rotation: Float,
-    origin: Float,
+    chain: Chain, joint_range: Float, position: Float, axes: Float, oriented: bool, joints: Float
 ) -> float:
     """Move joints towards a target by damped least squares, and return the remaining error, 0 if it is reached.
 
     The step is J^T (J J^T + d^2 I)^-1 e for the error e of place and orientation, cut off at the limits of the joints
     (Y. Nakamura and H. Hanafusa, Inverse kinematic solutions with singularity robustness, 1986). Axes, shape (3, 3),
-    matter only if `oriented`; rotation and origin are memory for the frames of the links.
+    matter only if `oriented`.
     """
     last = len(chain.mass)
     rows = 6 if oriented else 3
+    rotation, origin = np.empty((last + 1, 3, 3)), np.empty((last + 1, 3))
     jacobian = np.empty((6, last))
     error = np.zeros(6)
     tool = np.empty(3)
@@ -268,6 +262,7 @@ def _least_distance(arm: Arm, position: Float, begin: Float) -> float:
 
     low, high = arm.joint_range.T
     nearest = begin[np.linalg.norm(arm.hand(begin) - position, axis=-1).argmin()]
+    descend(arm.chain, arm.joint_range, position, np.eye(3), False, nearest)
     inside = np.clip(nearest, low + INSIDE, high - INSIDE)
     found = least_squares(lambda joints: arm.hand(joints) - position, inside, bounds=(low, high))
     return float(np.linalg.norm(found.fun))
@@ -276,11 +271,9 @@ def _least_distance(arm: Arm, position: Float, begin: Float) -> float:
 def _different_solutions(arm: Arm, position: Float, axes: Float | None, begin: Float) -> list[Float]:
     """Return the different configurations that put the tool at a target from those to begin with, (N, J)."""
     found: list[Float] = []
-    number = len(arm.home) + 1
-    frames = np.empty((number, 3, 3)), np.empty((number, 3))
     target = np.eye(3) if axes is None else axes
     for joints in begin.copy():
-        error = descend(arm.chain, arm.joint_range, position, target, axes is not None, joints, *frames)
+        error = descend(arm.chain, arm.joint_range, position, target, axes is not None, joints)
         if error == 0.0 and all(np.abs(joints - other).max() > SAME for other in found):
             found.append(joints)
     return found
