@@ -326,28 +326,26 @@ def _chain(
 
 
 def _capsules(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    links: dict[str, int],
-    frames: list[tuple[Float, Float]],
-) -> list[Capsule]:
-    """Return the collision geoms of the arm, whose joints are at 0, in the frames of its links."""
-    found = []
+    model: mujoco.MjModel, data: mujoco.MjData, links: dict[str, int], frames: list[tuple[Float, Float]]
+) -> dict[str, list[Capsule]]:
+    """Return the collision geoms of each body of the arm, whose joints are at 0, in the frames of its links."""
+    found: dict[str, list[Capsule]] = {}
     for geom in range(model.ngeom):
         name = model.body(model.geom_bodyid[geom]).name
         if name not in links or not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
             continue
-        kind = mujoco.mjtGeom(int(model.geom_type[geom]))
-        size = model.geom_size[geom]
-        if kind not in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE):
+        radius, half, _ = model.geom_size[geom]
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:
+            half = 0.0
+        elif model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_CAPSULE:
             raise ValueError(
                 f"collision geoms must be capsules or spheres, geom {model.geom(geom).name!r} is none"
             )
-        half = size[1] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
         axis = half * data.geom_xmat[geom].reshape(3, 3)[:, 2]
         turn, place = frames[links[name]]
         centre = data.geom_xpos[geom] - place
-        found.append(Capsule(name, turn.T @ (centre - axis), turn.T @ (centre + axis), float(size[0])))
+        ends = np.stack((turn.T @ (centre - axis), turn.T @ (centre + axis)))
+        found.setdefault(name, []).append((ends, float(radius)))
     return found
 
 
