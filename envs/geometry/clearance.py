@@ -534,20 +534,6 @@ def _move(drift: float, spheres: Spheres, bounds: Bounds) -> None:
         bounds.pair_apart[pair] -= _way_of_pair(spheres, bounds, pair)
 
 
-@compiled
-def configuration_clearances(
-    chain: Chain, spheres: Spheres, configurations: Float, obstacles: Obstacles, times: Float
-) -> Float:
-    """Return the clearance of N arms in N scenes from obstacles and from themselves, shape (N, 2), at most FAR, [m]."""
-    placed = memory(chain, spheres)
-    found = np.empty((len(configurations), 2))
-    for scene in range(len(configurations)):
-        place(chain, spheres, configurations[scene], placed)
-        found[scene, 0] = obstacle_clearance(spheres, placed, obstacles, scene, times[scene], FAR, -FAR)
-        found[scene, 1] = self_clearance(spheres, placed, FAR, -FAR)
-    return found
-
-
 @inner
 def row_clearance(
     spheres: Spheres,

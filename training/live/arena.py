@@ -15,7 +15,7 @@ import numpy as np
 import viapoint.envs as ve
 from viapoint.envs.arms.kinematics import forward
 from viapoint.envs.common.arrays import Float, Observation
-from viapoint.envs.geometry.clearance import configuration_clearances
+from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.envs.geometry.obstacles import KINDS, pack, quaternions_of
 from viapoint.envs.scenes.options import scene_options
 from viapoint.training.agents.agent import Agent
@@ -194,8 +194,10 @@ class Arena:
         arm = self.task.arm
         joints = self.task.space.joints(coordinates)
         rows = obstacles.take(np.zeros(len(joints), np.int64))
-        when = np.zeros(len(joints)) if times is None else times
-        return np.asarray(configuration_clearances(arm.chain, arm.spheres, joints, rows, when))
+        if times is not None:
+            rows = rows._replace(centre=rows.centre + times[:, None, None] * rows.velocity)
+        apart, own = row_clearances(arm.chain, arm.spheres, joints, rows, FAR)
+        return np.stack((apart.min(axis=1, initial=FAR), own), axis=-1)
 
     def moved(self, coordinates: Float, place: Float, scene: Scene | None, turn: Any = None) -> Float:
         """Return coordinates with the tool at another place, in joint space the nearest ones that are free.
