@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -362,10 +363,9 @@ def _set_contacts(spec: mujoco.MjSpec, arm: Arm) -> None:
             if body.name in names and (geom.contype or geom.conaffinity):
                 geom.contype = 3 if body.name in moving else 1
                 geom.conaffinity = 1
-    for i, first in enumerate(names):
-        for second in names[i + 1 :]:
-            if frozenset((first, second)) not in compared:
-                spec.add_exclude(bodyname1=first, bodyname2=second)
+    for first, second in itertools.combinations(names, 2):
+        if frozenset((first, second)) not in compared:
+            spec.add_exclude(bodyname1=first, bodyname2=second)
 
 
 def _add_actuators(spec: mujoco.MjSpec, arm: Arm) -> None:

@@ -660,23 +660,29 @@ def _fitted(
             fits[body] += cover_geom(model, geom, tolerances[body])
     while True:
         xml = _write(parsed, ranges, origin, fits)
-        near = _near_capsules(parsed, xml, home, distances)
-        if not near:
-            break
+        capsules = mujoco.MjModel.from_xml_string(xml)
+        data = mujoco.MjData(capsules)
+        _move(data, parsed.joints, home)
+        begin = {body: int(capsules.body(parsed.names[body]).geomadr[0]) for body in fits}
         coarse: set[tuple[int, int]] = set()
-        for (first, i), (second, j) in near:
-            one = fits[first][i].excess
-            other = fits[second][j].excess
-            if max(one, other) < LEAST_EXCESS:
-                raise ValueError(
-                    f"the bodies {parsed.names[first]!r} and {parsed.names[second]!r} are "
-                    f"{1e3 * distances[first, second]:.2g} mm apart at home, too close for the capsules around them: "
-                    "give another home, or exclude their contact in the file"
-                )
-            coarse.add((first, i) if one >= other else (second, j))
+        for (first, second), distance in distances.items():
+            least = min(LEFT_SHARE * distance, LEFT_MOST)
+            for i, j in itertools.product(range(len(fits[first])), range(len(fits[second]))):
+                geoms = begin[first] + i, begin[second] + j
+                if mujoco.mj_geomDistance(capsules, data, *geoms, 0.01, None) >= least:
+                    continue
+                one, other = fits[first][i].excess, fits[second][j].excess
+                if max(one, other) < LEAST_EXCESS:
+                    raise ValueError(
+                        f"the bodies {parsed.names[first]!r} and {parsed.names[second]!r} are "
+                        f"{1e3 * distance:.2g} mm apart at home, too close for the capsules around them: give another "
+                        "home, or exclude their contact in the file"
+                    )
+                coarse.add((first, i) if one >= other else (second, j))
+        if not coarse:
+            return xml, max(capsule.excess for some in fits.values() for capsule in some)
         for body, index in sorted(coarse, reverse=True):
             fits[body] += split(model, fits[body].pop(index))
-    return xml, max(capsule.excess for some in fits.values() for capsule in some)
 
 
 def _apart(parsed: Parsed, pairs: Iterable[Pair], configurations: Float) -> list[Pair]:
@@ -695,25 +701,6 @@ def _distances(parsed: Parsed, joints: Float, pairs: Sequence[Pair]) -> Float:
         for one, other in itertools.product(parsed.geoms[first], parsed.geoms[second]):
             away = mujoco.mj_geomDistance(parsed.model, parsed.moved, one, other, 0.1, None)
             found[i] = min(found[i], away)
-    return found
-
-
-def _near_capsules(
-    parsed: Parsed, xml: str, home: Float, distances: dict[Pair, float]
-) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Return pairs of capsules, as body and index, that are much nearer to one another at home than the bodies."""
-    model = mujoco.MjModel.from_xml_string(xml)
-    data = mujoco.MjData(model)
-    _move(data, parsed.joints, home)
-    found = []
-    for (first, second), distance in distances.items():
-        least = min(LEFT_SHARE * distance, LEFT_MOST)
-        one = model.body(parsed.names[first])
-        other = model.body(parsed.names[second])
-        for i, j in itertools.product(range(int(one.geomnum[0])), range(int(other.geomnum[0]))):
-            geoms = int(one.geomadr[0]) + i, int(other.geomadr[0]) + j
-            if mujoco.mj_geomDistance(model, data, *geoms, 0.01, None) < least:
-                found.append(((first, i), (second, j)))
     return found
 
 

@@ -28,6 +28,8 @@ MOVING = (*LIMITED, "continuous")  # Types of joints that an arm may have
 WARNING = "warning: "  # Beginning of notes that are told as warnings, too
 LEFT_OUT = ("transmission", "gazebo", "material")  # Elements that MuJoCo does not need
 
+Packages = tuple[str | Path, ...]  # Folders in which packages are looked for
+
 
 class Urdf(NamedTuple):
     """Content of a URDF file."""
@@ -41,7 +43,7 @@ class Urdf(NamedTuple):
     notes: tuple[str, ...]  # Parts that were left out
 
 
-def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
+def read_urdf(path: Path, packages: Packages) -> Urdf:
     """Return the content of a URDF file; paths of meshes, which :func:`_places` looks for, become absolute ones.
 
     Raises:
@@ -132,11 +134,7 @@ def _limits(joint: ET.Element, notes: list[str]) -> dict[str, float]:
 
 
 def _prepare_link(
-    link: ET.Element,
-    path: Path,
-    packages: tuple[str | Path, ...],
-    assets: dict[str, bytes],
-    notes: list[str],
+    link: ET.Element, path: Path, packages: Packages, assets: dict[str, bytes], notes: list[str]
 ) -> None:
     """Mend the inertia of a link, and leave out its visual geoms and those for collisions that cannot be used."""
     _mend_inertia(link, notes)
@@ -152,33 +150,27 @@ def _prepare_link(
 
 def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
     """Replace an inertia that no body has, or that is missing, by that of a ball of the same mass."""
-    inertial = link.find("inertial")
-    mass = link.find("inertial/mass")
-    if mass is None and link.find("collision") is not None:
-        notes.append(f"mass of {link.get('name')}, which the file lacks: that of its geoms, as if of water")
-    elif mass is not None and float(mass.get("value", 0.0)) <= 0.0:
-        notes.append(f"mass of {link.get('name')}, which is not positive: {COMPILER['boundmass']} kg")
-    if inertial is None or mass is None:
+    name, mass = link.get("name"), link.find("inertial/mass")
+    if mass is None:
+        if link.find("collision") is not None:
+            notes.append(f"mass of {name}, which the file lacks: that of its geoms, as if of water")
         return
-    inertia = inertial.find("inertia")
-    if inertia is None:
-        inertia = ET.SubElement(inertial, "inertia", ixx="nan")
-    entries = [float(inertia.get(name, 0.0)) for name in INERTIA]
-    xx, xy, xz, yy, yz, zz = entries
-    matrix = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
-    if not np.isfinite(entries).all() or np.linalg.eigvalsh(matrix)[0] < 0.0:
-        moment = 0.4 * float(mass.get("value", 0.0)) * BALL**2
-        inertia.attrib.update(
-            dict.fromkeys(INERTIA, "0") | dict.fromkeys(("ixx", "iyy", "izz"), f"{moment:g}")
-        )
-        notes.append(
-            f"inertia of {link.get('name')}, which is missing or not positive: that of a ball of {BALL:g} m"
-        )
+    value = float(mass.get("value", 0.0))
+    if value <= 0.0:
+        notes.append(f"mass of {name}, which is not positive: {COMPILER['boundmass']} kg")
+    for inertial in link.findall("inertial"):
+        inertia = inertial.find("inertia")
+        if inertia is None:
+            inertia = ET.SubElement(inertial, "inertia", ixx="nan")
+        xx, xy, xz, yy, yz, zz = entries = [float(inertia.get(each, 0.0)) for each in INERTIA]
+        matrix = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+        if not np.isfinite(entries).all() or np.linalg.eigvalsh(matrix)[0] < 0.0:
+            moment = f"{0.4 * value * BALL**2:g}"
+            inertia.attrib.update(dict.fromkeys(INERTIA, "0"), ixx=moment, iyy=moment, izz=moment)
+            notes.append(f"inertia of {name}, which is missing or not positive: that of a ball of {BALL:g} m")
 
 
-def _prepared(
-    geometry: ET.Element, path: Path, packages: tuple[str | Path, ...], assets: dict[str, bytes]
-) -> str:
+def _prepared(geometry: ET.Element, path: Path, packages: Packages, assets: dict[str, bytes]) -> str:
     """Make the path of a mesh absolute, and return what is wrong with a geometry, empty for nothing."""
     for element in geometry:
         sizes = " ".join(element.get(name, "") for name in ("size", "radius", "length")).split()
@@ -216,7 +208,7 @@ def _add_text_stl(mesh: ET.Element, content: bytes, assets: dict[str, bytes]) ->
         mesh.set("filename", name)
 
 
-def _places(file: str, path: Path, packages: tuple[str | Path, ...]) -> Iterator[Path]:
+def _places(file: str, path: Path, packages: Packages) -> Iterator[Path]:
     """Yield the places where a mesh of a URDF may be.
 
     A relative path begins at the file. `package://NAME/REST`, then REST, then what is left without the first folder of
