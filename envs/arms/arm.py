@@ -168,12 +168,10 @@ def arm_from_xml(
     """
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
-    chain, links, frames = _chain(model, data, tuple(joints), tool)
+    chain, links, frames = _chain(model, data, joints, tool)
     capsules = _capsules(model, data, links, frames)
     home = np.array(home, dtype=np.float64)
-    data.qpos[model.jnt_qposadr[[model.joint(each).id for each in joints]]] = home
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
+    move(data, joints, home)
     touching = touching_at_home(model, data, links)
     names, spheres, left_out, excess = cover(chain, capsules, links, home, touching, exclude or {})
     # Pairs that touch in none of many configurations are not compared, either.
@@ -189,7 +187,7 @@ def arm_from_xml(
             reason = f"in contact in none of {COMPARED:,} configurations"
             left_out.append(LeftOut(names[first], names[second], reason))
     spheres = spheres._replace(pairs=spheres.pairs[kept])
-    inertia = _greatest_inertia(model, data, tuple(joints))
+    inertia = _greatest_inertia(data, joints, ranges)
     # Much damping makes a joint as slow to return as much inertia does.
     inertia = np.maximum(inertia, 0.5 * chain.damping / bandwidth)
     stiffness = inertia * bandwidth**2
@@ -212,6 +210,12 @@ def arm_from_xml(
         space=space,
         timestep=float(model.opt.timestep),
     )
+
+
+def move(data: mujoco.MjData, joints: Sequence[str], positions: Float) -> None:
+    """Compute the places of all parts of a model at positions of its joints."""
+    data.qpos[[int(data.model.joint(name).qposadr[0]) for name in joints]] = positions
+    mujoco.mj_kinematics(data.model, data)
 
 
 def asset(file: str) -> str:
@@ -258,16 +262,14 @@ def _controls(
 
 
 def _chain(
-    model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[str, ...], tool: str
+    model: mujoco.MjModel, data: mujoco.MjData, joints: Sequence[str], tool: str
 ) -> tuple[Chain, dict[str, int], list[tuple[Float, Float]]]:
     """Return the chain of some joints, the link that each body of the arm moves with, and frames of links at 0.
 
     Bodies that are fixed to the world and have collision geoms are the base.
     """
     numbers = [model.joint(name).id for name in joints]
-    data.qpos[model.jnt_qposadr[numbers]] = 0.0
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
+    move(data, joints, np.zeros(len(joints)))
     frames = [(np.eye(3), np.zeros(3))]
     for joint in numbers:
         turn = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
@@ -383,20 +385,19 @@ def _add_actuators(spec: mujoco.MjSpec, arm: Arm) -> None:
             servo.forcerange = -arm.torque_limit[j], arm.torque_limit[j]
 
 
-def _greatest_inertia(model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[str, ...]) -> Float:
+def _greatest_inertia(data: mujoco.MjData, joints: Sequence[str], ranges: Float) -> Float:
     """Return the greatest inertia that each joint sees in some configurations, shape (J,), [kg m^2] or [kg]."""
-    numbers = [model.joint(name).id for name in joints]
-    low, high = model.jnt_range[numbers].T
-    rng = np.random.default_rng(0)
+    model = data.model
+    low, high = ranges.T
+    dofs = [int(model.joint(name).dofadr[0]) for name in joints]
     full = np.zeros((model.nv, model.nv))
     greatest = np.zeros(len(joints))
-    for _ in range(SAMPLED):
-        data.qpos[model.jnt_qposadr[numbers]] = rng.uniform(low, high)
-        mujoco.mj_kinematics(model, data)
+    for configuration in np.random.default_rng(0).uniform(low, high, (SAMPLED, len(joints))):
+        move(data, joints, configuration)
         mujoco.mj_comPos(model, data)
         mujoco.mj_crb(model, data)
         mujoco.mj_fullM(model, data, full)
-        greatest = np.maximum(greatest, np.diag(full)[model.jnt_dofadr[numbers]])
+        greatest = np.maximum(greatest, np.diag(full)[dofs])
     return greatest
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
+from viapoint.envs.arms.arm import Arm, arm_from_xml, asset, move
 from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
 from viapoint.envs.arms.choices import (
     KNOWN_TORQUES,
@@ -442,7 +442,7 @@ def _greatest_weight(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
     dofs = [int(model.joint(name).dofadr[0]) for name in joints]
     greatest = np.zeros(len(joints))
     for _ in range(WEIGHED):
-        _move(data, joints, rng.uniform(-np.pi, np.pi, len(joints)))
+        move(data, joints, rng.uniform(-np.pi, np.pi, len(joints)))
         mujoco.mj_forward(model, data)
         greatest = np.maximum(greatest, np.abs(data.qfrc_bias[dofs]))
     return greatest
@@ -531,7 +531,7 @@ def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: li
         raise ValueError(f"the tool does not move with the last joint, {joints[-1]!r}")
     rest = mujoco.MjData(model)
     rest.qpos[:] = model.key_qpos[0] if model.nkey else model.qpos0
-    _move(rest, joints, np.zeros(len(joints)))
+    move(rest, joints, np.zeros(len(joints)))
     root = model.body_rootid[carriers[0]]
     links: dict[int, int] = {}
     names: dict[int, str] = {}
@@ -662,7 +662,7 @@ def _fitted(
         xml = _write(parsed, ranges, origin, fits)
         capsules = mujoco.MjModel.from_xml_string(xml)
         data = mujoco.MjData(capsules)
-        _move(data, parsed.joints, home)
+        move(data, parsed.joints, home)
         begin = {body: int(capsules.body(parsed.names[body]).geomadr[0]) for body in fits}
         coarse: set[tuple[int, int]] = set()
         for (first, second), distance in distances.items():
@@ -695,19 +695,13 @@ def _apart(parsed: Parsed, pairs: Iterable[Pair], configurations: Float) -> list
 
 def _distances(parsed: Parsed, joints: Float, pairs: Sequence[Pair]) -> Float:
     """Return the distances of P pairs of bodies in a configuration, shape (P,), [m]; at most 0.1."""
-    _move(parsed.moved, parsed.joints, joints)
+    move(parsed.moved, parsed.joints, joints)
     found = np.full(len(pairs), 0.1)
     for i, (first, second) in enumerate(pairs):
         for one, other in itertools.product(parsed.geoms[first], parsed.geoms[second]):
             away = mujoco.mj_geomDistance(parsed.model, parsed.moved, one, other, 0.1, None)
             found[i] = min(found[i], away)
     return found
-
-
-def _move(data: mujoco.MjData, joints: tuple[str, ...], positions: Float) -> None:
-    """Compute the places of all parts of a model at positions of its joints."""
-    data.qpos[[int(data.model.joint(name).qposadr[0]) for name in joints]] = positions
-    mujoco.mj_kinematics(data.model, data)
 
 
 def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[FittedCapsule]]) -> str:
