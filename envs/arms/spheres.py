@@ -119,9 +119,9 @@ def grouped(
     centres: Sequence[Float], radii: Sequence[Float], links: Sequence[int], pairs: Sequence[tuple[int, int]]
 ) -> Spheres:
     """Return spheres from centres (n, 3) and radii (n,) of each group, [m], the links of groups, and pairs of them."""
-    spheres: list[Float] = []
+    sorted_centres, sorted_radii = [], []
     balls, part_balls = [], []
-    first, part = [0], [len(links)]
+    part = [len(links)]
     for centre, radius in zip(centres, radii, strict=True):
         order = _neighbours(centre, np.arange(len(centre)))
         centre, radius = centre[order], radius[order]
@@ -130,15 +130,14 @@ def grouped(
             for begin in range(0, len(centre), PART):
                 some = slice(begin, begin + PART)
                 part_balls.append(_bounding_ball(centre[some].mean(axis=0), centre[some], radius[some]))
-        spheres.append(np.column_stack((centre, radius)))
-        first.append(first[-1] + len(centre))
+        sorted_centres.append(centre)
+        sorted_radii.append(radius)
         part.append(len(links) + len(part_balls))
-    every = np.concatenate(spheres)
     around = np.array(balls + part_balls)
     return Spheres(
-        centre=np.array(every[:, :3], order="C"),
-        radius=np.array(every[:, 3], order="C"),
-        first=np.array(first),
+        centre=np.concatenate(sorted_centres),
+        radius=np.concatenate(sorted_radii),
+        first=np.cumsum([0, *map(len, radii)]),
         link=np.array(links, dtype=np.int64),
         ball_centre=np.array(around[:, :3], order="C"),
         ball_radius=np.array(around[:, 3], order="C"),

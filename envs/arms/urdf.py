@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -59,19 +58,16 @@ def read_urdf(path: Path, packages: Packages) -> Urdf:
     for name in LEFT_OUT:
         for element in root.findall(name):
             root.remove(element)
-    for link in root.findall("link"):
-        try:
-            _prepare_link(link, path, packages, assets, notes)
-        except ValueError as error:
-            raise ValueError(f"{path.name}, link {link.get('name')!r}: {error}") from None
     velocity = {}
-    for joint in root.findall("joint"):
-        if joint.get("type") == "floating":  # MuJoCo has such joints of the first body only
-            joint.set("type", "fixed")
-            notes.append(f"fixed: {joint.get('name')}, which floats")
-        limits = _limits(joint, notes)
-        if limits.get("velocity", 0.0) > 0.0:
-            velocity[joint.get("name", "")] = limits["velocity"]
+    for element in (*root.findall("link"), *root.findall("joint")):
+        name = element.get("name", "")
+        try:
+            if element.tag == "link":
+                _prepare_link(element, path, packages, assets, notes)
+            else:
+                velocity[name] = _prepare_joint(element, notes)
+        except ValueError as error:
+            raise ValueError(f"{path.name}, {element.tag} {name!r}: {error}") from None
     extension = root.find("mujoco")
     if extension is None:
         extension = ET.SubElement(root, "mujoco")
@@ -100,37 +96,28 @@ def _root(path: Path) -> ET.Element:
     return ET.fromstring(re.sub(rb"(</?|\s)[\w.-]+:([\w.-]+)(?=[\s=/>])", rb"\1\2", content))
 
 
-def _limits(joint: ET.Element, notes: list[str]) -> dict[str, float]:
-    """Return the limits of a joint by name, and write out those that are 0 because they are not given.
+def _prepare_joint(joint: ET.Element, notes: list[str]) -> float:
+    """Return the velocity limit of a joint, 0 for none, and write out limits that are 0 because they are not given.
 
     Raises:
         ValueError: A limit is not a number, or the lower one is greater than the upper one.
     """
     name, limit = joint.get("name"), joint.find("limit")
-    found: dict[str, float] = {}
+    if joint.get("type") == "floating":  # MuJoCo has such joints of the first body only
+        joint.set("type", "fixed")
+        notes.append(f"fixed: {name}, which floats")
     if joint.get("type") not in MOVING:
-        return found
-    for key in ("lower", "upper", "velocity"):
-        text = None if limit is None else limit.get(key)
-        if text is None:
-            continue
-        try:
-            found[key] = float(text)
-        except ValueError:
-            found[key] = math.nan
-        if not math.isfinite(found[key]):
-            raise ValueError(f"the limit {key} of joint {name!r} must be a finite number, got {text!r}")
-    if joint.get("type") in LIMITED:
-        lower, upper = found.get("lower", 0.0), found.get("upper", 0.0)
-        if lower > upper:
-            raise ValueError(
-                f"the lower limit of joint {name!r} must be less than the upper one, got {lower:g} and {upper:g}"
-            )
-        if lower == upper:
-            notes.append(f"{WARNING}joint {name} has no limits, or equal ones: it is taken as unlimited")
-        elif limit is not None:
-            limit.attrib.update(lower=f"{lower!r}", upper=f"{upper!r}")
-    return found
+        return 0.0
+    given = {} if limit is None else limit.attrib
+    lower, upper, velocity = (float(given.get(key, 0.0)) for key in ("lower", "upper", "velocity"))
+    limited = joint.get("type") in LIMITED
+    if not np.isfinite((lower, upper, velocity)).all() or (limited and lower > upper):
+        raise ValueError(f"limits must be finite, the lower one less than the upper one, got {given}")
+    if limited and lower == upper:
+        notes.append(f"{WARNING}joint {name} has no limits, or equal ones: it is taken as unlimited")
+    elif limited:
+        given.update(lower=f"{lower!r}", upper=f"{upper!r}")
+    return velocity
 
 
 def _prepare_link(
