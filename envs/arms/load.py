@@ -506,7 +506,7 @@ def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[Pair], notes: l
         inside = (configuration >= low) & (configuration <= high)
         if inside.all() and apart(configuration) >= LEAST_GAP:
             notes.append(f"home: {origin}")
-            return configuration
+            return np.asarray(configuration)
     notes.append("home: the one that is farthest from touching itself, of random ones")
     inset = INSET * (high - low)
     drawn = np.random.default_rng(0).uniform(low + inset, high - inset, (HOMES, len(low)))
@@ -668,8 +668,8 @@ def _fitted(
         for (first, second), distance in distances.items():
             least = min(LEFT_SHARE * distance, LEFT_MOST)
             for i, j in itertools.product(range(len(fits[first])), range(len(fits[second]))):
-                geoms = begin[first] + i, begin[second] + j
-                if mujoco.mj_geomDistance(capsules, data, *geoms, 0.01, None) >= least:
+                both = begin[first] + i, begin[second] + j
+                if mujoco.mj_geomDistance(capsules, data, *both, 0.01, None) >= least:
                     continue
                 one, other = fits[first][i].excess, fits[second][j].excess
                 if max(one, other) < LEAST_EXCESS:
