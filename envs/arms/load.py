@@ -188,19 +188,17 @@ def _load(
             raise ValueError(f"no joint moves the tool {chosen.name!r}; name another one with tool=")
         names = _joint_names(arm_joints(whole, chain, notes))
         notes.append(f"joints: {', '.join(names)}")
-    there = [whole.joint(index).name for index in range(whole.njnt)]
-    missing = [each for each in names if each not in there]
-    if missing:
-        raise ValueError(
-            f"there is no joint {', '.join(map(repr, missing))} in the file; there are: {', '.join(there) or 'none'}"
-        )
+    try:
+        numbers = [whole.joint(each).id for each in names]
+    except KeyError as error:  # the message tells the names that there are
+        raise ValueError(f"joints: {error.args[0]}") from None
     ranges = _ranges(whole, names, given["joint_range"], notes)
     velocity = _velocities(whole, names, given["velocity_limit"], urdf.velocity_limits, known_as, notes)
     torque = _torques(whole, names, given["torque_limit"], known_as, notes)
     for what, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
         if not (limit > 0.0).all():
             raise ValueError(f"{what} must be positive, got {limit}")
-    dofs = np.array([whole.jnt_dofadr[whole.joint(each).id] for each in names])
+    dofs = whole.jnt_dofadr[numbers]
     # Models that are moved by other means than motors have such damping.
     stuck = whole.dof_damping[dofs].reshape(len(names), -1)[:, 0] * velocity > STUCK * torque
     if stuck.any():
@@ -232,10 +230,10 @@ def _load(
     for pair in near.difference(apart):
         tolerances.update(dict.fromkeys(pair, FINE))
     xml, excess = _fitted(parsed, ranges, origin, home, distances, tolerances)
-    numbers = {known: body for body, known in parsed.names.items()}
+    bodies = {known: body for body, known in parsed.names.items()}
 
     def touch(first: str, second: str, configuration: Float) -> bool:
-        return bool(_distances(parsed, configuration, [(numbers[first], numbers[second])])[0] <= 0.0)
+        return bool(_distances(parsed, configuration, [(bodies[first], bodies[second])])[0] <= 0.0)
 
     arm = arm_from_xml(
         name,
@@ -261,8 +259,7 @@ def _load(
             "hold; give torque_limit"
         )
         torque = np.where(weak, WEIGHTS * weight, torque)
-    limited = whole.jnt_limited[[whole.joint(each).id for each in names]].astype(bool)
-    endless = itertools.compress(names, ~limited & ~arm.chain.sliding)
+    endless = itertools.compress(names, (whole.jnt_limited[numbers] == 0) & ~arm.chain.sliding)
     return replace(
         arm,
         excess=arm.excess + excess,
