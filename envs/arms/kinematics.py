@@ -319,23 +319,32 @@ def slowdowns(
 
 @compiled
 def _all_frames(chain: Chain, joints: Float) -> tuple[Float, Float]:
-    """Return the frames of the links for N configurations, see :func:`link_poses`, and after them that of the tool."""
-    number, last = joints.shape
-    rotation = np.empty((number, last + 2, 3, 3))
-    origin = np.empty((number, last + 2, 3))
+    """Return the frames of the links for N configurations, see :func:`link_poses`."""
+    number, links = len(joints), len(chain.mass) + 1
+    rotation = np.empty((number, links, 3, 3))
+    origin = np.empty((number, links, 3))
     for n in range(number):
-        turn, place = rotation[n], origin[n]
-        place[last + 1, 0], place[last + 1, 1], place[last + 1, 2] = tool_position(
-            chain, joints[n], turn, place
-        )
+        link_frames(chain, joints[n], rotation[n], origin[n])
+    return rotation, origin
+
+
+@compiled
+def _all_tools(chain: Chain, joints: Float) -> tuple[Float, Float]:
+    """Return places and axes of the tool for N configurations, see :func:`forward`."""
+    number, last = joints.shape
+    rotation = np.empty((last + 1, 3, 3))
+    origin = np.empty((last + 1, 3))
+    places, axes = np.empty((number, 3)), np.empty((number, 3, 3))
+    for n in range(number):
+        places[n, 0], places[n, 1], places[n, 2] = tool_position(chain, joints[n], rotation, origin)
         for row in range(3):
             for column in range(3):
-                turn[last + 1, row, column] = (
-                    turn[last, row, 0] * chain.tool_rotation[0, column]
-                    + turn[last, row, 1] * chain.tool_rotation[1, column]
-                    + turn[last, row, 2] * chain.tool_rotation[2, column]
+                axes[n, row, column] = (
+                    rotation[last, row, 0] * chain.tool_rotation[0, column]
+                    + rotation[last, row, 1] * chain.tool_rotation[1, column]
+                    + rotation[last, row, 2] * chain.tool_rotation[2, column]
                 )
-    return rotation, origin
+    return places, axes
 
 
 @compiled
@@ -356,15 +365,14 @@ def _flat(name: str, chain: Chain, joints: Float) -> tuple[Float, tuple[int, ...
 def forward(chain: Chain, joints: Float) -> tuple[Float, Float]:
     """Return places of the tool, (..., 3), [m], and its axes as columns, (..., 3, 3), for joints (..., J)."""
     flat, batch = _flat("joints", chain, joints)
-    rotation, origin = _all_frames(chain, flat)
-    places, axes = np.ascontiguousarray(origin[:, -1]), np.ascontiguousarray(rotation[:, -1])
+    places, axes = _all_tools(chain, flat)
     return places.reshape(*batch, 3), axes.reshape(*batch, 3, 3)
 
 
 def link_poses(chain: Chain, joints: Float) -> tuple[Float, Float]:
     """Return the frames of links 0 to J: axes as columns, (..., J + 1, 3, 3), and origins (..., J + 1, 3), [m]."""
     flat, batch = _flat("joints", chain, joints)
-    rotation, origin = (np.ascontiguousarray(part[:, :-1]) for part in _all_frames(chain, flat))
+    rotation, origin = _all_frames(chain, flat)
     return rotation.reshape(*batch, *rotation.shape[1:]), origin.reshape(*batch, *origin.shape[1:])
 
 
