@@ -9,14 +9,15 @@ import numpy as np
 from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position
 from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.geometry.clearance import (
+    FAR,
     Placed,
     bounds_memory,
-    configuration_clearances,
     fastest,
     memory,
     movement_clearance,
     obstacle_clearance,
     place,
+    row_clearances,
     travel,
 )
 from viapoint.envs.geometry.compiled import compiled
@@ -59,8 +60,8 @@ class Executor:
         """Start episodes at rest at joint positions, shape (n, J), among the obstacles of n scenes."""
         arm = self.simulator.arm
         self.simulator.place(rows, joints, obstacles)
-        first = configuration_clearances(arm.chain, arm.spheres, joints, obstacles, np.zeros(len(rows)))
-        self.state.begin(rows, joints, arm.hand(joints), first[:, 0], first[:, 1])
+        apart, own = row_clearances(arm.chain, arm.spheres, joints, obstacles, FAR)
+        self.state.begin(rows, joints, arm.hand(joints), apart.min(axis=1, initial=FAR), own)
         for row in rows:
             self.past[row] = []
 
@@ -108,8 +109,8 @@ class Executor:
             steps = np.ones(1, np.int64)
         time = np.asarray(self.simulator.timestep * steps)
         every = scene.take(np.zeros(len(time), np.int64)).obstacles_at(time)
-        clearance = configuration_clearances(arm.chain, arm.spheres, joints, every, np.zeros(len(time)))
-        return Rollout(time, planned, joints, arm.hand(joints), contact, clearance[:, 0])
+        apart, _ = row_clearances(arm.chain, arm.spheres, joints, every, FAR)
+        return Rollout(time, planned, joints, arm.hand(joints), contact, apart.min(axis=1, initial=FAR))
 
     def _run_block(
         self,

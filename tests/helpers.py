@@ -10,6 +10,7 @@ import numpy as np
 from viapoint.envs import Box, ConvexMesh, Cylinder, arm_of, as_obstacle
 from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.events import Event
+from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.training.planning.problem import Problem
 
 PLANE = "viapoint/PlanarObstacles-v0"
@@ -121,6 +122,13 @@ def random_shape(kind, rng, *, moving=False):
             **sizes[kind],
         }
     )
+
+
+def configuration_clearances(arm, joints, obstacles, times=0.0):
+    """Return the clearance of N arms in N scenes at N times from obstacles and from themselves, shape (N, 2), [m]."""
+    centre = obstacles.centre + np.reshape(times, (-1, 1, 1)) * obstacles.velocity
+    apart, own = row_clearances(arm.chain, arm.spheres, joints, obstacles._replace(centre=centre), FAR)
+    return np.stack((apart.min(axis=1, initial=FAR), own), axis=-1)
 
 
 def least_pair_distance(arm, joints):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -10,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.kinematics import Chain, FirstTwo, Spheres, forward, inverse_dynamics
+from viapoint.envs.arms.kinematics import Chain, Spheres, forward, inverse_dynamics
 from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, overlapping, touching_at_home
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.geometry.compiled import compiled
@@ -166,12 +168,10 @@ def arm_from_xml(
     """
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
-    chain, links, frames = _chain(model, data, tuple(joints), tool)
+    chain, links, frames = _chain(model, data, joints, tool)
     capsules = _capsules(model, data, links, frames)
     home = np.array(home, dtype=np.float64)
-    data.qpos[model.jnt_qposadr[[model.joint(each).id for each in joints]]] = home
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
+    move(data, joints, home)
     touching = touching_at_home(model, data, links)
     names, spheres, left_out, excess = cover(chain, capsules, links, home, touching, exclude or {})
     # Pairs that touch in none of many configurations are not compared, either.
@@ -187,7 +187,7 @@ def arm_from_xml(
             reason = f"in contact in none of {COMPARED:,} configurations"
             left_out.append(LeftOut(names[first], names[second], reason))
     spheres = spheres._replace(pairs=spheres.pairs[kept])
-    inertia = _greatest_inertia(model, data, tuple(joints))
+    inertia = _greatest_inertia(data, joints, ranges)
     # Much damping makes a joint as slow to return as much inertia does.
     inertia = np.maximum(inertia, 0.5 * chain.damping / bandwidth)
     stiffness = inertia * bandwidth**2
@@ -210,6 +210,12 @@ def arm_from_xml(
         space=space,
         timestep=float(model.opt.timestep),
     )
+
+
+def move(data: mujoco.MjData, joints: Sequence[str], positions: Float) -> None:
+    """Compute the places of all parts of a model at positions of its joints."""
+    data.qpos[[int(data.model.joint(name).qposadr[0]) for name in joints]] = positions
+    mujoco.mj_kinematics(data.model, data)
 
 
 def asset(file: str) -> str:
@@ -256,16 +262,14 @@ def _controls(
 
 
 def _chain(
-    model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[str, ...], tool: str
+    model: mujoco.MjModel, data: mujoco.MjData, joints: Sequence[str], tool: str
 ) -> tuple[Chain, dict[str, int], list[tuple[Float, Float]]]:
     """Return the chain of some joints, the link that each body of the arm moves with, and frames of links at 0.
 
     Bodies that are fixed to the world and have collision geoms are the base.
     """
     numbers = [model.joint(name).id for name in joints]
-    data.qpos[model.jnt_qposadr[numbers]] = 0.0
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
+    move(data, joints, np.zeros(len(joints)))
     frames = [(np.eye(3), np.zeros(3))]
     for joint in numbers:
         turn = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
@@ -312,34 +316,39 @@ def _chain(
         armature=model.dof_armature[dofs].copy(),
         damping=model.dof_damping[dofs].reshape(len(joints), -1)[:, 0].copy(),
         gravity=model.opt.gravity.copy(),
-        first_two=FirstTwo.of(origin, rotation, tool_origin),
+        first_two=(
+            math.atan2(origin[1, 1], origin[1, 0]),
+            math.atan2(tool_origin[1], tool_origin[0]),
+            math.atan2(rotation[1, 1, 0], rotation[1, 0, 0]),
+            math.atan2(rotation[0, 1, 0], rotation[0, 0, 0]),
+            math.hypot(origin[1, 0], origin[1, 1]),
+            math.hypot(tool_origin[0], tool_origin[1]),
+        ),
     )
     return chain, links, frames
 
 
 def _capsules(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    links: dict[str, int],
-    frames: list[tuple[Float, Float]],
-) -> list[Capsule]:
-    """Return the collision geoms of the arm, whose joints are at 0, in the frames of its links."""
-    found = []
+    model: mujoco.MjModel, data: mujoco.MjData, links: dict[str, int], frames: list[tuple[Float, Float]]
+) -> dict[str, list[Capsule]]:
+    """Return the collision geoms of each body of the arm, whose joints are at 0, in the frames of its links."""
+    found: dict[str, list[Capsule]] = {}
     for geom in range(model.ngeom):
         name = model.body(model.geom_bodyid[geom]).name
         if name not in links or not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
             continue
-        kind = mujoco.mjtGeom(int(model.geom_type[geom]))
-        size = model.geom_size[geom]
-        if kind not in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE):
+        radius, half, _ = model.geom_size[geom]
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:
+            half = 0.0
+        elif model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_CAPSULE:
             raise ValueError(
                 f"collision geoms must be capsules or spheres, geom {model.geom(geom).name!r} is none"
             )
-        half = size[1] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
         axis = half * data.geom_xmat[geom].reshape(3, 3)[:, 2]
         turn, place = frames[links[name]]
         centre = data.geom_xpos[geom] - place
-        found.append(Capsule(name, turn.T @ (centre - axis), turn.T @ (centre + axis), float(size[0])))
+        ends = np.stack((turn.T @ (centre - axis), turn.T @ (centre + axis)))
+        found.setdefault(name, []).append((ends, float(radius)))
     return found
 
 
@@ -356,10 +365,9 @@ def _set_contacts(spec: mujoco.MjSpec, arm: Arm) -> None:
             if body.name in names and (geom.contype or geom.conaffinity):
                 geom.contype = 3 if body.name in moving else 1
                 geom.conaffinity = 1
-    for i, first in enumerate(names):
-        for second in names[i + 1 :]:
-            if frozenset((first, second)) not in compared:
-                spec.add_exclude(bodyname1=first, bodyname2=second)
+    for first, second in itertools.combinations(names, 2):
+        if frozenset((first, second)) not in compared:
+            spec.add_exclude(bodyname1=first, bodyname2=second)
 
 
 def _add_actuators(spec: mujoco.MjSpec, arm: Arm) -> None:
@@ -377,20 +385,19 @@ def _add_actuators(spec: mujoco.MjSpec, arm: Arm) -> None:
             servo.forcerange = -arm.torque_limit[j], arm.torque_limit[j]
 
 
-def _greatest_inertia(model: mujoco.MjModel, data: mujoco.MjData, joints: tuple[str, ...]) -> Float:
+def _greatest_inertia(data: mujoco.MjData, joints: Sequence[str], ranges: Float) -> Float:
     """Return the greatest inertia that each joint sees in some configurations, shape (J,), [kg m^2] or [kg]."""
-    numbers = [model.joint(name).id for name in joints]
-    low, high = model.jnt_range[numbers].T
-    rng = np.random.default_rng(0)
+    model = data.model
+    low, high = ranges.T
+    dofs = [int(model.joint(name).dofadr[0]) for name in joints]
     full = np.zeros((model.nv, model.nv))
     greatest = np.zeros(len(joints))
-    for _ in range(SAMPLED):
-        data.qpos[model.jnt_qposadr[numbers]] = rng.uniform(low, high)
-        mujoco.mj_kinematics(model, data)
+    for configuration in np.random.default_rng(0).uniform(low, high, (SAMPLED, len(joints))):
+        move(data, joints, configuration)
         mujoco.mj_comPos(model, data)
         mujoco.mj_crb(model, data)
         mujoco.mj_fullM(model, data, full)
-        greatest = np.maximum(greatest, np.diag(full)[model.jnt_dofadr[numbers]])
+        greatest = np.maximum(greatest, np.diag(full)[dofs])
     return greatest
 
 

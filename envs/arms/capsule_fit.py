@@ -12,7 +12,7 @@ each contains the piece; (1) still takes d from the whole of K.
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -51,14 +51,6 @@ class FittedCapsule(NamedTuple):
     geom: int = -1  # Number of the geom
 
 
-class Body(NamedTuple):
-    """Convex body."""
-
-    shape: ConvexMesh  # Shape that gives signed distances
-    normals: Float  # Outward normals of the faces, shape (F, 3)
-    offsets: Float  # Distances of the faces from the origin along their normals, shape (F,), [m]
-
-
 def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[FittedCapsule]:
     """Return capsules and spheres that together contain a geom, in the geom's frame.
 
@@ -76,7 +68,7 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
         return [FittedCapsule(ends, float(size[0]), 0.0, np.empty((0, 3)), geom)]
     try:
         corners, larger = polytope_around(model, geom)
-        found = cover_points(corners, tolerance - larger, SMALL - larger)
+        found = _cover_points(corners, tolerance - larger, SMALL - larger)
     except ValueError as error:
         raise ValueError(f"geom {model.geom(geom).name or geom}: {error}") from None
     return [each._replace(excess=each.excess + larger, geom=geom) for each in found]
@@ -85,7 +77,7 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
 def split(model: mujoco.MjModel, capsule: FittedCapsule) -> list[FittedCapsule]:
     """Return two capsules with less excess that together contain what a capsule of :func:`cover_geom` contains."""
     corners, larger = polytope_around(model, capsule.geom)
-    halves = _best_halves(capsule.corners, _body(corners), 0.5 * (capsule.excess - larger))
+    halves = _best_halves(capsule.corners, ConvexMesh.hull(corners), 0.5 * (capsule.excess - larger))
     return [each._replace(excess=each.excess + larger, geom=capsule.geom) for each in halves]
 
 
@@ -132,13 +124,13 @@ def _rim(number: int) -> Float:
     return np.stack((wide * np.cos(angle), wide * np.sin(angle), 0.0 * angle), axis=-1)
 
 
-def cover_points(points: Float, tolerance: float, small: float) -> list[FittedCapsule]:
+def _cover_points(points: Float, tolerance: float, small: float) -> list[FittedCapsule]:
     """Return capsules and spheres that together contain the convex hull of points, shape (n, 3), [m].
 
     Their excess is at most the tolerance, if MOST_CAPSULES suffice for that; below `small` MOST_SMALL are enough.
     """
-    body = _body(points)
-    found = [_fit_capsule(np.asarray(body.shape.vertices), body)]
+    body = ConvexMesh.hull(points)
+    found = [_fit_capsule(np.asarray(body.vertices), body)]
     while True:
         worst = max(range(len(found)), key=lambda index: found[index].excess)
         excess = found[worst].excess
@@ -148,15 +140,10 @@ def cover_points(points: Float, tolerance: float, small: float) -> list[FittedCa
         found += _best_halves(found.pop(worst).corners, body, tolerance)
 
 
-def _body(points: Float) -> Body:
-    """Return the convex hull of points, shape (n, 3), [m]."""
-    shape = ConvexMesh.hull(points)
-    equations = convex_hull(shape.vertices).equations
-    return Body(shape, np.ascontiguousarray(equations[:, :3]), -equations[:, 3])
-
-
-def _fit_capsule(corners: Float, body: Body, last_step: float = LAST_STEP) -> FittedCapsule:
+def _fit_capsule(corners: Float, body: ConvexMesh, last_step: float = LAST_STEP) -> FittedCapsule:
     """Return a capsule that contains points, shape (n, 3), [m], with little excess over a convex body around them."""
+    faces: Any = body.mesh
+    planes = faces.normals, (faces.normals * faces.corners[:, 0]).sum(axis=1)
     centre, axes, low, high = _principal_frame(corners)
     size = high - low
     away = ((corners - 0.5 * (corners.max(axis=0) + corners.min(axis=0))) ** 2).sum(axis=1)
@@ -168,21 +155,17 @@ def _fit_capsule(corners: Float, body: Body, last_step: float = LAST_STEP) -> Fi
         ends = np.tile(0.5 * (low + high), (2, 1))
         ends[:, i] = low[i] + inset, high[i] - inset
         ends = centre + ends @ axes.T
-        excess = _refine(
-            ends, sorted_corners, (body.normals, body.offsets), MOVES, float(size.max()), last_step
-        )
+        excess = _refine(ends, sorted_corners, planes, float(size.max()), last_step)
         if excess < least:
             best, least = ends, excess
     if np.linalg.norm(best[1] - best[0]) < SHORTEST:
         best = np.tile(best.mean(axis=0), (2, 1))
     radius = _radius(best, sorted_corners, np.inf) + ROUNDING
-    return FittedCapsule(best, radius, radius + float(body.shape.distance(best).max()), corners)
+    return FittedCapsule(best, radius, radius + float(body.distance(best).max()), corners)
 
 
 @compiled
-def _refine(
-    ends: Float, corners: Float, body: tuple[Float, Float], moves: Float, size: float, last_step: float
-) -> float:
+def _refine(ends: Float, corners: Float, body: tuple[Float, Float], size: float, last_step: float) -> float:
     """Move ends, shape (2, 3), to the least excess (1) near them, and return it without rounding.
 
     It is a compass search for the corners of a capsule, those far from the middle first, in a body of normals and
@@ -193,8 +176,8 @@ def _refine(
     least = _excess(ends, corners, body, np.inf)
     while step > last_step * size:
         lowest = least - 1e-9  # less of an improvement is rounding
-        for move in range(len(moves)):
-            probe[:] = ends + step * moves[move]
+        for move in range(len(MOVES)):
+            probe[:] = ends + step * MOVES[move]
             value = _excess(probe, corners, body, lowest)
             if value < lowest:
                 lowest = value
@@ -249,7 +232,7 @@ def _radius(ends: Float, corners: Float, bound: float) -> float:
     return float(np.sqrt(greatest))
 
 
-def _best_halves(corners: Float, body: Body, tolerance: float) -> list[FittedCapsule]:
+def _best_halves(corners: Float, body: ConvexMesh, tolerance: float) -> list[FittedCapsule]:
     """Return the capsules of two pieces of a polytope that is cut by the best of some planes."""
     centre, axes, low, high = _principal_frame(corners)
     hull, size = convex_hull(corners), high - low

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -62,81 +63,90 @@ def choose_tool(model: mujoco.MjModel, given: Any, base: str | None) -> Tool:
     Raises:
         ValueError: There is no such part, or there are several arms and neither `tool` nor `base` tells which.
     """
+    sites, bodies = list[Tool](), list[Tool]()
+    for index in range(model.nsite):
+        frame = model.site_pos[index].copy(), model.site_quat[index].copy()
+        sites.append(Tool(int(model.site_bodyid[index]), *frame, model.site(index).name))
+    for index in range(1, model.nbody):
+        bodies.append(Tool(index, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), model.body(index).name))
+    root = 0 if base is None else _named(base, bodies).body
     if isinstance(given, str):
-        return _named_tool(model, given)
-    if given is not None:
+        tool = _named(given, (*sites, *bodies))
+    elif given is not None:
         try:
             name, point = given
         except (TypeError, ValueError):
             raise ValueError(
                 f"tool must be a site, a body, or a pair of body and point, got {given!r:.60}"
             ) from None
-        tool = _named_tool(model, name, "body")
-        return tool._replace(position=finite_array("tool", point, (3,)), name=f"a point of {name!r}")
-    names = [model.body(index).name for index in range(1, model.nbody)]
-    if base is not None and base not in names:
-        raise ValueError(
-            f"there is no body {base!r} in the file; there are: {', '.join(filter(None, names))}"
-        )
-    root = 0 if base is None else int(model.body(base).id)
-    chains: dict[int, list[str]] = {}
+        tool = _named(name, bodies)
+        tool = tool._replace(position=finite_array("tool", point, (3,)), name=f"a point of {name!r}")
+    else:
+        usual = _usual_tool(model, sites, bodies, root)
+        tip = usual or bodies[_tip(model, root) - 1]
+        tool = usual or tip._replace(name=f"the frame of {tip.name!r}")
+    if root not in (tool.body, *ancestors(model, tool.body)):
+        raise ValueError(f"the tool {tool.name!r} is not carried by base={base!r}; name one of both")
+    return tool
+
+
+def _named(name: Any, parts: Sequence[Tool]) -> Tool:
+    """Return the part of a name."""
+    for part in parts:
+        if part.name == name:
+            return part
+    named = ", ".join(part.name for part in parts if part.name) or "none"
+    raise ValueError(f"there is no site or body {name!r} in the file; there are: {named}")
+
+
+def _usual_tool(model: mujoco.MjModel, sites: list[Tool], bodies: list[Tool], root: int) -> Tool | None:
+    """Return the site or body with the most telling of the usual names on a chain from a body, None for none.
+
+    Raises:
+        ValueError: There are several arms with such names.
+    """
+    chains = {}
     for body in range(model.nbody):
-        chain = chain_joints(model, body, base)
+        chain = set(chain_joints(model, body, root))
         if root in (body, *ancestors(model, body)) and len(chain) >= LEAST_CHAIN:
             chains[body] = chain
-    matches: list[tuple[str, dict[int, str]]] = []
-    kinds = (("site", model.nsite), ("body", model.nbody))
-    for pattern, (kind, number) in itertools.product(TOOL_NAMES, kinds):
-        found: dict[int, str] = {}
-        for index in range(number):
-            part = getattr(model, kind)(index)
-            body = int(part.bodyid[0]) if kind == "site" else index
+    matches: list[dict[int, Tool]] = []
+    for pattern, parts in itertools.product(TOOL_NAMES, (sites, bodies)):
+        found: dict[int, Tool] = {}
+        for part in parts:
             # The name of the robot may be its prefix.
             fits = re.fullmatch(rf"(.*[_/:])?{pattern}", part.name, re.IGNORECASE)
-            if fits and body in chains:
-                found.setdefault(body, part.name)
+            if fits and part.body in chains:
+                found.setdefault(part.body, part)
         if found:
-            matches.append((kind, found))
-    if matches:
-        kind, found = matches[0]
-        # Of several on one chain, the last one counts.
-        last = max(reversed(found), key=lambda body: len(chains[body]))
-        rivals = [name for body, name in found.items() if not set(chains[body]) <= set(chains[last])]
-        for _, others in matches[1:]:  # less telling names matter on other arms alone
-            rivals += [name for body, name in others.items() if set(chains[body]).isdisjoint(chains[last])]
-        if rivals:
-            listed = ", ".join(dict.fromkeys([found[last], *rivals]))
-            raise ValueError(f"there are several tools: {listed}; name one with tool=, or a side with base=")
-        return _named_tool(model, found[last], kind)
-    body = _tip(model, base)
-    return Tool(body, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), f"the frame of {model.body(body).name!r}")
+            matches.append(found)
+    if not matches:
+        return None
+    # Of several on one chain, the last one counts.
+    last = max(reversed(matches[0]), key=lambda body: len(chains[body]))
+    rivals = [part.name for body, part in matches[0].items() if not chains[body] <= chains[last]]
+    for others in matches[1:]:  # less telling names matter on other arms alone
+        rivals += [part.name for body, part in others.items() if chains[body].isdisjoint(chains[last])]
+    tool = matches[0][last]
+    if rivals:
+        listed = ", ".join(dict.fromkeys([tool.name, *rivals]))
+        raise ValueError(f"there are several tools: {listed}; name one with tool=, or a side with base=")
+    return tool
 
 
-def _named_tool(model: mujoco.MjModel, name: str, kind: str = "") -> Tool:
-    """Return the site of a name, or the origin of the body of a name."""
-    sites = [model.site(index).name for index in range(model.nsite)]
-    bodies = [model.body(index).name for index in range(1, model.nbody)]
-    if name in sites and kind != "body":
-        site = model.site(name)
-        return Tool(int(site.bodyid[0]), site.pos.copy(), site.quat.copy(), name)
-    if name in bodies:
-        return Tool(int(model.body(name).id), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), name)
-    raise ValueError(
-        f"there is no site or body {name!r} in the file; sites are {', '.join(filter(None, sites)) or 'none'}; bodies "
-        f"are {', '.join(filter(None, bodies)) or 'none'}"
-    )
+def _own_joints(model: mujoco.MjModel, body: int) -> list[str]:
+    """Return the names of the hinges and slides of a body."""
+    first = int(model.body_jntadr[body])
+    joints = range(first, first + int(model.body_jntnum[body]))
+    return [model.joint(joint).name for joint in joints if model.jnt_type[joint] in MOVES]
 
 
-def chain_joints(model: mujoco.MjModel, body: int, base: str | None = None) -> list[str]:
-    """Return the names of the hinges and slides that carry a body, from the base, whose own count, too, to it."""
-    end = int(model.body(base).id) if base is not None else 0
+def chain_joints(model: mujoco.MjModel, body: int, root: int) -> list[str]:
+    """Return the names of the hinges and slides that carry a body, from the root, whose own count, too, to it."""
     names: list[str] = []
     for each in (body, *ancestors(model, body)):
-        first = int(model.body_jntadr[each])
-        for joint in range(first, first + int(model.body_jntnum[each])):
-            if model.jnt_type[joint] in MOVES:
-                names.insert(0, model.joint(joint).name)
-        if each == end:
+        names = _own_joints(model, each) + names
+        if each == root:
             break
     return names
 
@@ -155,13 +165,12 @@ def arm_joints(model: mujoco.MjModel, chain: list[str], notes: list[str]) -> lis
             mobile.add(name)
         elif model.joint(name).type[0] == MOVES[0]:
             break
-    below = {body: _joints_below(model, body) for body in range(model.nbody)}
-    hands = set()
-    for body in range(1, model.nbody):
-        moving = [each for each in _children(model, body) if below[each]]
-        if len(moving) > 1 and not any(_is_branch(model, each, below) for each in moving):
-            hands.add(body)
-    fingers = {name for name in chain if hands & set(ancestors(model, carriers[name]))}
+    fingers = set()
+    for name in chain:
+        for body in ancestors(model, carriers[name])[:-1]:
+            moving, arms = _branches(model, body)
+            if len(moving) > 1 and not arms:
+                fingers.add(name)
     for some, what in ((mobile, "which seem to move a mobile base"), (fingers, "which seem to move fingers")):
         if some:
             notes.append(f"fixed: {', '.join(sorted(some))}, {what}")
@@ -182,25 +191,21 @@ def ancestors(model: mujoco.MjModel, body: int) -> list[int]:
     return found
 
 
-def _tip(model: mujoco.MjModel, base: str | None) -> int:
+def _tip(model: mujoco.MjModel, root: int) -> int:
     """Return the last body of the longest chain of joints, or its flange, before it branches into fingers.
 
     Raises:
         ValueError: There are several arms, or no chain.
     """
-    below = {body: _joints_below(model, body) for body in range(model.nbody)}
-    body = int(model.body(base).id) if base is not None else 0
+    body = root
     while True:
-        moving = [each for each in _children(model, body) if below[each]]
-        arms = [each for each in moving if _is_branch(model, each, below)]
-        if (
-            len(arms) > 1
-            and max(below[each] for each in arms) - min(below[each] for each in arms) < LEAST_CHAIN
-        ):
+        moving, arms = _branches(model, body)
+        lengths = [_joints_below(model, each) for each in arms]
+        if len(arms) > 1 and max(lengths) - min(lengths) < LEAST_CHAIN:
             names = ", ".join(model.body(each).name or str(each) for each in arms)
             raise ValueError(f"the chain branches into {names}; name one with base=, or a tool with tool=")
         if arms:
-            body = max(arms, key=lambda each: below[each])
+            body = arms[int(np.argmax(lengths))]
         elif len(moving) == 1 and not _is_gripper(model, moving[0]):
             body = moving[0]
         else:  # nothing more that moves, or fingers
@@ -210,32 +215,33 @@ def _tip(model: mujoco.MjModel, base: str | None) -> int:
         if len(frames) != 1:
             break
         body = frames[0]
-    if len(chain_joints(model, body, base)) < 2:
+    if len(chain_joints(model, body, root)) < 2:
         raise ValueError("no chain of two or more hinges and slides leads to a tool; name one with tool=")
     return body
 
 
-def _is_branch(model: mujoco.MjModel, body: int, below: dict[int, int]) -> bool:
-    """Return True if a body is the first of an arm, and not of a finger."""
-    return below[body] >= LEAST_CHAIN and not _is_gripper(model, body)
+def _branches(model: mujoco.MjModel, body: int) -> tuple[list[int], list[int]]:
+    """Return the bodies that hang on a body and move, and those of them that begin an arm, and not a finger."""
+    moving = [each for each in _children(model, body) if _joints_below(model, each)]
+    arms = []
+    for each in moving:
+        if _joints_below(model, each) >= LEAST_CHAIN and not _is_gripper(model, each):
+            arms.append(each)
+    return moving, arms
 
 
 def _is_gripper(model: mujoco.MjModel, body: int) -> bool:
     """Return True if a joint of a body is named after a part of a gripper; or the body, where nothing moves on it."""
-    first = int(model.body_jntadr[body])
-    number = int(model.body_jntnum[body])
-    names = [model.joint(joint).name for joint in range(first, first + number)]
-    if names and _joints_below(model, body) == number:
+    names = _own_joints(model, body)
+    if names and _joints_below(model, body) == len(names):
         names.append(model.body(body).name)
     return any(GRIPPERS.search(name) for name in names)
 
 
 def _joints_below(model: mujoco.MjModel, body: int) -> int:
     """Return the greatest number of hinges and slides on a way from a body to a leaf, its own included."""
-    first = int(model.body_jntadr[body])
-    number = int(model.body_jntnum[body])
-    own = sum(model.jnt_type[joint] in MOVES for joint in range(first, first + number))
-    return own + max((_joints_below(model, each) for each in _children(model, body)), default=0)
+    deepest = max((_joints_below(model, each) for each in _children(model, body)), default=0)
+    return len(_own_joints(model, body)) + deepest
 
 
 def known_limits(table: dict[str, tuple[float, ...]], name: str, number: int) -> Float | None:

@@ -20,9 +20,8 @@ LONGEST_STEP = 0.5  # Greatest error that one iteration corrects, [m] and [rad] 
 DAMPING = 1e-2  # Damping for errors of 1; it falls with the error, so that the last iterations converge fast
 STALLED = 1e-9  # Greatest step of the joints that ends the iterations, [rad]
 SAME = 1e-3  # Greatest difference of joints in solutions that count as the same, [rad]
-NEAREST, INSIDE = 8, 1e-6
+INSIDE = 1e-6  # Least distance from the limits of joints from which the nearest place is looked for, [rad]
 PATIENCE = 4  # Factor on the number of seeds where the first ones find nothing
-"""Number of configurations from which the nearest place is looked for, and their distance from the limits, [rad]."""
 REACHED = 1e-9  # Greatest distance of the hand from a target in the plane, [m]
 
 
@@ -49,23 +48,17 @@ def solve_symmetric(matrix: Float, vector: Float, number: int) -> None:
 
 @compiled
 def descend(
-    chain: Chain,
-    joint_range: Float,
-    position: Float,
-    axes: Float,
-    oriented: bool,
-    joints: Float,
-    rotation: Float,
-    origin: Float,
+    chain: Chain, joint_range: Float, position: Float, axes: Float, oriented: bool, joints: Float
 ) -> float:
     """Move joints towards a target by damped least squares, and return the remaining error, 0 if it is reached.
 
     The step is J^T (J J^T + d^2 I)^-1 e for the error e of place and orientation, cut off at the limits of the joints
     (Y. Nakamura and H. Hanafusa, Inverse kinematic solutions with singularity robustness, 1986). Axes, shape (3, 3),
-    matter only if `oriented`; rotation and origin are memory for the frames of the links.
+    matter only if `oriented`.
     """
     last = len(chain.mass)
     rows = 6 if oriented else 3
+    rotation, origin = np.empty((last + 1, 3, 3)), np.empty((last + 1, 3))
     jacobian = np.empty((6, last))
     error = np.zeros(6)
     tool = np.empty(3)
@@ -178,7 +171,7 @@ def planar_limits(chain: Chain, joint_range: Float) -> Float:
 @kernel
 def in_planar_reach(chain: Chain, limits: Float, x: float, y: float) -> bool:
     """Return True where :func:`solve_planar` finds joints; without angles it takes a twentieth of the time."""
-    upper, fore = chain.first_two.upper, chain.first_two.fore
+    _, _, _, _, upper, fore = chain.first_two
     u = x - chain.origin[0, 0]
     v = y - chain.origin[0, 1]
     square = u * u + v * v
@@ -267,33 +260,22 @@ def _least_distance(arm: Arm, position: Float, begin: Float) -> float:
     """Return the least distance between tool and a place that is found from some configurations, (N, J), [m]."""
     from scipy.optimize import least_squares  # here, because it is needed where nothing was found only
 
-    def away(configurations: Float) -> Float:
-        return np.asarray(np.linalg.norm(arm.hand(configurations) - position, axis=-1))
-
     low, high = arm.joint_range.T
-    some = begin[np.argsort(away(begin))[:NEAREST]]
-    for configuration in some:
-        _descend(arm, position, None, configuration)
-    inside = np.clip(some[away(some).argmin()], low + INSIDE, high - INSIDE)
+    nearest = begin[np.linalg.norm(arm.hand(begin) - position, axis=-1).argmin()]
+    descend(arm.chain, arm.joint_range, position, np.eye(3), False, nearest)
+    inside = np.clip(nearest, low + INSIDE, high - INSIDE)
     found = least_squares(lambda joints: arm.hand(joints) - position, inside, bounds=(low, high))
     return float(np.linalg.norm(found.fun))
-
-
-def _descend(arm: Arm, position: Float, axes: Float | None, joints: Float) -> float:
-    """Move joints towards a target, see :func:`descend`; without axes any orientation will do."""
-    number = len(joints) + 1
-    memory = np.empty((number, 3, 3)), np.empty((number, 3))
-    target = np.eye(3) if axes is None else axes
-    return descend(arm.chain, arm.joint_range, position, target, axes is not None, joints, *memory)
 
 
 def _different_solutions(arm: Arm, position: Float, axes: Float | None, begin: Float) -> list[Float]:
     """Return the different configurations that put the tool at a target from those to begin with, (N, J)."""
     found: list[Float] = []
-    for configuration in begin.copy():
-        error = _descend(arm, position, axes, configuration)
-        if error == 0.0 and all(np.abs(configuration - other).max() > SAME for other in found):
-            found.append(configuration)
+    target = np.eye(3) if axes is None else axes
+    for joints in begin.copy():
+        error = descend(arm.chain, arm.joint_range, position, target, axes is not None, joints)
+        if error == 0.0 and all(np.abs(joints - other).max() > SAME for other in found):
+            found.append(joints)
     return found
 
 
@@ -307,7 +289,6 @@ def inverse_kinematics(
     quaternion: Any = None,
     *,
     seed: Any = None,
-    rng: np.random.Generator | None = None,
     n_seeds: int = 64,
 ) -> Float:
     """Return different joint positions that put the tool at a pose, the nearest to the first seed first, (S, J).
@@ -317,7 +298,6 @@ def inverse_kinematics(
         position: Place of the tool, shape (3,), [m].
         quaternion: Orientation (w, x, y, z) of the tool, shape (4,); None for any.
         seed: Joint positions to begin with, shape (J,); home by default.
-        rng: Random generator of further seeds; one with a fixed seed by default.
         n_seeds: Number of seeds; as many again, four times, where these find nothing.
 
     Raises:
@@ -333,12 +313,10 @@ def inverse_kinematics(
         [0.5, 0.2, 0.4]
     """
     position = finite_array("position", position, (3,))
-    axes = None
-    if quaternion is not None:
-        axes = frame_matrices(unit_quaternion("quaternion", quaternion))
+    axes = None if quaternion is None else frame_matrices(unit_quaternion("quaternion", quaternion))
     number = whole_number("n_seeds", n_seeds, 1)
     first = arm.home if seed is None else finite_array("seed", seed, arm.home.shape)
-    rng = np.random.default_rng(0) if rng is None else rng
+    rng = np.random.default_rng(0)
     low, high = arm.joint_range.T
     begin = np.concatenate((first[None], rng.uniform(low, high, (number - 1, len(low)))))
     found = _different_solutions(arm, position, axes, begin)

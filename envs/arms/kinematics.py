@@ -23,29 +23,6 @@ LEAST_TORQUE_SHARE = 0.01
 TORQUE_STRIDE = 2  # Torques are looked at in every second configuration: they change slowly
 
 
-class FirstTwo(NamedTuple):
-    """Angles and lengths of an arm of two hinges with vertical axes."""
-
-    upper_angle: float  # Angle of the upper arm in the frame of the shoulder, [rad]
-    fore_angle: float  # Angle of the forearm in the frame of the elbow, [rad]
-    elbow: float  # Angle of the frame of the elbow in that of the shoulder, [rad]
-    base: float  # Angle of the frame of the shoulder in the world, [rad]
-    upper: float  # Length of the upper arm, [m]
-    fore: float  # Length of the forearm, [m]
-
-    @classmethod
-    def of(cls, origin: Float, rotation: Float, tool_origin: Float) -> FirstTwo:
-        """Return the numbers of a chain; see :class:`Chain` for the arguments."""
-        return cls(
-            upper_angle=math.atan2(origin[1, 1], origin[1, 0]),
-            fore_angle=math.atan2(tool_origin[1], tool_origin[0]),
-            elbow=math.atan2(rotation[1, 1, 0], rotation[1, 0, 0]),
-            base=math.atan2(rotation[0, 1, 0], rotation[0, 0, 0]),
-            upper=math.hypot(origin[1, 0], origin[1, 1]),
-            fore=math.hypot(tool_origin[0], tool_origin[1]),
-        )
-
-
 class Chain(NamedTuple):
     """Serial chain of J joints with one link each.
 
@@ -66,8 +43,9 @@ class Chain(NamedTuple):
     armature: Float  # Inertia of the motors seen at the joints, shape (J,), [kg m^2] or [kg]
     damping: Float  # Viscous friction of the joints, shape (J,), [N m s/rad] or [N s/m]
     gravity: Float  # Gravitational acceleration, shape (3,), [m/s^2]
-    # Angles and lengths of the first two links, for the inverse kinematics of an arm in the plane
-    first_two: FirstTwo
+    # Of an arm in the plane: angles of the upper arm in the frame of the shoulder, of the forearm in that of the elbow,
+    # of the latter in the former, and of the former in the world, [rad], and the lengths of both, [m]
+    first_two: tuple[float, float, float, float, float, float]
 
 
 class Spheres(NamedTuple):
@@ -292,51 +270,6 @@ def _product(matrix: Float, vector: Vector) -> Vector:
 
 
 @compiled
-def slowdown(
-    chain: Chain,
-    velocity_limit: Float,
-    torque_limit: Float,
-    position: Float,
-    velocity: Float,
-    acceleration: Float,
-) -> float:
-    """Return the factor by which a movement must be slower to keep the limits; less than 1 if it may be faster.
-
-    If all durations are multiplied by s, velocities become 1/s of what they were, and the torque of the motion becomes
-    a sum of a term with 1/s^2 and one with 1/s, the viscous friction. Gravity stays. So joint j needs
-
-        |v| / s <= share limit_v,    |m| / s^2 + |f| / s <= share limit_t - g,
-
-    with the torques m of inertia, f of friction, and g of gravity in the direction of the motion's torque. Positions,
-    velocities and accelerations have the shape (T, J); limits are infinite for none.
-    """
-    joints = position.shape[1]
-    least = 0.0
-    rest = np.zeros(joints)
-    heavy = np.empty(joints)
-    whole = np.empty(joints)
-    for k in range(len(position)):
-        for j in range(joints):
-            least = max(least, abs(velocity[k, j]) / (LIMIT_SHARE * velocity_limit[j]))
-        if k % TORQUE_STRIDE and k < len(position) - 1:  # torques change slowly
-            continue
-        inverse_dynamics(chain, position[k], rest, rest, heavy)
-        inverse_dynamics(chain, position[k], velocity[k], acceleration[k], whole)
-        for j in range(joints):
-            friction = chain.damping[j] * velocity[k, j]
-            motion = whole[j] - heavy[j] - friction
-            against = heavy[j] if motion + friction >= 0.0 else -heavy[j]
-            room = max(LIMIT_SHARE * torque_limit[j] - against, LEAST_TORQUE_SHARE * torque_limit[j])
-            if room > 1e9:  # no limit
-                continue
-            friction = abs(friction)
-            # The positive root of room s^2 - |f| s - |m| = 0.
-            root = np.sqrt(friction * friction + 4.0 * room * abs(motion))
-            least = max(least, (friction + root) / (2.0 * room))
-    return least
-
-
-@compiled
 def slowdowns(
     chain: Chain,
     velocity_limit: Float,
@@ -345,12 +278,42 @@ def slowdowns(
     velocity: Float,
     acceleration: Float,
 ) -> Float:
-    """Return :func:`slowdown` of N movements, with arrays of shape (N, T, J)."""
-    found = np.empty(len(position))
-    for row in range(len(position)):
-        found[row] = slowdown(
-            chain, velocity_limit, torque_limit, position[row], velocity[row], acceleration[row]
-        )
+    """Return factors by which N movements must be slower to keep the limits; less than 1 for those that may be faster.
+
+    If all durations are multiplied by s, velocities become 1/s of what they were, and the torque of the motion becomes
+    a sum of a term with 1/s^2 and one with 1/s, the viscous friction. Gravity stays. So joint j needs
+
+        |v| / s <= share limit_v,    |m| / s^2 + |f| / s <= share limit_t - g,
+
+    with the torques m of inertia, f of friction, and g of gravity in the direction of the motion's torque. Positions,
+    velocities and accelerations have the shape (N, T, J); limits are infinite for none.
+    """
+    number, length, joints = position.shape
+    found = np.empty(number)
+    rest = np.zeros(joints)
+    heavy = np.empty(joints)
+    whole = np.empty(joints)
+    for n in range(number):
+        least = 0.0
+        for k in range(length):
+            for j in range(joints):
+                least = max(least, abs(velocity[n, k, j]) / (LIMIT_SHARE * velocity_limit[j]))
+            if k % TORQUE_STRIDE and k < length - 1:  # torques change slowly
+                continue
+            inverse_dynamics(chain, position[n, k], rest, rest, heavy)
+            inverse_dynamics(chain, position[n, k], velocity[n, k], acceleration[n, k], whole)
+            for j in range(joints):
+                friction = chain.damping[j] * velocity[n, k, j]
+                motion = whole[j] - heavy[j] - friction
+                against = heavy[j] if motion + friction >= 0.0 else -heavy[j]
+                room = max(LIMIT_SHARE * torque_limit[j] - against, LEAST_TORQUE_SHARE * torque_limit[j])
+                if room > 1e9:  # no limit
+                    continue
+                friction = abs(friction)
+                # The positive root of room s^2 - |f| s - |m| = 0.
+                root = np.sqrt(friction * friction + 4.0 * room * abs(motion))
+                least = max(least, (friction + root) / (2.0 * room))
+        found[n] = least
     return found
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
+from viapoint.envs.arms.arm import Arm, arm_from_xml, asset, move
 from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
 from viapoint.envs.arms.choices import (
     KNOWN_TORQUES,
@@ -45,29 +45,28 @@ WEIGHTS, LEAST_TORQUE = 3.0, 1.0
 WEIGHED = 200  # Number of configurations in which the arm is weighed
 # Numbers of configurations in which bodies that are always near are looked for, and contacts of these
 LOOKED_AT, NEAR_LOOKED_AT = 16, 1000
-# Distance within which bodies are near in at least half of the configurations, and tolerance for these, [m]
+# Distance within which bodies are near in at least half of the configurations, and tolerance for these, which is the
+# least one, [m]
 NEAR, FINE = 0.03, 0.005
-STUCK = (
-    100.0  # Damping beyond which a joint hardly moves: its torque at full speed, relative to the torque limit
-)
+# Damping beyond which a joint hardly moves: its torque at full speed, relative to the torque limit
+STUCK = 100.0
 # Names of files that do not tell the arm; it gets the name of the model
 GENERIC_NAMES = ("arm", "model", "robot", "scene")
 MIN_JOINTS = 2  # Least number of joints
-MIN_TOLERANCE, MAX_TOLERANCE = 0.005, 1.0  # Bounds of the tolerance of fitted capsules, [m]
+MAX_TOLERANCE = 1.0  # Greatest tolerance of fitted capsules, [m]
 # Distance at home that capsules leave between bodies, as a share of that of the geoms, and at most, [m]
 LEFT_SHARE, LEFT_MOST = 0.25, 0.002
 LEAST_EXCESS = 0.001  # Excess of capsules below which they are not split, [m]
 SHORT = 1e-5  # Length of a capsule that is written as a sphere around it, [m]
 MIN_INERTIA = 1e-12  # Least principal moment of inertia of a body, [kg m^2]
-# Relative margin of the triangle inequality of principal moments; the text of a model keeps six digits
-INERTIA_MARGIN = 2e-5
+INERTIA_MARGIN = 2e-5  # Relative margin of the triangle inequality of principal moments
 # Transmissions of actuators that drive a joint directly
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 # Types of geoms that are left out
 GROUNDS = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 RESERVED = ("", "world", "meshes")  # Names that bodies of the arm cannot have, beside those of obstacles
 
-Pair = tuple[int, int]  # Numbers of two bodies, the first one first in the file
+Pair = tuple[int, int]  # Numbers of two bodies, that of the lower link first
 
 
 class Parsed(NamedTuple):
@@ -78,33 +77,18 @@ class Parsed(NamedTuple):
     rest: mujoco.MjData
     moved: mujoco.MjData  # Places in any configuration
     joints: tuple[str, ...]
+    carriers: list[int]  # Body of each joint
     tool: Tool
     links: dict[int, int]  # Link of each body of the arm, 0 for the base, in the order of the file
     # Names of these bodies in the model of the arm: those of the file, where it has free ones
     names: dict[int, str]
-    # Geoms of each of these bodies that count for collisions; bodies without any are left out
+    # Geoms of each of these bodies that count for collisions, by links; bodies without any are left out
     geoms: dict[int, list[int]]
+    pairs: list[Pair]  # Pairs of bodies with geoms, of different links
 
-    def pair(self, bodies: Pair) -> frozenset[str]:
+    def named(self, pair: Pair) -> frozenset[str]:
         """Return the names of a pair of bodies."""
-        return frozenset(self.names[body] for body in bodies)
-
-    def compared(self, exclude: Mapping[Pair, str]) -> list[Pair]:
-        """Return the pairs of bodies with geoms of different links that are not excluded."""
-        found = []
-        for first, second in itertools.combinations(self.geoms, 2):
-            if self.links[first] != self.links[second] and (first, second) not in exclude:
-                found.append((first, second))
-        return found
-
-    def consecutive(self) -> list[Pair]:
-        """Return the pairs of bodies of consecutive links; of the base, those that carry the first link count."""
-        found = []
-        for first, second in self.compared({}):
-            carries = first > 0 and first in ancestors(self.model, second)
-            if self.links[second] - self.links[first] == 1 and (self.links[first] or carries):
-                found.append((first, second))
-        return found
+        return frozenset(self.names[body] for body in pair)
 
 
 def load_arm(
@@ -173,7 +157,7 @@ def load_arm(
         "joint_range": joint_range,
         "torque_limit": torque_limit,
         "velocity_limit": velocity_limit,
-        "tolerance": number_of_at_least("tolerance", tolerance, MIN_TOLERANCE, MAX_TOLERANCE),
+        "tolerance": number_of_at_least("tolerance", tolerance, FINE, MAX_TOLERANCE),
     }
     notes = list(urdf.notes)
     whole = _compiled(spec, notes)
@@ -195,30 +179,26 @@ def _load(
     given: Mapping[str, Any],
 ) -> Arm:
     """Return the arm of a model and the given arguments; see :func:`load_arm`."""
-    base = given["base"]
-    chosen = choose_tool(whole, given["tool"], base)
+    chosen = choose_tool(whole, given["tool"], given["base"])
     notes.insert(0, f"tool: {chosen.name!r}")
     names = given["joints"]
-    if base is not None and whole.body(base).id not in (chosen.body, *ancestors(whole, chosen.body)):
-        raise ValueError(f"the tool {chosen.name!r} is not carried by base={base!r}; name one of both")
     if names is None:
-        chain = chain_joints(whole, chosen.body, base)
+        chain = chain_joints(whole, chosen.body, 0 if given["base"] is None else whole.body(given["base"]).id)
         if not chain:
             raise ValueError(f"no joint moves the tool {chosen.name!r}; name another one with tool=")
         names = _joint_names(arm_joints(whole, chain, notes))
         notes.append(f"joints: {', '.join(names)}")
-    there = [whole.joint(index).name for index in range(whole.njnt)]
-    missing = [each for each in names if each not in there]
-    if missing:
-        named = ", ".join(filter(None, there)) or "none"
-        raise ValueError(f"there is no joint {', '.join(map(repr, missing))} in the file; there are: {named}")
+    try:
+        numbers = [whole.joint(each).id for each in names]
+    except KeyError as error:  # the message tells the names that there are
+        raise ValueError(f"joints: {error.args[0]}") from None
     ranges = _ranges(whole, names, given["joint_range"], notes)
     velocity = _velocities(whole, names, given["velocity_limit"], urdf.velocity_limits, known_as, notes)
     torque = _torques(whole, names, given["torque_limit"], known_as, notes)
     for what, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
         if not (limit > 0.0).all():
             raise ValueError(f"{what} must be positive, got {limit}")
-    dofs = np.array([whole.jnt_dofadr[whole.joint(each).id] for each in names])
+    dofs = whole.jnt_dofadr[numbers]
     # Models that are moved by other means than motors have such damping.
     stuck = whole.dof_damping[dofs].reshape(len(names), -1)[:, 0] * velocity > STUCK * torque
     if stuck.any():
@@ -229,38 +209,31 @@ def _load(
         whole.dof_damping[dofs[stuck]] = 0.0
     parsed = _parse(whole, names, chosen, notes)
     # Pairs that cannot touch are not compared: those of the file, and those that are always near and always apart.
-    exclude = dict.fromkeys(_excluded(parsed, urdf.never_touch), "excluded in the file")
-    exclude |= dict.fromkeys(parsed.consecutive(), "consecutive links")
+    exclude = _excluded(parsed, urdf.never_touch)
     never = f"in contact in none of {NEAR_LOOKED_AT:,} configurations, though always near"
-    pairs = parsed.compared(exclude)
+    pairs = [pair for pair in parsed.pairs if pair not in exclude]
     low, high = ranges.T
     drawn = np.random.default_rng(0).uniform(low, high, (NEAR_LOOKED_AT, len(names)))
     looked_at = np.array([_distances(parsed, each, pairs) for each in drawn[:LOOKED_AT]])
-    near = list(itertools.compress(pairs, np.median(looked_at, axis=0) < NEAR))
+    near = set(itertools.compress(pairs, np.median(looked_at, axis=0) < NEAR))
     apart = _apart(parsed, near, drawn)
     exclude |= dict.fromkeys(apart, never)
     movable = itertools.compress(pairs, looked_at.max(axis=0) > 0.0)
-    kept = [pair for pair in movable if pair not in exclude]
-    home = _home(parsed, ranges, given["home"], kept, notes)
+    home = _home(parsed, ranges, given["home"], [pair for pair in movable if pair not in exclude], notes)
     origin = np.zeros(3) if given["origin"] is None else finite_array("origin", given["origin"], (3,))
     # Bodies that are near at home get smaller capsules, or are not compared, either.
-    pairs = parsed.compared(exclude)
-    at_home = _distances(parsed, home, pairs)
-    close = itertools.compress(pairs, (at_home > 0.0) & (at_home < LEAST_GAP))
+    at_home = dict(zip(pairs, _distances(parsed, home, pairs).tolist(), strict=True))
+    close = [pair for pair in pairs if pair not in exclude and 0.0 < at_home[pair] < LEAST_GAP]
     exclude |= dict.fromkeys(_apart(parsed, close, drawn), never)
-    distances = {}
-    for pair, away in zip(pairs, at_home.tolist(), strict=True):
-        if away > 0.0 and pair not in exclude:
-            distances[pair] = away
-    tolerance = given["tolerance"]
-    tolerances = dict.fromkeys(parsed.geoms, tolerance)
-    for pair in set(near) - set(apart):
-        tolerances.update(dict.fromkeys(pair, min(FINE, tolerance)))
+    distances = {pair: away for pair, away in at_home.items() if away > 0.0 and pair not in exclude}
+    tolerances = dict.fromkeys(parsed.geoms, given["tolerance"])
+    for pair in near.difference(apart):
+        tolerances.update(dict.fromkeys(pair, FINE))
     xml, excess = _fitted(parsed, ranges, origin, home, distances, tolerances)
-    numbers = {known: body for body, known in parsed.names.items()}
+    bodies = {known: body for body, known in parsed.names.items()}
 
     def touch(first: str, second: str, configuration: Float) -> bool:
-        return bool(_distances(parsed, configuration, [(numbers[first], numbers[second])])[0] <= 0.0)
+        return bool(_distances(parsed, configuration, [(bodies[first], bodies[second])])[0] <= 0.0)
 
     arm = arm_from_xml(
         name,
@@ -270,24 +243,23 @@ def _load(
         home=home,
         velocity_limit=velocity,
         torque_limit=torque,
-        exclude={parsed.pair(pair): reason for pair, reason in exclude.items()},
+        exclude={parsed.named(pair): reason for pair, reason in exclude.items()},
         touch=touch,
     )
     weight = np.abs(torques(arm.chain, home, np.zeros(1), np.zeros(1)))
     weak = weight > torque
-    some = ", ".join(itertools.compress(names, weak))
-    if some and given["torque_limit"] is not None:
-        raise ValueError(
-            f"the torque limits of {some} do not hold the arm's own weight at home; raise torque_limit"
-        )
-    if some:  # a spring or a counterweight may bear it, which the file does not have
+    if weak.any():  # a spring or a counterweight may bear it, which the file does not have
+        some = ", ".join(itertools.compress(names, weak))
+        if given["torque_limit"] is not None:
+            raise ValueError(
+                f"the torque limits of {some} do not hold the arm's own weight at home; raise torque_limit"
+            )
         notes.append(
             f"{WARNING}torque limits of {some}: {WEIGHTS:g} times the weight at home, which those of the file do not "
             "hold; give torque_limit"
         )
         torque = np.where(weak, WEIGHTS * weight, torque)
-    limited = whole.jnt_limited[[whole.joint(each).id for each in names]].astype(bool)
-    endless = itertools.compress(names, ~limited & ~arm.chain.sliding)
+    endless = itertools.compress(names, (whole.jnt_limited[numbers] == 0) & ~arm.chain.sliding)
     return replace(
         arm,
         excess=arm.excess + excess,
@@ -312,20 +284,17 @@ def _read(file: Any, packages: tuple[str | Path, ...]) -> tuple[mujoco.MjSpec, s
         raise TypeError(f"file must be the name or the text of an MJCF file, or an MjSpec, got {file!r:.60}")
     text = os.fspath(file)
     is_text = text.lstrip().startswith("<")
-    text = text if is_text else os.path.expanduser(text)
-    path = Path(text)
+    path = Path(text).expanduser()
+    urdf = nothing._replace(text=text if is_text else "")
     if not is_text and not path.is_file():
         raise ValueError(f"there is no file {text!r}")
-    urdf = nothing
     if not is_text and (path.suffix.lower() == ".urdf" or b"<robot" in path.read_bytes()[:4096]):
         urdf = read_urdf(path, packages)
     try:
-        as_text = urdf.text or (text if is_text else "")
-        spec = (
-            mujoco.MjSpec.from_string(as_text, assets=urdf.assets)
-            if as_text
-            else mujoco.MjSpec.from_file(text)
-        )
+        if urdf.text:
+            spec = mujoco.MjSpec.from_string(urdf.text, assets=urdf.assets)
+        else:
+            spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot read {text!r:.60} as MJCF or URDF: {error}") from None
     named_after_model = is_text or path.stem.lower() in GENERIC_NAMES
@@ -354,11 +323,11 @@ def _leave_out(spec: mujoco.MjSpec, fault: str) -> str:
     """
     quoted = [Path(each) for each in re.findall(r"'(.+?)'", fault)]
 
-    def is_meant(file: str) -> bool:
-        return bool(file) and any(path.match(file) for path in quoted)
+    def is_meant(*names: str) -> bool:
+        return any(path.match(name) for path in quoted for name in names if name)
 
     for texture in spec.textures:
-        if any(map(is_meant, (texture.file, *texture.cubefiles))):
+        if is_meant(texture.file, *texture.cubefiles):
             name = texture.name or Path(texture.file).stem
             for material in spec.materials:
                 material.textures = ["" if each == name else each for each in material.textures]
@@ -366,15 +335,16 @@ def _leave_out(spec: mujoco.MjSpec, fault: str) -> str:
             return f"left out: texture {name}, which is missing or broken"
     for mesh in spec.meshes:
         name = mesh.name or Path(mesh.file).stem
-        if not is_meant(mesh.file) and not (mesh.file and f"Element name {name!r}" in fault):
+        if not mesh.file or not is_meant(mesh.file, name):
             continue
         geoms = [geom for geom in spec.geoms if geom.meshname == name]
         bodies = [geom.parent.name for geom in geoms if geom.contype or geom.conaffinity]
         if bodies:
-            named = f"the mesh {mesh.file} of {', '.join(bodies)}, which collides,"
             # A text has no folder to look in.
             advice = "; give the URDF as a file, and packages=" if "package:" in mesh.file else ""
-            raise ValueError(f"{named} is missing or broken: {fault}{advice}")
+            raise ValueError(
+                f"the mesh {mesh.file} of {', '.join(bodies)}, which collides, is missing or broken: {fault}{advice}"
+            )
         bare = [geom.parent.name for geom in geoms if len(geom.parent.geoms) == 1]
         for part in (*geoms, mesh):
             spec.delete(part)
@@ -402,49 +372,46 @@ def _per_joint(name: str, values: Any, joints: tuple[str, ...]) -> Float:
 
 def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: list[str]) -> Float:
     """Return the range of each joint, as MuJoCo read it from the file or as given, shape (J, 2)."""
-    found, endless = [], []
-    for name in joints:
-        joint = model.joint(name).id
-        if not np.isin(model.jnt_type[joint], MOVES):
-            raise ValueError(f"joint {name!r} is neither a hinge nor a slide; leave it out to fix it")
-        limited = bool(model.jnt_limited[joint])
-        if given is None and not limited and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
-            raise ValueError(
-                f"joint {name!r} has no limits; give it a range in the file, or give joint_range"
-            )
-        if given is None and not limited:
-            endless.append(name)
-        found.append(model.jnt_range[joint] if limited else (-np.pi, np.pi))
-    if endless:
-        notes.append(f"range of {', '.join(endless)}, continuous: +-pi")
-    if given is None:
-        return np.array(found)
-    ranges = finite_array("joint_range", given, (len(joints), 2))
-    if (ranges[:, 0] >= ranges[:, 1]).any():
-        raise ValueError(f"joint_range must be pairs in increasing order, got {given!r}")
-    return ranges
+    numbers = [model.joint(name).id for name in joints]
+    kinds = model.jnt_type[numbers]
+    if not np.isin(kinds, MOVES).all():
+        some = ", ".join(itertools.compress(joints, ~np.isin(kinds, MOVES)))
+        raise ValueError(f"neither a hinge nor a slide: {some}; leave it out to fix it")
+    if given is not None:
+        ranges = finite_array("joint_range", given, (len(joints), 2))
+        if (ranges[:, 0] >= ranges[:, 1]).any():
+            raise ValueError(f"joint_range must be pairs in increasing order, got {given!r}")
+        return ranges
+    endless = model.jnt_limited[numbers] == 0
+    some = ", ".join(itertools.compress(joints, endless))
+    if (endless & (kinds == MOVES[1])).any():
+        raise ValueError(
+            f"slides need limits, but {some} has none; give it a range in the file, or joint_range"
+        )
+    if some:
+        notes.append(f"range of {some}, continuous: +-pi")
+    return np.where(endless[:, None], (-np.pi, np.pi), model.jnt_range[numbers])
 
 
 def _torques(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, arm: str, notes: list[str]) -> Float:
     """Return the torque limit of each joint, its own, or the greatest of the actuators that drive it."""
     if given is not None:
         return _per_joint("torque_limit", given, joints)
-    found = []
-    for name in joints:
+    found = np.zeros(len(joints))
+    for i, name in enumerate(joints):
         joint = model.joint(name).id
         if model.jnt_actfrclimited[joint]:
-            found.append(_symmetric_limit(model.jnt_actfrcrange[joint]))
+            found[i] = _symmetric_limit(model.jnt_actfrcrange[joint])
             continue
         drives = np.isin(model.actuator_trntype, JOINT_TRANSMISSIONS) & (model.actuator_trnid[:, 0] == joint)
-        limits = [_actuator_torque(model, int(index)) for index in np.flatnonzero(drives)]
-        found.append(max(limits, default=0.0))
-    torque = np.array(found)
+        for index in np.flatnonzero(drives):
+            found[i] = max(found[i], _actuator_torque(model, int(index)))
     known = known_limits(KNOWN_TORQUES, arm, len(joints))
     weight: Any = 0.0
-    if known is None and (torque <= 0.0).any():
+    if known is None and (found <= 0.0).any():
         weight = np.maximum(WEIGHTS * _greatest_weight(model, joints), LEAST_TORQUE)
     how = f"{WEIGHTS:g} times what the arm's weight needs"
-    return _completed("torque", joints, torque, known, weight, how, notes)
+    return _completed("torque", joints, found, known, weight, how, notes)
 
 
 def _completed(
@@ -458,24 +425,21 @@ def _completed(
 ) -> Float:
     """Return limits of which missing ones, which are 0, are those of a known arm or a default; a note tells it."""
     missing = limits <= 0.0
-    if not missing.any():
-        return limits
-    if known is not None:
-        notes.append(f"{what} limits: those of the arm of this name")
-        return np.where(missing, known, limits)
     some = ", ".join(itertools.compress(joints, missing))
-    notes.append(f"{WARNING}the file has no {what} limits of {some}; they get {how}; give {what}_limit")
-    return np.where(missing, default, limits)
+    if some and known is not None:
+        notes.append(f"{what} limits: those of the arm of this name")
+    elif some:
+        notes.append(f"{WARNING}the file has no {what} limits of {some}; they get {how}; give {what}_limit")
+    return np.where(missing, default if known is None else known, limits)
 
 
 def _greatest_weight(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
     """Return the greatest torques that gravity needs in random configurations, shape (J,)."""
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    address = [int(model.joint(name).qposadr[0]) for name in joints]
     dofs = [int(model.joint(name).dofadr[0]) for name in joints]
     greatest = np.zeros(len(joints))
     for _ in range(WEIGHED):
-        data.qpos[address] = rng.uniform(-np.pi, np.pi, len(joints))
+        move(data, joints, rng.uniform(-np.pi, np.pi, len(joints)))
         mujoco.mj_forward(model, data)
         greatest = np.maximum(greatest, np.abs(data.qfrc_bias[dofs]))
     return greatest
@@ -507,10 +471,10 @@ def _velocities(
     notes: list[str],
 ) -> Float:
     """Return the velocity limit of each joint, shape (J,)."""
+    if given is None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
+        given = model.numeric("velocity_limit").data
     if given is not None:
         return _per_joint("velocity_limit", given, joints)
-    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
-        return _per_joint("velocity_limit", model.numeric("velocity_limit").data, joints)
     found = np.array([in_urdf.get(name, 0.0) for name in joints])
     how = f"{DEFAULT_VELOCITY_LIMIT:g} rad/s (slides {DEFAULT_VELOCITY_LIMIT:g} m/s)"
     known = known_limits(KNOWN_VELOCITIES, arm, len(joints))
@@ -520,22 +484,21 @@ def _velocities(
 def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[Pair], notes: list[str]) -> Float:
     """Return the home configuration, shape (J,), in which some pairs of bodies do not touch."""
     model, joints = parsed.model, parsed.joints
+    low, high = ranges.T
     if given is not None:
         home = _per_joint("home", given, joints)
-        outside = (home < ranges[:, 0]) | (home > ranges[:, 1])
-        if outside.any():
-            raise ValueError(f"home is outside the range of {', '.join(itertools.compress(joints, outside))}")
+        outside = ", ".join(itertools.compress(joints, (home < low) | (home > high)))
+        if outside:
+            raise ValueError(f"home is outside the range of {outside}")
         return home
-    candidates = {}
-    if model.nkey:
-        address = [int(model.joint(name).qposadr[0]) for name in joints]
-        candidates["the file's keyframe"] = model.key_qpos[0, address].copy()
-    low, high = ranges.T
-    candidates |= {"zeros": np.zeros(len(joints)), "the middle of the ranges": 0.5 * (low + high)}
 
     def apart(configuration: Float) -> float:
         return float(_distances(parsed, configuration, pairs).min(initial=1.0))
 
+    candidates = {"zeros": np.zeros(len(joints)), "the middle of the ranges": 0.5 * (low + high)}
+    if model.nkey:
+        address = [int(model.joint(name).qposadr[0]) for name in joints]
+        candidates = {"the file's keyframe": model.key_qpos[0, address].copy(), **candidates}
     for origin, configuration in candidates.items():
         inside = (configuration >= low) & (configuration <= high)
         if inside.all() and apart(configuration) >= LEAST_GAP:
@@ -550,38 +513,44 @@ def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[Pair], notes: l
 def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: list[str]) -> Parsed:
     """Return the arm of a model: the bodies that its joints move, and what they stand on."""
     carriers = [int(model.joint(name).bodyid[0]) for name in joints]
+    for i in range(1, len(joints)):
+        if carriers[i - 1] not in ancestors(model, carriers[i]):
+            raise ValueError(
+                "joints must be in order from the base, each on a body of its own: "
+                f"{joints[i - 1]!r} does not carry {joints[i]!r}"
+            )
     moves_with = np.zeros(model.nbody, int)
     for body in range(1, model.nbody):
         moves_with[body] = moves_with[model.body_parentid[body]]
         if body in carriers:
             moves_with[body] = carriers.index(body) + 1
-    _check_order(model, joints, carriers)
     if moves_with[tool.body] != len(joints):
         raise ValueError(f"the tool does not move with the last joint, {joints[-1]!r}")
     rest = mujoco.MjData(model)
     rest.qpos[:] = model.key_qpos[0] if model.nkey else model.qpos0
-    _move(rest, joints, np.zeros(len(joints)))
-    root = int(model.body_rootid[carriers[0]])
+    move(rest, joints, np.zeros(len(joints)))
+    root = model.body_rootid[carriers[0]]
     links: dict[int, int] = {}
     names: dict[int, str] = {}
     taken = {model.body(body).name for body in range(model.nbody)}
-    for body in range(model.nbody):
-        link = int(moves_with[body])
-        if link or body == 0 or model.body_rootid[body] == root:
-            links[body] = link
-            name = str(model.body(body).name)
-            if body == 0 or name in RESERVED or name.startswith("obstacle_"):
-                name = f"body_{body}" if link else f"base_{body}"
-                while name in taken:
-                    name += "_"
-            names[body] = name
+    for body in np.flatnonzero(
+        moves_with | (model.body_rootid == root) | (np.arange(model.nbody) == 0)
+    ).tolist():
+        links[body] = int(moves_with[body])
+        name = str(model.body(body).name)
+        if name in RESERVED or name.startswith("obstacle_"):
+            name = f"body_{body}" if links[body] else f"base_{body}"
+            while name in taken:
+                name += "_"
+        names[body] = name
     geoms = _collision_geoms(model, links)
     if not any(links[body] for body in geoms):
         raise ValueError(
             f"no geom moves with any of {', '.join(joints)}: nothing of the arm can collide; {'; '.join(notes)}"
         )
+    pairs = [(one, other) for one, other in itertools.combinations(geoms, 2) if links[one] != links[other]]
     _note_rest(model, joints, tool, list(links), notes)
-    return Parsed(model, rest, copy.copy(rest), joints, tool, links, names, geoms)
+    return Parsed(model, rest, copy.copy(rest), joints, carriers, tool, links, names, geoms, pairs)
 
 
 def _note_rest(
@@ -590,30 +559,30 @@ def _note_rest(
     """Note what the arm does not take from its file: other bodies and joints, planes, and forces such as of springs."""
     collides = (model.geom_contype | model.geom_conaffinity) > 0
     ground = np.isin(model.geom_type, GROUNDS)
-    others = set(model.geom_bodyid[collides & ~ground].tolist()) - set(bodies)
-    still = {body for body in others if model.body_weldid[body] == 0}
-    if still:
-        walls = _body_names(model, still)
-        notes.append(f"{WARNING}left out, though the arm may hit them: {walls}; give them as obstacles")
-    if others - still:
-        notes.append(f"left out, not part of the arm: {_body_names(model, others - still)}")
+    others = np.setdiff1d(model.geom_bodyid[collides & ~ground], bodies)
+    still = model.body_weldid[others] == 0
+    for some, what in (
+        (others[still], f"{WARNING}left out, though the arm may hit them: {{}}; give them as obstacles"),
+        (others[~still], "left out, not part of the arm: {}"),
+    ):
+        if some.size:
+            notes.append(what.format(", ".join(sorted(model.body(body).name or str(body) for body in some))))
     carrying = (tool.body, *ancestors(model, tool.body))
-    fixed = np.isin(model.jnt_bodyid, carrying) & ~np.isin(model.jnt_type, MOVES)
-    if fixed.any():
-        named = ", ".join(model.joint(index).name for index in np.flatnonzero(fixed))
+    fixed = np.flatnonzero(np.isin(model.jnt_bodyid, carrying) & ~np.isin(model.jnt_type, MOVES))
+    if fixed.size:
+        named = ", ".join(model.joint(index).name for index in fixed)
         notes.append(f"fixed: {named}, neither a hinge nor a slide")
     if (collides & ground).any():
         notes.append("left out: planes and height fields of the file; a floor is an obstacle, HalfSpace")
     numbers = [model.joint(name).id for name in joints]
-    dofs = model.jnt_dofadr[numbers]
     forces = {
         "springs": model.jnt_stiffness[numbers],
-        "dry friction": model.dof_frictionloss[dofs],
+        "dry friction": model.dof_frictionloss[model.jnt_dofadr[numbers]],
         "gravity compensation": model.body_gravcomp[bodies],
     }
-    some = [what for what, values in forces.items() if values.any()]
-    if some:
-        notes.append(f"left out of torques: {', '.join(some)}")
+    some_forces = ", ".join(what for what, values in forces.items() if values.any())
+    if some_forces:
+        notes.append(f"left out of torques: {some_forces}")
     coupled = model.eq_obj1id[(model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (model.eq_active0 > 0)]
     followers = ", ".join(itertools.compress(joints, np.isin(numbers, coupled)))
     if followers:
@@ -622,45 +591,27 @@ def _note_rest(
         )
 
 
-def _body_names(model: mujoco.MjModel, bodies: Iterable[int]) -> str:
-    """Return the names of bodies, or their numbers, in a row."""
-    return ", ".join(sorted(model.body(body).name or str(body) for body in bodies))
-
-
 def _collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, list[int]]:
     """Return the geoms of each body: those that collide, or all of a link of which none does; grounds are left out."""
     collides = (model.geom_contype | model.geom_conaffinity) > 0
     solid = ~np.isin(model.geom_type, GROUNDS)
+    link = np.array([links.get(int(body), -1) for body in model.geom_bodyid])
     found = {}
-    for link in sorted(set(links.values())):
-        bodies = [body for body in links if links[body] == link]
-        used = solid & np.isin(model.geom_bodyid, bodies)
+    for body in sorted(links, key=lambda body: links[body]):
+        used = solid & (link == links[body])
         if (used & collides).any():
             used &= collides
-        for body in bodies:
-            geoms = np.flatnonzero(used & (model.geom_bodyid == body)).tolist()
-            if geoms:
-                found[body] = geoms
+        geoms = np.flatnonzero(used & (model.geom_bodyid == body)).tolist()
+        if geoms:
+            found[body] = geoms
     return found
 
 
-def _check_order(model: mujoco.MjModel, joints: tuple[str, ...], bodies: list[int]) -> None:
-    """Check that each joint carries the next one."""
-    for i in range(1, len(joints)):
-        first, second = joints[i - 1], joints[i]
-        if bodies[i - 1] == bodies[i]:
-            raise ValueError(
-                f"joints {first!r} and {second!r} belong to one body; leave one out to fix it, or give each a body of "
-                "its own in the file"
-            )
-        if bodies[i - 1] not in ancestors(model, bodies[i]):
-            raise ValueError(f"joints must be in order from the base: {first!r} does not carry {second!r}")
+def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> dict[Pair, str]:
+    """Return the pairs of bodies that the file, or an SRDF file, does not let collide, and those of consecutive links.
 
-
-def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> list[Pair]:
-    """Return the pairs of bodies that the file does not let collide, or an SRDF file.
-
-    MuJoCo decides by contact bits, excluded bodies, and explicit pairs of geoms.
+    Of the base, the bodies that carry the first link count. MuJoCo decides by contact bits, excluded bodies, and
+    explicit pairs of geoms.
     """
     model = parsed.model
     silent = set(map(frozenset, never_touch))
@@ -668,15 +619,18 @@ def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> list[Pa
     types, affinities = model.geom_contype, model.geom_conaffinity
     # Geoms that collide with nothing stand for a link that has no others.
     spare = (types | affinities) == 0
-    found = []
-    for first, second in parsed.compared({}):
+    found = {}
+    for first, second in parsed.pairs:
         collide = False
         for a, b in itertools.product(parsed.geoms[first], parsed.geoms[second]):
             bits = (types[a] & affinities[b]) | (types[b] & affinities[a])
             collide = collide or bool(bits or spare[a] or spare[b] or frozenset((a, b)) in explicit)
         excluded = (min(first, second) << 16) + max(first, second) in model.exclude_signature
-        if excluded or not collide or parsed.pair((first, second)) in silent:
-            found.append((first, second))
+        carries = first > 0 and first in ancestors(model, second)
+        if parsed.links[second] - parsed.links[first] == 1 and (parsed.links[first] or carries):
+            found[first, second] = "consecutive links"
+        elif excluded or not collide or parsed.named((first, second)) in silent:
+            found[first, second] = "excluded in the file"
     return found
 
 
@@ -703,23 +657,29 @@ def _fitted(
             fits[body] += cover_geom(model, geom, tolerances[body])
     while True:
         xml = _write(parsed, ranges, origin, fits)
-        near = _near_capsules(parsed, xml, home, distances)
-        if not near:
-            break
+        capsules = mujoco.MjModel.from_xml_string(xml)
+        data = mujoco.MjData(capsules)
+        move(data, parsed.joints, home)
+        begin = {body: int(capsules.body(parsed.names[body]).geomadr[0]) for body in fits}
         coarse: set[tuple[int, int]] = set()
-        for (first, i), (second, j) in near:
-            one = fits[first][i].excess
-            other = fits[second][j].excess
-            if max(one, other) < LEAST_EXCESS:
-                raise ValueError(
-                    f"the bodies {parsed.names[first]!r} and {parsed.names[second]!r} are "
-                    f"{1e3 * distances[first, second]:.2g} mm apart at home, too close for the capsules around them: "
-                    "give another home, or exclude their contact in the file"
-                )
-            coarse.add((first, i) if one >= other else (second, j))
+        for (first, second), distance in distances.items():
+            least = min(LEFT_SHARE * distance, LEFT_MOST)
+            for i, j in itertools.product(range(len(fits[first])), range(len(fits[second]))):
+                both = begin[first] + i, begin[second] + j
+                if mujoco.mj_geomDistance(capsules, data, *both, 0.01, None) >= least:
+                    continue
+                one, other = fits[first][i].excess, fits[second][j].excess
+                if max(one, other) < LEAST_EXCESS:
+                    raise ValueError(
+                        f"the bodies {parsed.names[first]!r} and {parsed.names[second]!r} are "
+                        f"{1e3 * distance:.2g} mm apart at home, too close for the capsules around them: give another "
+                        "home, or exclude their contact in the file"
+                    )
+                coarse.add((first, i) if one >= other else (second, j))
+        if not coarse:
+            return xml, max(capsule.excess for some in fits.values() for capsule in some)
         for body, index in sorted(coarse, reverse=True):
             fits[body] += split(model, fits[body].pop(index))
-    return xml, max(capsule.excess for some in fits.values() for capsule in some)
 
 
 def _apart(parsed: Parsed, pairs: Iterable[Pair], configurations: Float) -> list[Pair]:
@@ -732,7 +692,7 @@ def _apart(parsed: Parsed, pairs: Iterable[Pair], configurations: Float) -> list
 
 def _distances(parsed: Parsed, joints: Float, pairs: Sequence[Pair]) -> Float:
     """Return the distances of P pairs of bodies in a configuration, shape (P,), [m]; at most 0.1."""
-    _move(parsed.moved, parsed.joints, joints)
+    move(parsed.moved, parsed.joints, joints)
     found = np.full(len(pairs), 0.1)
     for i, (first, second) in enumerate(pairs):
         for one, other in itertools.product(parsed.geoms[first], parsed.geoms[second]):
@@ -741,139 +701,67 @@ def _distances(parsed: Parsed, joints: Float, pairs: Sequence[Pair]) -> Float:
     return found
 
 
-def _near_capsules(
-    parsed: Parsed, xml: str, home: Float, distances: dict[Pair, float]
-) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Return pairs of capsules, as body and index, that are much nearer to one another at home than the bodies."""
-    model = mujoco.MjModel.from_xml_string(xml)
-    data = mujoco.MjData(model)
-    _move(data, parsed.joints, home)
-    found = []
-    for (first, second), distance in distances.items():
-        least = min(LEFT_SHARE * distance, LEFT_MOST)
-        one = model.body(parsed.names[first])
-        other = model.body(parsed.names[second])
-        for i, j in itertools.product(range(int(one.geomnum[0])), range(int(other.geomnum[0]))):
-            geoms = int(one.geomadr[0]) + i, int(other.geomadr[0]) + j
-            if mujoco.mj_geomDistance(model, data, *geoms, 0.01, None) < least:
-                found.append(((first, i), (second, j)))
-    return found
-
-
-def _move(data: mujoco.MjData, joints: tuple[str, ...], positions: Float) -> None:
-    """Compute the places of all parts of a model at positions of its joints."""
-    data.qpos[[int(data.model.joint(name).qposadr[0]) for name in joints]] = positions
-    mujoco.mj_kinematics(data.model, data)
-
-
 def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[FittedCapsule]]) -> str:
     """Return the text of the arm's model: its bodies on the stage, with capsules as geoms."""
     model, rest = parsed.model, parsed.rest
-    spec = mujoco.MjSpec.from_string(asset("stage.xml"))
-    spec.option.gravity = model.opt.gravity
-    carriers = [int(model.joint(name).bodyid[0]) for name in parsed.joints]
-    written: dict[int, Any] = {}
+    root = ET.fromstring(asset("stage.xml"))
+    _set(next(root.iter("option")), gravity=model.opt.gravity)
+    written: dict[int, ET.Element] = {}
     for body, link in parsed.links.items():
-        parent, axes, start = spec.worldbody, np.eye(3), origin
+        parent, axes, start = next(root.iter("worldbody")), np.eye(3), origin
         # A body hangs on the body with the joint that moves it, which comes before it in the file.
-        above = link - 1 if body in carriers else link
+        above = link - 1 if body in parsed.carriers else link
         if above:
-            before = carriers[above - 1]
+            before = parsed.carriers[above - 1]
             parent = written[before]
             axes = rest.xmat[before].reshape(3, 3)
             start = rest.xpos[before]
-        written[body] = parent.add_body(
-            name=parsed.names[body],
-            pos=axes.T @ (rest.xpos[body] - start),
-            quat=quaternions_of(axes.T @ rest.xmat[body].reshape(3, 3)),
-        )
-        if link:
-            _add_inertia(written[body], model, body)
-        if body in carriers:
-            _add_joint(written[body], parsed, link - 1, ranges)
+        turn = rest.xmat[body].reshape(3, 3)
+        written[body] = ET.SubElement(parent, "body", name=parsed.names[body])
+        _set(written[body], pos=axes.T @ (rest.xpos[body] - start), quat=quaternions_of(axes.T @ turn))
+        if link and model.body_mass[body] > 0.0:
+            inertial = ET.SubElement(written[body], "inertial")
+            _set(inertial, mass=model.body_mass[body], diaginertia=_moments(model.body_inertia[body]))
+            _set(inertial, pos=model.body_ipos[body], quat=model.body_iquat[body])
+        if body in parsed.carriers:
+            name = parsed.joints[link - 1]
+            joint = int(model.joint(name).id)
+            dof = model.jnt_dofadr[joint]
+            kind = "hinge" if model.jnt_type[joint] == MOVES[0] else "slide"
+            added = ET.SubElement(written[body], "joint", name=name, type=kind)
+            # Point and axis at 0 in the frame of the body, whatever the reference of the joint is.
+            _set(added, pos=turn.T @ (rest.xanchor[joint] - rest.xpos[body]), axis=turn.T @ rest.xaxis[joint])
+            _set(added, range=ranges[link - 1], armature=model.dof_armature[dof])
+            _set(added, damping=model.dof_damping[dof].flat[0])
         for capsule in fits.get(body, []):
             _add_capsule(written[body], model, capsule)
-    tool = parsed.tool
-    written[tool.body].add_site(
-        name="hand",
-        pos=tool.position,
-        quat=tool.quaternion,
-        size=(0.004, 0.0, 0.0),
-        rgba=(0.0, 0.0, 0.0, 0.0),
-    )
-    spec.compile()
-    return _exact(spec, [parsed.names[body] for body in parsed.links])
-
-
-def _exact(spec: mujoco.MjSpec, names: list[str]) -> str:
-    """Return the text of a model with all digits of frames, ranges and inertias of some bodies; MuJoCo writes six."""
-    root = ET.fromstring(spec.to_xml())
-    for element in root.iter("body"):
-        if element.get("name") not in names:
-            continue
-        body = spec.body(element.get("name"))
-        _set_numbers(element, pos=body.pos, quat=body.quat)
-        for part, joint in zip(element.findall("joint"), body.joints, strict=True):
-            _set_numbers(part, pos=joint.pos, axis=joint.axis, range=joint.range)
-        for part, site in zip(element.findall("site"), body.sites, strict=True):
-            _set_numbers(part, pos=site.pos, quat=site.quat)
-        inertial = element.find("inertial")
-        if inertial is not None:
-            _set_numbers(inertial, pos=body.ipos, quat=body.iquat, mass=body.mass, diaginertia=body.inertia)
+    site = ET.SubElement(written[parsed.tool.body], "site", name="hand")
+    _set(site, pos=parsed.tool.position, quat=parsed.tool.quaternion, size=0.004, rgba=np.zeros(4))
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
-def _set_numbers(element: ET.Element, **values: Any) -> None:
+def _set(element: ET.Element, **values: Any) -> None:
     """Set attributes to numbers with all digits."""
     for name, numbers in values.items():
         element.set(name, " ".join(repr(float(number)) for number in np.atleast_1d(numbers)))
 
 
-def _add_inertia(written: Any, model: mujoco.MjModel, body: int) -> None:
-    """Give a body its mass and inertia.
-
-    No principal moment exceeds the sum of the others. Those of flat and tiny bodies are changed until this holds with a
-    margin, because the text has fewer digits.
-    """
-    moments = np.maximum(model.body_inertia[body], MIN_INERTIA)
+def _moments(given: Float) -> Float:
+    """Return principal moments of inertia of which none exceeds the sum of the others, as some of flat bodies do."""
+    moments = np.maximum(given, MIN_INERTIA)
     largest = int(moments.argmax())
     moments[largest] = min(moments[largest], (1.0 - INERTIA_MARGIN) * (moments.sum() - moments[largest]))
-    if model.body_mass[body] > 0.0:
-        written.mass = model.body_mass[body]
-        written.inertia = moments
-        written.explicitinertial = True
-        written.ipos = model.body_ipos[body]
-        written.iquat = model.body_iquat[body]
+    return moments
 
 
-def _add_joint(written: Any, parsed: Parsed, index: int, ranges: Float) -> None:
-    """Add a joint of the arm to its body."""
-    model, name = parsed.model, parsed.joints[index]
-    joint = model.joint(name).id
-    dof = model.jnt_dofadr[joint]
-    # The joint's point and axis at 0 in the frame of the body, whatever its reference is.
-    turn = parsed.rest.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
-    place = parsed.rest.xanchor[joint] - parsed.rest.xpos[model.jnt_bodyid[joint]]
-    added = written.add_joint(
-        name=name,
-        type=mujoco.mjtJoint(int(model.jnt_type[joint])),
-        pos=turn.T @ place,
-        axis=turn.T @ parsed.rest.xaxis[joint],
-        range=ranges[index],
-        limited=True,
-        armature=model.dof_armature[dof],
-    )
-    added.damping[0] = model.dof_damping[dof].flat[0]
-
-
-def _add_capsule(written: Any, model: mujoco.MjModel, capsule: FittedCapsule) -> None:
+def _add_capsule(written: ET.Element, model: mujoco.MjModel, capsule: FittedCapsule) -> None:
     """Add a capsule that covers a geom, or a part of it, to the body."""
     turn = frame_matrices(model.geom_quat[capsule.geom])
     first, second = model.geom_pos[capsule.geom] + capsule.ends @ turn.T
     length = float(np.linalg.norm(second - first))
     if length < SHORT:
-        size = (capsule.radius + 0.5 * length, 0.0, 0.0)
-        written.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=0.5 * (first + second), size=size)
+        added = ET.SubElement(written, "geom", type="sphere")
+        _set(added, pos=0.5 * (first + second), size=capsule.radius + 0.5 * length)
     else:
-        size = (capsule.radius, 0.0, 0.0)
-        written.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=(*first, *second), size=size)
+        added = ET.SubElement(written, "geom", type="capsule")
+        _set(added, fromto=(*first, *second), size=capsule.radius)

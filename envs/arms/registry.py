@@ -96,15 +96,15 @@ def arm_of(arm: Any) -> Arm:
     """
     if isinstance(arm, Arm):
         return arm
-    arm = str(arm) if isinstance(arm, Path) else arm
-    if isinstance(arm, str) and arm in _BUILT_IN:
-        return _BUILT_IN[arm]()
-    if isinstance(arm, str) and arm in _OWN:
-        return _OWN[arm]
-    if isinstance(arm, str) and arm.endswith(ARM_FILES):
-        path = Path(arm).expanduser().resolve()
+    name = str(arm) if isinstance(arm, str | Path) else ""
+    if name in _BUILT_IN:
+        return _BUILT_IN[name]()
+    if name in _OWN:
+        return _OWN[name]
+    if name.endswith(ARM_FILES):
+        path = Path(name).expanduser().resolve()
         if not path.is_file():
-            raise ValueError(f"arm: there is no file {arm!r}")
+            raise ValueError(f"arm: there is no file {name!r}")
         return _of_file(path, path.stat().st_mtime_ns)
     raise ValueError(
         f"arm must be an Arm, a file that ends in {' or '.join(ARM_FILES)}, or one of {', '.join(arm_names())}, got "
@@ -115,9 +115,8 @@ def arm_of(arm: Any) -> Arm:
 @functools.lru_cache(maxsize=16)
 def _of_file(path: Path, changed: int) -> Arm:
     """Return the arm of a file, which was last changed at some time."""
-    arm = read_arm(path)
     try:
-        arm = load_arm(path) if arm is None else arm
+        arm = read_arm(path) or load_arm(path)
     except ValueError as error:
         raise ValueError(
             f"{error}; with arguments of load_arm, write_arm makes a file that needs none"

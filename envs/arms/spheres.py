@@ -19,18 +19,7 @@ SHRUNK = 0.5  # Factor on this distance for bodies whose spheres overlap at home
 SHRINKING = 6  # Greatest number of times that it is applied
 ROUNDS = 2000  # Iterations for bounding balls
 
-
-class Capsule(NamedTuple):
-    """Collision geom of an arm: a capsule, or a sphere, which is one without a length."""
-
-    body: str
-    """Name of the body."""
-    first: Float
-    """One end of the axis in the frame of the link, shape (3,), [m]."""
-    second: Float
-    """The other end, shape (3,), [m]."""
-    radius: float
-    """Radius, [m]."""
+Capsule = tuple[Float, float]  # Ends of the axis, shape (2, 3), equal for a sphere, and radius, [m]
 
 
 class LeftOut(NamedTuple):
@@ -43,7 +32,7 @@ class LeftOut(NamedTuple):
 
 def cover(
     chain: Chain,
-    capsules: Sequence[Capsule],
+    capsules: dict[str, list[Capsule]],
     links: dict[str, int],
     home: Float,
     touching: Collection[frozenset[str]],
@@ -51,20 +40,27 @@ def cover(
 ) -> tuple[tuple[str, ...], Spheres, list[LeftOut], float]:
     """Return groups of spheres that contain all capsules: names of bodies, spheres, pairs left out, and excess, [m].
 
-    Pairs that are in contact at home, `touching`, or named in `exclude` with the reason, may pass through one another.
+    Capsules of each body are in the frame of its link. Pairs that are in contact at home, `touching`, or named in
+    `exclude` with the reason, may pass through one another.
 
     Raises:
         ValueError: Spheres of bodies that are apart at home overlap there, however small they are.
     """
-    names = tuple(dict.fromkeys(capsule.body for capsule in capsules))
+    names = tuple(capsules)
     pairs, left_out = _pairs(names, links, touching, exclude)
     excess = dict.fromkeys(names, LARGEST_EXCESS)
     for _ in range(SHRINKING):
-        spheres = _spheres(names, links, capsules, excess, pairs)
+        centres, radii, beyond = [], [], 0.0
+        for name in names:
+            covers = [_along(*capsule, excess[name]) for capsule in capsules[name]]
+            centres.append(np.concatenate([points for points, _ in covers]))
+            radii.append(np.concatenate([np.full(len(points), radius) for points, radius in covers]))
+            for (_, inner), (_, outer) in zip(capsules[name], covers, strict=True):
+                beyond = max(beyond, outer - inner)
+        spheres = grouped(centres, radii, [links[name] for name in names], pairs)
         close = spheres.pairs[overlapping(chain, spheres, home[None], False)[0]]
         if not len(close):
-            beyond = [_along(each, excess[each.body])[1] - each.radius for each in capsules]
-            return names, spheres, left_out, max(beyond)
+            return names, spheres, left_out, beyond
         for group in np.unique(close):
             excess[names[group]] *= SHRUNK  # smaller spheres, and more of them
     first, second = close[0]
@@ -119,29 +115,13 @@ def _pairs(
     return pairs, left_out
 
 
-def _spheres(
-    names: Sequence[str],
-    links: dict[str, int],
-    capsules: Sequence[Capsule],
-    excess: dict[str, float],
-    pairs: Sequence[tuple[int, int]],
-) -> Spheres:
-    """Return the spheres of all bodies."""
-    centres, radii = [], []
-    for name in names:
-        covers = [_along(capsule, excess[name]) for capsule in capsules if capsule.body == name]
-        centres.append(np.concatenate([points for points, _ in covers]))
-        radii.append(np.concatenate([np.full(len(points), radius) for points, radius in covers]))
-    return grouped(centres, radii, [links[name] for name in names], pairs)
-
-
 def grouped(
     centres: Sequence[Float], radii: Sequence[Float], links: Sequence[int], pairs: Sequence[tuple[int, int]]
 ) -> Spheres:
     """Return spheres from centres (n, 3) and radii (n,) of each group, [m], the links of groups, and pairs of them."""
-    spheres: list[Float] = []
+    sorted_centres, sorted_radii = [], []
     balls, part_balls = [], []
-    first, part = [0], [len(links)]
+    part = [len(links)]
     for centre, radius in zip(centres, radii, strict=True):
         order = _neighbours(centre, np.arange(len(centre)))
         centre, radius = centre[order], radius[order]
@@ -150,15 +130,14 @@ def grouped(
             for begin in range(0, len(centre), PART):
                 some = slice(begin, begin + PART)
                 part_balls.append(_bounding_ball(centre[some].mean(axis=0), centre[some], radius[some]))
-        spheres.append(np.column_stack((centre, radius)))
-        first.append(first[-1] + len(centre))
+        sorted_centres.append(centre)
+        sorted_radii.append(radius)
         part.append(len(links) + len(part_balls))
-    every = np.concatenate(spheres)
     around = np.array(balls + part_balls)
     return Spheres(
-        centre=np.array(every[:, :3], order="C"),
-        radius=np.array(every[:, 3], order="C"),
-        first=np.array(first),
+        centre=np.concatenate(sorted_centres),
+        radius=np.concatenate(sorted_radii),
+        first=np.cumsum([0, *map(len, radii)]),
         link=np.array(links, dtype=np.int64),
         ball_centre=np.array(around[:, :3], order="C"),
         ball_radius=np.array(around[:, 3], order="C"),
@@ -178,20 +157,17 @@ def _neighbours(centre: Float, some: Int) -> Int:
     return np.concatenate((_neighbours(centre, along[:middle]), _neighbours(centre, along[middle:])))
 
 
-def _along(capsule: Capsule, excess: float) -> tuple[Float, float]:
+def _along(ends: Float, radius: float, excess: float) -> tuple[Float, float]:
     """Return the centres, shape (n, 3), and the radius of spheres that contain a capsule, [m].
 
     Spheres of radius R that are s apart contain the cylinder of radius r between them if R^2 >= r^2 + s^2 / 4.
     """
-    length = float(np.linalg.norm(capsule.second - capsule.first))
-    largest = capsule.radius + excess
-    spacing = 2.0 * np.sqrt(largest**2 - capsule.radius**2)
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    spacing = 2.0 * np.sqrt((radius + excess) ** 2 - radius**2)
     number = int(np.ceil(length / spacing))
-    if number == 0:  # a capsule without a length is a sphere
-        return capsule.first[None], capsule.radius
     share = np.linspace(0.0, 1.0, number + 1)[:, None]
-    radius = np.sqrt(capsule.radius**2 + 0.25 * (length / number) ** 2)
-    return capsule.first + share * (capsule.second - capsule.first), float(radius)
+    larger = np.sqrt(radius**2 + 0.25 * (length / max(number, 1)) ** 2)
+    return ends[0] + share * (ends[1] - ends[0]), float(larger)
 
 
 @compiled

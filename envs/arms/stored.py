@@ -15,7 +15,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -118,16 +117,14 @@ def cached_arm(model: mujoco.MjModel, arguments: dict[str, Any], make: Callable[
     """
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
-    digest = hashlib.blake2b(content.tobytes(), digest_size=16)
-    digest.update(_program().encode())
+    digest = hashlib.blake2b(_program() + content.tobytes(), digest_size=16)
     digest.update(json.dumps(arguments, sort_keys=True, default=_plain).encode())
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "viapoint" / "arms"
     path = folder / f"{digest.hexdigest()}.xml"
-    arm = None
     with suppress(OSError, KeyError, TypeError, ValueError, ET.ParseError):
-        arm = read_arm(path)
-    if arm is not None:
-        return arm
+        stored = read_arm(path)
+        if stored is not None:
+            return stored
     arm = make()
     with suppress(OSError):  # the folder cannot be written
         folder.mkdir(parents=True, exist_ok=True)
@@ -139,14 +136,10 @@ def cached_arm(model: mujoco.MjModel, arguments: dict[str, Any], make: Callable[
 
 
 @functools.cache
-def _program() -> str:
-    """Return the versions of what makes arms of files: of MuJoCo, and the code beside this file."""
-    code = hashlib.blake2b(digest_size=16)
-    for path in sorted(files(__package__).iterdir(), key=lambda path: path.name):
-        if path.name.endswith(".py"):
-            code.update(path.read_bytes())
-    code.update(asset("stage.xml").encode())
-    return f"{mujoco.__version__} {code.hexdigest()}"
+def _program() -> bytes:
+    """Return what makes arms of files: the version of MuJoCo, and the code beside this file."""
+    code = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]
+    return b"".join((mujoco.__version__.encode(), asset("stage.xml").encode(), *code))
 
 
 def _plain(value: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -28,6 +27,8 @@ MOVING = (*LIMITED, "continuous")  # Types of joints that an arm may have
 WARNING = "warning: "  # Beginning of notes that are told as warnings, too
 LEFT_OUT = ("transmission", "gazebo", "material")  # Elements that MuJoCo does not need
 
+Packages = tuple[str | Path, ...]  # Folders in which packages are looked for
+
 
 class Urdf(NamedTuple):
     """Content of a URDF file."""
@@ -41,7 +42,7 @@ class Urdf(NamedTuple):
     notes: tuple[str, ...]  # Parts that were left out
 
 
-def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
+def read_urdf(path: Path, packages: Packages) -> Urdf:
     """Return the content of a URDF file; paths of meshes, which :func:`_places` looks for, become absolute ones.
 
     Raises:
@@ -57,19 +58,16 @@ def read_urdf(path: Path, packages: tuple[str | Path, ...] = ()) -> Urdf:
     for name in LEFT_OUT:
         for element in root.findall(name):
             root.remove(element)
-    for link in root.findall("link"):
-        try:
-            _prepare_link(link, path, packages, assets, notes)
-        except ValueError as error:
-            raise ValueError(f"{path.name}, link {link.get('name')!r}: {error}") from None
     velocity = {}
-    for joint in root.findall("joint"):
-        if joint.get("type") == "floating":  # MuJoCo has such joints of the first body only
-            joint.set("type", "fixed")
-            notes.append(f"fixed: {joint.get('name')}, which floats")
-        limits = _limits(joint, notes)
-        if limits.get("velocity", 0.0) > 0.0:
-            velocity[joint.get("name", "")] = limits["velocity"]
+    for element in (*root.findall("link"), *root.findall("joint")):
+        name = element.get("name", "")
+        try:
+            if element.tag == "link":
+                _prepare_link(element, path, packages, assets, notes)
+            else:
+                velocity[name] = _prepare_joint(element, notes)
+        except ValueError as error:
+            raise ValueError(f"{path.name}, {element.tag} {name!r}: {error}") from None
     extension = root.find("mujoco")
     if extension is None:
         extension = ET.SubElement(root, "mujoco")
@@ -98,45 +96,32 @@ def _root(path: Path) -> ET.Element:
     return ET.fromstring(re.sub(rb"(</?|\s)[\w.-]+:([\w.-]+)(?=[\s=/>])", rb"\1\2", content))
 
 
-def _limits(joint: ET.Element, notes: list[str]) -> dict[str, float]:
-    """Return the limits of a joint by name, and write out those that are 0 because they are not given.
+def _prepare_joint(joint: ET.Element, notes: list[str]) -> float:
+    """Return the velocity limit of a joint, 0 for none, and write out limits that are 0 because they are not given.
 
     Raises:
         ValueError: A limit is not a number, or the lower one is greater than the upper one.
     """
     name, limit = joint.get("name"), joint.find("limit")
-    found: dict[str, float] = {}
+    if joint.get("type") == "floating":  # MuJoCo has such joints of the first body only
+        joint.set("type", "fixed")
+        notes.append(f"fixed: {name}, which floats")
     if joint.get("type") not in MOVING:
-        return found
-    for key in ("lower", "upper", "velocity"):
-        text = None if limit is None else limit.get(key)
-        if text is None:
-            continue
-        try:
-            found[key] = float(text)
-        except ValueError:
-            found[key] = math.nan
-        if not math.isfinite(found[key]):
-            raise ValueError(f"the limit {key} of joint {name!r} must be a finite number, got {text!r}")
-    if joint.get("type") in LIMITED:
-        lower, upper = found.get("lower", 0.0), found.get("upper", 0.0)
-        if lower > upper:
-            raise ValueError(
-                f"the lower limit of joint {name!r} must be less than the upper one, got {lower:g} and {upper:g}"
-            )
-        if lower == upper:
-            notes.append(f"{WARNING}joint {name} has no limits, or equal ones: it is taken as unlimited")
-        elif limit is not None:
-            limit.attrib.update(lower=f"{lower!r}", upper=f"{upper!r}")
-    return found
+        return 0.0
+    given = {} if limit is None else limit.attrib
+    lower, upper, velocity = (float(given.get(key, 0.0)) for key in ("lower", "upper", "velocity"))
+    limited = joint.get("type") in LIMITED
+    if not np.isfinite((lower, upper, velocity)).all() or (limited and lower > upper):
+        raise ValueError(f"limits must be finite, the lower one less than the upper one, got {given}")
+    if limited and lower == upper:
+        notes.append(f"{WARNING}joint {name} has no limits, or equal ones: it is taken as unlimited")
+    elif limited:
+        given.update(lower=f"{lower!r}", upper=f"{upper!r}")
+    return velocity
 
 
 def _prepare_link(
-    link: ET.Element,
-    path: Path,
-    packages: tuple[str | Path, ...],
-    assets: dict[str, bytes],
-    notes: list[str],
+    link: ET.Element, path: Path, packages: Packages, assets: dict[str, bytes], notes: list[str]
 ) -> None:
     """Mend the inertia of a link, and leave out its visual geoms and those for collisions that cannot be used."""
     _mend_inertia(link, notes)
@@ -152,33 +137,27 @@ def _prepare_link(
 
 def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
     """Replace an inertia that no body has, or that is missing, by that of a ball of the same mass."""
-    inertial = link.find("inertial")
-    mass = link.find("inertial/mass")
-    if mass is None and link.find("collision") is not None:
-        notes.append(f"mass of {link.get('name')}, which the file lacks: that of its geoms, as if of water")
-    elif mass is not None and float(mass.get("value", 0.0)) <= 0.0:
-        notes.append(f"mass of {link.get('name')}, which is not positive: {COMPILER['boundmass']} kg")
-    if inertial is None or mass is None:
+    name, mass = link.get("name"), link.find("inertial/mass")
+    if mass is None:
+        if link.find("collision") is not None:
+            notes.append(f"mass of {name}, which the file lacks: that of its geoms, as if of water")
         return
-    inertia = inertial.find("inertia")
-    if inertia is None:
-        inertia = ET.SubElement(inertial, "inertia", ixx="nan")
-    entries = [float(inertia.get(name, 0.0)) for name in INERTIA]
-    xx, xy, xz, yy, yz, zz = entries
-    matrix = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
-    if not np.isfinite(entries).all() or np.linalg.eigvalsh(matrix)[0] < 0.0:
-        moment = 0.4 * float(mass.get("value", 0.0)) * BALL**2
-        inertia.attrib.update(
-            dict.fromkeys(INERTIA, "0") | dict.fromkeys(("ixx", "iyy", "izz"), f"{moment:g}")
-        )
-        notes.append(
-            f"inertia of {link.get('name')}, which is missing or not positive: that of a ball of {BALL:g} m"
-        )
+    value = float(mass.get("value", 0.0))
+    if value <= 0.0:
+        notes.append(f"mass of {name}, which is not positive: {COMPILER['boundmass']} kg")
+    for inertial in link.findall("inertial"):
+        inertia = inertial.find("inertia")
+        if inertia is None:
+            inertia = ET.SubElement(inertial, "inertia", ixx="nan")
+        xx, xy, xz, yy, yz, zz = entries = [float(inertia.get(each, 0.0)) for each in INERTIA]
+        matrix = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+        if not np.isfinite(entries).all() or np.linalg.eigvalsh(matrix)[0] < 0.0:
+            moment = f"{0.4 * value * BALL**2:g}"
+            inertia.attrib.update(dict.fromkeys(INERTIA, "0"), ixx=moment, iyy=moment, izz=moment)
+            notes.append(f"inertia of {name}, which is missing or not positive: that of a ball of {BALL:g} m")
 
 
-def _prepared(
-    geometry: ET.Element, path: Path, packages: tuple[str | Path, ...], assets: dict[str, bytes]
-) -> str:
+def _prepared(geometry: ET.Element, path: Path, packages: Packages, assets: dict[str, bytes]) -> str:
     """Make the path of a mesh absolute, and return what is wrong with a geometry, empty for nothing."""
     for element in geometry:
         sizes = " ".join(element.get(name, "") for name in ("size", "radius", "length")).split()
@@ -216,7 +195,7 @@ def _add_text_stl(mesh: ET.Element, content: bytes, assets: dict[str, bytes]) ->
         mesh.set("filename", name)
 
 
-def _places(file: str, path: Path, packages: tuple[str | Path, ...]) -> Iterator[Path]:
+def _places(file: str, path: Path, packages: Packages) -> Iterator[Path]:
     """Yield the places where a mesh of a URDF may be.
 
     A relative path begins at the file. `package://NAME/REST`, then REST, then what is left without the first folder of

@@ -90,15 +90,20 @@ def place(chain: Chain, spheres: Spheres, joints: Float, placed: Placed) -> None
     """Place links and bounding balls for joint positions of shape (J,)."""
     link_frames(chain, joints, placed.rotation, placed.origin)
     for group in range(len(spheres.link)):
-        link = spheres.link[group]
-        for axis in range(3):
-            placed.ball[group, axis] = (
-                placed.origin[link, axis]
-                + placed.rotation[link, axis, 0] * spheres.ball_centre[group, 0]
-                + placed.rotation[link, axis, 1] * spheres.ball_centre[group, 1]
-                + placed.rotation[link, axis, 2] * spheres.ball_centre[group, 2]
-            )
+        _place_point(placed, spheres.link[group], spheres.ball_centre, group, placed.ball)
         placed.known[group] = False
+
+
+@inlined
+def _place_point(placed: Placed, link: int, points: Float, row: int, places: Float) -> None:
+    """Place one of the points of a table that are fixed to links."""
+    for axis in range(3):
+        places[row, axis] = (
+            placed.origin[link, axis]
+            + placed.rotation[link, axis, 0] * points[row, 0]
+            + placed.rotation[link, axis, 1] * points[row, 1]
+            + placed.rotation[link, axis, 2] * points[row, 2]
+        )
 
 
 @inlined
@@ -106,23 +111,10 @@ def place_group(spheres: Spheres, group: int, placed: Placed) -> None:
     """Place the spheres of a group, if they are not known yet."""
     if not placed.known[group]:
         placed.known[group] = True
-        link = spheres.link[group]
         for sphere in range(spheres.first[group], spheres.first[group + 1]):
-            for axis in range(3):
-                placed.centre[sphere, axis] = (
-                    placed.origin[link, axis]
-                    + placed.rotation[link, axis, 0] * spheres.centre[sphere, 0]
-                    + placed.rotation[link, axis, 1] * spheres.centre[sphere, 1]
-                    + placed.rotation[link, axis, 2] * spheres.centre[sphere, 2]
-                )
+            _place_point(placed, spheres.link[group], spheres.centre, sphere, placed.centre)
         for part in range(spheres.part[group], spheres.part[group + 1]):
-            for axis in range(3):
-                placed.ball[part, axis] = (
-                    placed.origin[link, axis]
-                    + placed.rotation[link, axis, 0] * spheres.ball_centre[part, 0]
-                    + placed.rotation[link, axis, 1] * spheres.ball_centre[part, 1]
-                    + placed.rotation[link, axis, 2] * spheres.ball_centre[part, 2]
-                )
+            _place_point(placed, spheres.link[group], spheres.ball_centre, part, placed.ball)
 
 
 @inlined
@@ -540,20 +532,6 @@ def _move(drift: float, spheres: Spheres, bounds: Bounds) -> None:
         bounds.apart[group] -= bounds.group_way[group] + drift
     for pair in range(len(bounds.pair_apart)):
         bounds.pair_apart[pair] -= _way_of_pair(spheres, bounds, pair)
-
-
-@compiled
-def configuration_clearances(
-    chain: Chain, spheres: Spheres, configurations: Float, obstacles: Obstacles, times: Float
-) -> Float:
-    """Return the clearance of N arms in N scenes from obstacles and from themselves, shape (N, 2), at most FAR, [m]."""
-    placed = memory(chain, spheres)
-    found = np.empty((len(configurations), 2))
-    for scene in range(len(configurations)):
-        place(chain, spheres, configurations[scene], placed)
-        found[scene, 0] = obstacle_clearance(spheres, placed, obstacles, scene, times[scene], FAR, -FAR)
-        found[scene, 1] = self_clearance(spheres, placed, FAR, -FAR)
-    return found
 
 
 @inner

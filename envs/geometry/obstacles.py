@@ -136,10 +136,8 @@ class Obstacles(NamedTuple):
 def no_obstacles(n_scenes: int, n_rows: int = 0) -> Obstacles:
     """Return scenes without obstacles, with rows for some."""
     shape = (n_scenes, n_rows)
-    rotation = np.empty((*shape, 3, 3))
-    rotation[:] = np.eye(3)
-    vectors = [np.zeros((*shape, 3)) for _ in range(3)]
-    centre, size, velocity = vectors
+    rotation = np.tile(np.eye(3), (*shape, 1, 1))
+    centre, size, velocity = np.zeros((3, *shape, 3))
     kind = np.full(shape, ABSENT, np.int64)
     return Obstacles(kind, centre, rotation, size, velocity, NO_MESHES, NO_CLOUDS)
 

@@ -1,13 +1,7 @@
 """Shapes of obstacles as users write them, with one compiled function each: the signed distance of a point.
 
-A new shape needs a few lines in this module, and its name in the table KINDS. An ellipsoid, for example:
-
-1. KINDS: its name at the end, so that the numbers of the others stay, and a constant ELLIPSOID.
-2. A function `ellipsoid_distance(a, b, c, x, y, z)` with a line in :func:`local_distance`. It takes the sizes and a
-   point in the frame of the shape, and returns the signed distance and the three components of its gradient.
-3. A class `Ellipsoid(Shape)` like :class:`Box`, with parameters, MuJoCo's geom and bounding box, and a place in SHAPES.
-
-Everything else follows: dictionaries, JSON, packed obstacles, rows of observations, geoms, and checks of movements.
+A new shape is a name in KINDS with a constant, a function with a line in :func:`local_distance`, and a class in SHAPES.
+Everything else follows; CONTRIBUTING.md shows it for an ellipsoid.
 """
 
 from __future__ import annotations
@@ -26,14 +20,7 @@ from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, unit_quaternion
 from viapoint.envs.geometry.clouds import Clouds, build_cloud, cloud_distance, join_clouds
 from viapoint.envs.geometry.compiled import TINY, inlined, kernel
-from viapoint.envs.geometry.meshes import (
-    FAR,
-    Meshes,
-    build_mesh,
-    convex_hull,
-    join_meshes,
-    mesh_distance,
-)
+from viapoint.envs.geometry.meshes import FAR, Meshes, build_mesh, convex_hull, join_meshes, mesh_distance
 
 # Kinds of obstacles; the number of a kind is its place in this table
 KINDS = ("sphere", "capsule", "cylinder", "box", "half_space", "convex_mesh", "point_cloud")
@@ -250,30 +237,18 @@ class Shape:
         radius = finite_array("radius", radius)
         if (radius < 0.0).any():
             raise ValueError(f"radius must be 0 or greater, got {radius.min()}")
-        batch = points.shape[:-1]
-        try:
-            np.broadcast_shapes(batch, radius.shape)
-        except ValueError:
-            raise ValueError(f"radius must broadcast with {batch}, got the shape {radius.shape}") from None
         flat = np.array(points.reshape(-1, 3))
         found = np.empty(len(flat))
-        meshes = self.mesh or join_meshes([])
-        clouds = self.cloud or join_clouds([])
-        _distances(
-            self.number, self.packed_size, self.rotation, np.array(self.position), meshes, clouds, flat, found
-        )
-        return found.reshape(batch) - radius
+        pose = self.rotation, np.array(self.position)
+        tables = self.mesh or join_meshes([]), self.cloud or join_clouds([])
+        _distances(self.number, self.packed_size, *pose, *tables, flat, found)
+        return found.reshape(points.shape[:-1]) - radius
 
     @property
     def packed_size(self) -> Float:
         """Sizes in MuJoCo's convention, shape (3,), [m]; missing ones are 0, see also :class:`Obstacles`."""
-        packed = np.zeros(3)
-        first = 0
-        for name, shape in self.sizes.items():
-            after = first + (shape[0] if shape else 1)
-            packed[first:after] = getattr(self, name)
-            first = after
-        return packed
+        given = [np.ravel(getattr(self, name)) for name in self.sizes]
+        return np.concatenate((*given, np.zeros(3)))[:3]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the parameters as plain numbers and lists, with the kind as `shape`."""

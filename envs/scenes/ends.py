@@ -292,7 +292,7 @@ def _bit_reversed(number: int) -> float:
 @inlined
 def _reach(draft: Draft, scene: int, there: Float, numbers: Float, joints: Float) -> bool:
     """Solve for joint positions with the tool in a place, and return True if it gets there."""
-    setting, placed = draft.setting, draft.placed
+    setting = draft.setting
     across = there[6] * (2.0 * numbers[0] - 1.0), there[7] * (2.0 * numbers[1] - 1.0)
     position, axes = draft.position, draft.axes
     position[0] = there[0] + there[9] * across[0] - there[10] * across[1]
@@ -302,13 +302,12 @@ def _reach(draft: Draft, scene: int, there: Float, numbers: Float, joints: Float
     if setting.plane:
         return bool(solve_planar(chain, limits, position[0], position[1], joints))
     _seed(setting, position, joints)
-    rotation, origin = placed.rotation, placed.origin
     if len(joints) < 6:
-        return bool(descend(chain, limits, position, axes, False, joints, rotation, origin) == 0.0)
+        return bool(descend(chain, limits, position, axes, False, joints) == 0.0)
     _tool_axes(there[3:6], there[11], numbers[3:7], axes)
     if draft.keep[scene] == 0 and not _is_hand_clear(draft, scene, position, axes):
         return False
-    return bool(descend(chain, limits, position, axes, True, joints, rotation, origin) == 0.0)
+    return bool(descend(chain, limits, position, axes, True, joints) == 0.0)
 
 
 @inner

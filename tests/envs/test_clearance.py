@@ -5,7 +5,12 @@ import dataclasses
 import mujoco
 import numpy as np
 import pytest
-from helpers import check_contact_implies_overlap, least_pair_distance, random_shape
+from helpers import (
+    check_contact_implies_overlap,
+    configuration_clearances,
+    least_pair_distance,
+    random_shape,
+)
 
 from viapoint.envs.arms.capsule_fit import cover_geom, polytope_around
 from viapoint.envs.arms.kinematics import sphere_centres
@@ -16,7 +21,6 @@ from viapoint.envs.geometry.clearance import (
     RESOLUTION,
     ROUGHLY,
     bounds_memory,
-    configuration_clearances,
     memory,
     movement_clearance,
 )
@@ -45,7 +49,7 @@ def test_clearance_is_that_of_the_nearest_sphere(name):
     joints = some_joints(rng, arm, number)
     scenes = [some_shapes(rng, 4) for _ in range(number)]
     times = rng.uniform(0.0, 1.0, number)
-    found = configuration_clearances(arm.chain, arm.spheres, joints, pack(scenes), times)
+    found = configuration_clearances(arm, joints, pack(scenes), times)
     link = np.repeat(arm.spheres.link, np.diff(arm.spheres.first))
     for i in range(number):
         centres = sphere_centres(arm.chain, arm.spheres, joints[i])
@@ -76,7 +80,7 @@ def test_clearance_of_a_movement_is_that_of_its_nearest_configuration(name, numb
             arm.chain, arm.spheres, arm.reach, path, obstacles, 0, 0.0, step, placed, bounds, 0.0
         )
         scenes = obstacles.take(np.zeros(len(path), int))
-        each = configuration_clearances(arm.chain, arm.spheres, path, scenes, step * np.arange(len(path)))
+        each = configuration_clearances(arm, path, scenes, step * np.arange(len(path)))
         np.testing.assert_allclose(np.maximum(found, -FAR), np.maximum(each.min(axis=0), -FAR), atol=1e-9)
 
 

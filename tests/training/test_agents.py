@@ -11,7 +11,17 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
-from helpers import MOVING, PANDA, PLANE, REACH, SENSED, WHOLE, problem_of, scenes_of
+from helpers import (
+    MOVING,
+    PANDA,
+    PLANE,
+    REACH,
+    SENSED,
+    WHOLE,
+    configuration_clearances,
+    problem_of,
+    scenes_of,
+)
 from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
@@ -20,7 +30,6 @@ import viapoint.envs.geometry.clearance
 import viapoint.envs.geometry.distance
 import viapoint.training.planning.movements
 import viapoint.training.planning.search
-from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import BOX, bounding_boxes, no_obstacles, unpack
 from viapoint.training import GeometrySearch, ViaQ, ViaRank, ViaVecEnv, evaluate, load_agent
 from viapoint.training.agents import viaq_policy
@@ -447,9 +456,7 @@ def test_the_clearance_of_the_arm_from_itself_is_computed():
     for scene, row in np.argwhere(found.inside.numpy()):
         one = plan.take((scene, row))
         path = one.trajectory()(np.linspace(0.0, one.durations.sum(), INSTANTS))
-        apart = configuration_clearances(
-            arm.chain, arm.spheres, path, no_obstacles(INSTANTS), np.zeros(INSTANTS)
-        )
+        apart = configuration_clearances(arm, path, no_obstacles(INSTANTS))
         least = min(apart[:, 1].min(), CLEAR)
         assert float(found.self_clearance[scene, row]) == pytest.approx(
             least, abs=6e-3

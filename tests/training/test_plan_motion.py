@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 from helpers import PANDA as PANDA_TASK
-from helpers import PLANE, UR5E, WHOLE, scenes_of
+from helpers import PLANE, UR5E, WHOLE, configuration_clearances, scenes_of
 
 from viapoint.envs import (
     Box,
@@ -24,7 +24,6 @@ from viapoint.envs import (
     obstacles_to_json,
 )
 from viapoint.envs.arms.kinematics import torques
-from viapoint.envs.geometry.clearance import configuration_clearances
 from viapoint.envs.geometry.obstacles import pack
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training import UnsafePlanError, plan_motion, plan_motions, read_motion, write_motion
@@ -158,7 +157,7 @@ def test_movements_in_motion_begin_as_given_and_are_as_clear_as_they_say() -> No
     assert (np.abs(motion.velocity) <= PANDA.velocity_limit).all()
     path = np.ascontiguousarray(plan.trajectory()(np.linspace(0.0, plan.duration, 500)))
     scenes = pack([[POST]]).take(np.zeros(500, np.int64))
-    least = configuration_clearances(PANDA.chain, PANDA.spheres, path, scenes, np.zeros(500)).min()
+    least = configuration_clearances(PANDA, path, scenes).min()
     assert plan.clearance == pytest.approx(least, abs=1e-3)
 
 

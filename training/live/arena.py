@@ -15,7 +15,7 @@ import numpy as np
 import viapoint.envs as ve
 from viapoint.envs.arms.kinematics import forward
 from viapoint.envs.common.arrays import Float, Observation
-from viapoint.envs.geometry.clearance import configuration_clearances
+from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.envs.geometry.obstacles import pack, quaternions_of
 from viapoint.envs.geometry.shapes import KINDS, PLAIN_KINDS
 from viapoint.envs.scenes.options import scene_options
@@ -188,8 +188,10 @@ class Arena:
         arm = self.task.arm
         joints = self.task.space.joints(coordinates)
         rows = pack([obstacles]).take(np.zeros(len(joints), np.int64))
-        when = np.full(len(joints), times)
-        return np.asarray(configuration_clearances(arm.chain, arm.spheres, joints, rows, when))
+        when = np.broadcast_to(times, len(joints))
+        rows = rows._replace(centre=rows.centre + when[:, None, None] * rows.velocity)
+        apart, own = row_clearances(arm.chain, arm.spheres, joints, rows, FAR)
+        return np.stack((apart.min(axis=1, initial=FAR), own), axis=-1)
 
     def moved(
         self, coordinates: Float, place: Float, obstacles: Iterable[ve.Shape] = (), turn: Any = None

@@ -17,7 +17,7 @@ import numpy as np
 from viapoint import primitives
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import UnreachableError, inverse_kinematics
-from viapoint.envs.arms.kinematics import motion_torques, slowdown, torques
+from viapoint.envs.arms.kinematics import motion_torques, slowdowns, torques
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.validation import finite_array, number_of_at_least, whole_number
@@ -683,7 +683,8 @@ def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple
     velocity = movement.table.rate[movement.times, LIMIT_INSTANTS] @ offsets / duration
     acceleration = movement.table.bend[movement.times, LIMIT_INSTANTS] @ offsets / duration**2
     motion = joint_motion(problem.space, position, velocity, acceleration)
-    needed = slowdown(arm.chain, arm.velocity_limit, arm.torque_limit, *motion)
+    one = (part[None] for part in motion)
+    (needed,) = slowdowns(arm.chain, arm.velocity_limit, arm.torque_limit, *one)
     factor = 1.0 if least is None else max(needed, least)
     if least == 0.0:
         shortest = SHORTEST if np.isfinite(arm.velocity_limit).all() else UNLIMITED
