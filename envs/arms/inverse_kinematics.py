@@ -290,6 +290,7 @@ def inverse_kinematics(
     *,
     seed: Any = None,
     n_seeds: int = 64,
+    rng: np.random.Generator | None = None,
 ) -> Float:
     """Return different joint positions that put the tool at a pose, the nearest to the first seed first, (S, J).
 
@@ -299,6 +300,7 @@ def inverse_kinematics(
         quaternion: Orientation (w, x, y, z) of the tool, shape (4,); None for any.
         seed: Joint positions to begin with, shape (J,); home by default.
         n_seeds: Number of seeds; as many again, four times, where these find nothing.
+        rng: Random generator of further seeds; one with a fixed seed by default.
 
     Raises:
         UnreachableError: No solution was found; the message tells the nearest distance.
@@ -316,7 +318,7 @@ def inverse_kinematics(
     axes = None if quaternion is None else frame_matrices(unit_quaternion("quaternion", quaternion))
     number = whole_number("n_seeds", n_seeds, 1)
     first = arm.home if seed is None else finite_array("seed", seed, arm.home.shape)
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(0) if rng is None else rng
     low, high = arm.joint_range.T
     begin = np.concatenate((first[None], rng.uniform(low, high, (number - 1, len(low)))))
     found = _different_solutions(arm, position, axes, begin)
