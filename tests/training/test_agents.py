@@ -671,8 +671,24 @@ def test_places_are_those_of_the_movement() -> None:
     assert np.array_equal(task.sensor.ray_towards(local), np.flatnonzero(sight.hit[0]))
 
 
+LOOKING = {"sensor": "hand_rays", "decide_at": ["horizon"], "horizon": 0.3}
+
+
+def test_it_learns_to_revise_plans(tmp_path) -> None:
+    env = ViaVecEnv(SENSED, 32, seed=0, **LOOKING)
+    small = {"explore_candidates": 24, "labels": 12, "policy_kwargs": {"candidates": 64, "refinements": 0}}
+    agent = ViaRank("ViaRankPolicy", env, seed=0, gradient_steps=8, **small).learn(256)
+    agent.save(tmp_path / "agent.zip")
+    again = ViaRank.load(tmp_path / "agent.zip")
+    result = evaluate(
+        again, env=SENSED, env_kwargs=LOOKING, scenes="validation", n_scenes=50, baselines=["untrained"]
+    )
+    learned, untrained = [row["success"]["rate"] for row in result.rows]
+    assert learned > untrained + 0.3
+
+
 def test_what_any_look_saw_to_be_free_is_free() -> None:
-    env = ViaVecEnv(SENSED, 16, seed=0, sensor="hand_rays", decide_at=["horizon"], horizon=0.2)
+    env = ViaVecEnv(SENSED, 16, seed=0, **LOOKING)
     task, observation = env.venv.unwrapped.task, env.reset()
     for _ in range(3):
         observation, *_ = env.step(np.zeros((16, task.action.size), np.float32))

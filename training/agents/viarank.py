@@ -3,8 +3,9 @@
 It learns with privileged information (D. Chen et al., Learning by cheating, 2020). In training the true obstacles are
 known, so that computed geometry labels any number of plans of a scene as clear or not. The network predicts the labels
 from the readings alone. For each update new scenes are drawn, which need no simulation; movements in the environment
-measure how well the agent does. Half of the plans that are learned from are those that the network itself prefers:
-otherwise it would be right on average, and too sure of those that it chooses.
+measure how well the agent does. Where plans are revised on the way, it learns from the present scenes of the
+environment instead. Half of the plans that are learned from are those that the network itself prefers: otherwise it
+would be right on average, and too sure of those that it chooses.
 """
 
 from __future__ import annotations
@@ -53,6 +54,8 @@ from viapoint.training.planning.search import (
 )
 
 EFFORT_WEIGHT = 0.05  # Weight of the reward of a successful plan beside its probability of success
+# Time from the present during which clearance counts twice as much as later, where plans are revised, [s]
+SOON = 0.45
 KEEP = 2.0  # Reward by which another plan must be better than the one under way, as each change of plan costs jerk
 # First part of the seeds of scenes for the calibration, far from those of training, and their number
 CALIBRATION, CALIBRATION_SCENES = 3_000_017, 640
@@ -115,8 +118,9 @@ class ViaRankPolicy(PlanPolicy):
         self.belief = belief
         self._check_candidates()
         self._check_refine()
-        _check_task(self.task)
-        self.network = SightNetwork(self.task.sensor, width=width)
+        sensor = _check_task(self.task).sensor
+        assert sensor is not None
+        self.network = SightNetwork(sensor, width=width)
         self._make_optimizer(self.network, lr_schedule)
 
     def _check_setting(self, name: str, value: Any) -> None:
@@ -238,10 +242,11 @@ class ViaRank(PlanAlgorithm):
 
     Args:
         policy: `ViaRankPolicy`.
-        env: Environment or vector environment of this package with a sensor, in which an action is a whole movement.
+        env: Environment or vector environment of this package with a sensor, in which an action is a movement, whole or
+            revised on the way, and obstacles rest.
         learning_rate: Learning rate, or a function of the remaining progress.
         learning_starts: Number of decisions before the first update.
-        batch_size: Scenes that are drawn for each update.
+        batch_size: Scenes that are drawn for each update; where plans are revised, it learns from those of `env`.
         gradient_steps: Updates after each step of all environments.
         explore_candidates: Candidates of each scene during training, of which the best one is executed.
         labels: Plans of each scene that are learned from: the better half are the best candidates, the others random.
@@ -252,7 +257,8 @@ class ViaRank(PlanAlgorithm):
             `tensorboard_log`.
 
     Raises:
-        ValueError: A hyperparameter is out of range, or the environment has no sensor.
+        ValueError: A hyperparameter is out of range, or the environment has no sensor, control steps or moving
+            obstacles.
 
     Example:
         >>> from viapoint.training import ViaRank, ViaVecEnv
@@ -348,8 +354,10 @@ class ViaRank(PlanAlgorithm):
         chosen = self._chosen(inputs, worth)
         some = np.take_along_axis(plans, chosen[..., None], axis=1)
         # The labels are privileged: they need the true obstacles, which the inputs do not tell.
-        clearance = plan_clearances(task, truth, some, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
-        labels = torch.from_numpy((clearance >= CLEARANCE_MARGIN).astype(np.float32)).to(policy.device)
+        clear = _are_clear(task, truth, some)
+        if policy.replanning:  # what comes later may still be revised
+            clear = 0.5 * (clear + _are_clear(task, truth, some, SOON))
+        labels = torch.from_numpy(clear).to(policy.device)
         logits = policy.network(inputs.take(torch.from_numpy(chosen).to(policy.device)))
         return {"loss": functional.binary_cross_entropy_with_logits(logits, labels)}
 
@@ -499,6 +507,12 @@ def sight_inputs(
         torch.from_numpy(plans_in.astype(np.float32)),
     )
     return found, _worth(task, problem, actions, moves).astype(np.float32)
+
+
+def _are_clear(task: Task, truth: Problem, actions: Numbers, until: float = np.inf) -> Single:
+    """Return 1 for plans of shape (B, H, m) that are clear of the true obstacles until a time, [s], 0 for others."""
+    least = CLEARANCE_MARGIN
+    return (plan_clearances(task, truth, actions, least, least, until=until) >= least).astype(np.float32)
 
 
 def _worth(task: Task, problem: Problem, actions: Numbers, moves: Moves) -> Numbers:

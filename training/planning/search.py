@@ -272,16 +272,24 @@ def refined_actions(task: Task, problem: Problem, actions: Numbers) -> Numbers:
 
 
 def plan_clearances(
-    task: Task, problem: Problem, actions: Numbers, most: float, least: float, *, exact: bool = False
+    task: Task,
+    problem: Problem,
+    actions: Numbers,
+    most: float,
+    least: float,
+    *,
+    exact: bool = False,
+    until: float = HORIZONS[0],
 ) -> Float:
     """Return the planned clearances of actions of shape (B, H, m), shape (B, H), [m].
 
-    They are at most `most`, and below `least` the exact value does not matter, [m]. With `exact`, movements are those
-    that are executed, and looked at in many instants, which takes longer.
+    They are at most `most`, and below `least` the exact value does not matter, [m]. After the time `until`, [s],
+    nothing counts. With `exact`, movements are those that are executed, and looked at in many instants, which takes
+    longer.
     """
     moves = moves_of(task, problem, actions, exact=exact)
     setting = setting_of(task, problem.obstacles, exact=exact)
-    return np.asarray(_clearances(setting, moves, problem.obstacles, most, least))
+    return np.asarray(_clearances(setting, moves, problem.obstacles, most, least, until))
 
 
 @inner
@@ -301,14 +309,16 @@ def _clearance(
 
 
 @compiled
-def _clearances(setting: Setting, moves: Moves, obstacles: Obstacles, most: float, least: float) -> Float:
+def _clearances(
+    setting: Setting, moves: Moves, obstacles: Obstacles, most: float, least: float, until: float
+) -> Float:
     """Return the clearances of H plans in each of B problems, see :func:`plan_clearances`."""
     number, plans = moves.duration.shape
     found = np.empty((number, plans))
     memory = memory_of(setting, moves.table, moves.start.shape[1])
     for b in range(number):
         for h in range(plans):
-            found[b, h] = _clearance(setting, moves, b, h, obstacles, most, least, HORIZONS[0], memory)
+            found[b, h] = _clearance(setting, moves, b, h, obstacles, most, least, until, memory)
     return found
 
 
