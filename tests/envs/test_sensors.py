@@ -106,7 +106,7 @@ def test_hidden_obstacles_change_nothing() -> None:
     seen, other = env.begin(scenes), env.begin(without)
     for name in seen:
         assert np.array_equal(seen[name], other[name])
-    agent = ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1), seed=0)
+    agent = ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1), seed=0, policy_kwargs={"candidates": 64})
     assert np.array_equal(agent.predict(seen)[0], agent.predict(other)[0])
 
 
