@@ -22,6 +22,7 @@ from viapoint.envs.rewards import TERMS
 INFO = {*Outcome._fields, *TERMS, "elapsed", "time", "event"}
 DIFFERENT = sorted({str(TASKS[env_id]): env_id for env_id in reversed(ENV_IDS)}.values())
 """One id of each task."""
+MODES = ("SameStep", "NextStep", "Disabled")
 
 
 @pytest.fixture(params=DIFFERENT)
@@ -127,7 +128,8 @@ def test_episodes_go_on_with_another_number_of_threads(env_id):
     np.testing.assert_array_equal(expected[1], found[1])
 
 
-@pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
+@pytest.mark.parametrize("env_id", [PLANE, STEP, MOVING])
+@pytest.mark.parametrize("mode", MODES)
 def test_a_limit_of_decisions_is_that_of_gymnasium(env_id, mode):
     limit = 2 if "decide_at" in TASKS[env_id] else 1
     alone = gym.make(env_id, max_episode_steps=limit)
@@ -189,9 +191,6 @@ def test_broken_physics_ends_its_episode_alone(env_id, broken, tmp_path, monkeyp
     np.testing.assert_array_equal(reward[[0, 2]], whole[[0, 2]])
     *_, after = env.step(actions)
     assert not after["unstable"].any()  # the next episode is sound
-
-
-MODES = ("SameStep", "NextStep", "Disabled")
 
 
 def zeros(env):

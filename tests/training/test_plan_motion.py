@@ -171,14 +171,6 @@ def objective(setting, table, row, start, offsets, scene, aim, gradient):
     return refine._assemble(setting, movement, scene, 0, aim, 360.0, np.inf, hessian, gradient, work)[0]
 
 
-def test_moving_obstacles_are_avoided_where_they_are_then() -> None:
-    # It starts out of the way, and crosses the straight movement; where it will be later is free now.
-    ball = Sphere(0.1, position=(0.75, 0.15, 0.5), velocity=(-0.3, 0.0, 0.0))
-    plan = plan_motion(PANDA, PANDA.home, GOAL, [ball])
-    assert plan.success
-    assert plan.execute().is_success.all()
-
-
 def test_poses_and_several_goals() -> None:
     pose = Pose(position=(0.45, 0.35, 0.35), quaternion=(0.0, 1.0, 0.0, 0.0))
     plan = plan_motion(PANDA, PANDA.home, pose, [POST])
@@ -337,16 +329,32 @@ def test_nothing_thin_is_passed_through_between_two_instants() -> None:
             assert plan.clearance < -0.001
 
 
-def test_plans_are_executed_among_all_shapes() -> None:
-    points = np.random.default_rng(0).normal(0.0, 0.04, (30, 3))
-    place = (0.5, 0.15, 0.4)
-    for shape in (ConvexMesh.hull(points, position=place), PointCloud(points, 0.01, position=place)):
-        plan = plan_motion(PANDA, PANDA.home, GOAL, [shape])
-        assert plan.success
-        assert plan.execute().is_success
-    low = (-0.05, 0.37, 0.0)
-    for shape in (Sphere(0.02, position=low), Capsule(0.02, 0.05, position=low), PointCloud([low], 0.02)):
-        assert plan_motion("planar", (-0.2, 0.3), (0.1, 0.4), [shape]).execute().is_success
+POINTS, PLACE, LOW = np.random.default_rng(0).normal(0.0, 0.04, (30, 3)), (0.5, 0.15, 0.4), (-0.05, 0.37, 0.0)
+TO_THE_GOAL = np.array((-0.18, 0.24, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("arm", "obstacle"),
+    [
+        ("panda", ConvexMesh.hull(POINTS, position=PLACE)),
+        ("panda", PointCloud(POINTS, 0.01, position=PLACE)),
+        # It starts out of the way, and crosses the straight movement; where it will be later is free now.
+        ("panda", Sphere(0.1, position=(0.75, 0.15, 0.5), velocity=(-0.3, 0.0, 0.0))),
+        ("planar", Sphere(0.02, position=LOW)),
+        ("planar", Capsule(0.02, 0.05, position=LOW)),
+        ("planar", PointCloud([LOW], 0.02)),
+        # The movement waits or hurries where it crosses the goal after so many seconds.
+        *(
+            ("planar", Sphere(0.05, position=(0.1, 0.4, 0.0) - seconds * TO_THE_GOAL, velocity=TO_THE_GOAL))
+            for seconds in (1.0, 1.25, 1.5, 1.75)
+        ),
+    ],
+)
+def test_plans_succeed_among_all_shapes_at_rest_and_moving(arm, obstacle) -> None:
+    ends = (PANDA.home, GOAL) if arm == "panda" else ((-0.2, 0.3), (0.1, 0.4))
+    plan = plan_motion(arm, *ends, [obstacle])
+    assert plan.success
+    assert plan.execute().is_success.all()
 
 
 def test_the_benchmark_is_that_of_the_literature() -> None:
@@ -430,15 +438,6 @@ def test_command_line_plans_and_measures(tmp_path, capsys, failed) -> None:
     assert "of the arm planar" in failed(*words)
     main(["evaluate", "--scenes", "motionbenchmaker", "--n-scenes", "3"])
     assert "| plan_motion | all" in capsys.readouterr().out
-
-
-def test_a_movement_waits_or_hurries_where_an_obstacle_crosses_its_goal() -> None:
-    passing = np.array((-0.18, 0.24, 0.0))
-    for seconds in (1.0, 1.25, 1.5, 1.75):  # until it is at the goal
-        ball = Sphere(0.05, position=np.array((0.1, 0.4, 0.0)) - seconds * passing, velocity=passing)
-        plan = plan_motion("planar", (-0.2, 0.3), (0.1, 0.4), [ball])
-        assert plan.success
-        assert plan.execute().is_success.all()
 
 
 def write_problem(folder, number, objects, names, start, goal) -> None:
