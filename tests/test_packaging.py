@@ -127,14 +127,11 @@ def test_the_wheel_works_in_an_environment_of_its_own(extras, clean, tmp_path):
     assert all(Path(file).is_relative_to(clean) for file in done.stdout.split()[-3:])
 
 
-def test_modules_models_scenes_and_agents_are_inside_and_nothing_else(wheel):
+def test_modules_models_scenes_agents_and_the_command_are_inside_and_nothing_else(wheel):
     tree = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.is_file()]
     expected = {f"viapoint/{path.relative_to(ROOT)}" for path in tree if "__pycache__" not in path.parts}
     found = {name for name in wheel.namelist() if not re.match(r"viapoint-[^/]+\.dist-info/", name)}
     assert found == expected
-
-
-def test_the_console_script_is_declared(wheel):
     (name,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
     assert "viapoint = viapoint.training.cli.entry:main" in wheel.read(name).decode()
 
