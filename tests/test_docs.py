@@ -28,13 +28,15 @@ PUBLIC = ("viapoint.primitives", "viapoint.envs", "viapoint.training")
 OWN_TESTS = {"docs/bring-your-arm.md", "docs/datasets.md", "docs/live.md", "docs/studies.md"}
 """Pages whose examples train for long or need files; tests of their subject run them."""
 PRELOADED = [
+    "gymnasium",
     "matplotlib.pyplot",
+    "mujoco",
+    "numba",
+    "pandas",
     "stable_baselines3",
-    "viapoint.training.evaluation",
-    "viapoint.training.planning.plan_motion",
-    "viapoint.training.trainer",
+    "scipy.optimize",
 ]
-"""Modules that take long to import."""
+"""Modules that take long to import; not Viapoint, whose import registers what an example may lack."""
 SHORTER = {"learn(1_000)": "learn(300)", "BUDGET = 1_000": "BUDGET = 250", "n_scenes=100": "n_scenes=20"}
 """Numbers with which examples are as good, and faster."""
 every_page = pytest.mark.parametrize("name", sorted(PAGES))
