@@ -11,7 +11,7 @@ import pytest
 os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
 
 TESTS = Path(__file__).parent
-sys.path += [str(TESTS), str(TESTS.parent / "benchmarks")]
+sys.path += [str(TESTS), str(TESTS.parent / "benchmarks"), str(TESTS.parent / "docs")]
 
 
 def pytest_collection_modifyitems(items):

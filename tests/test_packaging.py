@@ -92,36 +92,46 @@ def test_the_wheel_of_the_source_distribution_is_the_same(source, wheel, tmp_pat
         assert sorted(archive.namelist()) == sorted(wheel.namelist())
 
 
-@pytest.mark.parametrize("extras", INSTALLED)
-def test_the_wheel_works_in_an_environment_of_its_own(extras, wheel_path, tmp_path):
-    """The environment is new; packages come from this one, so that nothing is downloaded, and some are hidden."""
-    hidden, use = INSTALLED[extras]
-    venv.create(tmp_path / "clean", with_pip=False)
-    python = tmp_path / "clean" / "bin" / "python"
-    install = ["pip", "--python", str(python), "install", "--quiet", "--no-deps", "--no-index"]
+@pytest.fixture(scope="module")
+def clean(wheel_path, tmp_path_factory):
+    """A new environment, in which only the wheel is installed."""
+    folder = tmp_path_factory.mktemp("clean")
+    venv.create(folder, with_pip=False)
+    install = [
+        "pip",
+        "--python",
+        str(folder / "bin" / "python"),
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+    ]
     subprocess.run([sys.executable, "-m", *install, str(wheel_path)], check=True, capture_output=True)
-    environment = {**os.environ, "PYTHONPATH": sysconfig.get_path("purelib")}  # after those of the new one
+    return folder
+
+
+@pytest.mark.parametrize("extras", INSTALLED)
+def test_the_wheel_works_in_an_environment_of_its_own(extras, clean, tmp_path):
+    """Packages come from the environment of the tests, so that nothing is downloaded, and some are hidden."""
+    hidden, use = INSTALLED[extras]
     begin = "import sys; sys.path.append(sys.path.pop(1))\n"
     begin += "".join(f"sys.modules[{name!r}] = None\n" for name in hidden)
     done = subprocess.run(
-        [str(python), "-c", begin + use + WHERE],
+        [str(clean / "bin" / "python"), "-c", begin + use + WHERE],
         cwd=tmp_path,
-        env=environment,
+        env={**os.environ, "PYTHONPATH": sysconfig.get_path("purelib")},  # after those of the new one
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    assert all(Path(file).is_relative_to(tmp_path / "clean") for file in done.stdout.split()[-3:])
+    assert all(Path(file).is_relative_to(clean) for file in done.stdout.split()[-3:])
 
 
-def test_modules_models_scenes_and_agents_are_inside_and_nothing_else(wheel):
+def test_modules_models_scenes_agents_and_the_command_are_inside_and_nothing_else(wheel):
     tree = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.is_file()]
     expected = {f"viapoint/{path.relative_to(ROOT)}" for path in tree if "__pycache__" not in path.parts}
     found = {name for name in wheel.namelist() if not re.match(r"viapoint-[^/]+\.dist-info/", name)}
     assert found == expected
-
-
-def test_the_console_script_is_declared(wheel):
     (name,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
     assert "viapoint = viapoint.training.cli.entry:main" in wheel.read(name).decode()
 
@@ -138,35 +148,25 @@ def test_dependencies_have_a_lower_bound_that_the_tried_versions_fulfil():
         assert [int(n) for n in bound.split(".")] <= [int(n) for n in tried.split(".")], line
 
 
-NUMERICAL = {"numpy", "array_api_compat", "viapoint.primitives"}
-SIMULATION = {"gymnasium", "mujoco", "numba", "scipy", "glfw", "viapoint.envs"}
-MAY_IMPORT = {"primitives": NUMERICAL, "envs": NUMERICAL | SIMULATION}
-"""Modules outside the standard library; MuJoCo comes with `glfw`."""
 IMPORT = re.compile(r"^\s*(?:from (\w[\w.]*) import |import (\w[\w.]*)(?: as \w+)?$)", re.MULTILINE)
+OF_OTHER_NAMES = {"yaml", "pil", "mpl_toolkits", "glfw"}
+"""PyYAML, and what Matplotlib and MuJoCo bring."""
 
 
-def foreign(package):
-    """Modules that a package imports, also within functions, with the file, but those of the standard library."""
-    for path in sorted((ROOT / package).rglob("*.py")):
-        text = path.read_text().replace("from viapoint import ", "import viapoint.")
-        for first, second in IMPORT.findall(text):
-            parts = (first or second).split(".")
-            if parts[0] not in sys.stdlib_module_names:
-                yield ".".join(parts[:2]) if parts[0] == "viapoint" else parts[0], path
-
-
-@pytest.mark.parametrize("package", MAY_IMPORT)
-def test_imports_point_one_way(package):
-    assert [each for each in foreign(package) if each[0] not in MAY_IMPORT[package]] == []
-
-
-def test_what_training_imports_is_declared():
-    extras = PROJECT["optional-dependencies"].values()
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_imports_are_declared_and_point_one_way(folder):
+    """Also those within functions."""
+    extras = PROJECT["optional-dependencies"].values() if folder == "training" else []
     lines = itertools.chain(PROJECT["dependencies"], *extras)
     declared = {re.split(r"[><=\[; ]", line)[0].lower().replace("-", "_") for line in lines}
-    allowed = {*declared, "yaml", "pil", "mpl_toolkits"}  # PyYAML, and what Matplotlib brings
-    outside = [each for each in foreign("training") if not each[0].startswith("viapoint.")]
-    assert [each for each in outside if each[0].lower() not in allowed] == []
+    before = {f"viapoint.{name}" for name in FOLDERS[: FOLDERS.index(folder) + 1]}
+    for path in (ROOT / folder).rglob("*.py"):
+        text = path.read_text().replace("from viapoint import ", "import viapoint.")
+        for names in IMPORT.findall(text):
+            parts = "".join(names).lower().split(".")
+            if parts[0] not in sys.stdlib_module_names:
+                name = ".".join(parts[:2]) if parts[0] == "viapoint" else parts[0]
+                assert name in declared | before | OF_OTHER_NAMES, path
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import resting
 
 SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")
-MOVEMENTS = int(os.environ.get("VIAPOINT_TEST_MOVEMENTS", "200"))
+MOVEMENTS = int(os.environ.get("VIAPOINT_TEST_MOVEMENTS", "100"))
 """Random movements for each arm and shape."""
 
 
@@ -181,7 +181,7 @@ def test_zero_actions_are_straight_minimum_jerk_movements(n_via, timing, space):
 
 @pytest.mark.parametrize("env_id", [PLANE, "viapoint/PlanarWholeArm-v0", PANDA])
 def test_any_success_is_worth_more_than_any_failure(env_id):
-    number = 16 if env_id == PANDA else 256
+    number = 16 if env_id == PANDA else 128
     env = gym.make_vec(env_id, num_envs=number)
     env.reset(seed=1)
     rng = np.random.default_rng(1)

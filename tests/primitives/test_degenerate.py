@@ -49,8 +49,7 @@ def test_points_that_differ_by_rounding_are_one():
         assert merged < 1.01 * plain.cost()
 
 
-@pytest.mark.parametrize("number", [50, 120])
-@pytest.mark.parametrize("noise", [0.0, 1e-3])
+@pytest.mark.parametrize(("number", "noise"), [(50, 1e-3), (120, 0.0)])
 def test_passage_times_of_many_points_are_stationary(number, noise, rng):
     x = np.linspace(0, 1, number)
     points = np.stack([x, 0.2 * np.sin(6 * x)], axis=-1) + noise * rng.normal(size=(number, 2))
@@ -112,7 +111,7 @@ def test_a_movement_that_stands_still_may_last_no_time_and_leaves_others_alone(n
 
 
 @pytest.mark.parametrize("kind", [np, torch])
-@pytest.mark.parametrize("batch", [(0,), (3, 0), (0, 2)])
+@pytest.mark.parametrize("batch", [(0,), (3, 0)])
 @pytest.mark.parametrize("name", SHAPES)
 def test_no_movements_have_every_property_of_movements(name, batch, kind):
     ask, shape = SHAPES[name]

@@ -35,7 +35,7 @@ def assert_same(found, expected, atol=1e-7):
 
 @ENDS
 @given(st.integers(0, 2), st.integers(1, 3), st.integers(0, 10**6))
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 def test_without_noise_the_movement_is_recovered(free_ends, n_via, dimension, seed):
     rng = np.random.default_rng(seed)
     waypoints, durations, trajectory = movement(rng, n_via, max(dimension, 1 + (n_via > 0)))
@@ -125,28 +125,28 @@ def test_via_points_are_passed_within_the_recording(part, rng):
 
 def test_the_number_of_via_points_is_found_where_noise_is_low():
     right = 0
-    for seed in range(40):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         _, _, trajectory = movement(rng, seed % 3)
         time, position = samples(trajectory, seed % 2 == 0, rng, noise=0.0005)
         right += int(fit_via_points(time, position, free_ends=seed % 2 == 0).n_via) == seed % 3
-    assert right >= 38
+    assert right >= 19
 
 
 def test_a_batch_holds_the_fits_of_its_movements(rng):
     several = []
-    for n_via in (0, 1, 2, 1):
+    for n_via in (0, 2):
         several.append(samples(movement(rng, n_via)[2], True, rng, noise=0.001))
     time, position = (np.stack(part) for part in zip(*several, strict=True))
-    batch = fit_via_points(time.reshape(2, 2, 100), position.reshape(2, 2, 100, 2))
-    starts = 5 * np.arange(4)  # movements of a list may have different lengths
+    batch = fit_via_points(time[None], position[None])
+    starts = 5 * np.arange(2)  # movements of a list may have different lengths
     parts = [(own[0][start:], own[1][start:]) for own, start in zip(several, starts, strict=True)]
     listed = fit_via_points([own_time for own_time, _ in parts], [own_position for _, own_position in parts])
     np.testing.assert_array_equal(batch(0.3, 1), batch([0.3], 1)[..., 0, :])
-    assert batch.via_points.shape == (2, 2, 2, 2)
-    assert listed.via_points.shape == (4, 2, 2)
-    for i in range(4):
-        for found, row, recording in ((batch, divmod(i, 2), several[i]), (listed, (i,), parts[i])):
+    assert batch.via_points.shape == (1, 2, 2, 2)
+    assert listed.via_points.shape == (2, 2, 2)
+    for i in range(2):
+        for found, row, recording in ((batch, (0, i), several[i]), (listed, (i,), parts[i])):
             one = fit_via_points(*recording)
             count = int(one.n_via)
             np.testing.assert_array_equal(found.via_points[row][:count], one.via_points)

@@ -126,12 +126,6 @@ def test_one_via_point_anywhere_with_moving_ends_is_passed_at_the_global_minimum
         assert (cost <= anywhere * (1 + 1e-9)).all()
 
 
-def test_of_three_minima_the_lowest_is_found():
-    waypoints = np.array([[0.0, 0.0], [0.807, 0.752], [1.0, 0.0]])
-    ends = {"start_velocity": np.array([8.83, 6.31]), "goal_velocity": np.array([1.49, -15.13])}
-    np.testing.assert_allclose(passage_durations(waypoints, 1.0, **ends)[0], 0.1065, atol=5e-5)
-
-
 @pytest.mark.parametrize("distance", [1e-1, 1e-3, 1e-5, 1e-7, 1e-10, 1e-40, 1e-160, 1e-300])
 @pytest.mark.parametrize("rest", ["nowhere", "at the start", "at the goal"])
 def test_a_movement_and_its_reversal_pass_at_the_same_instant(distance, rest, rng):

@@ -121,7 +121,7 @@ def fake(success, **changes):
         "tracking_error": np.zeros(n),
         "jerk_ratio": np.where(success, 2.0, 100.0),
         "duration": np.where(success, 0.8, 9.0),
-        "path_length": np.where(success, 0.5, 7.0),
+        "path_length": np.where(success, np.linspace(0.3, 0.65, n), 7.0),
     }
     values = {
         "name": "fake",
@@ -146,8 +146,10 @@ def test_the_metrics_are_what_their_names_say():
         band: {**summary["success_by_band"][band], "rate": rate, "of": 2}
         for band, rate in zip(BANDS, (0.5, 0.0, 1.0, 1.0), strict=True)
     }
-    assert (summary["jerk_ratio"], summary["duration"], summary["path_length"]) == (2.0, 0.8, 0.5)
-    assert summary["spl"] == pytest.approx(5 / 8 * 0.4 / 0.5)
+    assert (summary["jerk_ratio"], summary["duration"]) == (2.0, 0.8)
+    assert summary["path_length"] == pytest.approx(0.45)
+    # Paths of successes are 0.3, 0.4, 0.45, 0.6 and 0.65 m long, at a distance of 0.4 m.
+    assert summary["spl"] == pytest.approx((2.0 + 0.4 / 0.45 + 0.4 / 0.6 + 0.4 / 0.65) / 8)
     assert summary["min_clearance"] == pytest.approx(0.0)
     assert summary["decision_time"] == pytest.approx(0.002)
     assert summary["decision_time_98"] == pytest.approx(0.00296)
@@ -325,12 +327,6 @@ def test_across_seeds_without_any_spread_is_wilsons():
     strata = np.arange(20) < 5
     interval = statistics.across_seeds(np.tile(strata, (3, 1)), strata, np.random.default_rng(0))
     assert interval == statistics.wilson(5, 20)
-
-
-def test_spl_by_its_formula():
-    assert statistics.success_weighted_path_length([1, 1, 0, 1], [1, 1, 1, 2], [1, 2, 1, 1]) == pytest.approx(
-        2.5 / 4
-    )
 
 
 MOVING_STEP = "viapoint/PlanarMovingObstaclesStep-v0"

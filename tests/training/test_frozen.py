@@ -75,29 +75,29 @@ def test_sets_made_again_are_the_same():
 
 
 def test_scenes_are_of_the_kind_asked_for_and_can_be_solved(simulation, monkeypatch):
-    monkeypatch.setattr(make, "NUMBERS", {"test": 8, "hard": 6, "uniform": 8})
-    monkeypatch.setattr(make, "TOGETHER", 100)
+    monkeypatch.setattr(make, "NUMBERS", {"test": 4, "hard": 6, "uniform": 4})
+    monkeypatch.setattr(make, "TOGETHER", 25)
     maker = make.Maker(ENV)
     test, hard, uniform = (maker.make(name) for name in ("test", "hard", "uniform"))
-    np.testing.assert_array_equal(np.bincount(test.band), [2, 2, 2, 2])
+    np.testing.assert_array_equal(np.bincount(test.band), [1, 1, 1, 1])
     assert sorted(hard.family) == sorted(set(hard.family))
     assert (hard.share < 0.05).all()
     method = make_method("search4096", ENV)
     for each in (test, hard, uniform):
         assert len(each.share) == len(each.scenes.start) == make.NUMBERS[each.name]
         done = simulation(each.scenes, method.decide(simulation.observe(each.scenes), each.scenes))
-        assert done["is_success"].mean() > 0.8
+        assert done["is_success"].mean() > 0.7
 
 
 def test_the_stated_share_is_what_one_measures(simulation):
     """Other random actions give the same shares in physics, within what chance and the least clearance allow."""
     frozen = load(shipped_path(ENV), "validation")
     few = frozen.take(np.flatnonzero(frozen.share > 0.1)[:12])
-    draws = np.random.default_rng(123).uniform(-1.0, 1.0, (200, 3))
-    rows = np.repeat(np.arange(12), 200)
+    draws = np.random.default_rng(123).uniform(-1.0, 1.0, (100, 3))
+    rows = np.repeat(np.arange(12), 100)
     success = simulation(few.scenes.take(rows), np.tile(draws, (12, 1)))["is_success"]
-    measured = success.reshape(12, 200).mean(axis=-1)
-    spread = np.sqrt(few.share * (1.0 - few.share) * (1.0 / 200 + 1.0 / 512))
+    measured = success.reshape(12, 100).mean(axis=-1)
+    spread = np.sqrt(few.share * (1.0 - few.share) * (1.0 / 100 + 1.0 / 512))
     assert (np.abs(measured - few.share) < 4.0 * spread + 0.03).all()
 
 

@@ -138,10 +138,8 @@ def test_a_decision_depends_on_its_scene_alone(env_id):
 @pytest.mark.parametrize(
     ("env_id", "name", "number", "least"),
     [
-        (REACH, "search16", 100, 1.0),
-        (PLANE, "search512", 100, 0.9),
-        (WHOLE, "search512", 100, 0.85),
         ("viapoint/PandaReach-v0", "search16", 100, 0.95),
+        (WHOLE, "search512", 100, 0.85),
         (PANDA, "search512", 100, 0.85),
         (JUMPS, "search64", 30, 0.95),
         (MOVING, "search512", 40, 0.9),

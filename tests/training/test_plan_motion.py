@@ -75,7 +75,6 @@ def test_plans_keep_the_limits_and_use_them() -> None:
     motion = plan.joints(rate=1000)
     shares = np.abs(motion.velocity) / PANDA.velocity_limit, np.abs(motion.torque) / PANDA.torque_limit
     assert 0.9 < max(share.max() for share in shares) <= 1.0
-    assert np.allclose(max(plan.limits), max(share.max() for share in shares), atol=0.01)
     assert np.allclose(motion.position[[0, -1]], [PANDA.home, GOAL])
     assert np.allclose(motion.velocity[[0, -1]], 0.0, atol=1e-9)
     assert np.allclose(
@@ -135,15 +134,10 @@ def test_the_reason_of_a_plan_without_success_is_told(arguments, reason) -> None
     assert reason in plan.reason
 
 
-def test_a_given_duration_stays() -> None:
-    slow = plan_motion(PANDA, PANDA.home, GOAL, [POST], duration=4.0)
-    assert slow.success
-    assert slow.duration == pytest.approx(4.0)
-
-
-def test_a_margin_is_kept() -> None:
-    plan = plan_motion(PANDA, PANDA.home, GOAL, [POST], margin=0.03)
+def test_a_given_duration_and_a_margin_are_kept() -> None:
+    plan = plan_motion(PANDA, PANDA.home, GOAL, [POST], duration=4.0, margin=0.03)
     assert plan.success
+    assert plan.duration == pytest.approx(4.0)
     assert plan.clearance >= 0.03
 
 
@@ -174,14 +168,6 @@ def objective(setting, table, row, start, offsets, scene, aim, gradient):
     movement = Movement(table, row, np.ascontiguousarray(start), offsets, 1.0)
     hessian = np.empty((len(gradient), len(gradient)))
     return refine._assemble(setting, movement, scene, 0, aim, 360.0, np.inf, hessian, gradient, work)[0]
-
-
-def test_moving_obstacles_are_avoided_where_they_are_then() -> None:
-    # It starts out of the way, and crosses the straight movement; where it will be later is free now.
-    ball = Sphere(0.1, position=(0.75, 0.15, 0.5), velocity=(-0.3, 0.0, 0.0))
-    plan = plan_motion(PANDA, PANDA.home, GOAL, [ball])
-    assert plan.success
-    assert plan.execute().is_success.all()
 
 
 def test_poses_and_several_goals() -> None:
@@ -238,12 +224,13 @@ def test_given_seeds_come_first() -> None:
 
 def test_results_depend_on_neither_threads_nor_the_form_of_obstacles() -> None:
     task, starts, goals, obstacles = drawn(6, arm="panda")
-    alone = [plan_motion(task.arm, *each, rng=5) for each in zip(starts, goals, obstacles, strict=True)]
-    for threads in (1, 3):
-        together = plan_motions(task.arm, starts, goals, obstacles, threads=threads, rng=5)
-        for one, other in zip(alone, together, strict=True):
-            assert np.array_equal(one.waypoints, other.waypoints)
-            assert np.array_equal(one.durations, other.durations)
+    several = np.random.default_rng(5).spawn(6)  # problems of a batch share no generator
+    for threads, rng, own in ((1, 5, [5] * 6), (3, np.random.default_rng(5), several)):
+        together = plan_motions(task.arm, starts, goals, obstacles, threads=threads, rng=rng)
+        for i in range(6):
+            alone = plan_motion(task.arm, starts[i], goals[i], obstacles[i], rng=own[i])
+            assert np.array_equal(alone.waypoints, together[i].waypoints)
+            assert np.array_equal(alone.durations, together[i].durations)
     forms = [POST], [POST.to_dict()], pack([[POST]])
     first, *others = (plan_motion(PANDA, PANDA.home, GOAL, form) for form in forms)
     assert all(np.array_equal(first.waypoints, other.waypoints) for other in others)
@@ -273,19 +260,6 @@ def test_gradient_of_the_objective(kwargs) -> None:
         computed = 2.0 * gradient
         # The nearest sphere changes here and there, where the objective has a kink.
         assert np.abs(computed - measured).max() < 0.03 * np.abs(measured).max()
-
-
-def test_problems_of_a_batch_share_no_generator(monkeypatch) -> None:
-    drawn_first = []
-
-    def draw(*_, rng=None, **__):
-        if rng is not None:
-            drawn_first.append(rng.uniform())
-
-    monkeypatch.setattr(module, "plan_motion", draw)
-    plan_motions(PANDA, [PANDA.home] * 2, [GOAL] * 2, [[]] * 2, threads=1, rng=np.random.default_rng(1))
-    children = np.random.default_rng(1).spawn(2)
-    assert drawn_first == [child.uniform() for child in children]
 
 
 def test_a_batch_goes_on_after_problems_that_are_refused() -> None:
@@ -354,16 +328,32 @@ def test_nothing_thin_is_passed_through_between_two_instants() -> None:
             assert plan.clearance < -0.001
 
 
-def test_plans_are_executed_among_all_shapes() -> None:
-    points = np.random.default_rng(0).normal(0.0, 0.04, (30, 3))
-    place = (0.5, 0.15, 0.4)
-    for shape in (ConvexMesh.hull(points, position=place), PointCloud(points, 0.01, position=place)):
-        plan = plan_motion(PANDA, PANDA.home, GOAL, [shape])
-        assert plan.success
-        assert plan.execute().is_success
-    low = (-0.05, 0.37, 0.0)
-    for shape in (Sphere(0.02, position=low), Capsule(0.02, 0.05, position=low), PointCloud([low], 0.02)):
-        assert plan_motion("planar", (-0.2, 0.3), (0.1, 0.4), [shape]).execute().is_success
+POINTS, PLACE, LOW = np.random.default_rng(0).normal(0.0, 0.04, (30, 3)), (0.5, 0.15, 0.4), (-0.05, 0.37, 0.0)
+TO_THE_GOAL = np.array((-0.18, 0.24, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("arm", "obstacle"),
+    [
+        ("panda", ConvexMesh.hull(POINTS, position=PLACE)),
+        ("panda", PointCloud(POINTS, 0.01, position=PLACE)),
+        # It starts out of the way, and crosses the straight movement; where it will be later is free now.
+        ("panda", Sphere(0.1, position=(0.75, 0.15, 0.5), velocity=(-0.3, 0.0, 0.0))),
+        ("planar", Sphere(0.02, position=LOW)),
+        ("planar", Capsule(0.02, 0.05, position=LOW)),
+        ("planar", PointCloud([LOW], 0.02)),
+        # The movement waits or hurries where it crosses the goal after so many seconds.
+        *(
+            ("planar", Sphere(0.05, position=(0.1, 0.4, 0.0) - seconds * TO_THE_GOAL, velocity=TO_THE_GOAL))
+            for seconds in (1.0, 1.25, 1.5, 1.75)
+        ),
+    ],
+)
+def test_plans_succeed_among_all_shapes_at_rest_and_moving(arm, obstacle) -> None:
+    ends = (PANDA.home, GOAL) if arm == "panda" else ((-0.2, 0.3), (0.1, 0.4))
+    plan = plan_motion(arm, *ends, [obstacle])
+    assert plan.success
+    assert plan.execute().is_success.all()
 
 
 def test_the_benchmark_is_that_of_the_literature() -> None:
@@ -449,15 +439,6 @@ def test_command_line_plans_and_measures(tmp_path, capsys, failed) -> None:
     assert "| plan_motion | all" in capsys.readouterr().out
 
 
-def test_a_movement_waits_or_hurries_where_an_obstacle_crosses_its_goal() -> None:
-    passing = np.array((-0.18, 0.24, 0.0))
-    for seconds in (1.0, 1.25, 1.5, 1.75):  # until it is at the goal
-        ball = Sphere(0.05, position=np.array((0.1, 0.4, 0.0)) - seconds * passing, velocity=passing)
-        plan = plan_motion("planar", (-0.2, 0.3), (0.1, 0.4), [ball])
-        assert plan.success
-        assert plan.execute().is_success.all()
-
-
 def write_problem(folder, number, objects, names, start, goal) -> None:
     """Write a problem as the benchmark does; values of JSON are values of YAML."""
     folder.mkdir(exist_ok=True)
@@ -536,9 +517,9 @@ def test_planners_are_measured_on_problems_of_another_arm(tmp_path, capsys, fail
 
 
 def test_narrow_passages_that_a_search_finds_are_planned() -> None:
-    # Ten of these scenes were not solved when every refinement asked for a clearance of 4 cm.
+    # A third of these scenes were not solved when every refinement asked for a clearance of 4 cm.
     task = registered_task(WHOLE)
-    frozen = scenes_for("validation", task, 120)
+    frozen = scenes_for("validation", task, 60)
     hard = frozen.take(frozen.band == len(BANDS) - 1).scenes
     start, goal = task.space.coordinates(hard.start), task.space.coordinates(hard.goal)
     solved = [
