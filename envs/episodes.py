@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,10 +10,10 @@ import numpy as np
 from viapoint.envs.arms.kinematics import slowdowns
 from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict, norm, put, take
 from viapoint.envs.events import NEVER, Event, EventPredictor, next_step
-from viapoint.envs.executor import Executor, Pieces, References
+from viapoint.envs.executor import CONTROL_STRIDE, Executor, Piece, blocks
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
 from viapoint.envs.outcome import SETTLING, Outcome, Rollout, straight_jerk_cost
-from viapoint.envs.plans import Motion, Movements, Plan, checked_plan, jerk_cost_between
+from viapoint.envs.plans import MAX_START_OFFSET, Motion, Movements, Plan, jerk_cost_between
 from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed
 from viapoint.envs.rewards import reward_terms
 from viapoint.envs.scenes.scene import Scenes, resting
@@ -28,6 +28,8 @@ MOST_PROLONGED = 1.5
 """Greatest factor each time. Longer plans in motion swing out and need more: the factors would grow without bound."""
 
 History = list[tuple[float, Plan]]  # Plans of an episode with the times at which they began, [s]
+# Function of rows and a number of steps T that returns references from now on, shape (n, T + 1, D) each
+References = Callable[[Int, int], Motion]
 
 
 class Recorded(NamedTuple):
@@ -63,7 +65,7 @@ class Episodes:
         """Scenes of the running episodes."""
         self.history: list[History] = [[] for _ in range(number)]
         """Plans of the running episodes."""
-        self._finished: tuple[Int, Scenes, list[tuple[History, Pieces]]] | None = None
+        self._finished: tuple[Int, Scenes, list[tuple[History, list[Piece]]]] | None = None
         """Rows, scenes and records of the episodes before the running ones; None if they are not kept."""
         self._moving = False
         self._events = EventPredictor(task)
@@ -173,31 +175,30 @@ class Episodes:
         return self._follow(plan, ~kept & active, active)
 
     def execute(self, plan: Plan) -> Decision:
-        """Replace every plan by another one of :meth:`checked`, and follow it."""
+        """Replace every plan by another one that begins where the references are, and follow it."""
         everyone = np.ones(len(self.begun), bool)
         return self._follow(plan, everyone, everyone)
 
-    def checked(self, plan: Plan) -> Plan:
-        """Return plans that begin in the present state of the references, after a check that they fit.
+    def plan_from_here(self, waypoints: Float, durations: Float) -> Plan:
+        """Return plans that begin in the present state of the references.
 
         Raises:
             ValueError: A plan begins elsewhere, or has another number of via-points where plans are revised.
-            TypeError: The task has no plans.
         """
-        if self.task.stepwise:
-            raise TypeError(
-                "here an action steers the arm for one control step; plans need another decide_at"
-            )
+        state = Motion.at_rest(self._start) if self.task.whole_movement else self.nominal.state
+        away = norm(waypoints[:, 0] - state.position)
+        if (away > MAX_START_OFFSET).any():
+            row = int(away.argmax())
+            where = f"at {state.position[row]}, got {waypoints[row, 0]}"
+            raise ValueError(f"plan {row} must begin where the arm is, {where}")
         if self.task.whole_movement:
-            return checked_plan(plan, self._start)
-        state = self.nominal.state
-        plan = checked_plan(plan, state.position)
-        if plan.waypoints.shape != self.plan.waypoints.shape:
+            return Plan.at_rest(waypoints, durations)
+        if waypoints.shape != self.plan.waypoints.shape:
             raise ValueError(
-                f"plan must have waypoints of shape {self.plan.waypoints.shape}, got {plan.waypoints.shape}"
+                f"plan must have waypoints of shape {self.plan.waypoints.shape}, got {waypoints.shape}"
             )
-        waypoints = np.concatenate((state.position[:, None], plan.waypoints[:, 1:]), axis=1)
-        return Plan(waypoints, plan.durations, state.velocity, state.acceleration)
+        waypoints = np.concatenate((state.position[:, None], waypoints[:, 1:]), axis=1)
+        return Plan(waypoints, durations, state.velocity, state.acceleration)
 
     def move_goals(self, joints: Float) -> None:
         """Replace the goals of the running episodes by joint positions, shape (n, J); they jump no more."""
@@ -304,11 +305,13 @@ class Episodes:
         state = self.executor.state
         turns = self._events.steps(self.scenes.course_times())
         while True:
-            rows = np.flatnonzero((state.steps < last) & ~state.collision & ~state.unstable)
+            rows = np.flatnonzero((state.steps < last) & (state.first_contact < 0) & ~state.unstable)
             if not rows.size:
                 return
             now = state.steps[rows]
-            self._run(rows, np.minimum(last[rows], next_step(turns[rows], now)) - now, references)
+            steps = np.minimum(last[rows], next_step(turns[rows], now)) - now
+            for some in blocks(steps):
+                self._run(rows[some], steps[some], references)
 
     def _run(self, rows: Int, steps: Int, references: References) -> None:
         """Execute references in some episodes for a number of physics steps each, shape (n,)."""
@@ -317,7 +320,9 @@ class Episodes:
         obstacles = scenes.obstacles_at(np.asarray(now * self.simulator.timestep))
         goals = scenes.goals(np.asarray((now + steps) * self.simulator.timestep))
         goal = self.task.space.coordinates(goals)
-        self.executor.run(rows, steps, obstacles, goal, references, self._moving)
+        # A few steps more than needed, so that no control depends on the longest movement of the block.
+        motion = references(rows, int(steps.max()) + CONTROL_STRIDE)
+        self.executor.run(rows, steps, obstacles, goal, motion, self._moving)
 
     def _references(self, rows: Int, number: int) -> Motion:
         """Return references of plans from now on, shape (n, T + 1, D) each."""
@@ -385,7 +390,7 @@ class Episodes:
     def _outcome(self, final: Bool) -> Outcome:
         """Return the metrics so far, where `final` is True for arms that have arrived at their last goal."""
         state, task, timestep = self.executor.state, self.task, self.simulator.timestep
-        time, touched = self.time, state.collision
+        time, touched = self.time, state.first_contact >= 0
         goal = self.goals(time)
         here = state.hand[:, :2] if task.space.of_hand else state.joints
         error = norm(here - goal) if task.space.of_hand else np.abs(here - goal).max(axis=-1)
@@ -457,13 +462,6 @@ class Episodes:
         self.simulator.physics_steps = int(state["physics_steps"])
         now = self.executor.state
         for row in np.flatnonzero(now.steps):  # records begin here, at the present time
-            joints = now.joints[row : row + 1].copy()
-            here = (
-                now.steps[row : row + 1].copy(),
-                joints,
-                self.task.space.coordinates(joints),
-                np.zeros(1, bool),
-            )
-            self.executor.past[row] = [here]
+            self.executor.past[row] = [self.executor.still(now.steps[row], now.joints[[row]])]
         if self.looks is not None:
             self.looks = Looks(*(np.array(part) for part in state["looks"]))

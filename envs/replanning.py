@@ -98,7 +98,7 @@ def timed(waypoints: Float, duration: Float, state: Motion) -> Plan:
 def _revised(layout: ActionLayout, nominal: NominalPlan, actions: Float) -> Plan:
     """Return plans in motion for actions that change them."""
     state, number, d = nominal.state, layout.n_via, layout.dimension
-    offsets = actions[:, : number * d].reshape(len(actions), number, d) * np.array(layout.via_scale)
+    offsets = actions[:, : number * d].reshape(len(actions), number, d) * layout.via_scale
     if layout.space == "hand":
         offsets = turned(offsets, _line(nominal)[:, None])
     points = np.concatenate((state.position[:, None], nominal.vias + offsets, nominal.goal[:, None]), axis=1)

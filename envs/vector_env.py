@@ -293,16 +293,23 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             plan: Movements of all environments, from the present references to the goals.
 
         Raises:
-            ValueError: A plan begins elsewhere.
+            ValueError: A plan begins elsewhere, or has another number of via-points where plans are revised.
+            TypeError: The task has no plans.
         """
         self._check_running()
-        waypoints = finite_array("waypoints of the plan", plan.waypoints, (self.num_envs, None, None))
-        durations = finite_array("durations of the plan", plan.durations, (self.num_envs, None))
-        whole = Plan(waypoints, durations)
+        if self.task.stepwise:
+            raise TypeError(
+                "here an action steers the arm for one control step; plans need another decide_at"
+            )
+        number, dimension = self.num_envs, self.task.space.dimension
+        waypoints = finite_array("waypoints of the plan", plan.waypoints, (number, None, dimension))
+        durations = finite_array("durations of the plan", plan.durations, (number, waypoints.shape[1] - 1))
+        if (durations <= 0.0).any():
+            raise ValueError(f"durations of the plan must be positive, got {durations.min()}")
         # Nothing moves before all plans are checked.
         plans = {}
         for episodes, share in zip(self._episodes, self._shares, strict=True):
-            plans[episodes] = episodes.checked(whole.take(share))
+            plans[episodes] = episodes.plan_from_here(waypoints[share], durations[share])
         parts = self._each(lambda episodes, _: episodes.execute(plans[episodes]))
         return self._joined(parts, np.ones(self.num_envs, bool))
 

@@ -47,19 +47,6 @@ def whole_number(name: str, value: Any, least: int, most: int | None = None) -> 
     return int(value)
 
 
-def check_increasing_pair(name: str, pair: Any, least: float = 0.0, most: float = np.inf) -> None:
-    """Check that a pair is two positive finite numbers in increasing order, from `least` to `most`."""
-    try:
-        low, high = pair
-    except (TypeError, ValueError):
-        low = high = None
-    numbers = is_number(low) and is_number(high)
-    if not numbers or not 0.0 < low < high < np.inf or low < least or high > most:
-        raise ValueError(
-            f"{name} must be two positive numbers in increasing order, from {least:g} to {most:g}, got {pair!r}"
-        )
-
-
 def names_of(argument: str, names: Any) -> tuple[Any, ...]:
     """Return one name, or a sequence of one or more names, as a tuple.
 
