@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from viapoint.envs.outcome import SETTLING, Outcome, Rollout, straight_jerk_cost
 from viapoint.envs.plans import MAX_START_OFFSET, Motion, Movements, Plan, jerk_cost_between
 from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed
 from viapoint.envs.rewards import reward_terms
+from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes, resting
 from viapoint.envs.sensors import Looks
 from viapoint.envs.simulator import Simulator
@@ -85,6 +87,11 @@ class Episodes:
         """Plans of the last decisions; None before the first, and where the arm is steered."""
         self.looks = None if task.sensor is None else Looks.none(task.sensor, number)
         """Looks of the sensor in the running episodes; None without a sensor."""
+
+    @functools.cached_property
+    def sampler(self) -> SceneSampler:
+        """Sampler of the task's scenes."""
+        return self.task.sampler()
 
     @property
     def time(self) -> Float:
@@ -450,18 +457,17 @@ class Episodes:
             "looks": [part.copy() for part in self.looks or ()],
         }
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state of environments of the same task and number."""
-        self.start(np.arange(len(self.begun)), from_dict(self.scenes, state["scenes"]))
+    def restore(self, state: Mapping[str, Any], scenes: Scenes) -> None:
+        """Continue from a state of environments of the same task and number, and their scenes."""
+        self.start(np.arange(len(self.begun)), scenes)
         put(self.executor.state, slice(None), from_dict(self.executor.state, state["metrics"]))
         self.plan = from_dict(self.plan, state["plan"])
         self._movements = Movements.of(self.plan)
         put(self._motion, slice(None), from_dict(self._motion, state["motion"]))
         self._began[:], self.begun[:] = state["began"], state["begun"]
         self.simulator.batch.state[:] = state["physics"]
-        self.simulator.physics_steps = int(state["physics_steps"])
         now = self.executor.state
         for row in np.flatnonzero(now.steps):  # records begin here, at the present time
             self.executor.past[row] = [self.executor.still(now.steps[row], now.joints[[row]])]
         if self.looks is not None:
-            self.looks = Looks(*(np.array(part) for part in state["looks"]))
+            self.looks = Looks(*state["looks"])
