@@ -207,11 +207,6 @@ class Episodes:
         waypoints = np.concatenate((state.position[:, None], waypoints[:, 1:]), axis=1)
         return Plan(waypoints, durations, state.velocity, state.acceleration)
 
-    def move_goals(self, joints: Float) -> None:
-        """Replace the goals of the running episodes by joint positions, shape (n, J); they jump no more."""
-        self.scenes.goal[:] = joints
-        self.scenes.jumps[:] = 0.0
-
     def recorded(self, row: int) -> Recorded:
         """Return the running episode of one environment; where it has not moved yet, the one before if it is kept."""
         scene = self.scenes.take([row])
@@ -309,7 +304,7 @@ class Episodes:
 
     def _run_until(self, last: Int, references: References) -> None:
         """Run the episodes until a physics step each; obstacles keep their velocity in every piece of it."""
-        state = self.executor.state
+        state, timestep = self.executor.state, self.simulator.timestep
         turns = self._events.steps(self.scenes.course_times())
         while True:
             rows = np.flatnonzero((state.steps < last) & (state.first_contact < 0) & ~state.unstable)
@@ -318,18 +313,13 @@ class Episodes:
             now = state.steps[rows]
             steps = np.minimum(last[rows], next_step(turns[rows], now)) - now
             for some in blocks(steps):
-                self._run(rows[some], steps[some], references)
-
-    def _run(self, rows: Int, steps: Int, references: References) -> None:
-        """Execute references in some episodes for a number of physics steps each, shape (n,)."""
-        scenes = self.scenes.take(rows)
-        now = self.executor.state.steps[rows]
-        obstacles = scenes.obstacles_at(np.asarray(now * self.simulator.timestep))
-        goals = scenes.goals(np.asarray((now + steps) * self.simulator.timestep))
-        goal = self.task.space.coordinates(goals)
-        # A few steps more than needed, so that no control depends on the longest movement of the block.
-        motion = references(rows, int(steps.max()) + CONTROL_STRIDE)
-        self.executor.run(rows, steps, obstacles, goal, motion, self._moving)
+                block, number, begin = rows[some], steps[some], now[some]
+                scenes = self.scenes.take(block)
+                obstacles = scenes.obstacles_at(np.asarray(begin * timestep))
+                goal = self.task.space.coordinates(scenes.goals(np.asarray((begin + number) * timestep)))
+                # A few steps more than needed, so that no control depends on the longest movement of the block.
+                motion = references(block, int(number.max()) + CONTROL_STRIDE)
+                self.executor.run(block, number, obstacles, goal, motion, self._moving)
 
     def _references(self, rows: Int, number: int) -> Motion:
         """Return references of plans from now on, shape (n, T + 1, D) each."""

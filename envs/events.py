@@ -65,8 +65,6 @@ class EventPredictor:
         self.task = task
         self.timestep = task.arm.timestep
         self.triggers = frozenset(() if isinstance(task.decide_at, str) else task.decide_at)
-        self.horizon = int(self.steps(min(task.horizon, task.time_limit)))
-        """Physics steps of the horizon."""
         self.limit = int(self.steps(task.time_limit))
         """Greatest number of physics steps of an episode."""
 
@@ -109,10 +107,9 @@ class EventPredictor:
             (Event.COURSE, "course", turn, after_turn),
         ):
             ends[event] = next_step(steps, now) if trigger in self.triggers else np.where(waits, later, NEVER)
-        horizon = now + self.horizon
-        ends[Event.HORIZON] = np.where(
-            ("horizon" in self.triggers) & (horizon < moving_until), horizon, NEVER
-        )
+        horizon = now + self.steps(min(self.task.horizon, self.task.time_limit))
+        interim = ("horizon" in self.triggers) & (horizon < moving_until)
+        ends[Event.HORIZON] = np.where(interim, horizon, NEVER)
         ends[Event.ARRIVAL] = np.where(waits, NEVER, arrival)
         latest = np.minimum.reduce([*ends.values()])
         ends[Event.CLEARANCE] = self._clearance(plan, began, now, scenes, latest)

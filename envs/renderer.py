@@ -69,13 +69,11 @@ class EpisodeRenderer:
         """Render the running episode so far."""
         recorded = self._episodes.recorded(self._row)
         rollout = recorded.rollout
-        if len(rollout.time) == 1:
-            picture = self._draw(recorded, 0)
-            return {"human": None, "rgb_array_list": [picture]}.get(str(self._mode), picture)
+        still = len(rollout.time) == 1
         if self._mode == "rgb_array":
-            touched = int(rollout.contact.argmax()) if rollout.contact.any() else len(rollout.time)
-            return self._draw(recorded, touched)
-        steps = frame_steps(rollout.time, self._fps)
+            last = int(rollout.contact.argmax()) if rollout.contact.any() else len(rollout.time)
+            return self._draw(recorded, 0 if still else last)
+        steps = np.zeros(1, np.int64) if still else frame_steps(rollout.time, self._fps)
         if self._mode == "human":
             return self._play(recorded, steps)
         return [self._draw(recorded, int(step)) for step in steps]
@@ -187,7 +185,12 @@ class SceneView:
         self._option = mujoco.MjvOption()
         self._flat = simulator.arm.space == "hand"
         self._floor = float(self.model.geom("table").pos[2])
-        self._aim(width, height)
+        camera = self.model.camera(CAMERA).id
+        self._camera = mujoco.MjvCamera()
+        self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
+        if width < height:  # a wider field of view keeps the whole workspace in upright pictures
+            half = np.tan(np.radians(self.model.cam_fovy[camera]) / 2.0)
+            self.model.cam_fovy[camera] = 2.0 * np.degrees(np.arctan(half * height / width))
 
     def write(self, picture: Picture) -> None:
         """Set up one picture."""
@@ -237,15 +240,6 @@ class SceneView:
             pairs = data.contact.geom[: data.ncon].ravel()
             for geom in self._shown({int(each) for each in pairs}):
                 geom.rgba = np.array((*PALETTE.contact, 1.0), dtype=np.float32)
-
-    def _aim(self, width: int, height: int) -> None:
-        """Widen the camera's field of view for upright pictures, so that the whole workspace stays in view."""
-        camera = self.model.camera(CAMERA).id
-        self._camera = mujoco.MjvCamera()
-        self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
-        if width < height:
-            half = np.tan(np.radians(self.model.cam_fovy[camera]) / 2.0)
-            self.model.cam_fovy[camera] = 2.0 * np.degrees(np.arctan(half * height / width))
 
     def _shown(self, numbers: set[int]) -> list[Any]:
         """Return the scene's geoms that show some geoms of the model."""

@@ -345,7 +345,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         joints = space.joints(goals)
         scenes = Scenes.together([each.scenes for each in self._episodes])
         check_jumps(scenes._replace(goal=joints), self.arm)
-        self._each(lambda episodes, share: episodes.move_goals(joints[share]))
+        for episodes, share in zip(self._episodes, self._shares, strict=True):
+            episodes.scenes.goal[:] = joints[share]
+            episodes.scenes.jumps[:] = 0.0
         return self.observe()
 
     def observe(self) -> Observation:
