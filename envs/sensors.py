@@ -224,8 +224,15 @@ class Sensor:
         """
         rotation, origin = self.pose(arm, np.asarray(joints, np.float64))
         ranges, seen, rays = self._cast(rotation, origin, obstacles)
-        if self.noise or self.dropped:
-            ranges = self._disturbed(ranges, seen)
+        if self.noise or self.dropped:  # functions of the distances and the rays' numbers
+            numbers = np.arange(1, self.n_rays + 1, dtype=np.uint64)
+            # Distances of one scene differ in their last bits where its numbers were written and read.
+            bits = np.rint(ranges / GRAIN).astype(np.uint64) + numbers * np.uint64(GOLDEN)
+            first, second, third = (_uniform(bits + np.uint64(k)) for k in range(3))
+            # Two uniform numbers give a normal one (G. E. P. Box and M. E. Muller, 1958).
+            normal = np.sqrt(-2.0 * np.log(1.0 - first)) * np.cos(2.0 * np.pi * second)
+            noisy = np.clip(ranges + self.noise * normal, 0.0, self.range)
+            ranges = np.where((seen < 0) | (third < self.dropped), self.range, noisy)
         return Readings(ranges, origin[:, None] + ranges[..., None] * rays, seen, origin)
 
     def hidden(self, rotation: Float, origin: Float, obstacles: Obstacles) -> Bool:
@@ -245,17 +252,6 @@ class Sensor:
         seen = np.full(ranges.shape, -1, np.int64)
         _cast(obstacles, centre, ball, origin, rays, ranges, seen)
         return ranges, seen, rays
-
-    def _disturbed(self, ranges: Float, seen: Int) -> Float:
-        """Return distances with noise and dropped rays, which are functions of the distances and the rays' numbers."""
-        # Distances of one scene differ in their last bits where its numbers were written and read.
-        numbers = np.arange(1, self.n_rays + 1, dtype=np.uint64)
-        bits = np.rint(ranges / GRAIN).astype(np.uint64) + numbers * np.uint64(GOLDEN)
-        first, second, third = (_uniform(bits + np.uint64(k)) for k in range(3))
-        # Two uniform numbers give a normal one (G. E. P. Box and M. E. Muller, 1958).
-        normal = np.sqrt(-2.0 * np.log(1.0 - first)) * np.cos(2.0 * np.pi * second)
-        noisy = np.clip(ranges + self.noise * normal, 0.0, self.range)
-        return np.where((seen < 0) | (third < self.dropped), self.range, noisy)
 
 
 NAMED = ("rays", "camera", "hand_rays", "hand_camera")  # Names of usual sensors, see :func:`named_sensor`

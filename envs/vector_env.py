@@ -19,7 +19,6 @@ from gymnasium.vector.utils import batch_space
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.common.arrays import Bool, Float, Int, Observation, from_dict
 from viapoint.envs.common.validation import (
-    as_given,
     finite_array,
     masked_rows,
     seeds_of,
@@ -103,7 +102,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         max_episode_steps: int | None = None,
         **task: Any,
     ) -> None:
-        task = as_given(task)
+        for name, value in task.items():
+            if isinstance(value, Mapping | list):  # the caller may change it later
+                task[name] = copy.copy(value)
         EzPickle.__init__(
             self,
             num_envs,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from numbers import Real
@@ -61,14 +60,6 @@ def names_of(argument: str, names: Any) -> tuple[Any, ...]:
     if not names:
         raise ValueError(f"{argument} must be one name or more, got {names!r}")
     return tuple(names)
-
-
-def as_given(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of arguments, independent of later changes of the caller's lists and mappings."""
-    return {
-        name: copy.copy(value) if isinstance(value, Mapping | list) else value
-        for name, value in arguments.items()
-    }
 
 
 def fewest_and_most(name: str, number: Any, most: int, most_drawn: int) -> tuple[int, int]:
