@@ -34,7 +34,6 @@ from viapoint.envs.scenes.scene import Scenes, check_jumps
 from viapoint.envs.task import Task
 
 SINGLE_METADATA: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
-METADATA: dict[str, Any] = {**SINGLE_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}
 LEAST_SHARE = 4  # Fewest environments for which a thread is worth its while
 
 
@@ -88,7 +87,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         (16,)
     """
 
-    metadata = METADATA
+    metadata = {**SINGLE_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - Gymnasium's
 
     def __init__(
         self,
