@@ -273,8 +273,10 @@ class Episodes:
         stretch = np.maximum(needed, 1.0)
         moving = ((plan.velocity != 0.0) | (plan.acceleration != 0.0)).any(axis=-1)
         stretch[moving] = np.minimum(stretch[moving], MOST_PROLONGED)
-        slower = plan._replace(durations=plan.durations * stretch[:, None])
-        movements = movements.stretched(stretch)
+        scale = stretch[:, None]
+        slower = plan._replace(durations=plan.durations * scale)
+        shape, starts, rates, end = movements
+        movements = Movements(shape, starts * scale, rates / scale, end * scale)
         rows = changed = np.flatnonzero(moving & (needed > ENOUGH))
         for _ in range(PROLONGED):
             if not rows.size:

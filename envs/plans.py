@@ -105,11 +105,6 @@ class Movements(NamedTuple):
         found = plan.trajectory()
         return cls(*map(np.array, (found.coefficients, found.starts, found.rates, found.end)))
 
-    def stretched(self, factor: Float) -> Movements:
-        """Return movements that begin at rest with durations that are longer by a factor, shape (N,)."""
-        scale = factor[:, None]
-        return Movements(self.coefficients, self.starts * scale, self.rates / scale, self.end * scale)
-
     def sample(self, times: Float) -> Motion:
         """Return the states at times of shape (N, T), [s]; outside the movement, the arm rests at an end."""
         return Motion(*_sampled(self, times))

@@ -18,12 +18,7 @@ from gymnasium.vector.utils import batch_space
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.common.arrays import Bool, Float, Int, Observation, from_dict
-from viapoint.envs.common.validation import (
-    finite_array,
-    masked_rows,
-    seeds_of,
-    whole_number,
-)
+from viapoint.envs.common.validation import finite_array, masked_rows, seeds_of, whole_number
 from viapoint.envs.episodes import Decision, Episodes, History
 from viapoint.envs.geometry.obstacles import geom_meshes
 from viapoint.envs.outcome import Rollout
