@@ -8,19 +8,19 @@ from types import FrameType
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.utils import EzPickle
 from gymnasium.wrappers import RecordVideo
 
 from viapoint.envs.common.arrays import Observation
-from viapoint.envs.common.validation import as_given, finite_array
+from viapoint.envs.common.validation import finite_array
 from viapoint.envs.episodes import History
 from viapoint.envs.outcome import Rollout
 from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.task import Task
 from viapoint.envs.vector_env import SINGLE_METADATA, ReachVectorEnv
 
 
-class ReachEnv(gym.Env[Any, Any], EzPickle):
+class ReachEnv(gym.Env[Any, Any]):
     """One environment of a :class:`~viapoint.envs.vector_env.ReachVectorEnv`, with the same keyword arguments.
 
     Example:
@@ -35,15 +35,18 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
     metadata = SINGLE_METADATA
 
     def __init__(self, *, threads: int = 1, **kwargs: Any) -> None:
-        EzPickle.__init__(self, threads=threads, **as_given(kwargs))
         self.batch = ReachVectorEnv(1, threads=threads, **kwargs)
         """Vector environment with one environment."""
         self.observation_space = self.batch.single_observation_space
         self.action_space = self.batch.single_action_space
         self.render_mode = self.batch.render_mode
-        self.task = self.batch.task
         self._over = True
         self._warned = False
+
+    @property
+    def task(self) -> Task:
+        """Task of an episode."""
+        return self.batch.task
 
     @property
     def last_rollout(self) -> Rollout | None:
@@ -104,22 +107,6 @@ class ReachEnv(gym.Env[Any, Any], EzPickle):
         seen = {name: part[0] for name, part in decision.observation.items()}
         values = {name: value[0].item() for name, value in decision.info.items()}
         return seen, float(decision.reward[0]), terminated, truncated, values
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a pickle or a copy holds: the arguments, and the running episode."""
-        running = {
-            "batch": self.batch,
-            "_over": self._over,
-            "_np_random": self._np_random,
-            "_np_random_seed": self._np_random_seed,
-        }
-        return {**EzPickle.__getstate__(self), "running": running}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Continue the running episode of a pickle or a copy."""
-        running = state.pop("running")
-        EzPickle.__setstate__(self, state)
-        self.__dict__.update(running)
 
     def render(self) -> Any:
         """Render the last movement in the render mode; after a reset, the scene."""

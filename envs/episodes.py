@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,12 +11,13 @@ import numpy as np
 from viapoint.envs.arms.kinematics import slowdowns
 from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict, norm, put, take
 from viapoint.envs.events import NEVER, Event, EventPredictor, next_step
-from viapoint.envs.executor import Executor, Pieces, References
+from viapoint.envs.executor import CONTROL_STRIDE, Executor, Piece, blocks
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
 from viapoint.envs.outcome import SETTLING, Outcome, Rollout, straight_jerk_cost
-from viapoint.envs.plans import Motion, Movements, Plan, checked_plan, jerk_cost_between
+from viapoint.envs.plans import MAX_START_OFFSET, Motion, Movements, Plan, jerk_cost_between
 from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed
 from viapoint.envs.rewards import reward_terms
+from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes, resting
 from viapoint.envs.sensors import Looks
 from viapoint.envs.simulator import Simulator
@@ -28,6 +30,8 @@ MOST_PROLONGED = 1.5
 """Greatest factor each time. Longer plans in motion swing out and need more: the factors would grow without bound."""
 
 History = list[tuple[float, Plan]]  # Plans of an episode with the times at which they began, [s]
+# Function of rows and a number of steps T that returns references from now on, shape (n, T + 1, D) each
+References = Callable[[Int, int], Motion]
 
 
 class Recorded(NamedTuple):
@@ -63,7 +67,7 @@ class Episodes:
         """Scenes of the running episodes."""
         self.history: list[History] = [[] for _ in range(number)]
         """Plans of the running episodes."""
-        self._finished: tuple[Int, Scenes, list[tuple[History, Pieces]]] | None = None
+        self._finished: tuple[Int, Scenes, list[tuple[History, list[Piece]]]] | None = None
         """Rows, scenes and records of the episodes before the running ones; None if they are not kept."""
         self._moving = False
         self._events = EventPredictor(task)
@@ -83,6 +87,11 @@ class Episodes:
         """Plans of the last decisions; None before the first, and where the arm is steered."""
         self.looks = None if task.sensor is None else Looks.none(task.sensor, number)
         """Looks of the sensor in the running episodes; None without a sensor."""
+
+    @functools.cached_property
+    def sampler(self) -> SceneSampler:
+        """Sampler of the task's scenes."""
+        return self.task.sampler()
 
     @property
     def time(self) -> Float:
@@ -173,36 +182,30 @@ class Episodes:
         return self._follow(plan, ~kept & active, active)
 
     def execute(self, plan: Plan) -> Decision:
-        """Replace every plan by another one of :meth:`checked`, and follow it."""
+        """Replace every plan by another one that begins where the references are, and follow it."""
         everyone = np.ones(len(self.begun), bool)
         return self._follow(plan, everyone, everyone)
 
-    def checked(self, plan: Plan) -> Plan:
-        """Return plans that begin in the present state of the references, after a check that they fit.
+    def plan_from_here(self, waypoints: Float, durations: Float) -> Plan:
+        """Return plans that begin in the present state of the references.
 
         Raises:
             ValueError: A plan begins elsewhere, or has another number of via-points where plans are revised.
-            TypeError: The task has no plans.
         """
-        if self.task.stepwise:
-            raise TypeError(
-                "here an action steers the arm for one control step; plans need another decide_at"
-            )
+        state = Motion.at_rest(self._start) if self.task.whole_movement else self.nominal.state
+        away = norm(waypoints[:, 0] - state.position)
+        if (away > MAX_START_OFFSET).any():
+            row = int(away.argmax())
+            where = f"at {state.position[row]}, got {waypoints[row, 0]}"
+            raise ValueError(f"plan {row} must begin where the arm is, {where}")
         if self.task.whole_movement:
-            return checked_plan(plan, self._start)
-        state = self.nominal.state
-        plan = checked_plan(plan, state.position)
-        if plan.waypoints.shape != self.plan.waypoints.shape:
+            return Plan.at_rest(waypoints, durations)
+        if waypoints.shape != self.plan.waypoints.shape:
             raise ValueError(
-                f"plan must have waypoints of shape {self.plan.waypoints.shape}, got {plan.waypoints.shape}"
+                f"plan must have waypoints of shape {self.plan.waypoints.shape}, got {waypoints.shape}"
             )
-        waypoints = np.concatenate((state.position[:, None], plan.waypoints[:, 1:]), axis=1)
-        return Plan(waypoints, plan.durations, state.velocity, state.acceleration)
-
-    def move_goals(self, joints: Float) -> None:
-        """Replace the goals of the running episodes by joint positions, shape (n, J); they jump no more."""
-        self.scenes.goal[:] = joints
-        self.scenes.jumps[:] = 0.0
+        waypoints = np.concatenate((state.position[:, None], waypoints[:, 1:]), axis=1)
+        return Plan(waypoints, durations, state.velocity, state.acceleration)
 
     def recorded(self, row: int) -> Recorded:
         """Return the running episode of one environment; where it has not moved yet, the one before if it is kept."""
@@ -270,8 +273,10 @@ class Episodes:
         stretch = np.maximum(needed, 1.0)
         moving = ((plan.velocity != 0.0) | (plan.acceleration != 0.0)).any(axis=-1)
         stretch[moving] = np.minimum(stretch[moving], MOST_PROLONGED)
-        slower = plan._replace(durations=plan.durations * stretch[:, None])
-        movements = movements.stretched(stretch)
+        scale = stretch[:, None]
+        slower = plan._replace(durations=plan.durations * scale)
+        shape, starts, rates, end = movements
+        movements = Movements(shape, starts * scale, rates / scale, end * scale)
         rows = changed = np.flatnonzero(moving & (needed > ENOUGH))
         for _ in range(PROLONGED):
             if not rows.size:
@@ -301,23 +306,22 @@ class Episodes:
 
     def _run_until(self, last: Int, references: References) -> None:
         """Run the episodes until a physics step each; obstacles keep their velocity in every piece of it."""
-        state = self.executor.state
+        state, timestep = self.executor.state, self.simulator.timestep
         turns = self._events.steps(self.scenes.course_times())
         while True:
-            rows = np.flatnonzero((state.steps < last) & ~state.collision & ~state.unstable)
+            rows = np.flatnonzero((state.steps < last) & (state.first_contact < 0) & ~state.unstable)
             if not rows.size:
                 return
             now = state.steps[rows]
-            self._run(rows, np.minimum(last[rows], next_step(turns[rows], now)) - now, references)
-
-    def _run(self, rows: Int, steps: Int, references: References) -> None:
-        """Execute references in some episodes for a number of physics steps each, shape (n,)."""
-        scenes = self.scenes.take(rows)
-        now = self.executor.state.steps[rows]
-        obstacles = scenes.obstacles_at(np.asarray(now * self.simulator.timestep))
-        goals = scenes.goals(np.asarray((now + steps) * self.simulator.timestep))
-        goal = self.task.space.coordinates(goals)
-        self.executor.run(rows, steps, obstacles, goal, references, self._moving)
+            steps = np.minimum(last[rows], next_step(turns[rows], now)) - now
+            for some in blocks(steps):
+                block, number, begin = rows[some], steps[some], now[some]
+                scenes = self.scenes.take(block)
+                obstacles = scenes.obstacles_at(np.asarray(begin * timestep))
+                goal = self.task.space.coordinates(scenes.goals(np.asarray((begin + number) * timestep)))
+                # A few steps more than needed, so that no control depends on the longest movement of the block.
+                motion = references(block, int(number.max()) + CONTROL_STRIDE)
+                self.executor.run(block, number, obstacles, goal, motion, self._moving)
 
     def _references(self, rows: Int, number: int) -> Motion:
         """Return references of plans from now on, shape (n, T + 1, D) each."""
@@ -385,7 +389,7 @@ class Episodes:
     def _outcome(self, final: Bool) -> Outcome:
         """Return the metrics so far, where `final` is True for arms that have arrived at their last goal."""
         state, task, timestep = self.executor.state, self.task, self.simulator.timestep
-        time, touched = self.time, state.collision
+        time, touched = self.time, state.first_contact >= 0
         goal = self.goals(time)
         here = state.hand[:, :2] if task.space.of_hand else state.joints
         error = norm(here - goal) if task.space.of_hand else np.abs(here - goal).max(axis=-1)
@@ -445,25 +449,17 @@ class Episodes:
             "looks": [part.copy() for part in self.looks or ()],
         }
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state of environments of the same task and number."""
-        self.start(np.arange(len(self.begun)), from_dict(self.scenes, state["scenes"]))
+    def restore(self, state: Mapping[str, Any], scenes: Scenes) -> None:
+        """Continue from a state of environments of the same task and number, and their scenes."""
+        self.start(np.arange(len(self.begun)), scenes)
         put(self.executor.state, slice(None), from_dict(self.executor.state, state["metrics"]))
         self.plan = from_dict(self.plan, state["plan"])
         self._movements = Movements.of(self.plan)
         put(self._motion, slice(None), from_dict(self._motion, state["motion"]))
         self._began[:], self.begun[:] = state["began"], state["begun"]
         self.simulator.batch.state[:] = state["physics"]
-        self.simulator.physics_steps = int(state["physics_steps"])
         now = self.executor.state
         for row in np.flatnonzero(now.steps):  # records begin here, at the present time
-            joints = now.joints[row : row + 1].copy()
-            here = (
-                now.steps[row : row + 1].copy(),
-                joints,
-                self.task.space.coordinates(joints),
-                np.zeros(1, bool),
-            )
-            self.executor.past[row] = [here]
+            self.executor.past[row] = [self.executor.still(now.steps[row], now.joints[[row]])]
         if self.looks is not None:
-            self.looks = Looks(*(np.array(part) for part in state["looks"]))
+            self.looks = Looks(*state["looks"])

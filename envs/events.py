@@ -46,18 +46,6 @@ class Event(IntEnum):
     UNSTABLE = 9  # The physics broke down
 
 
-# Rank of simultaneous events, highest first
-_RANK = (
-    Event.TIME_LIMIT,
-    Event.TARGET,
-    Event.COURSE,
-    Event.CLEARANCE,
-    Event.SIGHT,
-    Event.ARRIVAL,
-    Event.HORIZON,
-)
-
-
 class EventPredictor:
     """Predictor of the ends of decisions of a task."""
 
@@ -65,8 +53,6 @@ class EventPredictor:
         self.task = task
         self.timestep = task.arm.timestep
         self.triggers = frozenset(() if isinstance(task.decide_at, str) else task.decide_at)
-        self.horizon = int(self.steps(min(task.horizon, task.time_limit)))
-        """Physics steps of the horizon."""
         self.limit = int(self.steps(task.time_limit))
         """Greatest number of physics steps of an episode."""
 
@@ -103,22 +89,24 @@ class EventPredictor:
         after_turn = next_step(turn, arrival)
         # At rest at the goal, the arm waits for what is still to come.
         waits = there & (np.minimum(after_jump, after_turn) < NEVER) & (len(self.triggers) > 0)
-        ends = {Event.TIME_LIMIT: np.maximum(np.full(len(now), self.limit), now + 1)}
+        horizon = now + self.steps(min(self.task.horizon, self.task.time_limit))
+        interim = ("horizon" in self.triggers) & (horizon < moving_until)
+        horizon = np.where(interim, horizon, NEVER)
+        arrival = np.where(waits, NEVER, arrival)
+        # In the order of their rank: of simultaneous events, the first one counts.
+        ends = {Event.TIME_LIMIT: np.maximum(self.limit, now + 1)}
         for event, trigger, steps, later in (
             (Event.TARGET, "target", jump, after_jump),
             (Event.COURSE, "course", turn, after_turn),
         ):
             ends[event] = next_step(steps, now) if trigger in self.triggers else np.where(waits, later, NEVER)
-        horizon = now + self.horizon
-        ends[Event.HORIZON] = np.where(
-            ("horizon" in self.triggers) & (horizon < moving_until), horizon, NEVER
-        )
-        ends[Event.ARRIVAL] = np.where(waits, NEVER, arrival)
-        latest = np.minimum.reduce([*ends.values()])
+        latest = np.minimum.reduce([*ends.values(), arrival, horizon])
         ends[Event.CLEARANCE] = self._clearance(plan, began, now, scenes, latest)
         ends[Event.SIGHT] = self._sight(plan, began, now, scenes, latest, looks)
-        steps = np.stack([ends[event] for event in _RANK])
-        event = np.array([int(each) for each in _RANK])[steps.argmin(axis=0)]
+        ends[Event.ARRIVAL] = arrival
+        ends[Event.HORIZON] = horizon
+        steps = np.stack(list(ends.values()))
+        event = np.array(list(ends))[steps.argmin(axis=0)]
         return steps.min(axis=0), event, there & (event == Event.ARRIVAL)
 
     def _clearance(self, plan: Plan, began: Int, now: Int, scenes: Scenes, latest: Int) -> Int:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position
-from viapoint.envs.common.arrays import Bool, Float, Int
+from viapoint.envs.common.arrays import Bool, Float, Int, put
 from viapoint.envs.geometry.clearance import (
     FAR,
     Placed,
@@ -34,12 +34,9 @@ BLOCK, SIMILAR = 32, 1.1
 length of one relative to another: all run as long as the longest one."""
 CONTROL_STRIDE = 4  # Physics steps between two computed torques; those in between are interpolated linearly
 
-# Function of rows and a number of steps T that returns references from now on, shape (n, T + 1, D) each
-References = Callable[[Int, int], Motion]
-
 # Numbers of physics steps, joint positions [rad] and references after each, and contacts before it, in pieces of an
 # episode
-Pieces = list[tuple[Int, Float, Float, Bool]]
+Piece = tuple[Int, Float, Float, Bool]
 
 
 class Executor:
@@ -48,11 +45,11 @@ class Executor:
     def __init__(self, simulator: Simulator, task: Task) -> None:
         self.simulator, self.space, self.tolerance = simulator, task.space, task.tolerance
         self._resumes = not task.whole_movement
-        arm = simulator.arm
-        number = len(simulator.batch.state)
-        self.state = EpisodeState.empty(number, len(arm.joint_names))
+        arm, number = simulator.arm, len(simulator.batch.state)
+        home, far = np.tile(arm.home, (number, 1)), np.full(number, FAR)
+        self.state = EpisodeState.at_rest(home, arm.hand(home), far, far)
         """Metrics of the running episodes."""
-        self.past: list[Pieces] = [[] for _ in range(number)]
+        self.past: list[list[Piece]] = [[] for _ in range(number)]
         """Records of the running episodes."""
         self._placed = memory(arm.chain, arm.spheres)
 
@@ -61,20 +58,29 @@ class Executor:
         arm = self.simulator.arm
         self.simulator.place(rows, joints, obstacles)
         apart, own = row_clearances(arm.chain, arm.spheres, joints, obstacles, FAR)
-        self.state.begin(rows, joints, arm.hand(joints), apart.min(axis=1, initial=FAR), own)
+        nearest = apart.min(axis=1, initial=FAR)
+        put(self.state, rows, EpisodeState.at_rest(joints, arm.hand(joints), nearest, own))
         for row in rows:
             self.past[row] = []
 
+    def still(self, step: int, joints: Float) -> Piece:
+        """Return the record of one physics step at rest at joint positions, shape (1, J)."""
+        return np.array([step]), joints.copy(), self.space.coordinates(joints), np.zeros(1, bool)
+
+    def rollout(self, pieces: Sequence[Piece], scene: Scenes) -> Rollout:
+        """Return an episode that was recorded in pieces, in its scene; without a piece, the arm is at the start."""
+        arm = self.simulator.arm
+        parts = zip(*(pieces or [self.still(1, scene.start)]), strict=True)
+        steps, joints, planned, contact = (np.concatenate(part) for part in parts)
+        time = np.asarray(self.simulator.timestep * steps)
+        every = scene.take(np.zeros(len(time), np.int64)).obstacles_at(time)
+        apart, _ = row_clearances(arm.chain, arm.spheres, joints, every, FAR)
+        return Rollout(time, planned, joints, arm.hand(joints), contact, apart.min(axis=1, initial=FAR))
+
     def run(
-        self,
-        rows: Int,
-        steps: Int,
-        obstacles: Obstacles,
-        goal: Float,
-        references: References,
-        moving: bool,
+        self, rows: Int, steps: Int, obstacles: Obstacles, goal: Float, motion: Motion, moving: bool
     ) -> None:
-        """Execute references in n episodes and add what comes of it to their metrics.
+        """Execute references in n episodes of :func:`blocks` and add what comes of it to their metrics.
 
         An episode stops at its first contact. Obstacles keep their velocities.
 
@@ -83,49 +89,11 @@ class Executor:
             steps: Physics steps of each, 1 or more, shape (n,).
             obstacles: Obstacles of these episodes at their present places.
             goal: Goals in coordinates of the space, shape (n, D).
-            references: Function that returns the references.
+            motion: References from now on, for CONTROL_STRIDE steps more than the longest episode has.
             moving: True if obstacles move.
         """
-        order = np.argsort(steps, kind="stable")
-        length = steps[order]
-        first = 0
-        while first < len(order):
-            similar = int(np.searchsorted(length, SIMILAR * length[first], side="right"))
-            last = min(similar, first + BLOCK)
-            some = np.sort(order[first:last])
-            block = rows[some], steps[some], obstacles.take(some), goal[some]
-            self._run_block(*block, references, moving)
-            first = last
-
-    def rollout(self, pieces: Pieces, scene: Scenes) -> Rollout:
-        """Return an episode that was recorded in pieces, in its scene."""
-        arm = self.simulator.arm
-        if pieces:
-            steps, joints, planned, contact = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
-        else:  # at rest at the start
-            joints = scene.start.copy()
-            planned = self.space.coordinates(joints)
-            contact = np.zeros(1, bool)
-            steps = np.ones(1, np.int64)
-        time = np.asarray(self.simulator.timestep * steps)
-        every = scene.take(np.zeros(len(time), np.int64)).obstacles_at(time)
-        apart, _ = row_clearances(arm.chain, arm.spheres, joints, every, FAR)
-        return Rollout(time, planned, joints, arm.hand(joints), contact, apart.min(axis=1, initial=FAR))
-
-    def _run_block(
-        self,
-        rows: Int,
-        steps: Int,
-        obstacles: Obstacles,
-        goal: Float,
-        references: References,
-        moving: bool,
-    ) -> None:
-        """Execute episodes of about the same length; the arguments are those of :meth:`run`."""
         simulator, arm, placed = self.simulator, self.simulator.arm, self._placed
         timestep, number = simulator.timestep, int(steps.max())
-        # A few steps more than needed, so that no control depends on the longest movement of the block.
-        motion = references(rows, number + CONTROL_STRIDE)
         path, rates, accelerations = self.space.joint_motion(motion)
         controls = arm.controls(path, rates, accelerations, CONTROL_STRIDE)[:, :number]
         centres = None
@@ -165,10 +133,21 @@ class Executor:
         for i, row in enumerate(rows):
             end = done[i]
             steps_done = begin[i] + np.arange(1, end + 1)
-            self.past[row].append(
-                (steps_done, joints[i, :end], motion.position[i, 1 : end + 1], contact[i, :end])
-            )
+            piece = steps_done, joints[i, :end], motion.position[i, 1 : end + 1], contact[i, :end]
+            self.past[row].append(piece)
         self.state.unstable[rows] |= unstable
+
+
+def blocks(steps: Int) -> Iterator[Int]:
+    """Yield the indices of episodes of similar lengths, shape (n,), which are executed together."""
+    order = np.argsort(steps, kind="stable")
+    length = steps[order]
+    first = 0
+    while first < len(order):
+        similar = int(np.searchsorted(length, SIMILAR * length[first], side="right"))
+        last = min(similar, first + BLOCK)
+        yield np.sort(order[first:last])
+        first = last
 
 
 @compiled

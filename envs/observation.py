@@ -69,9 +69,9 @@ class ObservationLayout:
             found["command"] = place
             found["velocity"] = _box(2.0 * max(task.steering.top_speed), dimension)
             found["acceleration"] = _box(task.steering.greatest_acceleration, dimension)
-            found["time_left"] = _span(task.time_limit)
+            found["time_left"] = np.zeros(1), np.full(1, task.time_limit)
             if task.replanning:
-                found["remaining"] = _span(task.time_limit)
+                found["remaining"] = found["time_left"]
                 if task.n_via:
                     found["via"] = np.tile(place[0], task.n_via), np.tile(place[1], task.n_via)
         return found
@@ -140,8 +140,3 @@ class ObservationLayout:
 def _box(bound: float, size: int) -> tuple[Float, Float]:
     """Return symmetric bounds."""
     return np.full(size, -bound), np.full(size, bound)
-
-
-def _span(most: float) -> tuple[Float, Float]:
-    """Return the bounds of a time, [s]."""
-    return np.zeros(1), np.full(1, most)

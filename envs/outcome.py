@@ -122,16 +122,17 @@ class EpisodeState(NamedTuple):
     """True if the physics broke down."""
 
     @classmethod
-    def empty(cls, number: int, joints: int) -> EpisodeState:
-        """Return the state of episodes that have not begun."""
+    def at_rest(cls, joints: Float, hand: Float, clearance: Float, self_clearance: Float) -> EpisodeState:
+        """Return the state of episodes that begin, for joint and hand positions, (N, J) and (N, 3), and clearances."""
+        number = len(joints)
         return cls(
-            joints=np.zeros((number, joints)),
-            hand=np.zeros((number, 3)),
+            joints=joints.copy(),
+            hand=hand.copy(),
             steps=np.zeros(number, np.int64),
             first_contact=np.full(number, -1),
-            min_clearance=np.zeros(number),
-            self_clearance=np.zeros(number),
-            planned_clearance=np.zeros(number),
+            min_clearance=clearance.copy(),
+            self_clearance=self_clearance.copy(),
+            planned_clearance=np.minimum(clearance, self_clearance),  # the start is commanded, too
             path_length=np.zeros(number),
             peak_speed=np.zeros(number),
             last_speed=np.zeros(number),
@@ -143,22 +144,6 @@ class EpisodeState(NamedTuple):
             reachable=np.ones(number, bool),
             unstable=np.zeros(number, bool),
         )
-
-    def begin(self, rows: Int, joints: Float, hand: Float, clearance: Float, self_clearance: Float) -> None:
-        """Start episodes at rest with joint positions (n, J), hand positions (n, 3) and clearances (n,)."""
-        fresh = EpisodeState.empty(len(rows), self.joints.shape[1])
-        fresh.joints[:] = joints
-        fresh.hand[:] = hand
-        fresh.min_clearance[:] = clearance
-        fresh.self_clearance[:] = self_clearance
-        fresh.planned_clearance[:] = np.minimum(clearance, self_clearance)  # the start is commanded, too
-        for mine, new in zip(self, fresh, strict=True):
-            mine[rows] = new
-
-    @property
-    def collision(self) -> Bool:
-        """True where the arm has been in contact, shape (N,)."""
-        return np.asarray(self.first_contact >= 0)
 
 
 def straight_jerk_cost(length: Float, duration: Float | float) -> Float:

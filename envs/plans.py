@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from viapoint import primitives
 from viapoint.envs.common.arrays import Float
-from viapoint.envs.common.validation import check_increasing_pair, finite_array, whole_number
+from viapoint.envs.common.validation import finite_array
 from viapoint.envs.geometry.compiled import compiled
+
+if TYPE_CHECKING:
+    from viapoint.envs.arms.arm import Arm
 
 Timing = Literal["optimal", "learned"]
 SpaceName = Literal["hand", "joints"]
@@ -22,6 +23,11 @@ MOST_VIAS = 16  # Greatest number of via-points of an action; more add no new mo
 # Bounds of the duration range, [s] in hand space, factors in joint space
 SHORTEST_DURATION, LONGEST_DURATION = 0.05, 60.0
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)  # Nodes and weights of Gauss-Legendre quadrature
+# Largest offsets of via-points along and across the straight line of the hand, [m]
+HAND_OFFSETS = (0.15, 0.25)
+# Largest offset of a joint at a via-point: a share of its range, and a bound, [rad]
+RANGE_SHARE, LARGEST_OFFSET = 0.35, 1.0
+UNLIMITED_SPEED = 4.0  # Speed that counts as the limit of joints without one in durations of actions, [rad/s]
 PEAK_INSTANTS = 64  # Instants at which the joint rates of a movement are looked at
 
 
@@ -99,11 +105,6 @@ class Movements(NamedTuple):
         found = plan.trajectory()
         return cls(*map(np.array, (found.coefficients, found.starts, found.rates, found.end)))
 
-    def stretched(self, factor: Float) -> Movements:
-        """Return movements that begin at rest with durations that are longer by a factor, shape (N,)."""
-        scale = factor[:, None]
-        return Movements(self.coefficients, self.starts * scale, self.rates / scale, self.end * scale)
-
     def sample(self, times: Float) -> Motion:
         """Return the states at times of shape (N, T), [s]; outside the movement, the arm rests at an end."""
         return Motion(*_sampled(self, times))
@@ -166,7 +167,6 @@ def jerk_cost_between(movements: Movements, begin: Float, end: Float) -> Float:
     return cost
 
 
-@dataclass(frozen=True, kw_only=True)
 class ActionLayout:
     """Layout of actions: the meaning of each component.
 
@@ -177,75 +177,44 @@ class ActionLayout:
     that the velocity limits of the joints allow.
     """
 
-    space: SpaceName
-    names_of_axes: tuple[str, ...]  # Names of the components of an offset: D of them
-    n_via: int = 1  # Number of via-points K, 0 to :data:`MOST_VIAS`
-    # `optimal`: passage times of least jerk (Flash & Hogan 1985, Eq. C16); `learned`: part of the action.
-    timing: Timing = "optimal"
-    # Shortest and longest total duration, [s] or relative; an action of 0 is their geometric mean
-    duration_range: tuple[float, float]
-    via_scale: tuple[float, ...]  # Largest offset of each component, [m] or [rad]
-    rate_limit: tuple[float, ...] = ()  # Velocity limits of the joints in joint space, [rad/s]
-
-    def __post_init__(self) -> None:
-        """Check all fields."""
-        whole_number("n_via", self.n_via, 0, MOST_VIAS)
-        if self.timing not in get_args(Timing):
-            raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {self.timing!r}")
-        check_increasing_pair("duration_range", self.duration_range, SHORTEST_DURATION, LONGEST_DURATION)
-        if self.space == "joints" and self.duration_range[0] < 1.0:
-            raise ValueError(
-                "duration_range in joint space is relative to the shortest movement that the limits allow and must "
-                f"begin at 1 or more, got {self.duration_range!r}"
-            )
-        scale = finite_array("via_scale", self.via_scale, (self.dimension,))
-        if (scale <= 0.0).any():
-            raise ValueError(f"via_scale must be positive, got {self.via_scale!r}")
-        low, high = self.duration_range
-        object.__setattr__(self, "duration_range", (float(low), float(high)))
-
-    @functools.cached_property
-    def dimension(self) -> int:
+    def __init__(
+        self, arm: Arm, space: SpaceName, n_via: int, timing: Timing, duration_range: tuple[float, float]
+    ) -> None:
+        self.space, self.n_via, self.timing = space, n_via, timing
+        self.duration_range = low, high = duration_range
+        """Shortest and longest total duration, [s] or relative; an action of 0 is their geometric mean."""
+        in_hand = space == "hand"
+        self.names_of_axes = ("along", "across") if in_hand else arm.joint_names
+        """Names of the D components of an offset."""
+        self.dimension = len(self.names_of_axes)
         """Dimension D of the space."""
-        return len(self.names_of_axes)
-
-    @functools.cached_property
-    def size(self) -> int:
-        """Number of components m."""
-        return len(self.names)
-
-    @functools.cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of the components, in order."""
-        vias = [f"via_{k}_{axis}" for k in range(1, self.n_via + 1) for axis in self.names_of_axes]
-        splits = [f"split_{k}" for k in range(1, self.n_via + 1)] if self.timing == "learned" else []
-        return (*vias, "duration", *splits)
-
-    @functools.cached_property
-    def centre(self) -> float:
+        width = arm.joint_range[:, 1] - arm.joint_range[:, 0]
+        offsets = np.minimum(RANGE_SHARE * width, LARGEST_OFFSET)
+        self.via_scale = np.array(HAND_OFFSETS) if in_hand else offsets
+        """Largest offset of each component, shape (D,), [m] or [rad]."""
+        limited = np.isfinite(arm.velocity_limit)
+        self.rate_limit = np.where(limited, arm.velocity_limit, UNLIMITED_SPEED)
+        """Velocity limits of the joints, [rad/s]."""
+        self.centre = float((low * high) ** 0.5)
         """Duration of the zero action, [s] in hand space, relative in joint space."""
-        low, high = self.duration_range
-        return float((low * high) ** 0.5)
-
-    @functools.cached_property
-    def log_half_range(self) -> float:
+        self.log_half_range = float(0.5 * np.log(high / low))
         """Logarithm of the factor on the duration for an action of 1."""
-        low, high = self.duration_range
-        return float(0.5 * np.log(high / low))
-
-    @functools.cached_property
-    def straight_split(self) -> tuple[float, ...]:
+        vias = [f"via_{k}_{axis}" for k in range(1, n_via + 1) for axis in self.names_of_axes]
+        splits = [f"split_{k}" for k in range(1, n_via + 1)] if timing == "learned" else []
+        self.names = (*vias, "duration", *splits)
+        """Names of the components, in order."""
+        self.size = len(self.names)
+        """Number of components m."""
+        straight = np.linspace(0.0, 1.0, n_via + 2)[:, None]
+        self._straight_split = np.diff(np.log(primitives.passage_durations(straight, np.asarray(1.0))))
         """Log ratios of neighbouring segments' durations on the straight movement with evenly spaced vias."""
-        waypoints = np.linspace(0.0, 1.0, self.n_via + 2)[:, None]
-        durations = primitives.passage_durations(waypoints, np.asarray(1.0))
-        return tuple(float(ratio) for ratio in np.diff(np.log(durations)))
 
     def zero_duration(self, start: Float, goal: Float) -> Float:
         """Return the duration of the zero action, shape (...), [s], for ends of shape (..., D)."""
         if self.space == "hand":
             return np.full(start.shape[:-1], self.centre)
         # The greatest rate of the straight minimum-jerk movement is 15/8 of the mean one.
-        rate = 1.875 * np.abs(goal - start) / np.array(self.rate_limit)
+        rate = 1.875 * np.abs(goal - start) / self.rate_limit
         return np.asarray(self.centre * rate.max(axis=-1))
 
     def decode(self, action: Any, start: Any, goal: Any) -> Plan:
@@ -277,7 +246,7 @@ class ActionLayout:
         line = goal - start
         vias = [start]
         for k in range(self.n_via):
-            offset = action[..., k * self.dimension : (k + 1) * self.dimension] * np.array(self.via_scale)
+            offset = action[..., k * self.dimension : (k + 1) * self.dimension] * self.via_scale
             if self.space == "hand":
                 offset = turned(offset, line)
             vias.append(start + line * ((k + 1) / (self.n_via + 1)) + offset)
@@ -301,7 +270,7 @@ class ActionLayout:
             if self.space == "hand":
                 # The frame of the straight line turned back: its second axis mirrored.
                 offset = turned(offset, line * np.array([1.0, -1.0]))
-            parts.append(offset / np.array(self.via_scale))
+            parts.append(offset / self.via_scale)
         total = durations.sum(axis=-1)
         unit = (
             self.centre
@@ -311,14 +280,14 @@ class ActionLayout:
         parts.append((np.log(total / unit) / self.log_half_range)[..., None])
         if self.timing == "learned":
             ratios = np.log(durations[..., 1:] / durations[..., :-1])
-            parts.append((ratios - np.array(self.straight_split)) / LOG_SPLIT)
+            parts.append((ratios - self._straight_split) / LOG_SPLIT)
         return np.concatenate(parts, axis=-1)
 
     def shortest(self, waypoints: Float, shares: Float) -> Float:
         """Return the shortest durations that keep the velocity limits, (...), [s], for shares (..., K + 1)."""
         trajectory = primitives.through(waypoints, shares)
         velocity = trajectory(np.linspace(0.0, 1.0, PEAK_INSTANTS + 1)[1:-1], 1)
-        relative = np.abs(velocity) / np.array(self.rate_limit)
+        relative = np.abs(velocity) / self.rate_limit
         return np.asarray(np.maximum(relative.max(axis=(-2, -1)), SHORTEST_DURATION))
 
     def shares(self, waypoints: Float, action: Float) -> Float:
@@ -326,7 +295,7 @@ class ActionLayout:
         if self.timing == "optimal":
             return np.asarray(primitives.passage_durations(waypoints, np.ones(waypoints.shape[:-2])))
         split = action[..., self.n_via * self.dimension + 1 :]
-        logs = np.cumsum(np.array(self.straight_split) + LOG_SPLIT * split, axis=-1)
+        logs = np.cumsum(self._straight_split + LOG_SPLIT * split, axis=-1)
         shares = np.exp(np.concatenate((np.zeros((*logs.shape[:-1], 1)), logs), axis=-1))
         return np.asarray(shares / shares.sum(axis=-1, keepdims=True))
 
@@ -340,17 +309,3 @@ def turned(offset: Float, line: Float) -> Float:
 
 
 MAX_START_OFFSET = 1e-3  # Greatest distance of a plan's beginning from the present reference, [m] or [rad]
-
-
-def checked_plan(plan: Plan, start: Float) -> Plan:
-    """Return plans as arrays, after a check that they begin at the references, shape (N, D)."""
-    number, dimension = start.shape
-    waypoints = finite_array("waypoints of the plan", plan[0], (number, None, dimension))
-    durations = finite_array("durations of the plan", plan[1], (number, waypoints.shape[1] - 1))
-    away = np.sqrt(((waypoints[:, 0] - start) ** 2).sum(axis=-1))
-    if (away > MAX_START_OFFSET).any():
-        env = int(away.argmax())
-        raise ValueError(f"plan {env} must begin where the arm is, at {start[env]}, got {waypoints[env, 0]}")
-    if (durations <= 0.0).any():
-        raise ValueError(f"durations of the plan must be positive, got {durations.min()}")
-    return Plan.at_rest(waypoints, durations)

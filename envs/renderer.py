@@ -69,13 +69,11 @@ class EpisodeRenderer:
         """Render the running episode so far."""
         recorded = self._episodes.recorded(self._row)
         rollout = recorded.rollout
-        if len(rollout.time) == 1:
-            picture = self._draw(recorded, 0)
-            return {"human": None, "rgb_array_list": [picture]}.get(str(self._mode), picture)
+        still = len(rollout.time) == 1
         if self._mode == "rgb_array":
-            touched = int(rollout.contact.argmax()) if rollout.contact.any() else len(rollout.time)
-            return self._draw(recorded, touched)
-        steps = frame_steps(rollout.time, self._fps)
+            last = int(rollout.contact.argmax()) if rollout.contact.any() else len(rollout.time)
+            return self._draw(recorded, 0 if still else last)
+        steps = np.zeros(1, np.int64) if still else frame_steps(rollout.time, self._fps)
         if self._mode == "human":
             return self._play(recorded, steps)
         return [self._draw(recorded, int(step)) for step in steps]
@@ -187,30 +185,34 @@ class SceneView:
         self._option = mujoco.MjvOption()
         self._flat = simulator.arm.space == "hand"
         self._floor = float(self.model.geom("table").pos[2])
-        self._aim(width, height)
+        camera = self.model.camera(CAMERA).id
+        self._camera = mujoco.MjvCamera()
+        self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
+        if width < height:  # a wider field of view keeps the whole workspace in upright pictures
+            half = np.tan(np.radians(self.model.cam_fovy[camera]) / 2.0)
+            self.model.cam_fovy[camera] = 2.0 * np.degrees(np.arctan(half * height / width))
 
     def write(self, picture: Picture) -> None:
         """Set up one picture."""
         self._pose(picture)
-        shapes = ShapeWriter(self.scene)
-        self._draw_ends(shapes, picture)
+        self._draw_ends(picture)
         for path in picture.replaced:
-            shapes.line(self._lowered(path), REPLACED, FADED)
+            add_line(self.scene, self._lowered(path), REPLACED, FADED)
         if len(picture.planned):
-            shapes.line(self._lowered(picture.planned), PLAN, PALETTE.plan)
+            add_line(self.scene, self._lowered(picture.planned), PLAN, PALETTE.plan)
         for via in self._lowered(picture.vias):
-            shapes.ball(via, 0.011, PALETTE.via, GLOWING)
+            add_ball(self.scene, via, 0.011, PALETTE.via, GLOWING)
         seen = picture.seen[:: -(-len(picture.seen) // MOST_SEEN) or 1].copy()
         if self._flat and len(seen):  # on top of the obstacles, whose sides the camera hardly sees
             centre, half = bounding_boxes(picture.obstacles)
             seen[:, 2] = (centre + half)[0, picture.obstacles.present[0], 2].max()
         for point in seen:
-            shapes.ball(point, SEEN, PALETTE.seen, GLOWING)
+            add_ball(self.scene, point, SEEN, PALETTE.seen, GLOWING)
         free = picture.touched
         done = self._lowered(picture.done)
         for part, colour in ((done[: free + 1], PALETTE.executed), (done[free:], PALETTE.contact)):
             if len(part) > 1:
-                shapes.line(part + np.array([0.0, 0.0, PLAN]), DONE, colour)
+                add_line(self.scene, part + np.array([0.0, 0.0, PLAN]), DONE, colour)
 
     def _pose(self, picture: Picture) -> None:
         """Start the scene with the arm in a configuration among the obstacles; geoms in contact are red."""
@@ -238,15 +240,6 @@ class SceneView:
             for geom in self._shown({int(each) for each in pairs}):
                 geom.rgba = np.array((*PALETTE.contact, 1.0), dtype=np.float32)
 
-    def _aim(self, width: int, height: int) -> None:
-        """Widen the camera's field of view for upright pictures, so that the whole workspace stays in view."""
-        camera = self.model.camera(CAMERA).id
-        self._camera = mujoco.MjvCamera()
-        self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
-        if width < height:
-            half = np.tan(np.radians(self.model.cam_fovy[camera]) / 2.0)
-            self.model.cam_fovy[camera] = 2.0 * np.degrees(np.arctan(half * height / width))
-
     def _shown(self, numbers: set[int]) -> list[Any]:
         """Return the scene's geoms that show some geoms of the model."""
         geoms = self.scene.geoms[: self.scene.ngeom]
@@ -260,60 +253,59 @@ class SceneView:
         flat[..., 2] = self._floor + ABOVE_TABLE
         return flat
 
-    def _draw_ends(self, shapes: ShapeWriter, picture: Picture) -> None:
+    def _draw_ends(self, picture: Picture) -> None:
         """Draw start and goal."""
         start, goal = (self._lowered(end) for end in picture.ends)
-        if self._flat:
-            shapes.ring(start, 0.021, 0.004, PALETTE.start)
-            shapes.ring(goal, 0.031, 0.005, PALETTE.goal)
-            shapes.disc(goal, 0.018, 0.003, PALETTE.goal, GLOWING)
-        else:
-            shapes.ball(goal, 0.018, PALETTE.goal, GLOWING)
-            shapes.ball(start, 0.010, PALETTE.start, GLOWING)
+        if not self._flat:
+            add_ball(self.scene, goal, 0.018, PALETTE.goal, GLOWING)
+            add_ball(self.scene, start, 0.010, PALETTE.start, GLOWING)
+            return
+        rings = (start, 0.021, 0.017, PALETTE.start), (goal, 0.031, 0.026, PALETTE.goal)
+        for centre, radius, inner, colour in rings:  # two discs are far cheaper than a tube
+            add_disc(self.scene, centre, radius, 0.001, colour, GLOWING)
+            add_disc(self.scene, centre, inner, 0.002, PALETTE.table)
+        add_disc(self.scene, goal, 0.018, 0.003, PALETTE.goal, GLOWING)
 
 
-class ShapeWriter:
-    """Writer of decorative shapes into a scene; shapes beyond the scene's capacity are left out."""
+def add_ball(
+    scene: mujoco.MjvScene, centre: Float, radius: float, colour: Colour, glow: float = MATT
+) -> None:
+    """Add a sphere at `centre` (3,) [m] to a scene, without a shadow."""
+    geom = _new_geom(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (radius,) * 3, centre, colour, glow)
+    if geom is not None:
+        geom.castshadow = False
 
-    def __init__(self, scene: mujoco.MjvScene) -> None:
-        self._scene = scene
 
-    def ball(self, centre: Float, radius: float, colour: Colour, glow: float = MATT) -> None:
-        """Add a sphere at `centre` (3,) [m], without a shadow."""
-        geom = self._geom(mujoco.mjtGeom.mjGEOM_SPHERE, (radius,) * 3, centre, colour, glow)
+def add_disc(
+    scene: mujoco.MjvScene, centre: Float, radius: float, height: float, colour: Colour, glow: float = MATT
+) -> None:
+    """Add a flat cylinder that stands on `centre` (3,) [m] to a scene."""
+    middle = np.array([*centre[:2], centre[2] + height / 2.0])
+    size = radius, height / 2.0, 0.0
+    _new_geom(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, middle, colour, glow)
+
+
+def add_line(scene: mujoco.MjvScene, points: Float, radius: float, colour: Colour) -> None:
+    """Add a tube along a polyline, shape (n, 3), [m], to a scene, without a shadow."""
+    for first, second in itertools.pairwise(_resampled(points, SPACING)):
+        geom = _new_geom(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, (radius,) * 3, first, colour, GLOWING)
         if geom is not None:
+            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, radius, first, second)
             geom.castshadow = False
 
-    def disc(self, centre: Float, radius: float, height: float, colour: Colour, glow: float = MATT) -> None:
-        """Add a flat cylinder that stands on `centre` (3,) [m]."""
-        middle = np.array([*centre[:2], centre[2] + height / 2.0])
-        self._geom(mujoco.mjtGeom.mjGEOM_CYLINDER, (radius, height / 2.0, 0.0), middle, colour, glow)
 
-    def ring(self, centre: Float, radius: float, thickness: float, colour: Colour) -> None:
-        """Add a circle on the table around `centre` (3,) [m]: two discs, far cheaper than a tube."""
-        self.disc(centre, radius, 0.001, colour, GLOWING)
-        self.disc(centre, radius - thickness, 0.002, PALETTE.table)
-
-    def line(self, points: Float, radius: float, colour: Colour) -> None:
-        """Add a tube along a polyline, shape (n, 3), [m], without a shadow."""
-        for first, second in itertools.pairwise(_resampled(points, SPACING)):
-            geom = self._geom(mujoco.mjtGeom.mjGEOM_CAPSULE, (radius,) * 3, first, colour, GLOWING)
-            if geom is not None:
-                mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, radius, first, second)
-                geom.castshadow = False
-
-    def _geom(
-        self, kind: int, size: tuple[float, ...], centre: Float, colour: Colour, glow: float
-    ) -> Geom | None:
-        """Add a MuJoCo geom of a size [m] at `centre` (3,) [m]."""
-        if self._scene.ngeom >= self._scene.maxgeom:
-            return None
-        geom = self._scene.geoms[self._scene.ngeom]
-        lit = np.array((*(c / (1.0 + glow) for c in colour), 1.0), dtype=np.float32)
-        mujoco.mjv_initGeom(geom, kind, np.array(size), centre, np.eye(3).flatten(), lit)
-        geom.emission, geom.specular, geom.shininess = glow, 0.15, 0.3
-        self._scene.ngeom += 1
-        return geom
+def _new_geom(
+    scene: mujoco.MjvScene, kind: int, size: tuple[float, ...], centre: Float, colour: Colour, glow: float
+) -> Geom | None:
+    """Add a MuJoCo geom of a size [m] at `centre` (3,) [m]; None where the scene has no room for it."""
+    if scene.ngeom >= scene.maxgeom:
+        return None
+    geom = scene.geoms[scene.ngeom]
+    lit = np.array((*(c / (1.0 + glow) for c in colour), 1.0), dtype=np.float32)
+    mujoco.mjv_initGeom(geom, kind, np.array(size), centre, np.eye(3).flatten(), lit)
+    geom.emission, geom.specular, geom.shininess = glow, 0.15, 0.3
+    scene.ngeom += 1
+    return geom
 
 
 def _resampled(points: Float, spacing: float) -> Float:

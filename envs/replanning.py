@@ -98,9 +98,13 @@ def timed(waypoints: Float, duration: Float, state: Motion) -> Plan:
 def _revised(layout: ActionLayout, nominal: NominalPlan, actions: Float) -> Plan:
     """Return plans in motion for actions that change them."""
     state, number, d = nominal.state, layout.n_via, layout.dimension
-    offsets = actions[:, : number * d].reshape(len(actions), number, d) * np.array(layout.via_scale)
+    offsets = actions[:, : number * d].reshape(len(actions), number, d) * layout.via_scale
     if layout.space == "hand":
-        offsets = turned(offsets, _line(nominal)[:, None])
+        # The frame's line is that from the hand to the goal or, at the goal, from the start.
+        line = nominal.goal - state.position
+        for other in (nominal.goal - nominal.start, np.eye(1, d)):
+            line = np.where((norm(line) < NEARBY["hand"])[:, None], other, line)
+        offsets = turned(offsets, line[:, None])
     points = np.concatenate((state.position[:, None], nominal.vias + offsets, nominal.goal[:, None]), axis=1)
     least = least_remaining(layout)
     remaining = np.maximum(nominal.remaining, least)
@@ -113,14 +117,6 @@ def _revised(layout: ActionLayout, nominal: NominalPlan, actions: Float) -> Plan
     # The smoothest movement itself: its via-points are evenly spaced in time.
     even = np.broadcast_to(duration[:, None] / (number + 1), plan.durations.shape)
     return plan._replace(durations=np.where((zero & ~slightly)[:, None], even, plan.durations))
-
-
-def _line(nominal: NominalPlan) -> Float:
-    """Return the line of the offsets' frame: from the hand to the goal or, at the goal, from the start."""
-    line = nominal.goal - nominal.state.position
-    for other in (nominal.goal - nominal.start, np.eye(1, line.shape[-1])):
-        line = np.where((norm(line) < NEARBY["hand"])[:, None], other, line)
-    return line
 
 
 def _passages(plan: Plan, time: Float, number: int) -> Float:

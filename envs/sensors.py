@@ -61,15 +61,7 @@ class Looks(NamedTuple):
         return cls(np.zeros((*shape[:2], 3)), np.full(shape, sensor.range), np.zeros((*shape, 3)))
 
     def add(self, rows: Int, sensor: Sensor, arm: Arm, joints: Float, obstacles: Obstacles) -> None:
-        """Look once more in some scenes, and forget the oldest look.
-
-        Args:
-            rows: Indices of the scenes, shape (n,).
-            sensor: Sensor.
-            arm: Arm.
-            joints: Its joint positions, shape (n, J).
-            obstacles: Obstacles of these scenes at their present places.
-        """
+        """Look once more in the scenes at indices (n,), at joint positions (n, J), and forget the oldest look."""
         for part in self:
             part[rows, 1:] = part[rows, :-1]
         readings = sensor.read(arm, joints, obstacles)
@@ -123,27 +115,19 @@ class Sensor:
         """Check the numbers."""
         if self.mount not in MOUNTS:
             raise ValueError(f"mount of the sensor must be one of {', '.join(MOUNTS)}, got {self.mount!r}")
-        position = finite_array("position of the sensor", self.position, (3,))
-        quaternion = unit_quaternion("quaternion of the sensor", self.quaternion)
-        columns = whole_number("columns of the sensor", self.columns, 1)
-        rows = whole_number("rows of the sensor", self.rows, 1)
-        if columns * rows > MOST_RAYS:
-            raise ValueError(f"a sensor must have at most {MOST_RAYS} rays, got {columns * rows}")
-        widest = 2.0 * math.pi if rows == 1 else WIDEST_IMAGE
-        view = number_of_at_least("field_of_view of the sensor", self.field_of_view, 1e-3)
-        if view > widest + 1e-9:
-            raise ValueError(f"field_of_view of the sensor must be at most {widest:.3g} rad, got {view:g}")
-        checked = {
-            "position": tuple(map(float, position)),
-            "quaternion": tuple(map(float, quaternion)),
-            "columns": columns,
-            "rows": rows,
-            "field_of_view": view,
-            "range": number_of_at_least("range of the sensor", self.range, 1e-3, 100.0),
-            "noise": number_of_at_least("noise of the sensor", self.noise, 0.0, 1.0),
-            "dropped": number_of_at_least("dropped of the sensor", self.dropped, 0.0, 1.0),
-            "looks": whole_number("looks of the sensor", self.looks, 1, MOST_LOOKS),
+        checked: dict[str, Any] = {
+            "position": tuple(finite_array("position of the sensor", self.position, (3,)).tolist()),
+            "quaternion": tuple(unit_quaternion("quaternion of the sensor", self.quaternion).tolist()),
         }
+        for name, most in (("columns", MOST_RAYS), ("rows", MOST_RAYS), ("looks", MOST_LOOKS)):
+            checked[name] = whole_number(f"{name} of the sensor", getattr(self, name), 1, most)
+        if checked["columns"] * checked["rows"] > MOST_RAYS:
+            raise ValueError(f"a sensor must have at most {MOST_RAYS} rays")
+        widest = 2.0 * math.pi if checked["rows"] == 1 else WIDEST_IMAGE
+        bounds = {"field_of_view": (1e-3, widest + 1e-9), "range": (1e-3, 100.0)}
+        bounds |= {"noise": (0.0, 1.0), "dropped": (0.0, 1.0)}
+        for name, (least, below) in bounds.items():
+            checked[name] = number_of_at_least(f"{name} of the sensor", getattr(self, name), least, below)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
@@ -180,12 +164,7 @@ class Sensor:
         return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
     def pose(self, arm: Arm, joints: Float) -> tuple[Float, Float]:
-        """Return the axes of the sensor as columns, shape (N, 3, 3), and its origins, shape (N, 3), [m].
-
-        Args:
-            arm: Arm.
-            joints: Joint positions, shape (N, J).
-        """
+        """Return its axes as columns, (N, 3, 3), and its origins, (N, 3) [m], for joint positions of shape (N, J)."""
         rotation = frame_matrices(np.array(self.quaternion))
         position = np.array(self.position)
         number = len(joints)
@@ -199,8 +178,7 @@ class Sensor:
     def ray_towards(self, local: Any) -> Any:
         """Return the number of the ray nearest to points, -1 outside the field of view, shape (...), int32.
 
-        Args:
-            local: Points in the frame of the sensor, shape (..., 3), [m].
+        Points are in the frame of the sensor, shape (..., 3), [m].
         """
         x, y, z = local[..., 0], local[..., 1], local[..., 2]
         if self.rows == 1:
@@ -215,17 +193,18 @@ class Sensor:
         return np.where(inside, row * self.columns + column, -1).astype(np.int32)
 
     def read(self, arm: Arm, joints: Any, obstacles: Obstacles) -> Readings:
-        """Return the readings in N scenes.
-
-        Args:
-            arm: Arm.
-            joints: Joint positions, shape (N, J); they matter for a sensor at the hand.
-            obstacles: Obstacles at their present places.
-        """
+        """Return the readings of obstacles at their present places, with arms at joint positions of shape (N, J)."""
         rotation, origin = self.pose(arm, np.asarray(joints, np.float64))
         ranges, seen, rays = self._cast(rotation, origin, obstacles)
-        if self.noise or self.dropped:
-            ranges = self._disturbed(ranges, seen)
+        if self.noise or self.dropped:  # functions of the distances and the rays' numbers
+            numbers = np.arange(1, self.n_rays + 1, dtype=np.uint64)
+            # Distances of one scene differ in their last bits where its numbers were written and read.
+            bits = np.rint(ranges / GRAIN).astype(np.uint64) + numbers * np.uint64(GOLDEN)
+            first, second, third = (_uniform(bits + np.uint64(k)) for k in range(3))
+            # Two uniform numbers give a normal one (G. E. P. Box and M. E. Muller, 1958).
+            normal = np.sqrt(-2.0 * np.log(1.0 - first)) * np.cos(2.0 * np.pi * second)
+            noisy = np.clip(ranges + self.noise * normal, 0.0, self.range)
+            ranges = np.where((seen < 0) | (third < self.dropped), self.range, noisy)
         return Readings(ranges, origin[:, None] + ranges[..., None] * rays, seen, origin)
 
     def hidden(self, rotation: Float, origin: Float, obstacles: Obstacles) -> Bool:
@@ -245,17 +224,6 @@ class Sensor:
         seen = np.full(ranges.shape, -1, np.int64)
         _cast(obstacles, centre, ball, origin, rays, ranges, seen)
         return ranges, seen, rays
-
-    def _disturbed(self, ranges: Float, seen: Int) -> Float:
-        """Return distances with noise and dropped rays, which are functions of the distances and the rays' numbers."""
-        # Distances of one scene differ in their last bits where its numbers were written and read.
-        numbers = np.arange(1, self.n_rays + 1, dtype=np.uint64)
-        bits = np.rint(ranges / GRAIN).astype(np.uint64) + numbers * np.uint64(GOLDEN)
-        first, second, third = (_uniform(bits + np.uint64(k)) for k in range(3))
-        # Two uniform numbers give a normal one (G. E. P. Box and M. E. Muller, 1958).
-        normal = np.sqrt(-2.0 * np.log(1.0 - first)) * np.cos(2.0 * np.pi * second)
-        noisy = np.clip(ranges + self.noise * normal, 0.0, self.range)
-        return np.where((seen < 0) | (third < self.dropped), self.range, noisy)
 
 
 NAMED = ("rays", "camera", "hand_rays", "hand_camera")  # Names of usual sensors, see :func:`named_sensor`

@@ -16,17 +16,21 @@ REACH_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
-class JointSpace:
-    """Space of the joints: every coordinate is the position of a joint."""
+class Space:
+    """Space in which a movement is a minimum-jerk trajectory: by default that of the joints; coordinates (..., D)."""
 
     arm: Arm
     name: SpaceName = "joints"
-    of_hand: bool = False
+
+    @property
+    def of_hand(self) -> bool:
+        """True for the plane of the hand."""
+        return self.name == "hand"
 
     @property
     def dimension(self) -> int:
-        """Number of joints."""
-        return len(self.arm.joint_names)
+        """Number of coordinates D."""
+        return 2 if self.of_hand else len(self.arm.joint_names)
 
     def coordinates(self, joints: Float) -> Float:
         """Return joint positions as they are."""
@@ -48,13 +52,10 @@ class JointSpace:
 
 
 @dataclass(frozen=True)
-class HandPlane:
+class HandPlane(Space):
     """Horizontal plane of the hand of an arm of two hinges with vertical axes; coordinates are x and y."""
 
-    arm: Arm
     name: SpaceName = "hand"
-    of_hand: bool = True
-    dimension: int = 2
 
     def coordinates(self, joints: Float) -> Float:
         """Return the hand's x and y, [m]."""
@@ -77,10 +78,6 @@ class HandPlane:
         return found.reshape(coordinates.shape[:-1])
 
 
-# Space in which a movement is a minimum-jerk trajectory, with coordinates of shape (..., D)
-Space = JointSpace | HandPlane
-
-
 def space_of(arm: Arm, name: SpaceName) -> Space:
     """Return the space of a name for an arm.
 
@@ -90,4 +87,4 @@ def space_of(arm: Arm, name: SpaceName) -> Space:
     spaces = ("hand", "joints") if arm.space == "hand" else ("joints",)
     if name not in spaces:
         raise ValueError(f"space of this arm must be one of {', '.join(spaces)}, got {name!r}")
-    return HandPlane(arm) if name == "hand" else JointSpace(arm)
+    return HandPlane(arm) if name == "hand" else Space(arm)

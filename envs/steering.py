@@ -37,11 +37,6 @@ class Steering:
     timestep: float  # Length of a physics step, [s]
 
     @property
-    def control_step(self) -> float:
-        """Time for which an action holds, [s]."""
-        return self.physics_steps * self.timestep
-
-    @property
     def greatest_acceleration(self) -> float:
         """Bound of the acceleration of a component, [m/s^2] or [rad/s^2].
 
@@ -63,8 +58,13 @@ class Steering:
     def jerk_cost(self, motion: Motion, wanted: Float) -> Float:
         """Return half the integral of the squared jerk over one control step, exact, shape (N,)."""
         nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE)
-        half = 0.5 * self.control_step
-        jerk = _combined(self._jerk_table(half * (nodes + 1.0)), motion, wanted)
+        half = 0.5 * (self.physics_steps * self.timestep)
+        time = half * (nodes + 1.0)
+        w, decay = self.bandwidth, np.exp(-self.bandwidth * time)
+        of_velocity = -(w**2) * (1.0 - w * time) * decay
+        of_acceleration = (w * time - 2.0) * w * decay
+        table = np.stack((0.0 * time, of_velocity, of_acceleration, -of_velocity), axis=-1)
+        jerk = _combined(table, motion, wanted)
         each = (jerk * jerk).sum(axis=-1)
         cost = np.zeros(len(each))
         for k, weight in enumerate(half * weights):  # one after the other: the same bits in any batch
@@ -83,13 +83,6 @@ class Steering:
         velocity = (zero, (1.0 + w * time) * decay, time * decay, 1.0 - (1.0 + w * time) * decay)
         rate = (zero, -(w**2) * time * decay, (1.0 - w * time) * decay, w**2 * time * decay)
         return np.stack(position, axis=-1), np.stack(velocity, axis=-1), np.stack(rate, axis=-1)
-
-    def _jerk_table(self, time: Float) -> Float:
-        """Matrix from (p, v, a, u) at the beginning to the jerk at some times, shape (n, 4)."""
-        w = self.bandwidth
-        decay = np.exp(-w * time)
-        of_velocity = -(w**2) * (1.0 - w * time) * decay
-        return np.stack((0.0 * time, of_velocity, (w * time - 2.0) * w * decay, -of_velocity), axis=-1)
 
 
 def _combined(table: Float, motion: Motion, wanted: Float) -> Float:

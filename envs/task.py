@@ -15,6 +15,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.validation import (
     fewest_and_most,
+    finite_array,
     names_of,
     number_of_at_least,
     record_of,
@@ -23,7 +24,14 @@ from viapoint.envs.common.validation import (
 from viapoint.envs.geometry.shapes import check_kinds
 from viapoint.envs.observation import ObservationLayout
 from viapoint.envs.outcome import SETTLING, TOLERANCES, Tolerance
-from viapoint.envs.plans import ActionLayout, SpaceName, Timing
+from viapoint.envs.plans import (
+    LONGEST_DURATION,
+    MOST_VIAS,
+    SHORTEST_DURATION,
+    ActionLayout,
+    SpaceName,
+    Timing,
+)
 from viapoint.envs.rewards import RewardWeights
 from viapoint.envs.scenes.families_registry import check_families, default_families
 from viapoint.envs.scenes.sampler import MOST_DRAWN, SceneSampler, is_planar, room_of
@@ -40,16 +48,11 @@ END, STEPS = "end", "steps"
 MOST_OBSTACLES = 256  # Greatest number of obstacles in a scene that is given
 PLANE_SHAPES = ("cylinder", "box")  # Default shapes of obstacles in the plane
 SPACE_SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")  # Default shapes of obstacles in space
-# Largest offsets of via-points along and across the straight line of the hand, [m]
-HAND_OFFSETS = (0.15, 0.25)
-# Largest offset of a joint at a via-point: a share of its range, and a bound, [rad]
-RANGE_SHARE, LARGEST_OFFSET = 0.35, 1.0
 JOINT_MOVEMENT = 5.0  # Time that a movement in joint space is given where time is limited, [s]
 # Top speed of the hand where it is steered, [m/s], and bandwidth of the reference, [rad/s]
 HAND_SPEED, HAND_BANDWIDTH = 1.5, 25.0
 # Top speed of the joints where they are steered, as a share of their limits, and bandwidth, [rad/s]
 JOINT_SPEED_SHARE, JOINT_BANDWIDTH = 0.5, 12.0
-UNLIMITED_SPEED = 4.0  # Speed that counts as the limit of joints without one in durations of actions, [rad/s]
 # Default duration range by space: seconds, and multiples of the shortest movement that the limits allow
 DURATIONS: dict[str, tuple[float, float]] = {"hand": (0.6, 1.2), "joints": (1.1, 2.5)}
 
@@ -142,9 +145,9 @@ class Task:
         task = cls(
             arm=arm,
             space_name=space,
-            n_via=whole_number("n_via", n_via, 0),
+            n_via=whole_number("n_via", n_via, 0, MOST_VIAS),
             timing=timing,
-            duration_range=DURATIONS[space] if duration_range is None else duration_range,
+            duration_range=_checked_durations(space, duration_range),
             n_obstacles=n_obstacles,
             shapes=kinds,
             families=check_families(names, plane, kinds, n_obstacles[1]),
@@ -161,6 +164,8 @@ class Task:
             ),
             sensor=sensor,
         )
+        if timing not in get_args(Timing):
+            raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {timing!r}")
         if "sight" in task.decide_at and sensor is None:
             raise ValueError("decide_at with 'sight' needs a sensor")
         if task.whole_movement and sensor is not None and sensor.looks > 1:
@@ -171,10 +176,9 @@ class Task:
             raise ValueError(
                 "obstacles that move and targets that jump need decide_at with events of a movement"
             )
-        # Making the layout of actions checks the control step and the durations, and makes plain numbers of these.
         if task.stepwise:
-            task.steering  # noqa: B018
-        return dataclasses.replace(task, duration_range=task.action.duration_range)
+            task.steering  # noqa: B018 - making it checks the control step
+        return task
 
     @functools.cached_property
     def whole_movement(self) -> bool:
@@ -204,20 +208,7 @@ class Task:
     @functools.cached_property
     def action(self) -> ActionLayout:
         """Layout of the actions that are movements."""
-        in_hand = self.space_name == "hand"
-        width = self.arm.joint_range[:, 1] - self.arm.joint_range[:, 0]
-        offsets = np.minimum(RANGE_SHARE * width, LARGEST_OFFSET)
-        limits = self.arm.velocity_limit
-        limits = np.where(np.isfinite(limits), limits, UNLIMITED_SPEED)
-        return ActionLayout(
-            space=self.space_name,
-            names_of_axes=("along", "across") if in_hand else self.arm.joint_names,
-            n_via=self.n_via,
-            timing=self.timing,
-            duration_range=self.duration_range,
-            via_scale=HAND_OFFSETS if in_hand else tuple(float(offset) for offset in offsets),
-            rate_limit=() if in_hand else tuple(float(limit) for limit in limits),
-        )
+        return ActionLayout(self.arm, self.space_name, self.n_via, self.timing, self.duration_range)
 
     @functools.cached_property
     def steering(self) -> Steering:
@@ -293,6 +284,18 @@ class Task:
             ValueError: There is no such arm, or a value is not allowed.
         """
         return cls.of(**record)
+
+
+def _checked_durations(space: SpaceName, given: Any) -> tuple[float, float]:
+    """Return the shortest and longest duration of a movement, by default those of the space."""
+    pair = DURATIONS[space] if given is None else given
+    finite_array("duration_range", pair, (2,))
+    # In joint space a duration is relative to the shortest movement that the limits allow.
+    least = SHORTEST_DURATION if space == "hand" else 1.0
+    low, high = (number_of_at_least("duration_range", each, least) for each in pair)
+    if not low < high <= LONGEST_DURATION:
+        raise ValueError(f"duration_range must increase, up to {LONGEST_DURATION:g}, got {pair!r}")
+    return low, high
 
 
 def _checked_decisions(decide_at: Any) -> str | tuple[Trigger, ...]:

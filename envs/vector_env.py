@@ -17,14 +17,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict
-from viapoint.envs.common.validation import (
-    as_given,
-    finite_array,
-    masked_rows,
-    seeds_of,
-    whole_number,
-)
+from viapoint.envs.common.arrays import Bool, Float, Int, Observation, from_dict
+from viapoint.envs.common.validation import finite_array, masked_rows, seeds_of, whole_number
 from viapoint.envs.episodes import Decision, Episodes, History
 from viapoint.envs.geometry.obstacles import geom_meshes
 from viapoint.envs.outcome import Rollout
@@ -35,7 +29,6 @@ from viapoint.envs.scenes.scene import Scenes, check_jumps
 from viapoint.envs.task import Task
 
 SINGLE_METADATA: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
-METADATA: dict[str, Any] = {**SINGLE_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}
 LEAST_SHARE = 4  # Fewest environments for which a thread is worth its while
 
 
@@ -89,7 +82,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         (16,)
     """
 
-    metadata = METADATA
+    metadata = {**SINGLE_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - Gymnasium's
 
     def __init__(
         self,
@@ -103,7 +96,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         max_episode_steps: int | None = None,
         **task: Any,
     ) -> None:
-        task = as_given(task)
+        for name, value in task.items():
+            if isinstance(value, Mapping | list):  # the caller may change it later
+                task[name] = copy.copy(value)
         EzPickle.__init__(
             self,
             num_envs,
@@ -137,7 +132,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             for episodes in self._episodes
             for row in range(len(episodes.begun))
         ]
-        self._samplers = [self.task.sampler() for _ in self._shares]
         self._pool: ThreadPoolExecutor | None = None
         self._process = os.getpid()  # of the pool, whose threads do not survive a fork
         self.generators: list[np.random.Generator] = []
@@ -229,7 +223,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         generators, first_seed = self._seeded(seed, rows)
         # Nothing changes before all scenes are there: impossible ones raise an error.
         tried = [copy.deepcopy(generators[i]) for i in rows]
-        scenes = draw_given(options, self._samplers[0], tried)
+        scenes = draw_given(options, self._episodes[0].sampler, tried)
         geom_meshes(scenes.obstacles, self.task.shapes)
         for i, generator in zip(rows, tried, strict=True):
             generators[i] = generator
@@ -257,14 +251,26 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
                 f"episode {int(over.argmax())} is over: call reset(options={{'reset_mask': ...}}) before step()"
             )
         decision = self._decide(actions, ~over)
+        observation, info = decision.observation, decision.info
         if over.any():  # with next-step autoreset, the next episodes begin instead
             self._restart(over)
-            for part in (decision.reward, *decision.info.values()):
+            for part in (decision.reward, self.terminated, self.truncated, *info.values()):
                 part[over] = 0
-            self.terminated[over] = False
-            self.truncated[over] = False
-            decision = decision._replace(observation=self.observe())
-        return self._as_step(decision, ~over)
+            observation = self.observe()
+        self._show()
+        self._over = ended = self.terminated | self.truncated
+        infos = {**info, **_masks(info, ~over)}
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and ended.any():
+            self._over = np.zeros(self.num_envs, bool)
+            self._restart(ended)
+            last = np.full(self.num_envs, None, dtype=object)
+            for i in np.flatnonzero(ended):
+                last[i] = {name: part[i] for name, part in observation.items()}
+            final = {name: np.where(ended, value, np.zeros_like(value)) for name, value in info.items()}
+            finals = {"final_obs": last, "final_info": {**final, **_masks(final, ended)}}
+            infos |= {**finals, **_masks(finals, ended)}
+            observation = self.observe()
+        return observation, decision.reward, self.terminated.copy(), self.truncated.copy(), infos
 
     def begin(self, scenes: Scenes) -> Observation:
         """Start scenes that were drawn or checked before, one in each environment, and return first observations."""
@@ -293,16 +299,23 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             plan: Movements of all environments, from the present references to the goals.
 
         Raises:
-            ValueError: A plan begins elsewhere.
+            ValueError: A plan begins elsewhere, or has another number of via-points where plans are revised.
+            TypeError: The task has no plans.
         """
         self._check_running()
-        waypoints = finite_array("waypoints of the plan", plan.waypoints, (self.num_envs, None, None))
-        durations = finite_array("durations of the plan", plan.durations, (self.num_envs, None))
-        whole = Plan(waypoints, durations)
+        if self.task.stepwise:
+            raise TypeError(
+                "here an action steers the arm for one control step; plans need another decide_at"
+            )
+        number, dimension = self.num_envs, self.task.space.dimension
+        waypoints = finite_array("waypoints of the plan", plan.waypoints, (number, None, dimension))
+        durations = finite_array("durations of the plan", plan.durations, (number, waypoints.shape[1] - 1))
+        if (durations <= 0.0).any():
+            raise ValueError(f"durations of the plan must be positive, got {durations.min()}")
         # Nothing moves before all plans are checked.
         plans = {}
         for episodes, share in zip(self._episodes, self._shares, strict=True):
-            plans[episodes] = episodes.checked(whole.take(share))
+            plans[episodes] = episodes.plan_from_here(waypoints[share], durations[share])
         parts = self._each(lambda episodes, _: episodes.execute(plans[episodes]))
         return self._joined(parts, np.ones(self.num_envs, bool))
 
@@ -327,7 +340,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         joints = space.joints(goals)
         scenes = Scenes.together([each.scenes for each in self._episodes])
         check_jumps(scenes._replace(goal=joints), self.arm)
-        self._each(lambda episodes, share: episodes.move_goals(joints[share]))
+        for episodes, share in zip(self._episodes, self._shares, strict=True):
+            episodes.scenes.goal[:] = joints[share]
+            episodes.scenes.jumps[:] = 0.0
         return self.observe()
 
     def observe(self) -> Observation:
@@ -363,27 +378,19 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             self._np_random = self.generators[0]
         for generator, place in zip(self.generators, state["generators"], strict=True):
             generator.bit_generator.state = place
-        saved = state["episodes"]
-        if len(saved) != len(self._episodes):
-            saved = self._shared_out(saved)
-        for each, part in zip(self._episodes, saved, strict=True):
-            each.restore(part)
+        parts = [dict(part) for part in state["episodes"]]
+        like = self._episodes[0].scenes
+        scenes = Scenes.together([from_dict(like, part.pop("scenes")) for part in parts])
+        steps = [int(part.pop("physics_steps")) for part in parts]
+        every = _together(parts)
+        for each, share in zip(self._episodes, self._shares, strict=True):
+            each.restore(_taken(every, share), scenes.take(share))
+            each.simulator.physics_steps = 0
+        self._episodes[0].simulator.physics_steps = sum(steps)
         self._over[:] = state["over"]
         self._decisions[:] = state["decisions"]
         self.terminated, self.truncated = np.array(state["ended"])
         self._running = True
-
-    def _shared_out(self, states: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """Return states of the episodes of each thread from those with another number of threads."""
-        like = self._episodes[0].scenes
-        scenes = Scenes.together([from_dict(like, part["scenes"]) for part in states])
-        every = _joined([{**part, "scenes": None} for part in states])
-        parts = []
-        for share in self._shares:
-            parts.append({**_taken(every, share), "scenes": as_dict(scenes.take(share))})
-        for part in parts[1:]:
-            part["physics_steps"] = 0  # the first one has those of all
-        return parts
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a pickle holds: the arguments, and the running episodes."""
@@ -449,40 +456,13 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self.truncated = decision.truncated
         return decision
 
-    def _as_step(
-        self, decision: Decision, active: Bool
-    ) -> tuple[Observation, Float, Bool, Bool, dict[str, Any]]:
-        """Return the result of `step`, after the next episodes have begun where that is due."""
-        observation, info = decision.observation, decision.info
-        ended = self.terminated | self.truncated
-        self._over = ended.copy()
-        infos = dict(info)
-        for name in info:
-            infos[f"_{name}"] = active.copy()
-        self._show()
-        if self.autoreset_mode == AutoresetMode.SAME_STEP and ended.any():
-            self._restart(ended)
-            self._over[:] = False
-            last = np.full(self.num_envs, None, dtype=object)
-            for i in np.flatnonzero(ended):
-                last[i] = {name: part[i] for name, part in observation.items()}
-            final_info = {}
-            for name, value in info.items():
-                final_info[name] = np.where(ended, value, np.zeros_like(value))
-                final_info[f"_{name}"] = ended.copy()
-            infos |= {"final_obs": last, "_final_obs": ended.copy()}
-            infos |= {"final_info": final_info, "_final_info": ended.copy()}
-            observation = self.observe()
-        return observation, decision.reward, self.terminated.copy(), self.truncated.copy(), infos
-
     def _restart(self, ended: Bool) -> None:
         """Draw the next scenes of some environments, and start them."""
 
         def restart(episodes: Episodes, share: Int) -> None:
             rows = np.flatnonzero(ended[share])
             if rows.size:
-                sampler = self._samplers[self._episodes.index(episodes)]
-                scenes = sampler([self.generators[share[row]] for row in rows])
+                scenes = episodes.sampler([self.generators[i] for i in share[rows]])
                 episodes.start(rows, scenes, keep=True)
 
         self._each(restart)
@@ -518,31 +498,26 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         return generators, first_seed
 
 
+def _masks(info: Mapping[str, Any], mask: Bool) -> dict[str, Bool]:
+    """Return the masks that go with the entries of an info: True for environments that have them."""
+    return {f"_{name}": mask.copy() for name in info}
+
+
 def _together(parts: Sequence[Any]) -> Any:
-    """Return an array of all environments, or arrays by name, from those of the environments of each thread."""
+    """Return arrays of all environments, also in mappings and lists, from those of the environments of each thread."""
     if len(parts) == 1:
         return parts[0]
-    if isinstance(parts[0], dict):
+    if isinstance(parts[0], Mapping):
         return {name: _together([part[name] for part in parts]) for name in parts[0]}
+    if isinstance(parts[0], list):
+        return [_together(column) for column in zip(*parts, strict=True)]
     return np.concatenate(parts)
 
 
-def _joined(parts: Sequence[Any]) -> Any:
-    """Return the states of all episodes, nested values and arrays, from those of each thread; numbers are added."""
-    first = parts[0]
-    if isinstance(first, Mapping):
-        return {name: _joined([part[name] for part in parts]) for name in first}
-    if isinstance(first, list):
-        return [_joined(column) for column in zip(*parts, strict=True)]
-    if isinstance(first, int):
-        return sum(parts)
-    return None if first is None else np.concatenate(parts)
-
-
-def _taken(state: Any, rows: Int) -> Any:
-    """Return the states of some episodes from those of all; numbers stay."""
-    if isinstance(state, Mapping):
-        return {name: _taken(each, rows) for name, each in state.items()}
-    if isinstance(state, list):
-        return [_taken(each, rows) for each in state]
-    return state[rows] if isinstance(state, np.ndarray) else state
+def _taken(arrays: Any, rows: Int) -> Any:
+    """Return arrays of some environments, also in mappings and lists, from those of all."""
+    if isinstance(arrays, Mapping):
+        return {name: _taken(each, rows) for name, each in arrays.items()}
+    if isinstance(arrays, list):
+        return [_taken(each, rows) for each in arrays]
+    return arrays[rows]

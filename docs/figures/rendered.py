@@ -19,7 +19,7 @@ from viapoint.envs.common.arrays import Frame
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.geometry.obstacles import add_to_model, unpack
 from viapoint.envs.gl import Canvas
-from viapoint.envs.renderer import GLOWING, PLAN, ShapeWriter
+from viapoint.envs.renderer import GLOWING, PLAN, add_ball, add_line
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training import GeometrySearch, load_agent, plan_motion
 from viapoint.training.checks import SHIPPED_IDS
@@ -152,9 +152,8 @@ def own_arm(path: Path) -> None:
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, everything, canvas.scene)
         canvas.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
-        shapes = ShapeWriter(canvas.scene)
-        shapes.line(arm.hand(motion.position), PLAN, PALETTE.plan)
-        shapes.ball(arm.hand(plan.waypoints[-1:])[0], 0.018, PALETTE.goal, GLOWING)
+        add_line(canvas.scene, arm.hand(motion.position), PLAN, PALETTE.plan)
+        add_ball(canvas.scene, arm.hand(plan.waypoints[-1:])[0], 0.018, PALETTE.goal, GLOWING)
         frames.append(canvas.draw())
     canvas.close()
     side_by_side(frames).save(path, optimize=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from numbers import Real
@@ -47,19 +46,6 @@ def whole_number(name: str, value: Any, least: int, most: int | None = None) -> 
     return int(value)
 
 
-def check_increasing_pair(name: str, pair: Any, least: float = 0.0, most: float = np.inf) -> None:
-    """Check that a pair is two positive finite numbers in increasing order, from `least` to `most`."""
-    try:
-        low, high = pair
-    except (TypeError, ValueError):
-        low = high = None
-    numbers = is_number(low) and is_number(high)
-    if not numbers or not 0.0 < low < high < np.inf or low < least or high > most:
-        raise ValueError(
-            f"{name} must be two positive numbers in increasing order, from {least:g} to {most:g}, got {pair!r}"
-        )
-
-
 def names_of(argument: str, names: Any) -> tuple[Any, ...]:
     """Return one name, or a sequence of one or more names, as a tuple.
 
@@ -74,14 +60,6 @@ def names_of(argument: str, names: Any) -> tuple[Any, ...]:
     if not names:
         raise ValueError(f"{argument} must be one name or more, got {names!r}")
     return tuple(names)
-
-
-def as_given(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of arguments, independent of later changes of the caller's lists and mappings."""
-    return {
-        name: copy.copy(value) if isinstance(value, Mapping | list) else value
-        for name, value in arguments.items()
-    }
 
 
 def fewest_and_most(name: str, number: Any, most: int, most_drawn: int) -> tuple[int, int]:

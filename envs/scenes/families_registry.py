@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -58,7 +57,7 @@ def scene_families(plane: bool) -> Mapping[str, SceneFamily]:
         >>> families["shelf"].trained, families["cage"].trained
         (True, False)
     """
-    return MappingProxyType({name: each for (there, name), each in FAMILIES.items() if there == plane})
+    return {name: each for (there, name), each in FAMILIES.items() if there == plane}
 
 
 def default_families(plane: bool, kinds: Iterable[str], most: int) -> tuple[str, ...]:
@@ -77,9 +76,9 @@ def check_families(families: Sequence[str], plane: bool, kinds: Iterable[str], m
         ValueError: A name is unknown, or a family needs other kinds or more obstacles.
     """
     known = scene_families(plane)
-    if isinstance(families, str) or not families or any(name not in known for name in families):
-        raise ValueError(f"families must be some of {', '.join(known)}, got {families!r}")
     for name in families:
+        if name not in known:
+            raise ValueError(f"families must be some of {', '.join(known)}, got {name!r}")
         family = known[name]
         missing = set(family.kinds) - set(kinds)
         if missing:

@@ -146,11 +146,6 @@ class Furniture:
         """Number of obstacles that may still be added."""
         return self.room.most - len(self._rows) // ROW
 
-    @property
-    def base(self) -> tuple[float, float]:
-        """Base of the arm in the frame, [m]."""
-        return self._local(0.0, 0.0)
-
     def elbow(self, x: float, y: float) -> tuple[float, float]:
         """Return the elbow of an arm in the plane with its hand at a place, in the frame, [m]."""
         upper, fore = self.room.links
@@ -160,7 +155,8 @@ class Furniture:
         away = math.hypot(x, y)
         cosine = (away * away + upper * upper - fore * fore) / (2.0 * away * abs(upper))
         angle = math.atan2(y, x) - math.copysign(math.acos(min(max(cosine, -1.0), 1.0)), upper)
-        return self._local(abs(upper) * math.cos(angle), abs(upper) * math.sin(angle))
+        x, y = abs(upper) * math.cos(angle) - self._x, abs(upper) * math.sin(angle) - self._y
+        return self._cosine * x + self._sine * y, self._cosine * y - self._sine * x
 
     def box(self, centre: Vector, half: Vector, yaw: float = 0.0) -> None:
         """Add a box that is turned about the vertical axis."""
@@ -241,11 +237,6 @@ class Furniture:
     def _turned(self, x: float, y: float) -> tuple[float, float]:
         """Return a horizontal vector of the frame in the world."""
         return self._cosine * x - self._sine * y, self._sine * x + self._cosine * y
-
-    def _local(self, x: float, y: float) -> tuple[float, float]:
-        """Return a point that is seen from the base in the frame, [m]."""
-        x, y = x - self._x, y - self._y
-        return self._cosine * x + self._sine * y, self._cosine * y - self._sine * x
 
     def _world(self, point: Vector) -> Vector:
         """Return a point of the frame in the world, [m]."""

@@ -25,22 +25,11 @@ from viapoint.envs.geometry.shapes import (
 )
 from viapoint.envs.plans import SpaceName
 from viapoint.envs.scenes.sampler import VIEW_MARGIN, SceneSampler
-from viapoint.envs.scenes.scene import (
-    ENDS,
-    MOST_JUMPS,
-    NEVER,
-    Scenes,
-    check_scenes,
-    resting,
-)
+from viapoint.envs.scenes.scene import ENDS, MOST_JUMPS, NEVER, Scenes, check_scenes, resting
+from viapoint.envs.spaces import space_of
 
-OPTIONS = (
-    *ENDS,
-    "obstacles",
-    "jumps",
-    "turns",
-    "reaches",
-)  # Options of `reset` that give a scene, or a part of one
+# Options of `reset` that give a scene, or a part of one
+OPTIONS = (*ENDS, "obstacles", "jumps", "turns", "reaches")
 FORMAT = "viapoint-scene"  # Value of the key `format` of a scene file
 REACHED = 1e-6  # Greatest distance of the hand from a given place, [m]
 
@@ -127,19 +116,19 @@ def _refuse_unknown(names: Mapping[str, Any]) -> None:
 
 def _shapes(value: Any, sampler: SceneSampler, number: int) -> list[list[Shape]]:
     """Return the given obstacles of N scenes."""
-    if isinstance(value, str):
-        value = obstacles_from_json(value)
-    elif isinstance(value, Sequence):
-        value = [obstacles_from_json(each) if isinstance(each, str) else each for each in value]
-    several = (
-        isinstance(value, Sequence) and bool(value) and all(isinstance(each, list | tuple) for each in value)
-    )
+    several = False
+    if isinstance(value, list | tuple) and value:
+        several = all(isinstance(each, list | tuple | str) for each in value)
     if several and len(value) != number:
         raise ValueError(f"options['obstacles'] must be one list, or {number} lists, got {len(value)}")
-    try:
-        lists = [as_obstacles(each) for each in value] if several else [as_obstacles(value)] * number
-    except ValueError as error:
-        raise ValueError(f"options['obstacles']: {error}") from None
+    lists = []
+    for each in value if several else [value]:
+        try:
+            lists.append(obstacles_from_json(each) if isinstance(each, str) else as_obstacles(each))
+        except ValueError as error:
+            raise ValueError(f"options['obstacles']: {error}") from None
+    if not several:
+        lists *= number
     for shapes in lists:
         if len(shapes) > sampler.rows:
             raise ValueError(
@@ -295,20 +284,13 @@ def scene_to_json(
 
 def scene_options(scenes: Scenes, arm: Arm, space: SpaceName | None = None, scene: int = 0) -> dict[str, Any]:
     """Return a scene as options of `reset`, arrays and a list of shapes, see :func:`scene_to_json`."""
-    of_hand = (arm.space if space is None else space) == "hand"
-
-    def coordinates(joints: Float) -> Float:
-        return np.array(arm.hand(joints)[..., :2] if of_hand else joints)
-
-    options: dict[str, Any] = {
-        "start": coordinates(scenes.start[scene]),
-        "goal": coordinates(scenes.goal[scene]),
-        "obstacles": unpack(scenes.obstacles, scene),
-    }
+    where = space_of(arm, arm.space if space is None else space)
+    options: dict[str, Any] = {name: where.coordinates(getattr(scenes, name)[scene]).copy() for name in ENDS}
+    options["obstacles"] = unpack(scenes.obstacles, scene)
     times = scenes.jump_times[scene]
     jumps = scenes.jumps[scene][times < NEVER]
     if len(jumps):
-        options["jumps"] = np.column_stack((jumps[:, 0], coordinates(jumps[:, 1:])))
+        options["jumps"] = np.column_stack((jumps[:, 0], where.coordinates(jumps[:, 1:])))
     present = scenes.obstacles.present[scene]
     turn_time = scenes.turn_time[scene][present]
     if (turn_time < NEVER).any():

@@ -27,8 +27,6 @@ FASTEST = 1.0  # Greatest speed of an obstacle, [m/s]
 CHORD = 0.04
 SHORTEST_REACH, LATEST = 1e-3, 60.0  # Shortest duration of a reach of an obstacle, and its latest end, [s]
 MINIMUM_JERK_PEAK = 1.875  # Peak speed of a minimum-jerk movement relative to its mean speed
-# Fields with a row for each obstacle
-OF_OBSTACLES = ("turn_time", "turn_velocity", "reach")
 
 
 class Scenes(NamedTuple):
@@ -79,25 +77,21 @@ class Scenes(NamedTuple):
         """Return the scenes with another number of rows for obstacles; those behind are left out."""
         wide = resting(self.start, self.goal, self.obstacles.with_rows(rows))
         kept = min(rows, self.turn_time.shape[1])
-        for name in OF_OBSTACLES:
-            getattr(wide, name)[:, :kept] = getattr(self, name)[:, :kept]
+        for mine, theirs in zip(wide[4:], self[4:], strict=True):  # what has a row for each obstacle
+            mine[:, :kept] = theirs[:, :kept]
         return wide._replace(jumps=self.jumps)
 
-    @classmethod
-    def together(cls, parts: Sequence[Scenes]) -> Scenes:
+    @staticmethod
+    def together(parts: Sequence[Scenes]) -> Scenes:
         """Return the scenes of several records in one, which shares no memory with them."""
-        number = sum(len(part.start) for part in parts)
-        obstacles = no_obstacles(number, parts[0].obstacles.kind.shape[1])
+        start = np.concatenate([part.start for part in parts])
+        whole = resting(start, start.copy(), no_obstacles(len(start), parts[0].obstacles.kind.shape[1]))
         first = 0
         for part in parts:
             last = first + len(part.start)
-            obstacles = obstacles.put(slice(first, last), part.obstacles)
+            whole = whole.put(slice(first, last), part)
             first = last
-        arrays: dict[str, Any] = {"obstacles": obstacles}
-        for name in cls._fields:
-            if name != "obstacles":
-                arrays[name] = np.concatenate([getattr(part, name) for part in parts])
-        return cls(**arrays)
+        return whole
 
     @property
     def jump_times(self) -> Float:
@@ -252,11 +246,8 @@ def _check_obstacles(scenes: Scenes, names: Sequence[Sequence[str]]) -> None:
     _refuse(reaches & (duration < SHORTEST_REACH), shortest, duration, names)
     late = reaches & (begin + duration > LATEST)
     _refuse(late, f"must end its reach within {LATEST:g} s", begin + duration, names)
-    speed = (
-        MINIMUM_JERK_PEAK
-        * norm(scenes.reach[..., 2:])
-        / np.where(reaches & (duration > 0.0), duration, np.inf)
-    )
+    mean = norm(scenes.reach[..., 2:]) / np.where(reaches & (duration > 0.0), duration, np.inf)
+    speed = MINIMUM_JERK_PEAK * mean
     _refuse(reaches & (speed > FASTEST), f"must reach with at most {FASTEST:g} m/s", speed, names)
 
 
