@@ -394,12 +394,9 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
 
 def _goals(problem: _Problem, goal: Any) -> Float:
     """Return the goals that are tried, nearest first, shape (G, D)."""
-    if isinstance(goal, Pose | Mapping):
-        goal = [goal]
-    if isinstance(goal, Sequence) and any(isinstance(each, Pose | Mapping) for each in goal):
-        if not all(isinstance(each, Pose | Mapping) for each in goal):
-            raise ValueError("goals must be poses or coordinates, not some of both")
-        return _goals_of_poses(problem, [as_pose("goal", each) for each in goal])
+    poses = [goal] if isinstance(goal, Pose | Mapping) else goal
+    if isinstance(poses, Sequence) and any(isinstance(each, Pose | Mapping) for each in poses):
+        return _goals_of_poses(problem, [as_pose("goal", each) for each in poses])
     values = as_real_array(goal)
     number = 0 if values is None or not values.ndim else values.shape[-1]
     if number != len(problem.start) and number in (3, 7):
