@@ -77,7 +77,7 @@ class RandomVias:
 class PlannerMethod:
     """Planner whose movements have as many via-points as they need, and durations of their own.
 
-    A decision is a row: number of via-points, durations of the segments [s], via-points, then zeros.
+    A decision is a row: number of via-points, durations of the segments [s], waypoints, then zeros.
 
     Raises:
         ValueError: The library of the planner is not installed.
@@ -97,31 +97,26 @@ class PlannerMethod:
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return plans as rows, see :class:`Method`."""
-        most = VIA_COUNTS[-1]
-        rows = np.zeros((len(scenes.start), 2 + most * (1 + self._simulation.task.space.dimension)))
-        for i, row in enumerate(rows):
+        dimension, most = self._simulation.task.space.dimension, VIA_COUNTS[-1]
+        rows = np.zeros((len(scenes.start), 2 + most + (most + 2) * dimension))
+        for i in range(len(rows)):
             plan = self.plan(scenes.take([i]))
-            vias = plan.waypoints[1:-1]
-            row[0] = len(vias)
-            row[1 : 2 + len(vias)] = plan.durations
-            row[2 + len(vias) : 2 + len(vias) + vias.size] = vias.ravel()
+            row = np.concatenate(([len(plan.durations) - 1], plan.durations, plan.waypoints.ravel()))
+            rows[i, : len(row)] = row
         return rows
 
     def execute(self, scenes: Scenes, decisions: Float) -> Outcomes:
         """Simulate the plans; those with equally many via-points run together."""
-        space = self._simulation.task.space
+        dimension = self._simulation.task.space.dimension
         counts = decisions[:, 0].astype(np.int64)
         outcomes: Outcomes = {}
         for count in np.unique(counts):
             rows = np.flatnonzero(counts == count)
-            some = scenes.take(rows)
-            waypoints = np.empty((len(rows), count + 2, space.dimension))
-            waypoints[:, 0], waypoints[:, -1] = space.coordinates(some.start), space.coordinates(some.goal)
-            vias = decisions[rows, 2 + count : 2 + count * (1 + space.dimension)]
-            waypoints[:, 1:-1] = vias.reshape(len(rows), count, space.dimension)
-            result = self._simulation.execute_plan(
-                some, Plan.at_rest(waypoints, decisions[rows, 1 : 2 + count])
+            waypoints = decisions[rows, 2 + count : 2 + count + (count + 2) * dimension]
+            plan = Plan.at_rest(
+                waypoints.reshape(len(rows), count + 2, dimension), decisions[rows, 1 : 2 + count]
             )
+            result = self._simulation.execute_plan(scenes.take(rows), plan)
             for name, values in result.items():
                 outcomes.setdefault(name, np.zeros(len(decisions), dtype=values.dtype))[rows] = values
         return outcomes

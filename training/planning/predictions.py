@@ -126,8 +126,8 @@ class PredictedSearch:
     def _decide(self, observation: Observation, scenes: Scenes, memory: Memory) -> Float:
         problem = self._problem(observation)
         places = []
-        for i, seen in enumerate(self._look(problem, scenes, memory)):
-            places.append(self._predict(*seen, scenes.take([i])))
+        for i, (time, centre, velocity) in enumerate(self._look(problem, scenes, memory)):
+            places.append(self._predict(time, centre, velocity, scenes.take([i])))
         obstacles = _in_pieces(problem.obstacles, np.array(places))
         return np.asarray(self._search.solve(problem._replace(obstacles=obstacles), n_pieces=HORIZON))
 
