@@ -26,7 +26,6 @@ from viapoint.envs.common.arrays import Float, frame_matrices
 from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.obstacles import pack, quaternions_of
 from viapoint.envs.geometry.shapes import Box, Cylinder, Shape, Sphere
-from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import resting
 from viapoint.envs.task import MOST_OBSTACLES, Task
 from viapoint.training.checks import unknown_name
@@ -260,9 +259,7 @@ def _searched(arm: Arm, problem: BenchmarkProblem, checks: int) -> MotionPlan:
     obstacles = pack([problem.obstacles])
     given = Problem.of_scenes(resting(problem.start[None], problem.goal[None], obstacles), task)
     plan = task.action.decode(search.solve(given), given.start, given.goal).take(0)
-    return checked_motion(
-        arm, "joints", Plan(plan.waypoints, plan.durations), obstacles, "search", shortest=True
-    )
+    return checked_motion(arm, "joints", plan, obstacles, "search", shortest=True)
 
 
 def measure_planner(
