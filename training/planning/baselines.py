@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
@@ -76,12 +77,16 @@ class RandomVias:
 class PlannerMethod:
     """Planner whose movements have as many via-points as they need, and durations of their own.
 
-    A decision is a row: number of via-points, durations of the segments [s], via-points, then zeros. A planner is a
-    function of arm, start, goal and obstacles, and `space`.
+    A decision is a row: number of via-points, durations of the segments [s], waypoints, then zeros.
+
+    Raises:
+        ValueError: The library of the planner is not installed.
     """
 
-    def __init__(self, simulation: SceneSimulation, name: str, planner: Callable[..., MotionPlan]) -> None:
-        self.name, self._simulation, self._planner = name, simulation, planner
+    def __init__(self, simulation: SceneSimulation, name: str) -> None:
+        if name == "ompl":
+            import_ompl()  # an error where it is not installed
+        self.name, self._simulation, self._planner = name, simulation, PLANNERS[name]
 
     def plan(self, scene: Scenes) -> MotionPlan:
         """Return the plan of one scene."""
@@ -92,44 +97,29 @@ class PlannerMethod:
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return plans as rows, see :class:`Method`."""
-        most = VIA_COUNTS[-1]
-        rows = np.zeros((len(scenes.start), 2 + most * (1 + self._simulation.task.space.dimension)))
-        for i, row in enumerate(rows):
+        dimension, most = self._simulation.task.space.dimension, VIA_COUNTS[-1]
+        rows = np.zeros((len(scenes.start), 2 + most + (most + 2) * dimension))
+        for i in range(len(rows)):
             plan = self.plan(scenes.take([i]))
-            vias = plan.waypoints[1:-1]
-            row[0] = len(vias)
-            row[1 : 2 + len(vias)] = plan.durations
-            row[2 + len(vias) : 2 + len(vias) + vias.size] = vias.ravel()
+            row = np.concatenate(([len(plan.durations) - 1], plan.durations, plan.waypoints.ravel()))
+            rows[i, : len(row)] = row
         return rows
 
     def execute(self, scenes: Scenes, decisions: Float) -> Outcomes:
         """Simulate the plans; those with equally many via-points run together."""
-        space = self._simulation.task.space
+        dimension = self._simulation.task.space.dimension
         counts = decisions[:, 0].astype(np.int64)
         outcomes: Outcomes = {}
         for count in np.unique(counts):
             rows = np.flatnonzero(counts == count)
-            some = scenes.take(rows)
-            waypoints = np.empty((len(rows), count + 2, space.dimension))
-            waypoints[:, 0], waypoints[:, -1] = space.coordinates(some.start), space.coordinates(some.goal)
-            vias = decisions[rows, 2 + count : 2 + count * (1 + space.dimension)]
-            waypoints[:, 1:-1] = vias.reshape(len(rows), count, space.dimension)
-            result = self._simulation.execute_plan(
-                some, Plan.at_rest(waypoints, decisions[rows, 1 : 2 + count])
+            waypoints = decisions[rows, 2 + count : 2 + count + (count + 2) * dimension]
+            plan = Plan.at_rest(
+                waypoints.reshape(len(rows), count + 2, dimension), decisions[rows, 1 : 2 + count]
             )
+            result = self._simulation.execute_plan(scenes.take(rows), plan)
             for name, values in result.items():
                 outcomes.setdefault(name, np.zeros(len(decisions), dtype=values.dtype))[rows] = values
         return outcomes
-
-
-def _ompl_method(simulation: SceneSimulation) -> PlannerMethod:
-    """Return the motion planner of the library OMPL.
-
-    Raises:
-        ValueError: The library is not installed.
-    """
-    import_ompl()
-    return PlannerMethod(simulation, "ompl", ompl_motion)
 
 
 class AgentMethod:
@@ -218,14 +208,10 @@ COUNTED: dict[str, Callable[[SceneSimulation, int], Method]] = {
     "sobol": lambda simulation, checks: GeometrySearch(simulation.task, checks),
     "cautious": lambda simulation, checks: CautiousSearch(simulation.task, checks),
 }
-FEWEST_CHECKS = {"search": 4, "sobol": 1, "cautious": 1}
-SENSED = ("cautious",)  # Counted baselines that need a sensor
+SEARCHES = ("search", "sobol")  # Those that plan with any obstacles; `cautious` needs a sensor
 
-# Factories of the planners for known obstacles
-PLANNERS: dict[str, Callable[[SceneSimulation], PlannerMethod]] = {
-    "plan_motion": lambda simulation: PlannerMethod(simulation, "plan_motion", plan_motion),
-    "ompl": _ompl_method,
-}
+# Planners for known obstacles: functions of arm, start, goal and obstacles, and `space`
+PLANNERS: dict[str, Callable[..., MotionPlan]] = {"plan_motion": plan_motion, "ompl": ompl_motion}
 
 # Factories of baselines for all tasks; those with one decision for a movement have PLANNERS, too
 METHODS: dict[str, Callable[[SceneSimulation], Method]] = {"straight": Straight, "random": RandomVias}
@@ -243,33 +229,32 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
     Raises:
         ValueError: There is no such baseline, or it would check too many plans.
     """
-    known = METHODS if task.replanning else {**METHODS, **PLANNERS}
     sensed = task.sensor is not None
-    unsensed = [each for each in COUNTED if each not in SENSED]  # which plan with any belief, too
+    predicted = task.replanning and task.moving_obstacles
+    counted = tuple(COUNTED) if sensed else SEARCHES
     belief, _, planner = name.rpartition(":")
     if sensed and name in PLANNERS:  # they take the obstacles that they are given, which are not known here
         belief = DEFAULT_BELIEF
-    if sensed and belief in BELIEFS:
-        make = PLANNERS.get(planner) or _counted(planner, unsensed)
-        if make is not None:
-            return lambda simulation: BeliefMethod(task, belief, make(simulation))
-    elif name in known:
-        return known[name]
-    elif task.replanning and task.moving_obstacles and belief in PREDICTIONS:
-        search = _counted(planner, ("search", "sobol"))
-        if search is not None:
-            return lambda simulation: PredictedSearch(simulation, belief, search(simulation))
-    counted = list(COUNTED) if sensed else unsensed
-    found = _counted(name, counted)
-    if found is not None:
-        return found
+    planner = planner if belief else name
+    made = _counted(planner, SEARCHES if belief else counted)
+    if planner in PLANNERS and (sensed or not task.replanning):
+        made = functools.partial(PlannerMethod, name=planner)
+    if made is not None:
+        if not belief:
+            return made
+        if sensed and belief in BELIEFS:
+            return lambda simulation: BeliefMethod(task, belief, made(simulation))
+        if predicted and belief in PREDICTIONS and planner not in PLANNERS:
+            return lambda simulation: PredictedSearch(simulation, belief, made(simulation))
+    if name in METHODS:
+        return METHODS[name]
     if name == "untrained":
         raise ValueError("untrained needs an agent, whose network it is before training")
-    if not sensed and (belief in BELIEFS or _counted(name, SENSED)):
+    if not sensed and (belief in BELIEFS or _counted(name, COUNTED)):
         raise ValueError(f"{name} needs a task with a sensor: it plans with what is seen")
-    names = [*known, *(f"{each}N" for each in counted), "untrained"]  # N plans are checked
+    names = [*METHODS, *(() if task.replanning else PLANNERS), *(f"{each}N" for each in counted), "untrained"]
     names += [f"{each}:METHOD" for each in BELIEFS] if sensed else []
-    names += [f"{each}:searchN" for each in PREDICTIONS] if task.replanning and task.moving_obstacles else []
+    names += [f"{each}:searchN" for each in PREDICTIONS] if predicted else []
     raise ValueError(unknown_name("baseline", name, names))
 
 
@@ -278,6 +263,6 @@ def _counted(name: str, allowed: Collection[str]) -> Callable[[SceneSimulation],
     found = re.fullmatch(r"(\w+?)([0-9]+)", name)
     if found is None or found[1] not in allowed:
         return None
-    kind, number = found[1], int(found[2])
-    make, checks = COUNTED[kind], whole_number(f"N of {kind}N", number, FEWEST_CHECKS[kind], MOST_CANDIDATES)
-    return lambda simulation: make(simulation, checks)
+    kind, fewest = found[1], 4 if found[1] == "search" else 1
+    checks = whole_number(f"N of {kind}N", int(found[2]), fewest, MOST_CANDIDATES)
+    return lambda simulation: COUNTED[kind](simulation, checks)

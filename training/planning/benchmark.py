@@ -25,8 +25,7 @@ from viapoint.envs.arms.stored import read_arm
 from viapoint.envs.common.arrays import Float, frame_matrices
 from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.obstacles import pack, quaternions_of
-from viapoint.envs.geometry.shapes import Box, Cylinder, Shape, as_obstacle
-from viapoint.envs.plans import Plan
+from viapoint.envs.geometry.shapes import Box, Cylinder, Shape, Sphere
 from viapoint.envs.scenes.scene import resting
 from viapoint.envs.task import MOST_OBSTACLES, Task
 from viapoint.training.checks import unknown_name
@@ -148,14 +147,7 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
         start = dict(zip(state["name"], state["position"], strict=True))
         wanted = asked["goal_constraints"][0]["joint_constraints"]
         goal = {each["joint_name"]: each["position"] for each in wanted}
-        for name, there in (("start", start), ("goal", goal)):
-            missing = [joint for joint in joints if joint not in there]
-            if missing:
-                raise ValueError(
-                    f"joint {missing[0]!r} of the arm is not among those of the {name}: {', '.join(there)}"
-                )
-        begin = finite_array("start", [start[joint] for joint in joints], (len(joints),))
-        end = finite_array("goal", [goal[joint] for joint in joints], (len(joints),))
+        begin, end = _positions("start", start, joints), _positions("goal", goal, joints)
         for held in (read.get("robot_state"), asked["start_state"]):
             if held and held.get("attached_collision_objects"):
                 raise ValueError("an object is attached to the arm; plan for an arm whose model holds it")
@@ -173,6 +165,16 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
         raise ValueError(f"{scene}: {error}") from None
     number = int(scene.stem.removeprefix("scene"))
     return BenchmarkProblem(scene.parent.name.removesuffix("_panda"), number, begin, end, obstacles)
+
+
+def _positions(name: str, there: Mapping[str, Any], joints: Sequence[str]) -> Float:
+    """Return the positions of joints, shape (J,), by their names."""
+    for joint in joints:
+        if joint not in there:
+            raise ValueError(
+                f"joint {joint!r} of the arm is not among those of the {name}: {', '.join(there)}"
+            )
+    return finite_array(name, [there[joint] for joint in joints], (len(joints),))
 
 
 def _base(state: Mapping[str, Any]) -> Float:
@@ -199,14 +201,13 @@ def _shapes_of(objects: list[Mapping[str, Any]], base: Float) -> Iterator[Shape]
             kind = primitive["type"]
             sizes = np.array(primitive["dimensions"], dtype=np.float64)
             if kind == "box":
-                values: dict[str, Any] = {"size": 0.5 * sizes}
+                yield Box(0.5 * sizes, position=place[:3, 3], quaternion=turn)
             elif kind == "cylinder":
-                values = {"radius": sizes[1], "half_length": 0.5 * sizes[0]}
+                yield Cylinder(sizes[1], 0.5 * sizes[0], position=place[:3, 3], quaternion=turn)
             elif kind == "sphere":
-                values = {"radius": sizes[0]}
+                yield Sphere(sizes[0], position=place[:3, 3])
             else:
                 raise ValueError(f"primitives must be box, cylinder or sphere, got {kind!r}")
-            yield as_obstacle({"shape": kind, **values, "position": place[:3, 3], "quaternion": turn})
 
 
 def _matrix(pose: Mapping[str, Any] | None) -> Float:
@@ -258,9 +259,7 @@ def _searched(arm: Arm, problem: BenchmarkProblem, checks: int) -> MotionPlan:
     obstacles = pack([problem.obstacles])
     given = Problem.of_scenes(resting(problem.start[None], problem.goal[None], obstacles), task)
     plan = task.action.decode(search.solve(given), given.start, given.goal).take(0)
-    return checked_motion(
-        arm, "joints", Plan(plan.waypoints, plan.durations), obstacles, "search", shortest=True
-    )
+    return checked_motion(arm, "joints", plan, obstacles, "search", shortest=True)
 
 
 def measure_planner(

@@ -24,16 +24,7 @@ def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:
     size, at = task.action.size, task.n_via * task.action.dimension
     if replanning or not at:
         return sobol_actions(number, size)
-    return _with_duration(number, size, at, best_duration(task))
-
-
-@functools.cache
-def _with_duration(number: int, size: int, at: int, duration: float) -> Single:
-    """Return Sobol points in all components but one, which is the duration."""
-    actions: Single = np.insert(sobol_actions(number, size - 1), at, np.float32(duration), axis=1)
-    actions[0] = 0.0
-    actions.flags.writeable = False
-    return actions
+    return sobol_actions(number, size, at, best_duration(task))
 
 
 def best_duration(task: Task) -> float:
@@ -53,14 +44,19 @@ def best_duration(task: Task) -> float:
 
 
 @functools.cache
-def sobol_actions(number: int, size: int) -> Single:
-    """Return the zero action and points of the Sobol sequence in [-1, 1]^size, shape (number, size)."""
+def sobol_actions(number: int, size: int, fixed: int | None = None, value: float = 0.0) -> Single:
+    """Return the zero action and points of the Sobol sequence in [-1, 1]^size, shape (number, size).
+
+    With `fixed`, the index of a component, it has the same value in all points.
+    """
     import torch
 
     quasirandom: Any = torch.quasirandom
-    engine = quasirandom.SobolEngine(size)
+    engine = quasirandom.SobolEngine(size if fixed is None else size - 1)
     engine.fast_forward(2)  # the first points are a corner of the cube and its middle
     points = 2.0 * engine.draw(max(number - 1, 1)).numpy()[: number - 1] - 1.0
+    if fixed is not None:
+        points = np.insert(points, fixed, value, axis=1)
     actions = np.concatenate((np.zeros((1, size)), points)).astype(np.float32)
     actions.flags.writeable = False
     return actions

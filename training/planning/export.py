@@ -88,19 +88,18 @@ def read_motion(path: str | Path) -> tuple[tuple[str, ...], JointMotion]:
 
 def _form(path: Path) -> str:
     """Return the form of a file by its suffix."""
-    forms = {".csv": "csv", ".yaml": "yaml", ".yml": "yaml"}
-    if path.suffix.lower() not in forms:
+    form = path.suffix.lower().replace("yml", "yaml").removeprefix(".")
+    if form not in ("csv", "yaml"):
         raise ValueError(f"a movement is written as .csv or .yaml, got {path}")
-    return forms[path.suffix.lower()]
+    return form
 
 
 def _table(names: tuple[str, ...], motion: JointMotion) -> str:
     """Return a movement as comma-separated values."""
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["time", *(f"{part}:{name}" for part in PARTS for name in names)])
-    for row in np.column_stack(motion):
-        writer.writerow([f"{value:.12g}" for value in row])
+    head = ["time", *(f"{part}:{name}" for part in PARTS for name in names)]
+    csv.writer(text, lineterminator="\n").writerow(head)
+    np.savetxt(text, np.column_stack(motion), "%.12g", ",")
     return text.getvalue()
 
 
@@ -111,7 +110,7 @@ def _read_table(text: str) -> tuple[tuple[str, ...], Float, list[Float]]:
     names = tuple(column.removeprefix("position:") for column in head if column.startswith("position:"))
     if head != ["time", *(f"{part}:{name}" for part in PARTS for name in names)]:
         raise ValueError("its columns are others")
-    numbers = np.array([[float(value) for value in row] for row in rows])
+    numbers = np.array(list(rows), np.float64)
     return names, numbers[:, 0], np.split(numbers[:, 1:], len(PARTS), axis=1)
 
 

@@ -20,7 +20,12 @@ from viapoint.envs.arms.inverse_kinematics import UnreachableError, inverse_kine
 from viapoint.envs.arms.kinematics import motion_torques, slowdowns, torques
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.arrays import Float
-from viapoint.envs.common.validation import finite_array, number_of_at_least, whole_number
+from viapoint.envs.common.validation import (
+    as_real_array,
+    finite_array,
+    number_of_at_least,
+    whole_number,
+)
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape
@@ -77,7 +82,7 @@ GOALS = 8  # Greatest number of configurations that are tried for a pose
 
 
 class _Problem(NamedTuple):
-    """One planning problem in coordinates of a space."""
+    """One planning problem in coordinates of a space, and the beginning of its search."""
 
     arm: Arm
     space: Space
@@ -86,8 +91,11 @@ class _Problem(NamedTuple):
     acceleration: Float
     goal: Float
     obstacles: Obstacles
-    duration: float | None
-    margin: float
+    duration: float | None = None
+    margin: float = 0.0
+    given: Any = ()  # Via-points that are tried first, shape (S, K, D)
+    enough: int = 1  # Number of free movements
+    generator: Any = None  # Random generator of the seeds
 
     @property
     def setting(self) -> Setting:
@@ -104,42 +112,19 @@ class _Problem(NamedTuple):
         """True if the clearance of a movement depends on its duration."""
         return self.in_motion or bool(self.obstacles.velocity.any())
 
-    def offsets(self, vias: Float, duration: float) -> Float:
-        """Return the offsets of a movement, shape (K + 3, D), from its via-points relative to the start."""
+    @property
+    def least(self) -> float | None:
+        """Least factor on the durations of movements, see :func:`_timed`; None where they change clearances."""
+        return 0.0 if self.duration is None and not self.moves else None
+
+    def movement(self, vias: Float, table: MovementTable, times: int, duration: float) -> Movement:
+        """Return a movement through via-points relative to the start, shape (K, D), by its row of a table."""
         offsets = np.empty((len(vias) + 3, len(self.start)))
         offsets[:-3] = vias
         offsets[-3] = self.goal - self.start
         offsets[-2] = self.velocity * duration
         offsets[-1] = self.acceleration * duration**2
-        return offsets
-
-
-class _Effort(NamedTuple):
-    """Bounds of the search for a movement to one goal."""
-
-    n_via: int
-    given: Float  # Via-points that are tried first, shape (S, K, D)
-    seeds: int  # Greatest number of random seeds
-    enough: int  # Number of free movements
-    until: float  # Time after which no further seed is tried, [s]
-    generator: np.random.Generator
-    ompl: bool  # True to try a path of OMPL in the end
-
-
-class _Movement(NamedTuple):
-    """Movement with passage times from a table."""
-
-    vias: Float  # Via-points relative to the start, shape (K, D)
-    table: MovementTable  # Table with many instants
-    times: int  # Index of the passage times
-    duration: float  # Duration for which it was planned, [s]
-    source: str  # Origin of the via-points
-    clearance: float | None = None  # Its least clearance, [m]; None if it is not known yet
-
-    def compiled(self, problem: _Problem) -> Movement:
-        """Return the movement as compiled functions take it."""
-        offsets = problem.offsets(self.vias, self.duration)
-        return Movement(self.table, self.times, problem.start, offsets, self.duration)
+        return Movement(table, times, self.start, offsets, duration)
 
 
 def plan_motion(
@@ -220,41 +205,40 @@ def plan_motion(
     packed = obstacles if isinstance(obstacles, Obstacles) else pack([obstacles])
     if len(packed.kind) != 1:
         raise ValueError(f"obstacles must be those of one scene, got {len(packed.kind)} scenes")
+    number, given = SEEDS, np.zeros((0, n_via, where.dimension))
+    if np.ndim(seeds) == 0:
+        number = whole_number("seeds", seeds, 0)
+    else:
+        given = finite_array("seeds", seeds, (None, n_via, where.dimension))
+    if not isinstance(rng, np.random.Generator):
+        rng = np.random.default_rng(whole_number("rng", 0 if rng is None else rng, 0))
     shape = (where.dimension,)
     rest = np.zeros(shape)
+    change = rest if acceleration is None else acceleration
     problem = _Problem(
         arm=arm,
         space=where,
         start=np.array(finite_array("start", start, shape)),
         velocity=np.array(finite_array("velocity", rest if velocity is None else velocity, shape)),
-        acceleration=np.array(
-            finite_array("acceleration", rest if acceleration is None else acceleration, shape)
-        ),
+        acceleration=np.array(finite_array("acceleration", change, shape)),
         goal=rest,
         obstacles=packed,
         duration=duration,
         margin=margin,
+        given=given,
+        enough=enough,
+        generator=rng,
     )
     goals = _goals(problem, goal)
-    given, number = np.zeros((0, n_via, where.dimension)), SEEDS
-    if np.ndim(seeds) == 0:
-        number = whole_number("seeds", seeds, 0)
-    else:
-        given = finite_array("seeds", seeds, (None, n_via, where.dimension))
     number = -(-number // len(goals))  # rounded up
-    if not isinstance(rng, np.random.Generator):
-        rng = np.random.default_rng(whole_number("rng", 0 if rng is None else rng, 0))
     until = time.perf_counter() + time_limit
     # Straight movements are cheap, and the first goal that is reached bounds what others may cost.
-    little = _Effort(
-        n_via=n_via, given=given[:0], seeds=0, enough=enough, until=0.0, generator=rng, ompl=False
-    )
     straight = []
     if len(goals) > 1:
-        straight = [_plan(problem._replace(goal=each), little) for each in goals]
-    plans = list(straight)
+        straight = [_plan(problem._replace(goal=each), 0, 0.0, ompl) for each in goals]
+    plans = list[MotionPlan]()
     for rank, each in enumerate(goals):
-        least = min((plan.duration for plan in plans if plan.success), default=np.inf)
+        least = min((plan.duration for plan in (*straight, *plans) if plan.success), default=np.inf)
         if straight and straight[rank].duration >= least:
             continue
         # A goal that cannot be reached costs its share of the time, or a few seeds if another one is reached.
@@ -262,9 +246,9 @@ def plan_motion(
         share = now + (until - now) / (len(goals) - rank)
         few = number if np.isinf(least) else min(number, NARROW)
         tree = ompl and bool(np.isinf(least))
-        effort = little._replace(given=given, seeds=few, until=share, ompl=tree)
-        plans.append(_plan(problem._replace(goal=each), effort))
-    best = max(plans, key=_worth)
+        plans.append(_plan(problem._replace(goal=each), few, share, tree))
+    plans += straight
+    best = max(plans, key=lambda plan: (plan.success, -plan.duration if plan.success else plan.clearance))
     return dataclasses.replace(best, milliseconds=1e3 * (time.perf_counter() - began))
 
 
@@ -351,12 +335,10 @@ def checked_motion(
         acceleration=zero if plan.acceleration is None else np.asarray(plan.acceleration),
         goal=waypoints[-1],
         obstacles=obstacles,
-        duration=None,
-        margin=0.0,
     )
     table = table_with(durations[None] / duration, FINE_INSTANTS)
-    movement = _Movement(waypoints[1:-1] - waypoints[0], table, 0, duration, source)
-    return _known(problem, movement, _fault(problem)[0], 0.0 if shortest else 1.0)
+    movement = problem.movement(waypoints[1:-1] - waypoints[0], table, 0, duration)
+    return _known(problem, movement, source, 0.0 if shortest else 1.0, _fault(problem)[0])
 
 
 def ompl_motion(
@@ -403,34 +385,27 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     space = space_of(arm, "hand" if of_hand else "joints")
     start = np.array(space.coordinates(arm.home))
     still = np.zeros_like(start)
-    problem = _Problem(arm, space, start, still, still, start + 0.01, pack([[]]), None, 0.0)
+    problem = _Problem(arm, space, start, still, still, start + 0.01, pack([[]]))
     straight = _straight(problem)
-    is_free(problem.setting, straight.compiled(problem), problem.obstacles, 0, 0.0)
-    _result(problem, straight, _fault(problem)[0])
+    is_free(problem.setting, straight, problem.obstacles, 0, 0.0)
+    _known(problem, straight, "straight", 0.0, _fault(problem)[0])
     _refined(problem, 0.0, movement_table(n_via), fine_table(n_via), np.zeros((0, n_via, len(start))), 1.0)
 
 
 def _goals(problem: _Problem, goal: Any) -> Float:
     """Return the goals that are tried, nearest first, shape (G, D)."""
-    if isinstance(goal, Pose | Mapping):
-        goal = [goal]
-    if isinstance(goal, Sequence) and any(isinstance(each, Pose | Mapping) for each in goal):
-        if not all(isinstance(each, Pose | Mapping) for each in goal):
-            raise ValueError("goals must be poses or coordinates, not some of both")
-        return _goals_of_poses(problem, [as_pose("goal", each) for each in goal])
-    try:
-        several = np.ndim(goal) > 1
-        number = np.shape(goal)[-1:] or (0,)
-    except ValueError:
+    poses = [goal] if isinstance(goal, Pose | Mapping) else goal
+    if isinstance(poses, Sequence) and any(isinstance(each, Pose | Mapping) for each in poses):
+        return _goals_of_poses(problem, [as_pose("goal", each) for each in poses])
+    values = as_real_array(goal)
+    number = 0 if values is None or not values.ndim else values.shape[-1]
+    if number != len(problem.start) and number in (3, 7):
         raise ValueError(
-            f"goal must be coordinates, or several of them of the same length, got {goal!r:.60}"
-        ) from None
-    if number != (len(problem.start),) and number in ((3,), (7,)):
-        raise ValueError(
-            f"goal must be {len(problem.start)} coordinates, got {number[0]}; a place in space is "
+            f"goal must be {len(problem.start)} coordinates, got {number}; a place in space is "
             "goal=Pose(position=(x, y, z)), with quaternion=(w, x, y, z) for the direction of the tool "
             "(command line: --position, --quaternion)"
         )
+    several = values is not None and values.ndim > 1
     goals = finite_array("goal", goal if several else [goal], (None, len(problem.start)))
     if problem.arm.continuous and not problem.space.of_hand:
         # The equivalent position within the range that is nearest to the start.
@@ -445,41 +420,33 @@ def _goals(problem: _Problem, goal: Any) -> Float:
 
 
 def _goals_of_poses(problem: _Problem, poses: list[Pose]) -> Float:
-    """Return the goals that are tried for several poses, shape (G, D); those out of reach are passed over.
+    """Return coordinates of configurations with the tool at a pose, shape (G, D); free ones where there are any.
+
+    For each pose the nearest come first; poses out of reach are passed over.
 
     Raises:
         UnreachableError: All are out of reach.
     """
-    found = []
+    arm, found = problem.arm, []
     fault = None
+    near = problem.space.joints(problem.start)
+    resting = ~problem.obstacles.velocity[0].any(axis=-1)
     for pose in poses:
         try:
-            found.append(_solutions(problem, pose))
+            joints = inverse_kinematics(arm, pose.position, pose.quaternion, seed=near)
         except UnreachableError as error:
             fault = error
+            continue
+        many = problem.obstacles.take(np.zeros(len(joints), np.int64))
+        rows, own = row_clearances(arm.chain, arm.spheres, joints, many, problem.margin + SPARE)
+        apart = np.minimum(own, rows[:, resting].min(axis=1, initial=np.inf))
+        free = apart >= problem.margin
+        if free.any():
+            joints = joints[free]
+        found.append(problem.space.coordinates(joints[:GOALS]))
     if not found and fault is not None:
         raise fault
     return np.concatenate(found)
-
-
-def _solutions(problem: _Problem, pose: Pose) -> Float:
-    """Return coordinates of configurations with the tool at a pose, nearest first; free ones where there are any."""
-    arm = problem.arm
-    near = problem.space.joints(problem.start)
-    found = inverse_kinematics(arm, pose.position, pose.quaternion, seed=near)
-    resting = ~problem.obstacles.velocity[0].any(axis=-1)
-    many = problem.obstacles.take(np.zeros(len(found), np.int64))
-    rows, own = row_clearances(arm.chain, arm.spheres, found, many, problem.margin + SPARE)
-    apart = np.minimum(own, rows[:, resting].min(axis=1, initial=np.inf))
-    free = apart >= problem.margin
-    if free.any():
-        found = found[free]
-    return np.array(problem.space.coordinates(found[:GOALS]))
-
-
-def _worth(plan: MotionPlan) -> tuple[bool, float]:
-    """Return by what plans to several goals are compared: success, then motion time, or clearance."""
-    return plan.success, -plan.duration if plan.success else plan.clearance
 
 
 def _fault(problem: _Problem) -> tuple[str, float]:
@@ -499,15 +466,12 @@ def _fault(problem: _Problem) -> tuple[str, float]:
     for end, name in enumerate(("start", "goal")):
         beyond = np.maximum(arm.joint_range[:, 0] - joints[end], joints[end] - arm.joint_range[:, 1])
         worst = int(beyond.argmax())
-        if not inside[end] and (space.of_hand or beyond[worst] <= 0.0):
-            return f"the {name} is out of reach", most
         if not inside[end]:
+            if space.of_hand or beyond[worst] <= 0.0:
+                return f"the {name} is out of reach", most
             low, high = arm.joint_range[worst]
-            text = (
-                f"the {name} is outside the limits: joint {arm.joint_names[worst]!r} must be from {low:.4g} to "
-                f"{high:.4g}, got {joints[end, worst]:.4g}"
-            )
-            return text, most
+            allowed = f"must be from {low:.4g} to {high:.4g}, got {joints[end, worst]:.4g}"
+            return f"the {name} is outside the limits: joint {arm.joint_names[worst]!r} {allowed}", most
         if own[end] < problem.margin:
             touches = "touches itself" if own[end] < 0.0 else "is nearer to itself than the margin"
             return f"the arm {touches} at the {name}, clearance {1e3 * own[end]:.1f} mm", most
@@ -532,68 +496,73 @@ def _fault(problem: _Problem) -> tuple[str, float]:
     return "", max(problem.margin, min(most, nearest - ROUNDING))
 
 
-def _plan(problem: _Problem, effort: _Effort) -> MotionPlan:
-    """Return the best movement to one goal."""
+def _plan(problem: _Problem, number: int, until: float, ompl: bool) -> MotionPlan:
+    """Return the best movement to one goal, after a search with up to a number of random seeds until some time, [s].
+
+    With `ompl`, a path of OMPL is tried in the end, too.
+    """
     fault, kept = _fault(problem)
     straight = _straight(problem)
-    coarse = straight._replace(table=movement_table(0)).compiled(problem)
+    coarse = straight._replace(table=movement_table(0))
     if fault or is_free(problem.setting, coarse, problem.obstacles, 0, kept):
-        plan = _result(problem, straight, fault)
+        plan = _known(problem, straight, "straight", problem.least, fault)
         if plan.success or fault or problem.duration is not None:
             return plan
     duration = straight.duration
     # In motion, and among moving obstacles, a longer movement is another one: several durations share the seeds.
     several = problem.moves and problem.duration is None
     if several:
-        effort = effort._replace(seeds=-(-effort.seeds // ROUNDS))  # rounded up
+        number = -(-number // ROUNDS)  # rounded up
         duration *= 1.0 if problem.in_motion else LONGER  # the straight one in motion has it already
-    tried, found = 0, straight
+    tried, best = 0, None
     for _ in range(ROUNDS if several else 1):
-        best, more = _search(problem, effort, kept, duration)
+        found, more = _search(problem, kept, duration, number, until)
         tried += more
-        if best is None and effort.ompl and not problem.moves:
-            best = _along_path(problem, kept, duration, effort.until)
-        if best is not None:
-            found = best
-            plan = _result(problem, found, "")
-            if plan.success or not several:
-                return dataclasses.replace(plan, seeds=tried)
-            effort = effort._replace(given=(found.vias + problem.start)[None])
+        if found is None and ompl and not problem.moves:
+            found = _along_path(problem, kept, duration, until)
+        if found is not None:
+            best = found
+            if best.success or not several:
+                return dataclasses.replace(best, seeds=tried)
+            problem = problem._replace(given=best.waypoints[None, 1:-1])
         duration *= LONGER
-    plan = _result(problem, found, "")
-    ended = "the time limit was reached" if time.perf_counter() >= effort.until else "no free one was found"
-    number = "1 seed" if tried == 1 else f"{tried} seeds"
-    reason = f"{plan.reason}; {ended} from {number}"
+    plan = best or _known(problem, straight, "straight", problem.least)
+    ended = "the time limit was reached" if time.perf_counter() >= until else "no free one was found"
+    seeds = "1 seed" if tried == 1 else f"{tried} seeds"
+    reason = f"{plan.reason}; {ended} from {seeds}"
     return dataclasses.replace(plan, success=False, seeds=tried, reason=reason)
 
 
-def _straight(problem: _Problem) -> _Movement:
+def _straight(problem: _Problem) -> Movement:
     """Return the straight movement.
 
     Where clearance depends on its duration, it has the shortest one that it would have from rest, in motion LONGER.
     """
     still = np.zeros_like(problem.start)
-    nothing = np.zeros((0, len(still)))
-    movement = _Movement(nothing, fine_table(0), 0, problem.duration or 1.0, "straight")
+    resting = problem._replace(velocity=still, acceleration=still)
+    movement = resting.movement(np.zeros((0, len(still))), fine_table(0), 0, problem.duration or 1.0)
+    duration = movement.duration
     if problem.duration is None and problem.moves:
-        duration, _, _ = _timed(problem._replace(velocity=still, acceleration=still), movement, 0.0)
-        movement = movement._replace(duration=(LONGER if problem.in_motion else 1.0) * duration)
-    return movement
+        duration, _, _ = _timed(problem, movement, 0.0)
+        duration *= LONGER if problem.in_motion else 1.0
+    return problem.movement(movement.offsets[:-3], movement.table, 0, duration)
 
 
-def _search(problem: _Problem, effort: _Effort, kept: float, duration: float) -> tuple[_Movement | None, int]:
+def _search(
+    problem: _Problem, kept: float, duration: float, number: int, until: float
+) -> tuple[MotionPlan | None, int]:
     """Refine seeds until enough movements are free; return the one with the least jerk, and the number of seeds."""
-    n_via, given, enough = effort.n_via, effort.given, effort.enough
-    share = np.arange(1, n_via + 1)[:, None] / (n_via + 1)
-    straight = share * (problem.goal - problem.start)
-    unit = unit_of_jerk(problem.goal - problem.start, problem.space.of_hand)
+    given, enough, n_via = problem.given, problem.enough, problem.given.shape[1]
+    way = problem.goal - problem.start
+    straight = np.arange(1, n_via + 1)[:, None] / (n_via + 1) * way
+    unit = unit_of_jerk(way, problem.space.of_hand)
     near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
     table, fine = movement_table(n_via), fine_table(n_via)
     best, least = None, np.inf
     tight, widest = None, problem.margin  # the best of those that keep the margin and nothing more
     tried = free = 0
-    total = len(given) + 1 + effort.seeds
-    while tried < total and time.perf_counter() < effort.until:
+    total = len(given) + 1 + number
+    while tried < total and time.perf_counter() < until:
         if free >= enough and least <= ROUGH * unit:
             break
         seeds = np.empty((min(CHUNKS[min(tried, len(CHUNKS) - 1)], total - tried), *straight.shape))
@@ -603,16 +572,17 @@ def _search(problem: _Problem, effort: _Effort, kept: float, duration: float) ->
                 seeds[k] = given[tried + k] - problem.start
                 continue
             spread = 0.0 if rank == 0 else near if rank < NARROW else far
-            seeds[k] = straight + spread * effort.generator.uniform(-1.0, 1.0, straight.shape)
+            seeds[k] = straight + spread * problem.generator.uniform(-1.0, 1.0, straight.shape)
         wanted = max(enough - free, 1)
         done, found = _refined(problem, kept, table, fine, seeds, duration, enough=wanted)
         for k in range(done):
             clearance = float(found.clearance[k])
+            movement = problem.movement(found.vias[k], fine, int(found.times[k]), duration)
             if clearance < kept:
                 if clearance >= widest:
                     widest = clearance
                     # Its clearance is computed again, with regard to the margin.
-                    tight = _Movement(found.vias[k], fine, int(found.times[k]), duration, "random")
+                    tight = movement, "random", None
                 continue
             free += 1
             if free == enough:  # a rough movement is worth some more seeds
@@ -621,9 +591,13 @@ def _search(problem: _Problem, effort: _Effort, kept: float, duration: float) ->
                 rank = tried + k - len(given)
                 least = float(found.cost[k])
                 source = "given" if rank < 0 else "random" if rank else "straight, refined"
-                best = _Movement(found.vias[k], fine, int(found.times[k]), duration, source, clearance)
+                best = movement, source, clearance
         tried += done
-    return best or tight, tried
+    chosen = best or tight
+    if chosen is None:
+        return None, tried
+    movement, source, known = chosen
+    return _known(problem, movement, source, problem.least, clearance=known), tried
 
 
 def _refined(
@@ -638,8 +612,7 @@ def _refined(
     enough: int = 1,
 ) -> tuple[int, Found]:
     """Refine seeds, shape (S, K, D); see :func:`~viapoint.training.planning.refine.refine_seeds`."""
-    n_via = seeds.shape[1]
-    fixed = problem.offsets(np.zeros((n_via, len(problem.start))), duration)[n_via:]
+    fixed = problem.movement(seeds[:0, 0], table, 0, duration).offsets
     unit = unit_of_jerk(problem.goal - problem.start, problem.space.of_hand)
     return refine_seeds(
         problem.setting, table, fine, problem.start, fixed, seeds, duration, problem.obstacles, 0, kept, AIMS,
@@ -647,17 +620,17 @@ def _refined(
     )  # fmt: skip
 
 
-def _along_path(problem: _Problem, kept: float, duration: float, until: float) -> _Movement | None:
+def _along_path(problem: _Problem, kept: float, duration: float, until: float) -> MotionPlan | None:
     """Return a movement along a path of OMPL, with as many via-points as it needs; None if there is none."""
     patience = until - time.perf_counter()
+    if patience <= 0.0:
+        return None
     try:
         import_ompl()  # the time of the first import does not count
     except ValueError:
         return None
     ends = np.ascontiguousarray(problem.space.joints(np.stack((problem.start, problem.goal))))
-    path = None
-    if patience > 0.0:
-        path = path_around(problem.arm, ends, problem.obstacles, kept, patience)
+    path = path_around(problem.arm, ends, problem.obstacles, kept, patience)
     if path is None:
         return None
     for count in VIA_COUNTS:
@@ -667,21 +640,23 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
         fine = table_with(durations, FINE_INSTANTS)
         vias = points[None, 1:-1] - problem.start
         _, found = _refined(problem, kept, table, fine, vias, duration, smooth=0.0)
-        if found.clearance[0] >= kept:
-            return _Movement(found.vias[0], fine, 0, duration, "ompl", float(found.clearance[0]))
+        clearance = float(found.clearance[0])
+        if clearance >= kept:
+            movement = problem.movement(found.vias[0], fine, 0, duration)
+            return _known(problem, movement, "ompl", problem.least, clearance=clearance)
     return None
 
 
-def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple[float, Limits, str]:
+def _timed(problem: _Problem, movement: Movement, least: float | None) -> tuple[float, Limits, str]:
     """Return the duration of a movement, the shares of the limits that it uses, and how it fails to keep them.
 
     `least` is the least factor on its duration; limits may need a greater one. None keeps the duration as it is.
     """
-    arm, duration = problem.arm, movement.duration
-    offsets = problem.offsets(movement.vias, duration)
-    position = problem.start + movement.table.basis[movement.times, LIMIT_INSTANTS] @ offsets
-    velocity = movement.table.rate[movement.times, LIMIT_INSTANTS] @ offsets / duration
-    acceleration = movement.table.bend[movement.times, LIMIT_INSTANTS] @ offsets / duration**2
+    arm = problem.arm
+    table, times, start, offsets, duration = movement
+    position = start + table.basis[times, LIMIT_INSTANTS] @ offsets
+    velocity = table.rate[times, LIMIT_INSTANTS] @ offsets / duration
+    acceleration = table.bend[times, LIMIT_INSTANTS] @ offsets / duration**2
     motion = joint_motion(problem.space, position, velocity, acceleration)
     one = (part[None] for part in motion)
     (needed,) = slowdowns(arm.chain, arm.velocity_limit, arm.torque_limit, *one)
@@ -710,22 +685,22 @@ def _timed(problem: _Problem, movement: _Movement, least: float | None) -> tuple
     return factor * duration, limits, beyond
 
 
-def _result(problem: _Problem, movement: _Movement, fault: str) -> MotionPlan:
-    """Return a movement with what is known of it; it gets the shortest duration if that changes nothing else."""
-    return _known(problem, movement, fault, 0.0 if problem.duration is None and not problem.moves else None)
-
-
-def _known(problem: _Problem, movement: _Movement, fault: str, least: float | None) -> MotionPlan:
-    """Return a movement with what is known of it; see :func:`_timed` for its duration."""
+def _known(
+    problem: _Problem,
+    movement: Movement,
+    source: str,
+    least: float | None,
+    fault: str = "",
+    clearance: float | None = None,
+) -> MotionPlan:
+    """Return a movement with what is known of it; see :func:`_timed` for its duration, and `least`."""
     duration, limits, beyond = _timed(problem, movement, least)
-    movement = movement._replace(duration=duration)
-    clearance = movement.clearance
+    table, times, start, offsets, _ = movement
+    vias = offsets[:-3]
+    movement = problem.movement(vias, table, times, duration)
     if clearance is None:
-        clearance = exact_clearance(
-            problem.setting, movement.compiled(problem), problem.obstacles, 0, problem.margin
-        )
-    offsets = problem.offsets(movement.vias, duration)
-    cost = np.einsum("ij,id,jd->", movement.table.cost[movement.times], offsets, offsets)
+        clearance = exact_clearance(problem.setting, movement, problem.obstacles, 0, problem.margin)
+    cost = np.einsum("ij,id,jd->", table.cost[times], movement.offsets, movement.offsets)
     line = problem.goal - problem.start
     straight_cost = STRAIGHT_COST * float(line @ line)
     jerk = 1.0 if cost == 0.0 else max(float(cost) / straight_cost, 1.0) if straight_cost else np.nan
@@ -739,8 +714,8 @@ def _known(problem: _Problem, movement: _Movement, fault: str, least: float | No
     return MotionPlan(
         arm=problem.arm,
         space=problem.space.name,
-        waypoints=np.concatenate((problem.start[None], problem.start + movement.vias, problem.goal[None])),
-        durations=movement.table.durations[movement.times] * duration,
+        waypoints=np.concatenate((start[None], start + vias, problem.goal[None])),
+        durations=table.durations[times] * duration,
         velocity=problem.velocity,
         acceleration=problem.acceleration,
         obstacles=problem.obstacles,
@@ -748,6 +723,6 @@ def _known(problem: _Problem, movement: _Movement, fault: str, least: float | No
         clearance=clearance,
         limits=limits,
         jerk=jerk,
-        source=movement.source,
+        source=source,
         reason=reason,
     )

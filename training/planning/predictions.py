@@ -7,7 +7,7 @@ with computed geometry, which by itself takes the present velocities for constan
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.scenes.motions import REACH_LENGTH, REACH_TIME
 from viapoint.envs.scenes.scene import CHORD, Scenes, reached
-from viapoint.envs.task import Task
 from viapoint.training.planning.problem import Problem
 from viapoint.training.rollout import Outcomes, SceneSimulation
 
@@ -29,35 +28,27 @@ PASSED = np.linspace(0.01, 0.99, 50)
 PLACE_ERROR, RATE_ERROR, LENGTH_ERROR = 0.002, 0.02, 0.03
 
 
-class Seen(NamedTuple):
-    """Places and velocities of the n obstacles of one episode, as seen in its M decisions so far."""
-
-    time: Float  # Shape (M,), [s]
-    centre: Float  # Shape (M, n, 3), [m]
-    velocity: Float  # Shape (M, n, 3), [m/s]
-
-
-def _at_rest(seen: Seen, scene: Scenes) -> Float:
+def _at_rest(time: Float, centre: Float, velocity: Float, scene: Scenes) -> Float:
     """Return obstacles that stay where they are, shape (HORIZON + 1, n, 3), [m]."""
-    return np.repeat(seen.centre[-1:], HORIZON + 1, axis=0)
+    return np.repeat(centre[-1:], HORIZON + 1, axis=0)
 
 
-def known_courses(seen: Seen, scene: Scenes) -> Float:
+def known_courses(time: Float, centre: Float, velocity: Float, scene: Scenes) -> Float:
     """Return the true courses, which no method can know."""
-    time = seen.time[-1] + CHORD * np.arange(HORIZON + 1)
-    return scene.take(np.zeros(len(time), np.int64)).obstacles_at(time).centre
+    times = time[-1] + CHORD * np.arange(HORIZON + 1)
+    return scene.take(np.zeros(len(times), np.int64)).obstacles_at(times).centre
 
 
-def fitted_reaches(seen: Seen, scene: Scenes) -> Float:
+def fitted_reaches(time: Float, centre: Float, velocity: Float, scene: Scenes) -> Float:
     """Return minimum-jerk reaches that fit what was seen; an obstacle that rests stays where it is.
 
     Each hypothesis on duration and begin of the reach has a way, by least squares, and a probability, by what was seen
     and by the length of usual reaches. The prediction is the mean of all hypotheses.
     """
-    places = _at_rest(seen, scene)
+    places = _at_rest(time, centre, velocity, scene)
     ahead = np.linspace(0.0, CHORD * HORIZON, HORIZON + 1)
-    for row in np.flatnonzero(norm(seen.velocity[-1]) > MOVING):
-        made, weight, way = _hypotheses(seen.time, seen.centre[:, row], seen.velocity[:, row], ahead)
+    for row in np.flatnonzero(norm(velocity[-1]) > MOVING):
+        made, weight, way = _hypotheses(time, centre[:, row], velocity[:, row], ahead)
         places[:, row] += np.einsum("h,ht,hd->td", weight, made, way)
     return places
 
@@ -99,12 +90,14 @@ def _shares(begin: Float, duration: Float, time: Float) -> Float:
     return found
 
 
-# Predictions of the places of obstacles by name
-PREDICTIONS: dict[str, Callable[[Seen, Scenes], Float]] = {
+# Predictions of the places of obstacles by name: from the times of the M decisions of an episode so far, shape (M,),
+# [s], and places and velocities of its obstacles as seen then, shape (M, n, 3), [m] and [m/s]
+PREDICTIONS: dict[str, Callable[[Float, Float, Float, Scenes], Float]] = {
     "rest": _at_rest,
     "reach": fitted_reaches,
     "known": known_courses,
 }
+Memory = dict[bytes, list[Float]]  # Times, places and velocities that were seen in each episode
 
 
 class PredictedSearch:
@@ -123,32 +116,33 @@ class PredictedSearch:
 
     def execute(self, scenes: Scenes, decisions: Float) -> Outcomes:
         """Play every episode to its end, beginning with the given decisions, and remember what is seen."""
-        memory: dict[bytes, Seen] = {}
-        self._look(self._simulation.observe(scenes), scenes, memory)
+        memory: Memory = {}
+        self._look(self._problem(self._simulation.observe(scenes)), scenes, memory)
         return self._simulation(scenes, decisions, lambda seen, some: self._decide(seen, some, memory))
 
-    def _decide(self, observation: Observation, scenes: Scenes, memory: dict[bytes, Seen]) -> Float:
-        problem = Problem.of_observation(observation, self._search.task)
+    def _problem(self, observation: Observation) -> Problem:
+        return Problem.of_observation(observation, self._search.task)
+
+    def _decide(self, observation: Observation, scenes: Scenes, memory: Memory) -> Float:
+        problem = self._problem(observation)
         places = []
-        for i, seen in enumerate(self._look(observation, scenes, memory)):
-            places.append(self._predict(seen, scenes.take([i])))
+        for i, (time, centre, velocity) in enumerate(self._look(problem, scenes, memory)):
+            places.append(self._predict(time, centre, velocity, scenes.take([i])))
         obstacles = _in_pieces(problem.obstacles, np.array(places))
         return np.asarray(self._search.solve(problem._replace(obstacles=obstacles), n_pieces=HORIZON))
 
-    def _look(self, observation: Observation, scenes: Scenes, memory: dict[bytes, Seen]) -> list[Seen]:
-        """Add observations to what was seen in their episodes, which the scenes tell apart, and return that."""
-        task: Task = self._search.task
-        obstacles = Problem.of_observation(observation, task).obstacles
-        time = task.time_limit - np.asarray(observation["time_left"], np.float64)[:, 0]
+    def _look(self, problem: Problem, scenes: Scenes, memory: Memory) -> list[list[Float]]:
+        """Add what is seen to the memory of the episodes, which the scenes tell apart, and return that."""
+        assert problem.time_left is not None
+        time = self._search.task.time_limit - problem.time_left
         found = []
         for i in range(len(time)):
             parts = scenes.start[i], scenes.goal[i], scenes.obstacles.centre[i], scenes.reach[i]
             key = b"".join(part.tobytes() for part in parts)
-            new = Seen(time[i : i + 1], obstacles.centre[i : i + 1], obstacles.velocity[i : i + 1])
-            if key in memory:
-                new = Seen(*[np.concatenate(parts) for parts in zip(memory[key], new, strict=True)])
-            memory[key] = new
-            found.append(new)
+            seen = time[[i]], problem.obstacles.centre[[i]], problem.obstacles.velocity[[i]]
+            before = memory.get(key, [part[:0] for part in seen])
+            memory[key] = [np.concatenate(both) for both in zip(before, seen, strict=True)]
+            found.append(memory[key])
         return found
 
 

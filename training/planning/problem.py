@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ from viapoint.envs.geometry.clearance import Placed, place
 from viapoint.envs.geometry.compiled import compiled, inlined, inner
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
-from viapoint.envs.plans import SHORTEST_DURATION
+from viapoint.envs.plans import SHORTEST_DURATION, turned
 from viapoint.envs.replanning import NEARBY, least_remaining
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
@@ -158,149 +157,101 @@ def place_at(
     return True
 
 
-class _Given(NamedTuple):
-    """Plans of zero actions in B problems, and the meaning of other actions, see `ActionLayout`."""
-
-    start: Float
-    velocity: Float
-    acceleration: Float
-    goal: Float
-    line: Float  # Line along which offsets are measured in hand space, shape (B, D)
-    vias: Float  # Shape (B, K, D)
-    remaining: Float  # Shape (B,), [s]; unused in joint space at rest
-    whole: Float  # Durations of the straight movements that rewards are relative to, shape (B,), [s]
-    straight: Float  # Their jerk costs, shape (B,)
-    of_hand: bool
-    via_scale: Float
-    rate_limit: Float  # Velocity limits of the joints, shape (D,), [rad/s]; unused in hand space
-    centre: float
-    log_half_range: float
-    shortest: float  # Shortest duration of a revised movement, [s]
-    longest: float  # Longest duration in hand space, [s], unless more is left of the plan under way
-
-
 def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = False) -> Moves:
-    """Return the plans of actions of shape (B, H, m).
+    """Return the plans of actions of shape (B, H, m), as :func:`~viapoint.envs.replanning.revise` has them.
 
     Their passage times are the best of a table. With `exact`, plans from rest have those of the environment, and more
     instants.
     """
-    layout, table = task.action, movement_table(task.n_via)
+    layout, table, start = task.action, movement_table(task.n_via), problem.start
     vectors = np.ascontiguousarray(actions, dtype=np.float64)
+    number, plans, _ = vectors.shape
     own_times = (exact or layout.timing == "learned") and problem.remaining is None
     if own_times:  # each plan has passage times of its own
-        start, goal = problem.start[:, None], problem.goal[:, None]
-        start = np.broadcast_to(start, (*vectors.shape[:2], layout.dimension))
-        shares = layout.shares(layout.waypoints(vectors, start, goal), vectors)
+        starts = np.broadcast_to(start[:, None], (number, plans, layout.dimension))
+        shares = layout.shares(layout.waypoints(vectors, starts, problem.goal[:, None]), vectors)
         table = table_with(shares.reshape(-1, task.n_via + 1), FINE_INSTANTS if exact else INSTANTS)
-    given = _given(task, problem)
-    return Moves(table, given.start, *_expand(given, table, vectors, own_times))
-
-
-def _given(task: Task, problem: Problem) -> _Given:
-    """Return the plans of zero actions."""
-    layout = task.action
-    line = problem.goal - problem.start
-    remaining = problem.remaining
-    shares = np.arange(1, task.n_via + 1)[:, None] / (task.n_via + 1)
-    vias = problem.start[:, None] + line[:, None] * shares if problem.vias is None else problem.vias
-    length, whole = _straight_movement(task, problem)
-    if remaining is None:
-        remaining = np.full(len(line), layout.centre)
-    elif task.space.of_hand:
+    size = task.n_via * layout.dimension
+    way = line = problem.goal - start
+    if task.space.of_hand and problem.remaining is not None:
         line = np.where((norm(line) < NEARBY["hand"])[:, None], np.eye(1, line.shape[-1]), line)
-    return _Given(
-        np.ascontiguousarray(problem.start),
-        np.ascontiguousarray(problem.velocity),
-        np.ascontiguousarray(problem.acceleration),
-        np.ascontiguousarray(problem.goal),
-        np.ascontiguousarray(line),
-        np.ascontiguousarray(vias),
-        np.ascontiguousarray(remaining),
-        whole,
-        straight_jerk_cost(length, whole),
-        of_hand=task.space.of_hand,
-        via_scale=np.array(layout.via_scale),
-        rate_limit=np.array(layout.rate_limit),
-        centre=layout.centre,
-        log_half_range=layout.log_half_range,
-        shortest=least_remaining(layout),
-        longest=layout.duration_range[1],
-    )
+    steps = vectors[..., :size].reshape(number, plans, task.n_via, layout.dimension)
+    steps = steps * np.array(layout.via_scale)
+    if task.space.of_hand:
+        steps = turned(steps, line[:, None, None])
+    if problem.vias is None:
+        vias = way[:, None] * (np.arange(1, task.n_via + 1)[:, None] / (task.n_via + 1))
+    else:
+        vias = problem.vias - start[:, None]
+    offsets = np.empty((number, plans, task.n_via + 3, layout.dimension))
+    offsets[:, :, :-3] = vias[:, None] + steps
+    offsets[:, :, -3] = way[:, None]
+    least = least_remaining(layout)
+    left = np.full(number, layout.centre) if problem.remaining is None else problem.remaining
+    left = np.maximum(left, least)[:, None]
+    duration = np.maximum(left * np.exp(layout.log_half_range * vectors[..., size]), least)
+    if task.space.of_hand:
+        duration = np.minimum(duration, np.maximum(left, layout.duration_range[1]))
+    motion = np.ascontiguousarray(problem.velocity), np.ascontiguousarray(problem.acceleration)
+    rate_limit = np.array(layout.rate_limit, np.float64)
+    times, cost, fast = _expand(table, offsets, *motion, duration, rate_limit, own_times)
+    length, whole = _straight_movement(task, problem)
+    rough = np.log1p(cost / duration**5 / straight_jerk_cost(length, whole)[:, None])
+    relative = duration / whole[:, None]
+    return Moves(table, np.ascontiguousarray(start), offsets, times, duration, rough, relative, fast)
 
 
 @compiled
 def _expand(
-    given: _Given, table: MovementTable, actions: Float, own_times: bool
-) -> tuple[Float, Int, Float, Float, Float, Bool]:
-    """Return offsets, passage times, durations, `rough`, `relative` and `fast` of plans, see :class:`Moves`.
+    table: MovementTable,
+    every: Float,
+    velocity: Float,
+    acceleration: Float,
+    duration: Float,
+    rate_limit: Float,
+    own_times: bool,
+) -> tuple[Int, Float, Bool]:
+    """Fill in present motions and durations of plans; return passage times, jerk costs in unit time, and `fast`.
 
-    The meaning of an action is that of :meth:`~viapoint.envs.plans.ActionLayout.decode` and
-    :func:`~viapoint.envs.replanning.revise`. With `own_times`, each plan has a row of the table as passage times.
+    Durations of joint movements from rest are given relative to the shortest one. Movements without velocity limits,
+    shape (D,), are those of the hand. With `own_times`, each plan has a row of the table as passage times.
     """
-    number, plans, _ = actions.shape
-    _, vias, dimension = given.vias.shape
-    columns = vias + 3
-    every = np.empty((number, plans, columns, dimension))
+    number, plans, columns, dimension = every.shape
     times = np.empty((number, plans), np.int64)
-    duration = np.empty((number, plans))
-    rough = np.empty((number, plans))
-    relative = np.empty((number, plans))
+    costs = np.empty((number, plans))
     fast = np.zeros((number, plans), np.bool_)
     gram = np.empty((columns, columns))
     for b in range(number):
         moving = False
         for d in range(dimension):
-            moving = moving or given.velocity[b, d] != 0.0 or given.acceleration[b, d] != 0.0
+            moving = moving or velocity[b, d] != 0.0 or acceleration[b, d] != 0.0
         for h in range(plans):
-            offsets, action = every[b, h], actions[b, h]
-            _place_vias(given, b, action, offsets)
-            factor = math.exp(given.log_half_range * action[vias * dimension])
-            left = max(given.remaining[b], given.shortest)
-            time = max(left * factor, given.shortest)
-            if given.of_hand:
-                time = min(time, max(left, given.longest))
+            offsets, time = every[b, h], duration[b, h]
             row = b * plans + h if own_times else -1
-            chosen, cost = _timed(table, offsets, given, b, row, time, gram)
-            if not given.of_hand:
-                shortest = shortest_duration(table, chosen, offsets, given.rate_limit)
+            chosen, cost = _timed(table, offsets, velocity[b], acceleration[b], row, time, gram)
+            if len(rate_limit):
+                shortest = shortest_duration(table, chosen, offsets, rate_limit)
                 if moving:
                     # The environment prolongs plans in motion beyond the limits.
                     time *= min(max(shortest / time, 1.0), PROLONGED)
-                    chosen, cost = _timed(table, offsets, given, b, row, time, gram)
-                    shortest = shortest_duration(table, chosen, offsets, given.rate_limit)
+                    chosen, cost = _timed(table, offsets, velocity[b], acceleration[b], row, time, gram)
+                    shortest = shortest_duration(table, chosen, offsets, rate_limit)
                     fast[b, h] = shortest > 1.02 * time
                 else:
-                    time = given.centre * factor * shortest
-            times[b, h], duration[b, h] = chosen, time
-            rough[b, h] = math.log1p(cost / time**5 / given.straight[b])
-            relative[b, h] = time / given.whole[b]
-    return every, times, duration, rough, relative, fast
-
-
-@inner
-def _place_vias(given: _Given, b: int, action: Float, offsets: Float) -> None:
-    """Fill in the offsets of via-points and goal from the start."""
-    _, vias, dimension = given.vias.shape
-    line, start = given.line[b], given.start[b]
-    for k in range(vias):
-        for d in range(dimension):
-            step = action[k * dimension + d] * given.via_scale[d]
-            offsets[k, d] = given.vias[b, k, d] - start[d] + (0.0 if given.of_hand else step)
-        if given.of_hand:  # offsets along and across the line
-            length = math.sqrt(line[0] * line[0] + line[1] * line[1])
-            x, y = line[0] / length, line[1] / length
-            along = action[2 * k] * given.via_scale[0]
-            across = action[2 * k + 1] * given.via_scale[1]
-            offsets[k, 0] += along * x - across * y
-            offsets[k, 1] += along * y + across * x
-    for d in range(dimension):
-        offsets[vias, d] = given.goal[b, d] - start[d]
+                    time *= shortest
+            times[b, h], costs[b, h], duration[b, h] = chosen, cost, time
+    return times, costs, fast
 
 
 @inner
 def _timed(
-    table: MovementTable, offsets: Float, given: _Given, b: int, row: int, duration: float, gram: Float
+    table: MovementTable,
+    offsets: Float,
+    velocity: Float,
+    acceleration: Float,
+    row: int,
+    duration: float,
+    gram: Float,
 ) -> tuple[int, float]:
     """Fill in the present motion of a plan of some duration; return its passage times and jerk cost in unit time.
 
@@ -308,8 +259,8 @@ def _timed(
     """
     last = len(offsets)
     for d in range(offsets.shape[1]):
-        offsets[last - 2, d] = given.velocity[b, d] * duration
-        offsets[last - 1, d] = given.acceleration[b, d] * duration * duration
+        offsets[last - 2, d] = velocity[d] * duration
+        offsets[last - 1, d] = acceleration[d] * duration * duration
     if row >= 0:
         products(offsets, gram)
         return row, jerk_cost(table, row, gram)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -133,7 +132,7 @@ class GeometrySearch:
         """
         moving = problem.remaining is not None
         at = self.task.n_via * self.task.action.dimension
-        duration = None if moving or not at else at  # from rest the duration stays as it is
+        fixed = None if moving or not at else at  # from rest the duration stays as it is
         actions = candidate_actions(self.task, self.n_checks, replanning=moving)
         candidates = np.broadcast_to(actions, (len(problem.start), *actions.shape))
         setting = setting_of(self.task, problem.obstacles)._replace(n_pieces=n_pieces)
@@ -141,7 +140,7 @@ class GeometrySearch:
         for each in range(self.refinements):
             top = np.argsort(-merit, axis=-1, kind="stable")[:, :N_CENTRES]
             centres = np.take_along_axis(candidates, top[..., None], axis=1)
-            steps = SPREAD * 0.5**each * _steps(self.per_round, self.task.action.size, duration)
+            steps = SPREAD * 0.5**each * sobol_actions(self.per_round + 1, self.task.action.size, fixed)[1:]
             near = np.clip(centres[:, np.arange(self.per_round) % centres.shape[1]] + steps, -1.0, 1.0)
             candidates = np.concatenate((candidates, near), axis=1)
             merit = np.concatenate((merit, merits(self.task, problem, near, setting)), axis=1)
@@ -158,10 +157,10 @@ class GeometrySearch:
 
         The signature is that of Stable-Baselines3's `predict`; only the observation is used.
         """
-        parts = {name: np.asarray(part) for name, part in observation.items()}
-        if parts["joints"].ndim > 1:
-            return self.decide(parts).astype(np.float32), None
-        return self.decide({name: part[None] for name, part in parts.items()})[0].astype(np.float32), None
+        if np.ndim(observation["joints"]) > 1:
+            return self.decide(observation).astype(np.float32), None
+        alone = {name: np.asarray(part)[None] for name, part in observation.items()}
+        return self.decide(alone)[0].astype(np.float32), None
 
     def plan(self, start: Any, goal: Any, obstacles: Any = ()) -> MotionPlan:
         """Return the best plan from rest at `start` to rest at `goal` among obstacles that stand still.
@@ -181,14 +180,6 @@ class GeometrySearch:
         problem = Problem.of_scenes(scenes, self.task)
         plan = self.task.action.decode(self.solve(problem), problem.start, problem.goal).take(0)
         return checked_motion(self.task.arm, self.task.space_name, plan, problem.obstacles, self.name)
-
-
-@functools.cache
-def _steps(number: int, size: int, duration: int | None) -> Single:
-    """Return steps of a round of refinement, shape (number, size); the component of the duration is zero if given."""
-    if duration is None:
-        return sobol_actions(number + 1, size)[1:]
-    return np.insert(sobol_actions(number + 1, size - 1)[1:], duration, 0.0, axis=1)
 
 
 def best_of(task: Task, problem: Problem, actions: Numbers, merit: Numbers) -> Numbers:
