@@ -141,10 +141,17 @@ def fine_table(n_via: int) -> MovementTable:
 def table_with(durations: Float, number_of_instants: int = INSTANTS) -> MovementTable:
     """Return the table of movements whose segments take some durations in unit time, shape (M, K + 1)."""
     durations = np.ascontiguousarray(durations, dtype=np.float64)
-    order = np.zeros(1, np.int64)
-    while len(order) < number_of_instants:
-        order = np.concatenate((2 * order, 2 * order + 1))  # numbers in the order of their reversed bits
+    order = _everywhere_soon(number_of_instants)
     return MovementTable(durations, *_unit_movements(durations, number_of_instants), order)
+
+
+@functools.cache
+def _everywhere_soon(number: int) -> Int:
+    """Return the numbers below a power of two in the order of their reversed bits."""
+    order = np.zeros(1, np.int64)
+    while len(order) < number:
+        order = np.concatenate((2 * order, 2 * order + 1))
+    return order
 
 
 @compiled

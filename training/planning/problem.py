@@ -176,7 +176,7 @@ def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = Fa
     if task.space.of_hand and problem.remaining is not None:
         line = np.where((norm(line) < NEARBY["hand"])[:, None], np.eye(1, line.shape[-1]), line)
     steps = vectors[..., :size].reshape(number, plans, task.n_via, layout.dimension)
-    steps = steps * np.array(layout.via_scale)
+    steps = steps * layout.via_scale
     if task.space.of_hand:
         steps = turned(steps, line[:, None, None])
     if problem.vias is None:
@@ -193,7 +193,7 @@ def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = Fa
     if task.space.of_hand:
         duration = np.minimum(duration, np.maximum(left, layout.duration_range[1]))
     motion = np.ascontiguousarray(problem.velocity), np.ascontiguousarray(problem.acceleration)
-    rate_limit = np.array(layout.rate_limit, np.float64)
+    rate_limit = np.zeros(0) if task.space.of_hand else layout.rate_limit
     times, cost, fast = _expand(table, offsets, *motion, duration, rate_limit, own_times)
     length, whole = _straight_movement(task, problem)
     rough = np.log1p(cost / duration**5 / straight_jerk_cost(length, whole)[:, None])
