@@ -188,6 +188,9 @@ def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = Fa
     offsets[:, :, -3] = way[:, None]
     least = least_remaining(layout)
     left = np.full(number, layout.centre) if problem.remaining is None else problem.remaining
+    if not task.space.of_hand:  # from rest, durations are relative to the shortest one
+        moving = (problem.velocity != 0.0).any(axis=-1) | (problem.acceleration != 0.0).any(axis=-1)
+        left = np.where(moving, left, layout.centre)
     left = np.maximum(left, least)[:, None]
     duration = np.maximum(left * np.exp(layout.log_half_range * vectors[..., size]), least)
     if task.space.of_hand:
