@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import JUMPS, MOVING, PANDA, PLANE, REACH, WHOLE
+from helpers import JUMPS, MOVING, PANDA, PANDA_MOVING, PLANE, REACH, WHOLE
 
 from viapoint import primitives
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
@@ -56,6 +56,17 @@ def test_planned_movements_are_nearly_those_of_the_environment(env_id, n_via, ti
     size = np.abs(moves.offsets[:, :, : n_via + 1]).max()
     assert np.median(np.abs(path - executed)) < 0.01 * size
     np.testing.assert_allclose(path[..., -1, :], executed[..., -1, :], atol=1e-9)
+
+
+@pytest.mark.parametrize("env_id", [MOVING, PANDA_MOVING])
+def test_revised_movements_last_as_long_as_those_of_the_environment(env_id):
+    env, _, problem = drawn(env_id, 24)
+    for decision in range(2):  # from rest, and under way
+        actions = random_actions(env.task, 24, seed=decision)
+        planned = moves_of(env.task, problem, actions[:, None]).duration[:, 0]
+        observation, *_ = env.step(actions.astype(np.float32))
+        assert np.median(np.abs(planned / env.last_plan.duration - 1.0)) < 0.05
+        problem = Problem.of_observation(observation, env.task)
 
 
 @pytest.mark.parametrize("env_id", AMONG_OBSTACLES)
