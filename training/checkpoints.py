@@ -78,7 +78,8 @@ def read_checkpoint(model: BaseAlgorithm, path: Path) -> float:
     """
     state = read_state(path)
     written_by = f"was written by viapoint {state['model'].get('viapoint')} and"
-    mine, theirs = _with_any_file(describe(model)), _with_any_file(state["model"])
+    mine = _with_any_file(describe(model))
+    theirs = _with_any_file(state["model"])
     others = [name for name in mine if name not in MAY_DIFFER and mine[name] != theirs.get(name)]
     if others:
         raise BadFileError(path, f"{written_by} is of another model: {', '.join(others)}")
@@ -135,7 +136,8 @@ def _restore(model: BaseAlgorithm, state: dict[str, Any], arrays: dict[str, Any]
     buffer: Any = getattr(model, "replay_buffer", None)
     if buffer is not None:
         _fill(_buffer_arrays(buffer), arrays["buffer"]["arrays"])
-        buffer.pos, buffer.full = arrays["buffer"]["pos"], arrays["buffer"]["full"]
+        buffer.pos = arrays["buffer"]["pos"]
+        buffer.full = arrays["buffer"]["full"]
     env: Any = model.get_env()
     env.restore(arrays["env"])
     # Last: nothing may be drawn after it.

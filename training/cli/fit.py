@@ -90,7 +90,8 @@ def _warn(movements: Movements, fits: Fits, config: FitConfig) -> None:
     """Print what looks like other units than seconds and metres, or like several movements in one."""
     fewest, most = config.numbers
     for name, (time, position) in movements.items():
-        gap, extent = float(np.ptp(time)) / len(time), float(np.ptp(position, axis=0).max())
+        gap = float(np.ptp(time)) / len(time)
+        extent = float(np.ptp(position, axis=0).max())
         if gap > SLOW:
             print(f"movement {name}: samples are {gap:g} s apart; `time` is in seconds", file=sys.stderr)
         if extent > WIDE:

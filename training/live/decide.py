@@ -131,7 +131,9 @@ def propose(arena: Arena, state: State) -> tuple[Proposal, ...]:
 
 def _distinct(arena: Arena, state: State, scenes: Scenes) -> list[Proposal]:
     """Return the plan and the best candidates whose paths differ from it and from one another."""
-    scene, first, (name, task, _) = state.scene, state.proposals[0], _chooser(arena, state)
+    scene = state.scene
+    first = state.proposals[0]
+    name, task, _ = _chooser(arena, state)
     by_agent, maker = name == "own", SEARCH
     if by_agent and not hasattr(arena.policy, "propose"):  # it proposes one action
         return [first]

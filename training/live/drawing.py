@@ -193,9 +193,11 @@ class View:
         self._rings.visible = state.turning and (state.selected is not None or not self._planar)
         if state.selected is not None:
             shape = state.scene.obstacles[state.selected]
-            self._rings.wxyz, self._rings.position = shape.quaternion, shape.position
+            self._rings.wxyz = shape.quaternion
+            self._rings.position = shape.position
         elif not self._planar:
-            self._rings.wxyz, self._rings.position = self._arena.orientation(state.scene.goal), goal
+            self._rings.wxyz = self._arena.orientation(state.scene.goal)
+            self._rings.position = goal
 
     def _draw_arm(self, name: str, joints: Float) -> None:
         for i, (turn, position) in enumerate(self._arm.poses(joints)):

@@ -157,7 +157,10 @@ class Tab:
         """Show one of the proposals as the plan."""
         state = self.state
         if index < len(state.proposals):
-            state.picked, state.movement, state.playing, state.before = index, None, False, None
+            state.picked = index
+            state.movement = None
+            state.playing = False
+            state.before = None
             proposal = state.proposals[index]
             wanted = None if index else state.duration  # the others have durations of their own
             self._say(describe_plan(proposal, wanted), proposal.motion.success)

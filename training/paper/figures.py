@@ -208,7 +208,8 @@ def pair(first: Any, second: Any, texts: Any) -> Figure:
         plane(ax[0])
         paths(ax[0], motion.planned[0], motion.hand[0])
         _dot(ax[0], movement(passage))
-        (model,), (arm,) = movements.model_profiles(movement), movements.arm_profiles(motion)
+        (model,) = movements.model_profiles(movement)
+        (arm,) = movements.arm_profiles(motion)
         profiles(ax[1:], model, arm, float(movement.duration))
         for each in ax[1:]:
             each.axvline(passage, color=THIRD, linewidth=0.7, linestyle=":")

@@ -238,7 +238,8 @@ class Profile(NamedTuple):
     @property
     def valley(self) -> tuple[float, float]:
         """Time of the least speed between two peaks, and that speed / the mean of the highest peaks; else NaN and 1."""
-        valleys, peaks = self.local_maxima(-self.speed), self.local_maxima(self.speed)
+        valleys = self.local_maxima(-self.speed)
+        peaks = self.local_maxima(self.speed)
         if not len(valleys):
             return np.nan, 1.0
         depth = -valleys[0, 1] / peaks[:2, 1].mean() if len(peaks) > 1 else 1.0

@@ -147,7 +147,8 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
         start = dict(zip(state["name"], state["position"], strict=True))
         wanted = asked["goal_constraints"][0]["joint_constraints"]
         goal = {each["joint_name"]: each["position"] for each in wanted}
-        begin, end = _positions("start", start, joints), _positions("goal", goal, joints)
+        begin = _positions("start", start, joints)
+        end = _positions("goal", goal, joints)
         for held in (read.get("robot_state"), asked["start_state"]):
             if held and held.get("attached_collision_objects"):
                 raise ValueError("an object is attached to the arm; plan for an arm whose model holds it")
