@@ -46,7 +46,6 @@ SENSED_BASELINES = (
 LOOKING: dict[str, Any] = {
     "one look": "end",
     "a look each 0.3 s": ["horizon"],
-    "looks at what is new": ["sight"],
     "looks at what is new or near": ["sight", "clearance"],
 }
 """Decisions of PlanarSensed with rays around the hand, in which points that were seen are remembered."""
@@ -123,8 +122,8 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
         for when, decide_at in LOOKING.items():
             settings = {**common, "env_kwargs": {"sensor": "hand_rays", "decide_at": decide_at}}
             rows = evaluate(**settings, baselines=["thick:search512", "known:search512"]).rows
-            if "horizon" in decide_at or "clearance" in decide_at:
-                rows += seeds_of(config.looks, short, settings)
+            if decide_at != "end":
+                rows += seeds_of(config.looks, short, settings, untrained="horizon" in decide_at)
             for row in rows:
                 yield _numbers(LOOKS, name, f"{row['method']}, {when}", row)
     if config.only not in ("everything", "runs"):
@@ -151,12 +150,14 @@ def reaches_of(config: Config, short: str, common: dict[str, Any]) -> Iterator[d
             yield _numbers(f"{short}, reaches", "test", f"{row['method']}, every {interval} s", row)
 
 
-def seeds_of(folder: Path, short: str, settings: dict[str, Any]) -> list[dict[str, Any]]:
+def seeds_of(
+    folder: Path, short: str, settings: dict[str, Any], *, untrained: bool = True
+) -> list[dict[str, Any]]:
     """Return the numbers of the trainings of a task in a folder, such as `PlanarSensed-0` for seed 0."""
     rows = []
     for run in sorted(folder.glob(f"{short}-*")):
         seed = run.name.rpartition("-")[2]
-        baselines = ["untrained"] if seed == "0" else []
+        baselines = ["untrained"] if untrained and seed == "0" else []
         for row in evaluate(load_agent(run), **settings, baselines=baselines).rows:
             rows.append({**row, "method": row["method"].replace("agent", f"agent, seed {seed}")})
     return rows
