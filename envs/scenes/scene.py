@@ -77,8 +77,8 @@ class Scenes(NamedTuple):
         """Return the scenes with another number of rows for obstacles; those behind are left out."""
         wide = resting(self.start, self.goal, self.obstacles.with_rows(rows))
         kept = min(rows, self.turn_time.shape[1])
-        for mine, theirs in zip(wide[4:], self[4:], strict=True):  # what has a row for each obstacle
-            mine[:, :kept] = theirs[:, :kept]
+        for name in ("turn_time", "turn_velocity", "reach"):  # which have a row for each obstacle
+            getattr(wide, name)[:, :kept] = getattr(self, name)[:, :kept]
         return wide._replace(jumps=self.jumps)
 
     @staticmethod

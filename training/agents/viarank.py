@@ -54,7 +54,7 @@ from viapoint.training.planning.search import (
 )
 
 EFFORT_WEIGHT = 0.05  # Weight of the reward of a successful plan beside its probability of success
-# Time from the present during which clearance counts twice as much as later, where plans are revised, [s]
+# Time up to which a contact counts twice as much as later ones, which a revised plan may still avoid, [s]
 SOON = 0.45
 KEEP = 2.0  # Reward by which another plan must be better than the one under way, as each change of plan costs jerk
 # First part of the seeds of scenes for the calibration, far from those of training, and their number
@@ -212,20 +212,24 @@ class ViaRankPolicy(PlanPolicy):
 
 def _check_task(task: Task | None) -> Task:
     """Return a task for which this agent is made; ValueError for others."""
-    if task is None or task.sensor is None or task.stepwise or task.moving_obstacles:
+    if task is None:
         got = "another one"
-        if task is not None:
-            got = "one with control steps" if task.stepwise else "one with moving obstacles"
-            got = "one without a sensor" if task.sensor is None else got
-        raise ValueError(
-            "viarank needs an environment of this package with a sensor and obstacles at rest, in which an action is a "
-            f"movement, such as viapoint/PlanarSensed-v0; got {got}"
-        )
-    return task
+    elif task.sensor is None:
+        got = "one without a sensor"
+    elif task.stepwise:
+        got = "one with control steps"
+    elif task.moving_obstacles:
+        got = "one with moving obstacles"
+    else:
+        return task
+    raise ValueError(
+        "viarank needs an environment of this package with a sensor and obstacles at rest, in which an action is a "
+        f"movement, such as viapoint/PlanarSensed-v0; got {got}"
+    )
 
 
 class _NoBuffer(ReplayBuffer):
-    """Replay buffer that keeps nothing: scenes to learn from are drawn anew for each update."""
+    """Replay buffer that keeps nothing: the algorithm learns from scenes that are new, or under way in `env`."""
 
     def __init__(
         self, buffer_size: int, observation_space: Any, action_space: Any, *args: Any, **kwargs: Any
@@ -374,12 +378,12 @@ class ViaRank(PlanAlgorithm):
         assert self.env is not None
         task = self.policy.task
         observation: Any = self._last_obs
-        scenes = self.env.get_attr("scenes")
-        if len(scenes[0].start) < self.n_envs:  # each environment has one
-            scenes[0] = Scenes.together(scenes)
+        every = self.env.get_attr("scenes")
+        # A vector environment of this package has those of all copies, others have one each.
+        scenes = every[0] if len(every[0].start) == self.n_envs else Scenes.together(every)
         believed = Problem.of_observation(observation, task)
         sight = Sight.of(observation, task)
-        truth = believed._replace(obstacles=scenes[0].obstacles)
+        truth = believed._replace(obstacles=scenes.obstacles)
         if self.policy.belief != DEFAULT_BELIEF:
             believed = believed._replace(obstacles=self.policy.believed(sight, truth.obstacles))
         return truth, believed, sight

@@ -188,8 +188,8 @@ def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = Fa
     offsets[:, :, -3] = way[:, None]
     least = least_remaining(layout)
     left = np.full(number, layout.centre) if problem.remaining is None else problem.remaining
+    moving = (problem.velocity != 0.0).any(axis=-1) | (problem.acceleration != 0.0).any(axis=-1)
     if not task.space.of_hand:  # from rest, durations are relative to the shortest one
-        moving = (problem.velocity != 0.0).any(axis=-1) | (problem.acceleration != 0.0).any(axis=-1)
         left = np.where(moving, left, layout.centre)
     left = np.maximum(left, least)[:, None]
     duration = np.maximum(left * np.exp(layout.log_half_range * vectors[..., size]), least)
@@ -197,7 +197,7 @@ def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = Fa
         duration = np.minimum(duration, np.maximum(left, layout.duration_range[1]))
     motion = np.ascontiguousarray(problem.velocity), np.ascontiguousarray(problem.acceleration)
     rate_limit = np.zeros(0) if task.space.of_hand else layout.rate_limit
-    times, cost, fast = _expand(table, offsets, *motion, duration, rate_limit, own_times)
+    times, cost, fast = _expand(table, offsets, *motion, moving, duration, rate_limit, own_times)
     length, whole = _straight_movement(task, problem)
     rough = np.log1p(cost / duration**5 / straight_jerk_cost(length, whole)[:, None])
     relative = duration / whole[:, None]
@@ -210,6 +210,7 @@ def _expand(
     every: Float,
     velocity: Float,
     acceleration: Float,
+    moving: Bool,
     duration: Float,
     rate_limit: Float,
     own_times: bool,
@@ -219,22 +220,19 @@ def _expand(
     Durations of joint movements from rest are given relative to the shortest one. Movements without velocity limits,
     shape (D,), are those of the hand. With `own_times`, each plan has a row of the table as passage times.
     """
-    number, plans, columns, dimension = every.shape
+    number, plans, columns, _ = every.shape
     times = np.empty((number, plans), np.int64)
     costs = np.empty((number, plans))
     fast = np.zeros((number, plans), np.bool_)
     gram = np.empty((columns, columns))
     for b in range(number):
-        moving = False
-        for d in range(dimension):
-            moving = moving or velocity[b, d] != 0.0 or acceleration[b, d] != 0.0
         for h in range(plans):
             offsets, time = every[b, h], duration[b, h]
             row = b * plans + h if own_times else -1
             chosen, cost = _timed(table, offsets, velocity[b], acceleration[b], row, time, gram)
             if len(rate_limit):
                 shortest = shortest_duration(table, chosen, offsets, rate_limit)
-                if moving:
+                if moving[b]:
                     # The environment prolongs plans in motion beyond the limits.
                     time *= min(max(shortest / time, 1.0), PROLONGED)
                     chosen, cost = _timed(table, offsets, velocity[b], acceleration[b], row, time, gram)
