@@ -44,7 +44,8 @@ def _ompl() -> Any:
         import ompl.util
     except ImportError:
         raise ValueError(
-            "the method ompl needs the library of that name: pip install 'viapoint[planning]'"
+            "the method ompl needs the library of that name, which has packages for Python 3.11 to 3.13: "
+            "pip install 'viapoint[planning]'"
         ) from None
     ompl.util.setLogLevel(ompl.util.LogLevel.LOG_ERROR)
     ompl.util.RNG.setSeed(1)
