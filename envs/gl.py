@@ -159,7 +159,11 @@ def _gl_context() -> Any:
         # be imported without the library of that name; so the variable is not set, and EGL is used where it is found.
         with contextlib.suppress(ImportError, AttributeError):  # PyOpenGL raises both if it finds no library
             gl_context.GLContext = importlib.import_module("mujoco.egl").GLContext
-    return gl_context.GLContext(1, 1)
+    context = gl_context.GLContext(1, 1)
+    # GLFW without a display warns, and makes a context of no window.
+    if not getattr(context, "_context", True):
+        raise RuntimeError("GLFW finds no display, and EGL is not installed")
+    return context
 
 
 def _import_triton() -> None:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import weakref
+from types import SimpleNamespace
 
 import gymnasium as gym
 import imageio_ffmpeg
@@ -228,13 +229,19 @@ def test_any_thread_may_render_and_close(make):
     np.testing.assert_array_equal(env.render(), before)  # by a new context
 
 
-@pytest.mark.parametrize(("reason", "mode"), [(AttributeError, "egl"), (mujoco.FatalError, "")])
-def test_without_opengl_the_error_says_what_to_install(monkeypatch, reason, mode):
-    def missing(*arguments):
-        raise reason("no library")
+NO_WINDOW = SimpleNamespace(_context=None)
+"""What GLFW makes without a display."""
 
-    monkeypatch.setenv("MUJOCO_GL", mode)
-    monkeypatch.setattr(gl, "_gl_context", missing)
+
+@pytest.mark.parametrize("made", [AttributeError("no library"), mujoco.FatalError("no library"), NO_WINDOW])
+def test_without_opengl_the_error_says_what_to_install(monkeypatch, made):
+    def context(*sizes):
+        if isinstance(made, Exception):
+            raise made
+        return made
+
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    monkeypatch.setattr(gl.gl_context, "GLContext", context)
     env = gym.make(PLANE, render_mode="rgb_array")
     env.reset(seed=0)
     with pytest.raises(GLUnavailableError, match=r"apt-get install libegl1 libgl1.*MUJOCO_GL"):
