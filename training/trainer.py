@@ -6,10 +6,9 @@ import dataclasses
 import shlex
 import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from types import FrameType
 from typing import Any
 
@@ -121,10 +120,7 @@ def train_or_resume(config: TrainConfig, callback: Callbacks = None) -> Run:
     check_unchanged(run, dataclasses.replace(config, n_timesteps=run.config.total_timesteps).resolved)
     if run.ended and run.config.total_timesteps == config.total_timesteps:
         return run
-    again = TrainConfig(
-        out=config.folder, resume=True, progress=config.progress, n_timesteps=config.total_timesteps
-    )
-    return train(again, callback)
+    return train(dataclasses.replace(config, resume=True, n_timesteps=config.total_timesteps), callback)
 
 
 def _warn(config: TrainConfig) -> None:
@@ -264,13 +260,13 @@ class RunCallback(CallbackList):
             desc=f"{self.config.algo} on {task}",
             disable=None if self.config.progress else True,
         )
-        self._listens = threading.current_thread() is threading.main_thread()  # others get no signals
-        if self._listens:
+        self._handler: Any = None
+        with suppress(ValueError):  # other threads than the main one get no signals
             self._handler = signal.signal(signal.SIGINT, self._on_interrupt)
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._listens:
+        if self._handler is not None:
             signal.signal(signal.SIGINT, self._handler)
         self._bar.close()
 
@@ -281,8 +277,7 @@ class RunCallback(CallbackList):
 
     def _on_step(self) -> bool:
         self._show_progress()
-        if not super()._on_step():
-            self.stopped = True
+        self.stopped |= not super()._on_step()
         return True
 
     def _on_rollout_start(self) -> None:
