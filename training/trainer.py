@@ -235,12 +235,10 @@ class RunCallback(CallbackList):
     ) -> None:
         super().__init__(callbacks)
         self.run, self.config = run, run.config
-        self.curve: list[dict[str, Any]] = []  # one record for each evaluation so far
-        self._began = time.monotonic()  # if it had not been interrupted, and without the time of validations
+        earlier = [] if seconds is None else run.curve
+        self.curve = [record for record in earlier if record["decisions"] <= decisions]
+        self._began = time.monotonic() - (seconds or 0.0)  # without interruptions and validations
         self._before = decisions  # Decisions when it was last decided what is due
-        if seconds is not None:
-            self.curve = [record for record in run.curve if record["decisions"] <= decisions]
-            self._began -= seconds
         self._validation: FrozenScenes | None = None
         if self.config.evaluation_interval:
             self._validation = scenes_for("validation", self.config.task, self.config.eval_scenes)
