@@ -107,10 +107,6 @@ ENV = tyro.conf.arg(metavar="ID", help=f"Id of a registered environment, such as
 AGENT = tyro.conf.arg(
     metavar="AGENT", help="Run folder, model folder, or id of an environment with a shipped agent."
 )
-RECORDED = tyro.conf.arg(
-    metavar="METHOD",
-    help="Run folder, model folder, id of an environment with a shipped agent, or baseline, such as random.",
-)
 PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent: {_listed(SHIPPED_IDS)}.")
 ARM = tyro.conf.arg(metavar="ARM", help="Arm: panda, planar, or an MJCF or URDF file.")
 # Environments of the built-in arms; that of other arms is viapoint/Obstacles-v0
@@ -421,7 +417,6 @@ class RecordConfig(AgentConfig):
     Example: viapoint record search512 --env viapoint/PlanarObstacles-v0 --episodes 100 --dataset planar/search-v0
     """
 
-    agent: Annotated[tyro.conf.Positional[str | None], RECORDED] = None
     episodes: int = 100  # Number of episodes.
     dataset: str | None = None
     """Name of the dataset; default: <environment>/<method>-v0, in the folder MINARI_DATASETS_PATH."""
