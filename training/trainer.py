@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import configure
 
 from viapoint.training.agents.model_io import build
 from viapoint.training.configs import TrainConfig
@@ -156,11 +156,10 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
 
 def _continue_training(run: Run, model: BaseAlgorithm, callbacks: list[BaseCallback]) -> None:
     """Train from the last checkpoint of the run to its end."""
-    folder = str(run.folder / "tensorboard")
     try:
         seconds = run.restore(model)
         with (
-            closing(Logger(folder, [TensorBoardOutputFormat(folder)])) as logger,
+            closing(configure(str(run.folder / "tensorboard"), ["tensorboard"])) as logger,
             RunCallback(run, callbacks, seconds, model.num_timesteps) as monitor,
         ):
             model.set_logger(logger)
