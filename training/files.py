@@ -51,11 +51,12 @@ class BadFileError(ValueError):
     """Error of a file or folder; the message names it and the reason."""
 
     def __init__(self, path: Path, reason: str) -> None:
-        super().__init__(path, reason)  # both make the error again in another process
-        self.path = path
+        super().__init__(f"{path}: {reason}")
+        self.path, self.reason = path, reason
 
-    def __str__(self) -> str:
-        return ": ".join(map(str, self.args))
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what makes the error again, in another process of a study."""
+        return type(self), (self.path, self.reason)
 
 
 def check_ours(path: Path) -> None:

@@ -394,6 +394,7 @@ COMMANDS = [
     (f"evaluate --env {ENV} --baselines straight --scenes nowhere.npz", "nowhere.npz"),
     (f"evaluate --env {SENSED} --baselines search16 --env-kwargs sensor=nose", "hand_rays"),
     (f"evaluate --env {ENV} --json /proc/x", "--json /proc/x cannot be written"),
+    (f"evaluate --env {ENV} --json full/notes.txt", "full/notes.txt: exists and was not written by viapoint"),
     (f"evaluate --env {ENV} --baselines untrained", "untrained needs an agent"),
     *(
         (f"evaluate --env {ENV} --baselines {name}", f"{name} needs a task with a sensor")
