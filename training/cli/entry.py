@@ -96,7 +96,7 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
         raise SystemExit(0)
     command, *options = words or ("",)
     if command not in COMMANDS:
-        raise ValueError(checks.unknown_name("command", command, COMMANDS))
+        raise ValueError(f"{checks.unknown_name('command', command, COMMANDS)} (viapoint --help)")
     kind = kinds[command]
     default = {} if usual is None else {"default": usual}
     complaint = io.StringIO()
