@@ -150,7 +150,8 @@ class Maker:
                     possible.append(row)
             scenes = scenes.take(possible)
             share = self._share(scenes)
-            yield FrozenScenes(name=name, task=self.task.as_dict(), scenes=scenes, share=share, family=family)
+            names = np.full(len(share), family)
+            yield FrozenScenes(name=name, task=self.task.as_dict(), scenes=scenes, share=share, family=names)
 
     def _share(self, scenes: Scenes) -> Float:
         """Return the solution shares of scenes, shape (N,)."""

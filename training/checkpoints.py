@@ -98,9 +98,7 @@ def _with_any_file(record: Any) -> Any:
     """
 
     def renamed(part: dict[str, Any]) -> dict[str, Any]:
-        if str(part.get("arm")).endswith(ARM_FILES):
-            part["arm"] = COPY
-        return part
+        return {**part, "arm": COPY} if str(part.get("arm")).endswith(ARM_FILES) else part
 
     return json.loads(json.dumps(record), object_hook=renamed)
 

@@ -77,10 +77,8 @@ def check_file(name: str, path: Path | None, suffix: str = "") -> None:
     check_folder(f"{name} {path}", path.parent)
 
 
-def check_folder(name: str, folder: Path | None) -> None:
+def check_folder(name: str, folder: Path) -> None:
     """Check that a folder exists or can be created, and can be written to."""
-    if folder is None:
-        return
     there = next(each for each in (folder.absolute(), *folder.absolute().parents) if os.path.exists(each))
     if not os.path.isdir(there):
         raise ValueError(f"{name} cannot be written: {there} is no folder")

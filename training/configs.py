@@ -38,13 +38,8 @@ from viapoint.training.planning.search import registered_task
 from viapoint.training.presets import STEP_PRESETS, Algorithm, Preset, preset_of, usual_algorithm
 
 REGISTRY = ConstructorRegistry()  # Ways in which the command line reads numbers and paths
-# Name in helps and in errors of the types of values.
-KINDS = {
-    int: ("INT", "a whole number"),
-    float: ("FLOAT", "a number"),
-    Path: ("PATH", "a path"),
-    str: ("TEXT", ""),
-}
+# Types of values, and what errors call them
+KINDS = {int: "a whole number", float: "a number", Path: "a path", str: "a text"}
 
 
 @REGISTRY.primitive_rule
@@ -54,17 +49,16 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     kind: Any = next((each for each in KINDS if each in kinds), None)  # a path before a text
     if kind is None or not kinds <= {NoneType, *KINDS}:
         return None
-    metavar, what = KINDS[kind]
 
     def read(words: list[str]) -> Any:
         try:
             return named_path("it", words[0]) if kind is Path else kind(words[0])
         except ValueError:
-            raise ValueError(f"must be {what}, got {words[0]!r}") from None
+            raise ValueError(f"must be {KINDS[kind]}, got {words[0]!r}") from None
 
     return PrimitiveConstructorSpec(
         nargs=1,
-        metavar=metavar,
+        metavar=kind.__name__.upper(),
         instance_from_str=read,
         is_instance=lambda value: value is None or isinstance(value, kind),
         str_from_instance=lambda value: ["none" if value is None else str(value)],
@@ -112,10 +106,6 @@ def _listed(ids: Iterable[str]) -> str:
 ENV = tyro.conf.arg(metavar="ID", help=f"Id of a registered environment, such as {_listed(ENV_IDS)}.")
 AGENT = tyro.conf.arg(
     metavar="AGENT", help="Run folder, model folder, or id of an environment with a shipped agent."
-)
-RECORDED = tyro.conf.arg(
-    metavar="METHOD",
-    help="Run folder, model folder, id of an environment with a shipped agent, or baseline, such as random.",
 )
 PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent: {_listed(SHIPPED_IDS)}.")
 ARM = tyro.conf.arg(metavar="ARM", help="Arm: panda, planar, or an MJCF or URDF file.")
@@ -182,9 +172,8 @@ class Config:
                 value = named_path(name, value)
             elif str(each.type) == "NamedValues":
                 value = _plain(name, value)
-            elif name in RANGES and not isinstance(value, tuple | list):
-                optional = value is each.default is None
-                value = value if optional else check_whole(name, value)
+            elif name in RANGES and value is not each.default and not isinstance(value, tuple | list):
+                value = check_whole(name, value)
             object.__setattr__(self, name, value)
         self._check()
 
@@ -318,14 +307,11 @@ class TrainConfig(Config):
     def command(self) -> str:
         """Command that trains with this configuration, apart from where it is written and what is shown."""
         words = ["viapoint", "train"]
-        for name in ("env", "algo", "seed", "n_timesteps", "n_envs"):
+        for name in ("env", "algo", "seed", "n_timesteps", "n_envs", "env_kwargs", "hyperparameters"):
             value = getattr(self, name)
-            if value is not None:
-                words += [f"--{name.replace('_', '-')}", f"{value}"]
-        for name in ("env_kwargs", "hyperparameters"):
-            values = getattr(self, name)
-            if values:
-                words += [f"--{name.replace('_', '-')}", *to_words(values)]
+            if value not in (None, {}):
+                given = to_words(value) if isinstance(value, dict) else [str(value)]
+                words += [f"--{name.replace('_', '-')}", *given]
         return shlex.join(words)
 
     @property
@@ -431,7 +417,6 @@ class RecordConfig(AgentConfig):
     Example: viapoint record search512 --env viapoint/PlanarObstacles-v0 --episodes 100 --dataset planar/search-v0
     """
 
-    agent: Annotated[tyro.conf.Positional[str | None], RECORDED] = None
     episodes: int = 100  # Number of episodes.
     dataset: str | None = None
     """Name of the dataset; default: <environment>/<method>-v0, in the folder MINARI_DATASETS_PATH."""
@@ -458,13 +443,6 @@ class PlanConfig(Config):
     """Place of the tool at the goal, x y z, [m], in place of joint positions."""
     quaternion: tuple[float, ...] = ()  # Orientation of the tool there, w x y z; any if not given.
     scene: Path | None = None  # JSON file of a scene, or of a list of obstacles.
-    tool: str = ""
-    """Site or body of the tool of an arm of a file; by default one with a usual name, or the tip."""
-    joints: tuple[str, ...] = ()
-    """Names of its joints from the base to the tool; by default all of the chain."""
-    base: str = ""  # Body that the chain begins at, where a file has two arms.
-    packages: tuple[Path, ...] = ()  # Folders for package:// in a URDF.
-    velocity_limit: float | None = None  # Velocity limit of its joints, [rad/s]; by default that of the file.
     n_via: int = 2  # Number of via-points, 1 to 3.
     margin: float = 0.0  # Least clearance, [m].
     duration: float | None = None  # Duration, [s]; by default the shortest that the limits allow.

@@ -119,8 +119,8 @@ class EvaluationResult:
     @property
     def success_interval(self) -> tuple[float, float]:
         """Wilson interval of that share at 95 %."""
-        interval = wilson(int(self.results[0].success.sum()), len(self.results[0].success))
-        return interval.low, interval.high
+        rate = _rate(self.results[0].success)
+        return rate["low"], rate["high"]
 
     @property
     def rows(self) -> list[dict[str, Any]]:
@@ -382,14 +382,9 @@ def one_thread() -> Iterator[None]:
 
 def _rate(values: NDArray[np.bool_]) -> dict[str, Any]:
     """Return a rate with its 95 % Wilson interval."""
-    interval = wilson(int(values.sum()), len(values))
-    return {
-        "rate": interval.estimate if len(values) else None,
-        "low": interval.low,
-        "high": interval.high,
-        "count": int(values.sum()),
-        "of": len(values),
-    }
+    count, number = int(values.sum()), len(values)
+    rate, low, high = wilson(count, number)
+    return {"rate": rate if number else None, "low": low, "high": high, "count": count, "of": number}
 
 
 def _quantile(values: NDArray[Any], share: float = 0.5) -> float | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib.metadata
 import io
-import itertools
 import json
 import math
 import os
@@ -29,8 +28,7 @@ from viapoint.envs.arms.arm import Arm
 
 Arrays = dict[str, NDArray[Any]]
 
-LARGEST_JSON = 64 << 20  # Greatest size of a JSON file, [bytes]
-LARGEST_YAML = 1 << 20  # Greatest size of a YAML file, [bytes]
+LARGEST_JSON = 64 << 20  # Greatest size of a JSON or YAML file, [bytes]
 # Numbers such as 1e-3, which YAML 1.1 reads as words because they lack a point or a sign
 _NUMBER = re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+")
 MARK = b"written by viapoint"  # In every file that a user names, but JSON
@@ -63,13 +61,14 @@ class BadFileError(ValueError):
 
 def check_ours(path: Path) -> None:
     """Check that a file may be written: there is none yet, or one that this package wrote."""
-    if not (path.is_symlink() or path.exists()):
-        return
-    if not path.is_file():
-        raise BadFileError(path, "exists and is no file; name another one")
-    content = path.read_bytes()
-    if MARK not in content and JSON_MARK not in content:
+    if os.path.lexists(path) and not _is_ours(path):
         raise BadFileError(path, "exists and was not written by viapoint; name another file, or move it away")
+
+
+def _is_ours(path: Path) -> bool:
+    """Return True for a file that this package wrote."""
+    content = path.read_bytes() if path.is_file() else b""
+    return MARK in content or JSON_MARK in content
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -103,14 +102,13 @@ def write_folder(path: Path, fill: Callable[[Path], None], *, move_foreign: bool
         fill(temporary)
         _sync_folder(temporary)
         outdated = path.with_name(f".{path.name}.{uuid.uuid4().hex}.old")
-        if path.exists():
-            try:
-                _check_replaceable(path, {each.name for each in temporary.iterdir()})
-                path.rename(outdated)
-            except BadFileError:
-                if not move_foreign:
-                    raise
-                _move_aside(path)
+        foreign = _foreign(path, temporary)
+        if foreign and not move_foreign:
+            raise BadFileError(path, foreign)
+        if foreign:
+            _move_aside(path)
+        elif path.exists():
+            path.rename(outdated)
         temporary.rename(path)
         shutil.rmtree(outdated, ignore_errors=True)  # there is none of a new folder
         _sync_folder(path.parent)
@@ -119,24 +117,26 @@ def write_folder(path: Path, fill: Callable[[Path], None], *, move_foreign: bool
         raise
 
 
-def _check_replaceable(path: Path, names: set[str]) -> None:
-    """Check that a folder is empty, or holds nothing but an earlier version of files with these names."""
+def _foreign(path: Path, newer: Path) -> str:
+    """Return why a folder is neither empty nor an earlier version of a newer one; an empty text if it may go."""
     if not path.is_dir():
-        raise BadFileError(path, "exists and is no folder; name another one")
+        return "exists and is no folder; name another one" if path.exists() else ""
     there = sorted(path.iterdir())
     for each in there:
-        if each.name not in names or not each.is_file():
-            raise BadFileError(path, f"holds {each.name}, which is not written here; name a new folder")
-        if each.suffix == ".json":
-            check_ours(each)
-    if there and not any(each.suffix == ".json" for each in there):
-        raise BadFileError(path, f"holds {there[0].name}, not written by viapoint; name a new folder")
+        if not each.is_file() or not (newer / each.name).exists():
+            return f"holds {each.name}, which is not written here; name a new folder"
+    for record in newer.glob("*.json"):
+        if there and not _is_ours(path / record.name):
+            return f"holds no {record.name} that viapoint wrote; name a new folder"
+    return ""
 
 
 def _move_aside(path: Path) -> None:
     """Rename a file or folder, so that another one can be written in its place."""
-    numbered = (path.with_name(f"{path.name}.{number}") for number in itertools.count(1))
-    aside = path.rename(next(each for each in numbered if not os.path.lexists(each)))
+    number = 1
+    while os.path.lexists(f"{path}.{number}"):
+        number += 1
+    aside = path.rename(f"{path}.{number}")
     print(f"{path} holds what was not written by viapoint: it is kept as {aside}", file=sys.stderr)
 
 
@@ -228,16 +228,13 @@ def parse_yaml(text: str | bytes) -> Any:
         raise ValueError(f"cannot be read as YAML ({' '.join(str(error).split())})") from None
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML file of values by name; what is missing, too large or something else raises BadFileError."""
-    content = read_bytes(path, LARGEST_YAML)
+def read_yaml(path: Path) -> Any:
+    """Return the plain values of a YAML file; what is missing, too large or something else raises BadFileError."""
+    content = read_bytes(path, LARGEST_JSON)
     try:
-        value = parse_yaml(content)
+        return parse_yaml(content)
     except ValueError as error:
         raise BadFileError(path, str(error)) from None
-    if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
-        raise BadFileError(path, "must hold values by name, such as env: viapoint/PlanarObstacles-v0")
-    return value
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -263,9 +260,7 @@ def _finite(text: str) -> float:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make renames in a folder durable, if the operating system can."""
-    if os.name == "nt":
-        return
+    """Make renames in a folder durable."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -229,10 +229,9 @@ def check_free(folder: Path) -> None:
     if (folder / "config.json").exists():
         raise BadFileError(folder, "holds a run already; continue it with --resume or name another folder")
     check_folder(f"run folder {folder}", folder)
-    names = {path.name for path in folder.iterdir()} if folder.exists() else set()
-    begun = {name for name in names if UNFINISHED.fullmatch(name)}
-    if names - begun - {"versions.json", COPY, "lock"}:
-        raise BadFileError(folder, "is not empty and is no run folder")
+    for path in folder.glob("*"):
+        if path.name not in ("versions.json", COPY, "lock") and not UNFINISHED.fullmatch(path.name):
+            raise BadFileError(folder, f"holds {path.name} and is no run folder; name an empty or a new one")
     check_ours(folder / "versions.json")
 
 
@@ -259,8 +258,5 @@ def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = N
 def _settings(config: TrainConfig) -> dict[str, Any]:
     """Return the settings that may not change, those in fields with several by their own names."""
     values = as_plain(config)
-    for name in MAY_CHANGE:
-        del values[name]
-    env_kwargs = values.pop("env_kwargs")
-    hyperparameters = values.pop("hyperparameters")
-    return {**values, **env_kwargs, **hyperparameters}
+    values |= {**values.pop("env_kwargs"), **values.pop("hyperparameters")}
+    return {name: value for name, value in values.items() if name not in MAY_CHANGE}

@@ -48,12 +48,7 @@ class FrozenScenes:
     task: Mapping[str, Any]  # Task of the scenes, see :meth:`~viapoint.envs.task.Task.as_dict`
     scenes: Scenes  # N scenes, without meshes and point clouds
     share: Float  # Share of random actions whose plan is clear, shape (N,); NaN if unknown
-    family: Any = DRAWN  # Name of each scene's family, shape (N,), or one for all
-
-    def __post_init__(self) -> None:
-        """Expand the names of families to all scenes."""
-        names = np.broadcast_to(np.asarray(self.family, dtype=np.str_), self.share.shape)
-        object.__setattr__(self, "family", names)
+    family: NDArray[np.str_]  # Name of each scene's family, shape (N,)
 
     @property
     def band(self) -> NDArray[np.int64]:
@@ -250,7 +245,8 @@ def drawn(name: str, task: Task, number: int) -> FrozenScenes:
     """Draw a set without shares; equal arguments give equal scenes."""
     generators = [np.random.default_rng((SEEDS[name], each)) for each in range(number)]
     scenes = task.sampler()(generators)
-    return FrozenScenes(name="drawn", task=task.as_dict(), scenes=scenes, share=np.full(number, np.nan))
+    share, family = np.full(number, np.nan), np.full(number, DRAWN)
+    return FrozenScenes(name="drawn", task=task.as_dict(), scenes=scenes, share=share, family=family)
 
 
 def scenes_for(given: str | Path | FrozenScenes, task: Task, number: int | None = None) -> FrozenScenes:

@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
 CONFIDENCE = 0.95  # Confidence of all intervals
-
-
-class Interval(NamedTuple):
-    """Estimate with its confidence interval."""
-
-    estimate: float
-    low: float
-    high: float
+Interval = tuple[float, float, float]  # Estimate, and both ends of its confidence interval
 
 
 def wilson(successes: int, trials: int) -> Interval:
@@ -30,10 +22,10 @@ def wilson(successes: int, trials: int) -> Interval:
         TypeError: A count is not an integer.
     """
     if successes == trials == 0:
-        return Interval(math.nan, 0.0, 1.0)
+        return math.nan, 0.0, 1.0
     test = stats.binomtest(successes, trials)
     low, high = test.proportion_ci(CONFIDENCE, method="wilson")
-    return Interval(test.statistic, float(low), float(high))
+    return float(test.statistic), float(low), float(high)
 
 
 def mcnemar(first: ArrayLike, second: ArrayLike) -> dict[str, float]:
@@ -90,7 +82,7 @@ def across_seeds(
     chosen = generator.integers(seeds, size=(seeds, samples))
     draws = stats.trim_mean(np.take_along_axis(means, chosen, axis=0), 0.25, axis=0)
     low, high = np.quantile(draws, (0.5 - CONFIDENCE / 2.0, 0.5 + CONFIDENCE / 2.0))
-    return Interval(float(stats.trim_mean(table.mean(axis=1), 0.25)), float(low), float(high))
+    return float(stats.trim_mean(table.mean(axis=1), 0.25)), float(low), float(high)
 
 
 def success_weighted_path_length(success: ArrayLike, shortest: ArrayLike, taken: ArrayLike) -> float:

@@ -6,17 +6,16 @@ import dataclasses
 import shlex
 import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from types import FrameType
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import configure
 
 from viapoint.training.agents.model_io import build
 from viapoint.training.configs import TrainConfig
@@ -121,10 +120,7 @@ def train_or_resume(config: TrainConfig, callback: Callbacks = None) -> Run:
     check_unchanged(run, dataclasses.replace(config, n_timesteps=run.config.total_timesteps).resolved)
     if run.ended and run.config.total_timesteps == config.total_timesteps:
         return run
-    again = TrainConfig(
-        out=config.folder, resume=True, progress=config.progress, n_timesteps=config.total_timesteps
-    )
-    return train(again, callback)
+    return train(dataclasses.replace(config, resume=True, n_timesteps=config.total_timesteps), callback)
 
 
 def _warn(config: TrainConfig) -> None:
@@ -160,11 +156,10 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
 
 def _continue_training(run: Run, model: BaseAlgorithm, callbacks: list[BaseCallback]) -> None:
     """Train from the last checkpoint of the run to its end."""
-    folder = str(run.folder / "tensorboard")
     try:
         seconds = run.restore(model)
         with (
-            closing(Logger(folder, [TensorBoardOutputFormat(folder)])) as logger,
+            closing(configure(str(run.folder / "tensorboard"), ["tensorboard"])) as logger,
             RunCallback(run, callbacks, seconds, model.num_timesteps) as monitor,
         ):
             model.set_logger(logger)
@@ -239,12 +234,10 @@ class RunCallback(CallbackList):
     ) -> None:
         super().__init__(callbacks)
         self.run, self.config = run, run.config
-        self.curve: list[dict[str, Any]] = []  # one record for each evaluation so far
-        self._began = time.monotonic()  # if it had not been interrupted, and without the time of validations
+        earlier = [] if seconds is None else run.curve
+        self.curve = [record for record in earlier if record["decisions"] <= decisions]
+        self._began = time.monotonic() - (seconds or 0.0)  # without interruptions and validations
         self._before = decisions  # Decisions when it was last decided what is due
-        if seconds is not None:
-            self.curve = [record for record in run.curve if record["decisions"] <= decisions]
-            self._began -= seconds
         self._validation: FrozenScenes | None = None
         if self.config.evaluation_interval:
             self._validation = scenes_for("validation", self.config.task, self.config.eval_scenes)
@@ -264,13 +257,13 @@ class RunCallback(CallbackList):
             desc=f"{self.config.algo} on {task}",
             disable=None if self.config.progress else True,
         )
-        self._listens = threading.current_thread() is threading.main_thread()  # others get no signals
-        if self._listens:
+        self._handler: Any = None
+        with suppress(ValueError):  # other threads than the main one get no signals
             self._handler = signal.signal(signal.SIGINT, self._on_interrupt)
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._listens:
+        if self._handler is not None:
             signal.signal(signal.SIGINT, self._handler)
         self._bar.close()
 
@@ -281,8 +274,7 @@ class RunCallback(CallbackList):
 
     def _on_step(self) -> bool:
         self._show_progress()
-        if not super()._on_step():
-            self.stopped = True
+        self.stopped |= not super()._on_step()
         return True
 
     def _on_rollout_start(self) -> None:

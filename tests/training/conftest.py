@@ -11,7 +11,7 @@ from helpers import PLANE
 from viapoint.training import ViaVecEnv, scene_sets
 from viapoint.training.cli import entry
 from viapoint.training.rollout import SceneSimulation
-from viapoint.training.scene_sets import FrozenScenes
+from viapoint.training.scene_sets import DRAWN, FrozenScenes
 
 
 @pytest.fixture(autouse=True)
@@ -51,7 +51,11 @@ def small_scenes():
     success = np.array([simulation(scenes, each)["is_success"] for each in actions])
     simulation.close()
     return FrozenScenes(
-        name="small", task=simulation.task.as_dict(), scenes=scenes, share=success.mean(axis=0)
+        name="small",
+        task=simulation.task.as_dict(),
+        scenes=scenes,
+        share=success.mean(axis=0),
+        family=np.full(40, DRAWN),
     )
 
 

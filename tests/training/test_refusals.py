@@ -383,7 +383,6 @@ COMMANDS = [
     ("evaluate nowhere", "nowhere"),
     ("evaluate --pretrained nobody", "nobody"),
     ("plan --position 0.4 0.3", "position must have shape (3,)"),
-    ("plan --arm panda --velocity-limit 0.3 --position 0.4 0.3 0.3", "--velocity-limit"),
     ("plan --arm nowhere.xml --position 0.4 0.3 0.3", "nowhere.xml"),
     ("plan --arm panda --goal 0 0 0 -1 0 1 0 --quaternion 0 1 0 0", "--quaternion"),
     ("record", "name an agent"),
@@ -395,6 +394,7 @@ COMMANDS = [
     (f"evaluate --env {ENV} --baselines straight --scenes nowhere.npz", "nowhere.npz"),
     (f"evaluate --env {SENSED} --baselines search16 --env-kwargs sensor=nose", "hand_rays"),
     (f"evaluate --env {ENV} --json /proc/x", "--json /proc/x cannot be written"),
+    (f"evaluate --env {ENV} --json full/notes.txt", "full/notes.txt: exists and was not written by viapoint"),
     (f"evaluate --env {ENV} --baselines untrained", "untrained needs an agent"),
     *(
         (f"evaluate --env {ENV} --baselines {name}", f"{name} needs a task with a sensor")

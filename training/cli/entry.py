@@ -94,11 +94,9 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
         lines = [f"  {name:<10}{str(kind.__doc__).splitlines()[0]}" for name, kind in kinds.items()]
         print(OVERVIEW.format(commands="\n".join(lines)))
         raise SystemExit(0)
-    if not words:
-        raise ValueError(f"name a command: {', '.join(COMMANDS)} (viapoint --help)")
-    command, *options = words
+    command, *options = words or ("",)
     if command not in COMMANDS:
-        raise ValueError(checks.unknown_name("command", command, COMMANDS))
+        raise ValueError(f"{checks.unknown_name('command', command, COMMANDS)} (viapoint --help)")
     kind = kinds[command]
     default = {} if usual is None else {"default": usual}
     complaint = io.StringIO()
