@@ -443,6 +443,13 @@ class PlanConfig(Config):
     """Place of the tool at the goal, x y z, [m], in place of joint positions."""
     quaternion: tuple[float, ...] = ()  # Orientation of the tool there, w x y z; any if not given.
     scene: Path | None = None  # JSON file of a scene, or of a list of obstacles.
+    tool: str = ""
+    """Site or body of the tool of an arm of a file; by default one with a usual name, or the tip."""
+    joints: tuple[str, ...] = ()
+    """Names of its joints from the base to the tool; by default all of the chain."""
+    base: str = ""  # Body that the chain begins at, where a file has two arms.
+    packages: tuple[Path, ...] = ()  # Folders for package:// in a URDF.
+    velocity_limit: float | None = None  # Velocity limit of its joints, [rad/s]; by default that of the file.
     n_via: int = 2  # Number of via-points, 1 to 3.
     margin: float = 0.0  # Least clearance, [m].
     duration: float | None = None  # Duration, [s]; by default the shortest that the limits allow.

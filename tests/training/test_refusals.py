@@ -383,6 +383,7 @@ COMMANDS = [
     ("evaluate nowhere", "nowhere"),
     ("evaluate --pretrained nobody", "nobody"),
     ("plan --position 0.4 0.3", "position must have shape (3,)"),
+    ("plan --arm panda --velocity-limit 0.3 --position 0.4 0.3 0.3", "--velocity-limit"),
     ("plan --arm nowhere.xml --position 0.4 0.3 0.3", "nowhere.xml"),
     ("plan --arm panda --goal 0 0 0 -1 0 1 0 --quaternion 0 1 0 0", "--quaternion"),
     ("record", "name an agent"),

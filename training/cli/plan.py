@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.registry import arm_of
+from viapoint.envs.arms.load import load_arm
+from viapoint.envs.arms.registry import arm_names, arm_of
 from viapoint.envs.geometry.shapes import obstacles_from_json
 from viapoint.envs.scenes.options import Pose, scene_from_json
 from viapoint.training.configs import PlanConfig
@@ -18,12 +19,14 @@ from viapoint.training.planning.export import read_motion, write_motion
 from viapoint.training.planning.plan_motion import plan_motion
 from viapoint.training.planning.search import registered_task
 
+LOADING = ("tool", "joints", "base", "packages", "velocity_limit")  # Flags that are arguments of load_arm
+
 
 def run(config: PlanConfig) -> None:
     """Plan a movement, print what is known of it, and write it."""
-    if config.out is not None and config.out.exists():
-        _check_movement(config.out)
-    arm = arm_of(config.arm)
+    if config.out is not None:
+        _check_replaceable(config.out)
+    arm = _arm_for(config)
     scene = _scene(config.scene, arm)
     start = config.start or scene.get("start")
     if start is None:
@@ -51,14 +54,27 @@ def run(config: PlanConfig) -> None:
         print(f"{record_plan(config.video, plan)} frames: {config.video}")
 
 
-def _check_movement(path: Path) -> None:
-    """Check that a file holds a movement, which was written by an earlier call."""
+def _check_replaceable(path: Path) -> None:
+    """Check that there is no file yet, or a movement, which was written by an earlier call."""
+    if not path.exists():
+        return
     try:
         read_motion(path)
     except (OSError, ValueError):
         raise BadFileError(
             path, "exists and was not written by viapoint; name another file, or move it away"
         ) from None
+
+
+def _arm_for(config: PlanConfig) -> Arm:
+    """Return the arm of a name or of a file."""
+    given = {name: getattr(config, name) for name in LOADING if getattr(config, name)}
+    if not given:
+        return arm_of(config.arm)
+    if config.arm in arm_names():
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise ValueError(f"{flags} is for an arm of a file, got --arm {config.arm}")
+    return load_arm(config.arm, **given)
 
 
 def _scene(path: Path | None, arm: Arm) -> dict[str, Any]:
