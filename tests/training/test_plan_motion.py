@@ -435,8 +435,11 @@ def test_command_line_plans_and_measures(tmp_path, capsys, failed) -> None:
     assert "has reaches" in failed(*words)
     scene.write_text('{"format": "viapoint-scene", "env": "viapoint/PlanarReach-v0", "start": [0.1, 0.4]}')
     assert "of the arm planar" in failed(*words)
-    main(["evaluate", "--scenes", "motionbenchmaker", "--n-scenes", "3"])
+    results = tmp_path / "results.json"
+    for _ in range(2):  # the second time, the file of the first is replaced
+        main(["evaluate", "--scenes", "motionbenchmaker", "--n-scenes", "3", "--json", str(results)])
     assert "| plan_motion | all" in capsys.readouterr().out
+    assert len(json.loads(results.read_text())["problems"]) == 3
 
 
 def write_problem(folder, number, objects, names, start, goal) -> None:

@@ -27,7 +27,7 @@ from viapoint.training.configs import (
 )
 from viapoint.training.datasets import dataset_folder, record_dataset
 from viapoint.training.evaluation import evaluate as measure
-from viapoint.training.files import BadFileError, read_json, write_json
+from viapoint.training.files import BadFileError, read_json, versions, write_json
 from viapoint.training.planning import benchmark
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.search import registered_task
@@ -140,7 +140,7 @@ def _measure_planners(config: EvaluateConfig) -> None:
     else:
         print(f"{benchmark.markdown(table)}\n\n{benchmark.NOTES}")
     if config.json is not None:
-        write_json(config.json, table.to_dict("records"))
+        write_json(config.json, {"viapoint": versions()["viapoint"], "problems": table.to_dict("records")})
         print(f"results, problem by problem: {config.json}", file=_notes(config))
 
 
