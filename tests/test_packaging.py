@@ -32,7 +32,10 @@ from viapoint.training import evaluate, load_agent, plan_motion, train
 assert load_agent("viapoint/PlanarObstacles-v0").env_id == "viapoint/PlanarObstacles-v0"
 """
 ALL = """
-import viapoint.training.live.page, minari, ray.tune, ompl
+import sys
+import viapoint.training.live.page, minari, ray.tune
+if sys.version_info < (3, 14):  # newer ones have no package of it yet
+    import ompl
 from viapoint.training.study import run_study
 """
 OF_TRAINING = ("torch", "stable_baselines3", "matplotlib", "pandas", "tyro")

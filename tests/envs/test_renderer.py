@@ -167,6 +167,7 @@ def frames_of(path):
 
 @pytest.mark.parametrize("env_id", [PLANE, JUMPS])
 def test_each_frame_of_a_movement_of_one_or_several_steps_is_recorded_once(env_id, make, tmp_path):
+    pytest.importorskip("moviepy")
     made = make(env_id, "rgb_array_list", side=64, duration_range=(0.4, 0.6))
     env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
     env.reset(seed=0)
@@ -178,6 +179,7 @@ def test_each_frame_of_a_movement_of_one_or_several_steps_is_recorded_once(env_i
 
 
 def test_gymnasium_records_two_frames_of_a_movement_and_a_warning_says_so(make, tmp_path):
+    pytest.importorskip("moviepy")
     env = gym.wrappers.RecordVideo(make(side=64), str(tmp_path / "videos"), episode_trigger=lambda _: True)
     with pytest.warns(UserWarning, match="RecordMovements"):
         moved(env, AROUND)

@@ -52,10 +52,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names that a terminal without UTF-8 cannot show
     try:
-        config = parse(words)
-        if words[0] == "train" and config.resume:
-            _check_resumed(config, words)
-        run_command(config)
+        try:
+            config = parse(words)
+            if words[0] == "train" and config.resume:
+                _check_resumed(config, words)
+            run_command(config)
+        finally:
+            sys.stdout.flush()  # at Python's exit, a closed pipe would print a message
     except KeyboardInterrupt:
         _leave("stopped", 130)
     except BrokenPipeError:  # nobody reads the output any more, as in `viapoint --help | head`
