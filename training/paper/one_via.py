@@ -166,7 +166,7 @@ def _threshold_claim(along: float, exact: str, expected: float, tolerance: float
         (profile,) = movements.arm_profiles(simulate(curved(*ENDS, along, -height)))
         return int(np.isfinite(profile.valley[0]))
 
-    arm = _first_height(arm_valleys, precision=1e-4)
+    arm = _first_height(arm_valleys, precision=5e-5)
     return Claim(
         5, f"Not every curved movement has a valley: for d1/(d1+d2) = {along} only if d3/(d1+d2) exceeds", "1B",
         f"two peaks and a valley{exact}", (valley_threshold(along), near(expected, tolerance)),
