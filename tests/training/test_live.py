@@ -22,9 +22,23 @@ from viapoint.training import LivePage, ViaQ, ViaVecEnv
 from viapoint.training.agents.agent import SAC
 from viapoint.training.configs import LiveConfig
 from viapoint.training.live import drawing, page
-from viapoint.training.live.arena import AGENT, HAND, MOTION, OMPL, SEARCH, STRAIGHT, Arena
-from viapoint.training.live.decide import APART, decide, describe_plan, execute, profile, propose
-from viapoint.training.live.state import Scene, State
+from viapoint.training.live.arena import (
+    AGENT,
+    APART,
+    HAND,
+    MOTION,
+    OMPL,
+    SEARCH,
+    STRAIGHT,
+    Arena,
+    Scene,
+    State,
+    decide,
+    describe_plan,
+    execute,
+    profile,
+    propose,
+)
 
 
 @pytest.fixture(scope="module")
@@ -95,8 +109,8 @@ def test_every_environment_has_scenes_decisions_movements_and_a_drawing(env_id, 
     if arena.task.whole_movement and state.plan.success:
         assert movements[-1].info["is_success"]
         assert state.proposals[0].reward == pytest.approx(movements[-1].reward, abs=1e-6)
-    parts = drawing.ArmDrawing(arena.task.arm, arena.env("own").model)
-    assert len(parts.poses(arena.task.space.joints(scene.start))) == len(parts.parts) > 0
+    parts = drawing.ArmDrawing(arena.task.arm)
+    assert len(list(parts.posed(arena.task.space.joints(scene.start)))) == len(parts.parts) > 0
 
 
 @pytest.mark.parametrize("env_id", [PLANAR, MOVING])
@@ -114,9 +128,9 @@ def test_the_page_chooses_what_the_agent_chooses(env_id, checks):
     plan = state.plan
     first, *others = with_proposals(arena, state).proposals
     assert first.motion is plan
-    assert all(each.value is not None for each in others)
+    assert np.isfinite([each.value for each in others]).all()
     if not checks:
-        assert first.value is not None
+        assert np.isfinite(first.value)
 
 
 @pytest.mark.parametrize("env_id", [PLANAR, PANDA])
@@ -198,7 +212,7 @@ def test_a_dragged_goal_is_reached_without_a_jump(arenas):
         for movement in execute(arena, state):
             seen.append(movement)
             if movement.info["is_success"] if late else len(seen) > 1:
-                state.scene = scene.with_goal(aside)
+                state.scene = scene._replace(goal=aside, jumps=())
         rollout = seen[-1].rollout
         assert np.linalg.norm(rollout.hand[-1, :2] - aside) < 0.01
         velocity = np.diff(rollout.hand, axis=0) / np.diff(rollout.time)[:, None]
@@ -230,9 +244,9 @@ def test_a_dragged_goal_jumps_no_more(arenas):
     arena = arenas(JUMPS)
     scene = drawn(arena)
     assert len(scene.jumps)
-    state = with_proposals(arena, decided(arena, scene.with_goal(scene.goal)))
+    state = with_proposals(arena, decided(arena, scene._replace(jumps=())))
     assert state.plan.success
-    assert state.proposals[0].reward is not None
+    assert np.isfinite(state.proposals[0].reward)
     *_, movement = execute(arena, state)
     assert not movement.scenes.jumps.any()
 
@@ -286,19 +300,19 @@ def test_an_arm_of_ones_own_is_drawn_from_its_file(asset, tmp_path):
     file = tmp_path / "ur5e.xml"
     file.write_text(text.replace("<worldbody>", f"{asset}<worldbody>"))
     arm = ve.load_arm(file, tool="hand", joints=names, home=home, velocity_limit=np.pi)
-    parts = drawing.ArmDrawing(arm, arm.compile(0), file)
+    parts = drawing.ArmDrawing(arm, file)
     away = []
     for joints in arm.home + np.random.default_rng(0).uniform(-0.4, 0.4, (8, 6)):
         corners = [
             transforms.SO3(turn).as_matrix() @ np.asarray(mesh.vertices).T + place[:, None]
-            for (turn, place), (*_, mesh) in zip(parts.poses(joints), parts.parts, strict=True)
+            for _, mesh, turn, place in parts.posed(joints)
         ]
         hand = arm.hand(joints)
         away.append(np.linalg.norm(np.concatenate(corners, axis=1).T - hand, axis=-1).min())
     assert max(away) < 0.08
     np.testing.assert_allclose(away, away[0], atol=1e-6)  # the hand does not move in its link
     with pytest.raises(ValueError):
-        drawing.ArmDrawing(arm, arm.compile(0), file.with_name("index.md"))
+        drawing.ArmDrawing(arm, file.with_name("index.md"))
 
 
 def test_an_agent_of_control_steps_moves_to_the_end_of_its_episode():
@@ -307,7 +321,7 @@ def test_an_agent_of_control_steps_moves_to_the_end_of_its_episode():
     state = with_proposals(arena, decided(arena, drawn(arena), AGENT))
     assert state.proposals[0].maker == SEARCH
     *_, movement = execute(arena, state)
-    env = arena.env("steps")
+    env = arena.env("own")
     assert env.terminated[0] or env.truncated[0]
     assert movement.plan is None
     np.testing.assert_allclose(movement.rollout.hand[0], arena.tool(state.scene.start), atol=0.01)

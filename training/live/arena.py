@@ -1,29 +1,39 @@
-"""Arm, task, agent and environments of one tab of the live page, and the obstacles that can be added."""
+"""Computations of the live page: scenes, plans, ranked proposals and simulated movements, without a browser."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 import itertools
+import json
+import pprint
 import threading
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
 import viapoint.envs as ve
 from viapoint.envs.arms.kinematics import forward
-from viapoint.envs.common.arrays import Float, Observation
+from viapoint.envs.common.arrays import Float, Observation, norm
 from viapoint.envs.geometry.clearance import FAR, row_clearances
-from viapoint.envs.geometry.obstacles import pack, quaternions_of
+from viapoint.envs.geometry.obstacles import pack, quaternions_of, unpack
 from viapoint.envs.geometry.shapes import KINDS, PLAIN_KINDS
-from viapoint.envs.scenes.options import scene_options
+from viapoint.envs.outcome import Rollout
+from viapoint.envs.scenes.options import OPTIONS, options_to_json, scene_options
+from viapoint.primitives import passage_durations
 from viapoint.training.agents.agent import Agent
-from viapoint.training.live.state import Scene, State
 from viapoint.training.paper.movements import TARGETS, rows_of_lights
 from viapoint.training.planning.baselines import AgentMethod
-from viapoint.training.planning.search import registered_task
+from viapoint.training.planning.candidates import candidate_actions
+from viapoint.training.planning.motion_plan import MotionPlan
+from viapoint.training.planning.plan_motion import SEEDS, checked_motion, ompl_motion, plan_motion
+from viapoint.training.planning.problem import Problem
+from viapoint.training.planning.search import GeometrySearch, merits, registered_task
 from viapoint.training.rollout import whole_task
 from viapoint.training.scene_sets import shipped_set
 
@@ -40,8 +50,110 @@ SIZES: dict[str, tuple[str, Any, float, float]] = {
     "half-height": ("size", 2, 0.005, 0.5),
 }
 UPRIGHT = ("half-length", "half-height")  # Heights of obstacles in the plane, which have no sliders
+# Time limits of the motion planner after a change, and in a pause where that found no free movement, [s]
+TIME_LIMIT, SECOND_LIMIT = 0.03, 0.3
+N_PROPOSALS = 5  # Proposals that are shown
+N_CANDIDATES = 256  # Best candidates among which distinct proposals are looked for
+APART = 0.03  # Distance by which the paths of two proposals differ somewhere, [m]
+N_CHECKS, REFINEMENTS = 512, 3  # Candidates of the geometry search, and rounds around the best
+NEXT_START = 0.02  # Least way to a goal that begins a new movement, in a coordinate
 
+Shapes = Iterable[ve.Shape]
 _agent_lock = threading.Lock()  # tabs share an agent
+
+
+class Scene(NamedTuple):
+    """One scene in coordinates of the task's space: the options of `reset`."""
+
+    start: Float  # Shape (D,)
+    goal: Float  # Shape (D,)
+    obstacles: tuple[ve.Shape, ...]  # Obstacles at time 0, with their velocities
+    jumps: Any = ()  # Jumps of the target: rows (time [s], target D)
+    turns: Any = ()  # Changes of course: rows (time [s], velocity 3 [m/s]) by obstacle
+    reaches: Any = ()  # Reaches: rows (begin [s], duration [s], way 3 [m]) by obstacle
+    origin: str = ""  # Sentence on where the scene comes from, before a user changes it
+
+    def options(self) -> dict[str, Any]:
+        """Return the options of `reset`; what does not change is left out."""
+        given = {name: value for name, value in zip(OPTIONS, self, strict=False) if len(value)}
+        return {**given, "obstacles": list(self.obstacles)}
+
+    def to_json(self, env_id: str) -> str:
+        """Return the scene as the text of a JSON file, with the names of its obstacles."""
+        return options_to_json(self.options(), env_id)
+
+    def to_python(self, env_id: str, arguments: Mapping[str, Any]) -> str:
+        """Return Python code that makes an environment with arguments and sets the scene up."""
+        given = "".join(f", {name}={getattr(value, 'name', value)!r}" for name, value in arguments.items())
+        record = json.loads(self.to_json(env_id), parse_float=lambda text: round(float(text), 6))
+        options = {name: record[name] for name in self.options()}
+        return (
+            f'import gymnasium as gym\n\nenv = gym.make("viapoint.envs:{env_id}"{given})\n'
+            f"options = {pprint.pformat(options, width=100, sort_dicts=False)}\n"
+            "observation, info = env.reset(options=options)\n"
+        )
+
+    def with_obstacle(self, row: int, shape: ve.Shape) -> Scene:
+        """Return the scene with another obstacle in a row, or with one more."""
+        return self._replace(obstacles=(*self.obstacles[:row], shape, *self.obstacles[row + 1 :]))
+
+    def without(self, row: int) -> Scene:
+        """Return the scene without an obstacle."""
+        left: dict[str, Any] = {"obstacles": (*self.obstacles[:row], *self.obstacles[row + 1 :])}
+        for name in ("turns", "reaches"):
+            rows = getattr(self, name)
+            if row < len(rows):  # obstacles that were added have none
+                left[name] = np.delete(rows, row, axis=0)
+        return self._replace(**left)
+
+
+class Proposal(NamedTuple):
+    """One plan that was considered."""
+
+    motion: MotionPlan  # Plan, with what is known of it
+    maker: str  # Method that made it
+    seconds: float = 0.0  # Time that the decision took, [s]
+    value: float = np.nan  # Value by which the agent ranks the plan; NaN where it does not
+    reward: float = np.nan  # Simulated reward; NaN for a plan that fails, or not yet
+
+
+class Movement(NamedTuple):
+    """Simulated movement up to the next decision, or to its end."""
+
+    rollout: Rollout  # The movement from its beginning, at every physics step
+    scenes: ve.Scenes  # Its scene, which has the places of obstacles over time
+    plan: ve.Plan | None  # Plan that is followed; None where the arm is steered
+    info: Mapping[str, Any]  # Metrics so far, of a batch of one
+    reward: float  # Reward so far
+
+
+@dataclass(kw_only=True)
+class State:
+    """Everything that a tab shows; arrays and records in it are replaced, never changed."""
+
+    scene: Scene  # Present scene
+    drawn: Scene  # Scene before the user changed it
+    method: str  # Name of the method that decides
+    n_via: int | None = None  # Number of via-points; None for that of the method
+    checks: int = 0  # Proposals that the agent checks with computed geometry
+    duration: float | None = None  # Duration that the user wants, [s]; None for that of the method
+    by_hand: Float | None = None  # Via-points that the user has chosen, shape (K, D)
+    selected: int | None = None  # Row of the selected obstacle
+    turning: bool = False  # True if rings are shown that turn the tool at the goal
+    proposals: tuple[Proposal, ...] = ()  # Plans; the one of the method, or by hand, is first
+    picked: int = 0  # Index of the proposal that is the plan
+    before: MotionPlan | None = None  # Plan before the last change, which is pale; None from a pause on
+    movement: Movement | None = None  # Executed movement so far
+    instant: int = 0  # Row of its rollout that is shown
+    playing: bool = False  # True while the movement is played
+    results: tuple[tuple[str, float, Movement], ...] = ()  # Compared: method, time [s], movement
+    message: str = "Getting ready."  # Sentence on the plan or the movement
+    good: bool = True  # False for bad news
+
+    @property
+    def plan(self) -> MotionPlan | None:
+        """The plan; None before the first one."""
+        return self.proposals[self.picked].motion if self.proposals else None
 
 
 class Arena:
@@ -53,36 +165,30 @@ class Arena:
         self.env_id, self.agent, self._seed = env_id, agent, seed
         self.policy: Any = getattr(agent, "policy", None)
         own = dict(env_kwargs)
-        task = registered_task(env_id, **own)
-        self.stepwise = task.stepwise  # True if the agent acts in every control step
-        any_shape = tuple(dict.fromkeys((*PLAIN_KINDS, *task.shapes)))
-        more = {"shapes": any_shape, "n_obstacles": (0, MOST_OBSTACLES)}
-        self.arguments = {"own": own, "any": {**own, **more}}  # as a user writes them
         planned = whole_task(env_id, own)  # the page plans whole movements, or revises them
-        self._arguments = {
-            "steps": own,  # as the id says
-            "own": planned,  # with obstacles as the agent knows them
+        self.task = registered_task(env_id, **planned)
+        any_shape = tuple(dict.fromkeys((*PLAIN_KINDS, *self.task.shapes)))
+        more = {"shapes": any_shape, "n_obstacles": (0, MOST_OBSTACLES)}
+        revising = self.task.replanning
+        never = {"decide_at": (), "horizon": 1e3} if revising else {}
+        self.arguments = {
+            "own": own,  # as the id says, with obstacles as the agent knows them
             "any": {**planned, **more},  # with obstacles of any number and shape
-            "whole": {**planned, **more},  # the same, with a plan that is never revised
+            "whole": {**planned, **more, **never},  # the same, with a plan that is never revised
         }
         self._envs: dict[str, ve.ReachVectorEnv] = {}
-        self.task = self.env("own").task
-        if self.task.replanning:
-            self._arguments["whole"].update(decide_at=(), horizon=1e3)
+        self.stepwise = self.env("own").task.stepwise  # True if the agent acts in every control step
         self.planar = self.task.arm.space == "hand"  # True if the arm moves in a horizontal plane
         self._sampler = self.task.sampler()
-        methods = [SEARCH, STRAIGHT]
-        if agent is not None:
-            methods.insert(0, AGENT)
-        if not self.task.replanning:
-            methods.insert(0, MOTION)
-            methods += [OMPL] if importlib.util.find_spec("ompl") else []
-        self.methods = tuple(methods)  # those that can be chosen; the first one is the default
+        planner = () if revising else (MOTION,)
+        own_agent = () if agent is None else (AGENT,)
+        library = () if revising or importlib.util.find_spec("ompl") is None else (OMPL,)
+        self.methods = (*planner, *own_agent, SEARCH, STRAIGHT, *library)  # the first one is the default
 
     def env(self, name: str) -> ve.ReachVectorEnv:
-        """Return a batch of one environment, `own`, `any`, `whole` or `steps`, which is made once."""
+        """Return a batch of one environment, `own`, `any` or `whole`, which is made once."""
         if name not in self._envs:
-            env: Any = gym.make_vec(self.env_id, num_envs=1, **self._arguments[name])
+            env: Any = gym.make_vec(self.env_id, num_envs=1, **self.arguments[name])
             self._envs[name] = env.unwrapped
         return self._envs[name]
 
@@ -102,23 +208,13 @@ class Arena:
             actions, values = self.policy.propose(problem)
         return actions[0], values[0]
 
-    def agent_decides(self, state: State) -> bool:
-        """Return True if the agent decides in a scene, False if the search does in its place."""
-        own = self.stepwise or self.n_via(state) == self.task.n_via
-        return state.method == AGENT and own and not self.limit(state.scene)
-
-    def n_via(self, state: State) -> int:
-        """Return the number of via-points that the user wants, or that the method has by default."""
-        usual = 2 if state.method == MOTION else self.task.n_via
-        return usual if state.n_via is None else state.n_via
-
     # Scenes
 
     def scenes(self) -> dict[str, Iterator[Scene]]:
         """Return endless scenes by the names of their buttons."""
         task, generator = self.task, np.random.default_rng(self._seed)
-        kinds: dict[str, Iterator[Scene]] = {}
-        kinds["Random"] = (self.scene_of(self._sampler([generator])) for _ in itertools.count())
+        random = (self.scene_of(self._sampler([generator])) for _ in itertools.count())
+        kinds: dict[str, Iterator[Scene]] = {"Random": random}
         for name in ("test", "hard"):
             frozen = shipped_set(name, task)
             if frozen is not None:
@@ -155,14 +251,11 @@ class Arena:
 
     def limit(self, scene: Scene) -> str:
         """Return the limit of the task that a scene exceeds, as part of a sentence; "" if there is none."""
-        most = self.task.n_obstacles[1]
-        if not most and scene.obstacles:
-            return "without obstacles"
-        known = {name if name in KINDS else "convex_mesh" for name in self.task.shapes}
-        others = [each.kind for each in scene.obstacles if each.kind not in known]
-        if others:
-            return f"without {others[0].replace('_', '-')} obstacles"
-        return f"with at most {most} obstacles" if len(scene.obstacles) > most else ""
+        most, shapes = self.task.n_obstacles[1], self.task.shapes
+        known = {name if name in KINDS else "convex_mesh" for name in shapes}
+        if len(scene.obstacles) <= most and all(each.kind in known for each in scene.obstacles):
+            return ""
+        return f"with at most {most} obstacles ({', '.join(shapes)})" if most else "without obstacles"
 
     # Geometry
 
@@ -183,7 +276,7 @@ class Arena:
         """Return the orientation of the tool for joint positions, a quaternion."""
         return quaternions_of(forward(self.task.arm.chain, coordinates)[1])
 
-    def clearances(self, coordinates: Float, obstacles: Iterable[ve.Shape], times: Any = 0.0) -> Float:
+    def clearances(self, coordinates: Float, obstacles: Shapes, times: Any = 0.0) -> Float:
         """Return clearances from obstacles at T times [s] and of the arm from itself, shape (T, 2), [m]."""
         arm = self.task.arm
         joints = self.task.space.joints(coordinates)
@@ -193,9 +286,7 @@ class Arena:
         apart, own = row_clearances(arm.chain, arm.spheres, joints, rows, FAR)
         return np.stack((apart.min(axis=1, initial=FAR), own), axis=-1)
 
-    def moved(
-        self, coordinates: Float, place: Float, obstacles: Iterable[ve.Shape] = (), turn: Any = None
-    ) -> Float:
+    def moved(self, coordinates: Float, place: Float, obstacles: Shapes = (), turn: Any = None) -> Float:
         """Return coordinates with the tool at another place, in joint space the nearest that are free of obstacles.
 
         `turn` is a new orientation of the tool. A place out of reach raises ValueError.
@@ -235,11 +326,10 @@ class Arena:
         aside = np.array([-line[1], line[0], 0.0]) / max(float(np.hypot(line[0], line[1])), 1e-9)
         if aside @ middle < 0.0:
             aside = -aside
-        shape = self.new_shapes()[name]
-        sides, least = [aside, -aside], 0.02
+        shape, sides = self.new_shapes()[name], [aside, -aside]
         if name == "wall":
-            shape, sides, least = ve.HalfSpace.facing(-aside), [aside], 0.17
-        for way, side in itertools.product(least + 0.02 * np.arange(20), sides):
+            shape, sides = ve.HalfSpace.facing(-aside), [aside]
+        for way, side in itertools.product(0.02 * np.arange(1, 26), sides):
             shape = dataclasses.replace(shape, position=middle + way * side)
             alone = all(other.distance(shape.position, 0.03) > 0.0 for other in scene.obstacles)
             if alone and self.clearances(ends, [shape])[:, 0].min() > 0.0:
@@ -261,3 +351,223 @@ class Arena:
         sizes[index] = value
         changed: dict[str, Any] = {parameter: sizes}
         return dataclasses.replace(shape, **changed)
+
+
+def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Proposal:
+    """Return the plan of the method, or by hand; where the scene is impossible, the motion planner says why."""
+    if state.by_hand is not None and state.plan is not None:
+        return _by_hand(arena, state, state.by_hand, state.duration or state.plan.duration)
+    if state.method in (MOTION, OMPL):
+        return _planned(arena, state, time_limit)
+    scene, (name, task, decide_) = state.scene, _chooser(arena, state)
+    try:
+        observation = begin_episode(arena.env(name), scene)
+    except ValueError:
+        best = _planned(arena, state, time_limit)
+        if best.motion.success:
+            raise  # what changes later is at fault, which the motion planner does not know
+        return best
+    begin = time.perf_counter()
+    action = decide_(observation)
+    seconds = time.perf_counter() - begin
+    plan = task.action.decode(action, scene.start[None], scene.goal[None]).take(0)
+    if state.duration is not None:
+        return _by_hand(arena, state, plan.waypoints[1:-1], state.duration)
+    maker = SEARCH if state.method == AGENT and name == "any" else state.method
+    return Proposal(_checked(arena, scene, plan), maker, seconds)
+
+
+def n_via(arena: Arena, state: State) -> int:
+    """Return the number of via-points that the user wants, or that the method has by default."""
+    usual = 2 if state.method == MOTION else arena.task.n_via
+    return usual if state.n_via is None else state.n_via
+
+
+def _agent_decides(arena: Arena, state: State) -> bool:
+    """Return True if the agent decides in a scene, False if the search does in its place."""
+    own = arena.stepwise or n_via(arena, state) == arena.task.n_via
+    return state.method == AGENT and own and not arena.limit(state.scene)
+
+
+def _checked(arena: Arena, scene: Scene, plan: ve.Plan) -> MotionPlan:
+    return checked_motion(arena.task.arm, arena.task.space_name, plan, pack([scene.obstacles]), "given")
+
+
+def _chooser(arena: Arena, state: State) -> tuple[str, ve.Task, Callable[[Observation], Float]]:
+    """Return the environment in which a method decides, the task of its actions, and its function of observations."""
+    if _agent_decides(arena, state) and not arena.stepwise:
+        return "own", arena.task, functools.partial(arena.act, checks=state.checks)
+    task = dataclasses.replace(arena.env("any").task, n_via=n_via(arena, state))
+    # The first candidate of a search is the straight movement.
+    number, rounds = (1, 0) if state.method == STRAIGHT else (N_CHECKS, REFINEMENTS)
+    return "any", task, GeometrySearch(task, number, refinements=rounds).decide
+
+
+def _planned(arena: Arena, state: State, time_limit: float) -> Proposal:
+    """Return the plan of a motion planner, which also says why there is no free movement."""
+    scene, task = state.scene, arena.task
+    problem = task.arm, scene.start, scene.goal, pack([scene.obstacles])
+    begin = time.perf_counter()
+    if state.method == OMPL:
+        motion = ompl_motion(*problem, space=task.space_name)
+    else:
+        number, last = int(np.clip(n_via(arena, state), 1, 3)), state.before
+        seeds: Any = SEEDS
+        if last is not None and len(last.waypoints) == number + 2 and time_limit == TIME_LIMIT:
+            seeds = last.waypoints[None, 1:-1]
+        motion = plan_motion(
+            *problem, n_via=number, seeds=seeds, time_limit=time_limit, duration=state.duration,
+            space=task.space_name, ompl=False,
+        )  # fmt: skip
+    seconds = time.perf_counter() - begin
+    if state.duration is not None:  # or the shortest that the limits allow; as it is if that fails
+        plan = ve.Plan(motion.waypoints, motion.durations * (state.duration / motion.duration))
+        retimed = _checked(arena, scene, plan)
+        motion = retimed if retimed.success else motion
+    return Proposal(motion, OMPL if state.method == OMPL else MOTION, seconds)
+
+
+def _by_hand(arena: Arena, state: State, vias: Float, duration: float) -> Proposal:
+    """Return the plan from start to goal through via-points, shape (K, D), in a duration, [s]."""
+    waypoints = np.concatenate((state.scene.start[None], vias, state.scene.goal[None]))
+    plan = ve.Plan(waypoints, np.asarray(passage_durations(waypoints, np.asarray(duration))))
+    return Proposal(_checked(arena, state.scene, plan), HAND)
+
+
+def propose(arena: Arena, state: State) -> tuple[Proposal, ...]:
+    """Return the plan and the best others that differ from it, with their simulated rewards."""
+    first, found = state.proposals[0], []
+    if first.maker == MOTION and not first.motion.success:  # it looks once more
+        return (decide(arena, state, SECOND_LIMIT),)
+    if state.method in (MOTION, OMPL, STRAIGHT):
+        return (first,)
+    env = arena.env("whole")
+    now = state.scene._replace(jumps=(), turns=(), reaches=())  # later changes are not known
+    try:
+        begin_episode(env, now)
+    except ValueError:  # the scene is impossible
+        return (first,)
+    for each in _distinct(arena, state):
+        begin_episode(env, now)
+        outcome = env.execute_plan(each.motion.plan.take(np.newaxis))
+        success = each.motion.success and outcome.info["is_success"][0]
+        found.append(each._replace(reward=float(outcome.reward[0]) if success else np.nan))
+    return tuple(found)
+
+
+def _distinct(arena: Arena, state: State) -> list[Proposal]:
+    """Return the plan and the best candidates whose paths differ from it and from one another."""
+    scene, first = state.scene, state.proposals[0]
+    name, task, _ = _chooser(arena, state)
+    by_agent = name == "own"
+    if by_agent and not hasattr(arena.policy, "propose"):  # it proposes one action
+        return [first]
+    if by_agent:
+        observation = begin_episode(arena.env(name), scene)
+        actions, values = arena.propose(Problem.of_observation(observation, task))
+    else:
+        actions = candidate_actions(task, N_CHECKS, replanning=False).astype(np.float64)
+        # Merits of several actions in one problem are bounds for all but the best.
+        rest, start, goal = np.zeros_like(scene.start)[None], scene.start[None], scene.goal[None]
+        problem = Problem(start, rest, rest, goal, pack([scene.obstacles]))
+        each_alone = problem.take(np.zeros(len(actions), np.int64))
+        values = merits(task, each_alone, actions[:, None])[:, 0]
+    order = np.argsort(-values, kind="stable")[:N_CANDIDATES]
+    known = values[order] if by_agent else np.full(len(order), np.nan)
+    ends = (np.tile(end, (len(order), 1)) for end in (scene.start, scene.goal))
+    plans = task.action.decode(np.asarray(actions[order], dtype=np.float64), *ends)
+    chosen, paths = first.motion.plan, arena.path(plans, 9)
+    apart = norm(paths - arena.path(chosen, 9)).max(axis=-1)
+    same = (apart < 1e-6) & np.isclose(plans.duration, chosen.duration)
+    found = [first._replace(value=float(known[same.argmax()]) if same.any() else np.nan)]
+    while len(found) < N_PROPOSALS and (apart > APART).any():
+        i = int((apart > APART).argmax())
+        motion = _checked(arena, scene, plans.take(i))
+        found.append(Proposal(motion, AGENT if by_agent else SEARCH, value=float(known[i])))
+        apart = np.minimum(apart, norm(paths - paths[i]).max(axis=-1))
+    return found
+
+
+def execute(arena: Arena, state: State) -> Iterator[Movement]:
+    """Execute the plan, decision by decision where it is revised, and yield the movement so far after each.
+
+    A goal that is dragged meanwhile is followed. When the arm has reached a goal that has been dragged away, a new
+    episode begins there.
+    """
+    assert state.plan is not None
+    scene, goal, reward = state.scene, state.scene.goal, 0.0
+    if arena.stepwise and _agent_decides(arena, state) and state.by_hand is None and state.picked == 0:
+        env = arena.env("own")
+        decide_: Callable[[Observation], Float] = arena.act
+        decision = env.execute_actions(decide_(begin_episode(env, scene)))
+    else:
+        name, _, decide_ = _chooser(arena, state)
+        env = arena.env(name)
+        begin_episode(env, scene)
+        decision = env.execute_plan(state.plan.plan.take(np.newaxis))
+    while True:
+        rollout, scenes, plans = env.last_rollout[0], env.scenes, env.last_plan
+        assert scenes is not None
+        reward += float(decision.reward[0])
+        info = {name: value[0] for name, value in decision.info.items()}
+        yield Movement(rollout, scenes, None if plans is None else plans.take(0), info, reward)
+        moved = not np.array_equal(state.scene.goal, goal)
+        observation, goal = decision.observation, state.scene.goal
+        if decision.terminated[0] or decision.truncated[0]:
+            here = env.task.space.coordinates(rollout.joints[-1])
+            if not moved or not info["is_success"] or np.abs(here - goal).max() < NEXT_START:
+                return
+            now = scenes.obstacles_at(rollout.time[-1:])
+            scene = Scene(here, goal, tuple(unpack(now._replace(velocity=0.0 * now.velocity), 0)))
+            observation = begin_episode(env, scene)
+        elif moved:
+            observation = env.move_goals(goal[None])
+        decision = env.execute_actions(decide_(observation))
+
+
+def begin_episode(env: ve.ReachVectorEnv, scene: Scene) -> Observation:
+    """Begin an episode in a scene, and return the observation; a target without jumps gets none."""
+    jumps = {"jumps": ()} if env.task.n_jumps[1] else {}
+    observation, _ = env.reset(options={**jumps, **scene.options()})
+    return observation
+
+
+def profile(arena: Arena, scene: Scene, plan: ve.Plan, until: float = 0.0) -> dict[str, Float]:
+    """Return time, to the end of a plan or `until`, [s], speed of the tool, jerk, and clearance from obstacles."""
+    times = np.linspace(0.0, max(float(plan.duration), until), SAMPLES)
+    trajectory = plan.trajectory()
+    coordinates = np.asarray(trajectory(times))
+    return {
+        "time": times,
+        "speed": norm(np.gradient(arena.tool(coordinates), times, axis=0)),
+        "jerk": norm(np.asarray(trajectory(times, 3))),
+        "clearance": arena.clearances(coordinates, scene.obstacles, times)[:, 0],
+    }
+
+
+def describe_plan(proposal: Proposal, duration: float | None = None) -> str:
+    """Return one sentence on a plan, for which a user may want a duration, [s]."""
+    motion = proposal.motion
+    if not motion.success and proposal.maker == MOTION:
+        return f"No free movement was found: {motion.reason}. The best one is shown in red."
+    if not motion.success:
+        return f"This plan fails: {motion.reason}."
+    far = motion.clearance >= 0.999 * FAR
+    clear = "no obstacle near" if far else f"{1e3 * motion.clearance:.0f} mm clear"
+    jerk = f"{motion.jerk:.1f} times the jerk of the straight line"
+    short = duration is not None and motion.duration > duration + 0.005
+    limits = ", the shortest time that the limits of the arm allow" if short else ""
+    return f"The plan takes {motion.duration:.2f} s{limits}, {clear}, with {jerk}."
+
+
+def describe_outcome(info: Mapping[str, Any], in_joints: bool) -> str:
+    """Return one sentence on an executed movement."""
+    if info["collision"]:
+        return f"Failure: the arm touches something after {info['first_contact_time']:.2f} s."
+    if not info["reachable"]:
+        return "Failure: the plan leaves the arm's reach."
+    clearance = 1e3 * info["min_clearance"]
+    error = 1e3 * info["goal_error"]
+    near = "" if clearance >= 999.0 * FAR else f", least clearance {clearance:.0f} mm"
+    state = "Success: at rest" if info["is_success"] else "Failure:"
+    return f"{state} {error:.1f} {'mrad' if in_joints else 'mm'} from the goal after {info['duration']:.2f} s{near}."

@@ -1,33 +1,37 @@
-"""Three-dimensional view of the live page: arm, obstacles, plans, and handles to drag."""
+"""Display of the live page: a view in three dimensions with handles to drag, and panels on both sides."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import html
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+import pandas as pd
 import trimesh
 import viser
-from mjviser.conversions import get_geom_texture_id, merge_geoms
+from matplotlib.colors import to_hex
+from mjviser.conversions import merge_geoms
 
 from viapoint.envs import Arm, Box, Capsule, HalfSpace, Shape, Sphere
 from viapoint.envs.arms.load import read_model
 from viapoint.envs.common.arrays import Float, frame_matrices, norm, quaternion_to
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.geometry.obstacles import add_to_model, pack
-from viapoint.training.live.arena import SAMPLES, Arena
-from viapoint.training.live.state import State
+from viapoint.training.live.arena import AGENT, MOTION, OMPL, SAMPLES, SIZES, Arena, State, n_via, profile
 from viapoint.training.planning.motion_plan import MotionPlan
 
 PLAN, PROPOSAL, DONE = 0.0050, 0.0028, 0.0032  # Radii of plan, proposals, executed path, [m]
 ROD = trimesh.creation.cylinder(1.0, 2.0, sections=8)  # Piece of a tube before it is scaled
 ABOVE = np.array([0.0, 0.0, 0.004])  # Shift of the executed path, so that the plan stays visible, [m]
+DROP = 0.0015  # Radius of the lines from handles down to the table, [m]
 RADII = {"start": 0.018, "goal": 0.018, "via": 0.013}  # Radii of the handles, [m]
+HANDLES = {name: trimesh.creation.icosphere(3, radius) for name, radius in RADII.items()}
 # First views: position of the camera, point that it looks at, [m], direction up, and field of view, [rad]
 PLANE = (-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), math.radians(33.0)
 SPACE = (2.6, -2.0, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), math.radians(38.0)
@@ -35,8 +39,29 @@ OPACITY, GHOST = 0.45, 0.16  # Of what hides others, and of the arm at the goal
 POINT = 0.005  # Size of the points that a sensor sees, [m]
 LARGE = 0.16  # Greatest size of obstacles in space that are not large, [m]
 LOW, TALL = 0.030, 0.060  # Height of obstacles in the plane, [m]: below links, and as tall as links
-PALE = 0.45  # Strength of pale colours
+GRID, PALE = (214, 214, 218), 0.45  # Colour of the lines on the table, and strength of pale colours
 FARTHEST = 1.2  # Greatest coordinate to which something can be dragged, [m]
+WIDTH = 330  # Width of a panel, [pixels]
+RESET = "Reset"  # Name of the button that undoes all changes of a scene
+CHECKS = {"none": 0, "16": 16, "64": 64}  # Proposals that are checked with computed geometry
+NOTE = '<div style="padding:0.2em 0.9em;font-size:0.8em;color:#6b7078">{}</div>'
+MESSAGE = '<div id="viapoint-message" style="padding:0.2em 0.9em;font-size:0.9em;color:{}">{}</div>'
+CODE = (
+    '<pre id="viapoint-code" style="background:#f5f5f2;padding:1em;overflow:auto;font-size:0.82em">{}</pre>'
+    '<button onclick="navigator.clipboard.writeText(this.previousElementSibling.textContent)">Copy</button>'
+)
+TABLE = (
+    "<style>.viapoint{width:100%;padding:0 0.7em;font-size:0.8em;text-align:right!important}"
+    ".viapoint th{font-weight:500;color:#6b7078}.viapoint td{border-top:1px solid #e6e6e3}</style>"
+)
+LINE = {"width": 2, "points": {"show": False}}
+# Lines of the plots
+LINES: Any = (
+    {"label": "time"},
+    {**LINE, "label": "plan", "stroke": to_hex(PALETTE.plan)},
+    {**LINE, "label": "executed", "stroke": to_hex(PALETTE.executed), "dash": (6, 5)},
+)
+Act = Callable[..., None]  # Function that does what a user has done, from its name and values
 
 
 def tube(points: Float, radius: float) -> Any:
@@ -52,10 +77,7 @@ def tube(points: Float, radius: float) -> Any:
 
 
 def obstacle_mesh(shape: Shape, levels: tuple[float, float] | None = None) -> Any:
-    """Return the mesh of an obstacle around its position, turned as it is in the world; a plate is a half-space.
-
-    `levels` are the heights between which an obstacle in the plane is cut off, [m].
-    """
+    """Return the mesh of an obstacle around its position, cut off at two heights, [m]; a plate is a half-space."""
     place = np.array(shape.position)
     if isinstance(shape, HalfSpace):
         centre = place - 0.02 * shape.rotation[:, 2]
@@ -72,42 +94,38 @@ def obstacle_mesh(shape: Shape, levels: tuple[float, float] | None = None) -> An
 class ArmDrawing:
     """Meshes of an arm, those of its MuJoCo model or the visible geoms of another file, and their poses."""
 
-    def __init__(self, arm: Arm, model: mujoco.MjModel, model_file: str | Path | None = None) -> None:
-        drawn = model if model_file is None else read_model(model_file)
-        self._offset = _first_anchor(model, arm) - _first_anchor(drawn, arm)
-        self._model, self._data = drawn, mujoco.MjData(drawn)
+    def __init__(self, arm: Arm, model_file: str | Path | None = None) -> None:
+        own = arm.compile(n_obstacles=0)
+        drawn = own if model_file is None else read_model(model_file)
+        anchors = []  # places of the first joint
+        for model in (own, drawn):
+            self._model, self._data = model, mujoco.MjData(model)
+            mujoco.mj_kinematics(model, self._data)
+            anchors.append(self._data.joint(arm.joint_names[0]).xanchor.copy())
+        self._offset = anchors[0] - anchors[1]
         if drawn.nkey:
             mujoco.mj_resetDataKeyframe(drawn, self._data, 0)
         self._joints = np.array([drawn.joint(name).qposadr[0] for name in arm.joint_names])
         ground = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-        visible = ~np.isin(drawn.geom_type, ground) & (drawn.body_mocapid[drawn.geom_bodyid] < 0)
-        visible &= drawn.geom_rgba[:, 3] > 0.0
+        visible = ~np.isin(drawn.geom_type, ground) & (drawn.geom_rgba[:, 3] > 0.0)
         plain = visible & (drawn.geom_group < 3)  # MuJoCo's viewers hide others, which only collide
-        groups: dict[tuple[int, Any], list[int]] = {}
+        alike: dict[tuple[Any, ...], list[int]] = {}
         for geom in np.flatnonzero(plain if plain.any() else visible).tolist():
-            material = drawn.geom_matid[geom]
-            colour = drawn.geom_rgba[geom] if material < 0 else drawn.mat_rgba[material]
-            textured = get_geom_texture_id(drawn, geom) >= 0
-            key = int(drawn.geom_bodyid[geom]), None if textured else tuple(colour[:3])
-            groups.setdefault(key, []).append(geom)
-        self.parts = [(*key, merge_geoms(drawn, geoms)) for key, geoms in groups.items()]
-        """Body, colour (None for textures) and mesh of the parts that move alike."""
+            key = int(drawn.geom_bodyid[geom]), int(drawn.geom_matid[geom]), *drawn.geom_rgba[geom]
+            alike.setdefault(key, []).append(geom)
+        self.parts: list[tuple[int, Colour | None, Any]] = []
+        """Body, colour (None for textures) and mesh of the parts that move alike and have one material."""
+        for (body, *_), geoms in alike.items():
+            mesh = merge_geoms(drawn, geoms)
+            textured = mesh.visual.kind == "texture"
+            self.parts.append((body, None if textured else tuple(mesh.visual.main_color[:3] / 255.0), mesh))
 
-    def poses(self, joints: Float) -> list[tuple[Float, Float]]:
-        """Return quaternion and position of each part for joint angles, shape (J,), [rad]."""
+    def posed(self, joints: Float) -> Iterator[tuple[Colour | None, Any, Float, Float]]:
+        """Yield colour, mesh, quaternion and position of each part for joint angles, shape (J,), [rad]."""
         self._data.qpos[self._joints] = joints
         mujoco.mj_kinematics(self._model, self._data)
-        bodies = [body for body, *_ in self.parts]
-        return [(self._data.xquat[body].copy(), self._data.xpos[body] + self._offset) for body in bodies]
-
-
-def _first_anchor(model: mujoco.MjModel, arm: Arm) -> Float:
-    """Return the place of the first joint in a model, [m]."""
-    data = mujoco.MjData(model)
-    joint = model.joint(arm.joint_names[0])
-    data.qpos[joint.qposadr[0]] = 0.0
-    mujoco.mj_kinematics(model, data)
-    return np.array(data.xanchor[joint.id])
+        for body, colour, mesh in self.parts:
+            yield colour, mesh, self._data.xquat[body].copy(), self._data.xpos[body] + self._offset
 
 
 class View:
@@ -116,77 +134,88 @@ class View:
     All is drawn again after each change: the library sends only what differs from what it sent before.
     """
 
-    def __init__(
-        self, client: viser.ClientHandle, arena: Arena, arm: ArmDrawing, act: Callable[..., None]
-    ) -> None:
+    def __init__(self, client: viser.ClientHandle, arena: Arena, arm: ArmDrawing, act: Act) -> None:
         self._scene, self._arena, self._arm, self._act = client.scene, arena, arm, act
         self._planar = arena.planar
         self._floor = float(arena.env("own").model.geom("table").pos[2])
         self._levels = (self._floor, TALL if arena.task.whole_arm else LOW) if self._planar else None
         self._nodes: dict[str, Any] = {}
-        self._forms: dict[str, tuple[Any, ...]] = {}  # what the meshes of the obstacles show
-        self._grab = np.zeros(3)
-        lines = (214, 214, 218)
+        self._meshes: dict[str, Any] = {}  # what the nodes show
+        self._shapes: dict[str, Shape] = {}  # obstacles of these meshes
         centre = (-0.03, 0.35) if self._planar else (0.0, 0.0)
         self._scene.add_grid(
             "/grid", 2.0, 2.0, position=(*centre, self._floor), cell_size=0.1, section_size=0.1,
-            cell_color=lines, section_color=lines, section_thickness=1.0, shadow_opacity=0.0,
+            cell_color=GRID, section_color=GRID, section_thickness=1.0, shadow_opacity=0.0,
             plane_color=_rgb(PALETTE.table), plane_opacity=1.0,
         )  # fmt: skip
         for i, (_, colour, mesh) in enumerate(arm.parts):
-            if colour is None and not self._planar:
+            if colour is None and not self._planar:  # with its texture
+                self._meshes[f"/arm/{i}"] = mesh
                 self._nodes[f"/arm/{i}"] = self._scene.add_mesh_trimesh(f"/arm/{i}", mesh)
-            else:
-                self._mesh(f"/arm/{i}", mesh, _rgb(colour or PALETTE.arm), OPACITY if self._planar else None)
-            if not self._planar:
-                self._mesh(f"/ghost/{i}", mesh, _rgb(colour or PALETTE.arm), GHOST)
         axes = (True, True, not self._planar)
         self._rings = self._scene.add_transform_controls(
             "/turn", 0.2, disable_axes=True, disable_sliders=True, visible=False, active_axes=axes
         )
         self._rings.on_update(lambda _: act("turn", np.array(self._rings.wxyz)))
+        self._seen = self._scene.add_point_cloud(
+            "/seen", np.zeros((0, 3)), _rgb(PALETTE.seen), point_size=POINT, point_shape="circle"
+        )
 
     def draw(self, state: State) -> None:
         """Draw the scene, the plans and the movement."""
         arena, scene, movement = self._arena, state.scene, state.movement
+        self._shown: set[str] = set()  # names of the nodes that are visible
         joints = arena.task.space.joints(scene.start)
         places = [shape.position for shape in scene.obstacles]
-        done = []
         if movement is not None:
             rollout, now = movement.rollout, state.instant
             joints = rollout.joints[now]
             places = movement.scenes.obstacles_at(rollout.time[now : now + 1]).centre[0]
             rows = np.linspace(0, now, SAMPLES).astype(int)
             colour = PALETTE.contact if rollout.contact[: now + 1].any() else PALETTE.executed
-            done = [(rollout.hand[rows] + ABOVE, _rgb(colour))]
-        self._draw_paths("done", done, DONE)
-        self._draw_arm("arm", joints)
+            self._show("/done/0", tube(rollout.hand[rows] + ABOVE, DONE), colour)
+        self._draw_arm("arm", joints, OPACITY if self._planar else None)
         if not self._planar:
-            self._draw_arm("ghost", arena.task.space.joints(scene.goal))
-        self._draw_obstacles(scene.obstacles, places, state.selected)
+            self._draw_arm("ghost", arena.task.space.joints(scene.goal), GHOST)
+        for i, (shape, place) in enumerate(zip(scene.obstacles, places, strict=False)):
+            strength = PALE if i == state.selected else 1.0
+            key = f"/obstacle/{i}"
+            if self._shapes.get(key) is not shape:  # most stay as they are
+                self._shapes[key], mesh = shape, obstacle_mesh(shape, self._levels)
+            else:
+                mesh = self._meshes[key]
+            node = self._show(key, mesh, PALETTE.obstacle, strength, place)
+            node.flat_shading = not isinstance(shape, Sphere | Capsule)
+            large = isinstance(shape, HalfSpace) or float(shape.packed_size.max()) > LARGE
+            node.opacity = OPACITY if large and not self._planar else None
         self._draw_seen(state)
         start, goal = arena.tool(np.stack((scene.start, scene.goal)))
-        self._draw_handles("start", [start])
-        self._draw_handles("goal", [goal])
+        self._draw_handle("start", 0, start)
+        self._draw_handle("goal", 0, goal)
         self._draw_rings(state, goal)
-        if state.plan is None:
-            return
-        vias = arena.tool(state.plan.waypoints[1:-1])
-        planned = [self._line(state.plan, 1.0)]
-        if movement is not None and movement.plan is not None and arena.task.replanning:
-            vias = vias[:0]
-            planned = [(arena.path(movement.plan), _rgb(PALETTE.plan))]
-        others = [] if state.before is None else [state.before]
-        if len(state.proposals) > 1:
-            others = [each.motion for each in state.proposals]
-        self._draw_handles("via", vias)
-        self._draw_paths("plan", planned, PLAN)
-        self._draw_paths("proposal", [self._line(motion, PALE) for motion in others], PROPOSAL)
+        if state.plan is not None:
+            self._draw_plans(state, state.plan)
+        for key, node in self._nodes.items():
+            node.visible = key in self._shown
 
-    def _line(self, motion: MotionPlan, strength: float) -> tuple[Float, Any]:
-        """Return the path of a plan, and its colour."""
+    def _draw_plans(self, state: State, plan: MotionPlan) -> None:
+        """Draw the plan with its via-points, the proposals, and the plan before the last change."""
+        movement = state.movement
+        if movement is not None and movement.plan is not None and self._arena.task.replanning:
+            self._show("/plan/0", tube(self._arena.path(movement.plan), PLAN), PALETTE.plan)
+        else:
+            self._draw_plan("/plan/0", plan, PLAN, 1.0)
+            for i, place in enumerate(self._arena.tool(plan.waypoints[1:-1])):
+                self._draw_handle("via", i, place)
+        others = [each.motion for each in state.proposals]
+        if state.before is not None:
+            others.append(state.before)
+        for i, motion in enumerate(others):
+            self._draw_plan(f"/proposal/{i}", motion, PROPOSAL, PALE)
+
+    def _draw_plan(self, key: str, motion: MotionPlan, radius: float, strength: float) -> None:
         colour = PALETTE.plan if motion.success else PALETTE.contact
-        return self._arena.path(motion.plan), _rgb(colour, strength)
+        self._show(key, tube(self._arena.path(motion.plan), radius), colour, strength)
 
     def _draw_rings(self, state: State, goal: Float) -> None:
         """Draw rings that turn the selected obstacle or the tool at the goal; obstacles in the plane stay upright."""
@@ -199,95 +228,64 @@ class View:
             self._rings.wxyz = self._arena.orientation(state.scene.goal)
             self._rings.position = goal
 
-    def _draw_arm(self, name: str, joints: Float) -> None:
-        for i, (turn, position) in enumerate(self._arm.poses(joints)):
-            node = self._nodes[f"/{name}/{i}"]
-            node.wxyz, node.position = turn, position
-
-    def _draw_obstacles(self, shapes: tuple[Shape, ...], places: Any, selected: int | None) -> None:
-        for i, (shape, place) in enumerate(zip(shapes, places, strict=False)):
-            name = f"/obstacle/{i}"
-            form = (shape.kind, *shape.packed_size, *shape.quaternion, id(shape.mesh))
-            if self._forms.get(name) != form:  # most stay as they are
-                self._forms[name] = form
-                self._mesh(name, obstacle_mesh(shape, self._levels), _rgb(PALETTE.obstacle))
-            node = self._nodes[name]
-            node.flat_shading = not isinstance(shape, Sphere | Capsule)
-            large = isinstance(shape, HalfSpace) or float(shape.packed_size.max()) > LARGE
-            node.opacity = OPACITY if large and not self._planar else None
-            node.color = _rgb(PALETTE.obstacle, PALE if i == selected else 1.0)
-            node.position, node.visible = place, True
-        self._hide("obstacle", len(shapes))
+    def _draw_arm(self, name: str, joints: Float, opacity: float | None) -> None:
+        for i, (colour, mesh, turn, place) in enumerate(self._arm.posed(joints)):
+            node = self._show(f"/{name}/{i}", mesh, colour or PALETTE.arm, place=place)
+            node.wxyz, node.opacity = turn, opacity
 
     def _draw_seen(self, state: State) -> None:
         """Draw the points that the sensor of the task sees from the start."""
         task, scene = self._arena.task, state.scene
-        if task.sensor is None:
-            return
-        joints = task.space.joints(scene.start)[None]
-        found = task.sensor.read(task.arm, joints, pack([scene.obstacles]))
-        points = found.points[found.seen >= 0]
-        if self._planar:
-            points[:, 2] = LOW + 0.002  # on top of the obstacles
-        if "/seen" not in self._nodes:
-            self._nodes["/seen"] = self._scene.add_point_cloud(
-                "/seen", points, _rgb(PALETTE.seen), point_size=POINT, point_shape="circle"
-            )
-        self._nodes["/seen"].points = points
+        if task.sensor is not None:
+            joints = task.space.joints(scene.start)[None]
+            found = task.sensor.read(task.arm, joints, pack([scene.obstacles]))
+            points = found.points[found.seen >= 0]
+            if self._planar:
+                points[:, 2] = LOW + 0.002  # on top of the obstacles
+            self._seen.points = points
 
-    def _draw_paths(self, name: str, paths: list[tuple[Float, Any]], radius: float) -> None:
-        """Draw paths, shape (n, 3), [m], with their colours."""
-        for i, (path, colour) in enumerate(paths):
-            self._mesh(f"/{name}/{i}", tube(path, radius), colour)
-        self._hide(name, len(paths))
-
-    def _draw_handles(self, name: str, places: Float | list[Float]) -> None:
-        """Draw handles, and lines down to the table that show their places."""
+    def _draw_handle(self, name: str, number: int, place: Float) -> None:
+        """Draw a handle, and a line down to the table that shows its place."""
         colour = getattr(PALETTE, name)
-        for i, place in enumerate(places):
-            key = f"/{name}/{i}"
-            drop = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, self._floor - place[2]]]])
-            if key not in self._nodes:
-                self._mesh(key, trimesh.creation.icosphere(3, RADII[name]), _rgb(colour))
-                self._nodes[f"{key}/drop"] = self._scene.add_line_segments(
-                    f"{key}/drop", drop, _rgb(colour, PALE), thickness=0.003
-                )
-            self._nodes[f"{key}/drop"].points = drop
-            self._nodes[key].position, self._nodes[key].visible = place, True
-        self._hide(name, len(places))
+        self._show(f"/{name}/{number}", HANDLES[name], colour, place=place)
+        drop = np.array([place, (*place[:2], min(self._floor, place[2] - 1e-3))])
+        self._show(f"/drop-{name}/{number}", tube(drop, DROP), colour, PALE)
 
-    def _hide(self, name: str, number: int) -> None:
-        """Hide the nodes of a name from a number on."""
-        while (node := self._nodes.get(f"/{name}/{number}")) is not None:
-            node.visible = False
-            number += 1
-
-    def _mesh(self, key: str, mesh: Any, colour: Any, opacity: float | None = None) -> None:
-        """Add a mesh, or change the one of this name."""
-        _, name, number = key.split("/")
-        if key in self._nodes:
-            node = self._nodes[key]
+    def _show(
+        self, key: str, mesh: Any, colour: Colour, strength: float = 1.0, place: Any = (0.0, 0.0, 0.0)
+    ) -> Any:
+        """Show a mesh in a colour at a place, [m], and return its node."""
+        self._shown.add(key)
+        node = self._nodes.get(key)
+        if node is None:
+            node = self._nodes[key] = self._added(key, mesh)
+        elif self._meshes[key] is not mesh:  # many stay as they are
             node.vertices, node.faces = mesh.vertices, np.uint32(mesh.faces)
-            node.color, node.visible = colour, True
-            return
+        self._meshes[key] = mesh
+        node.color, node.position = _rgb(colour, strength), place
+        return node
+
+    def _added(self, key: str, mesh: Any) -> Any:
+        """Add a node, which can be clicked or dragged if it is a proposal, an obstacle or a handle."""
+        _, name, number = key.split("/")
         shadow = name in ("arm", "obstacle")
-        node = self._nodes[key] = self._scene.add_mesh_simple(
-            key, mesh.vertices, mesh.faces, color=colour, opacity=opacity, cast_shadow=shadow,
-            receive_shadow=shadow, flat_shading=name in ("done", "plan", "proposal"),
+        node = self._scene.add_mesh_simple(
+            key, mesh.vertices, mesh.faces, cast_shadow=shadow, receive_shadow=shadow,
+            flat_shading=name in ("done", "plan", "proposal"),
         )  # fmt: skip
         if name == "proposal":
             node.on_click(lambda _: self._act("pick", int(number)))
         if name == "obstacle":
             node.on_click(lambda _: self._act("show", "selected", int(number)))
-        if name == "obstacle" or name in RADII:
+        if name == "obstacle" or name in HANDLES:
             dragged = functools.partial(self._dragged, name, int(number))
             node.on_drag("left")(dragged)
             if not self._planar:
                 node.on_drag("left", modifier="shift")(dragged)
+        return node
 
-    async def _dragged(
-        self, kind: str, number: int, event: Any
-    ) -> None:  # such functions are called in order
+    # Asynchronous functions are called in order.
+    async def _dragged(self, kind: str, number: int, event: Any) -> None:
         """Drag a node horizontally, or up and down with Shift, to where the pointer's ray meets its plane."""
         eye = np.asarray(event.client.camera.position)
         place = np.asarray(event.target.position)
@@ -298,14 +296,215 @@ class View:
         ray = np.asarray(event.end_position) - eye
         slope = float(normal @ ray)
         share = float(normal @ (place + self._grab - eye)) / slope if abs(slope) > 1e-6 else 0.0
-        if share <= 0.0:
-            return
         point = eye + share * ray - self._grab
         if upright:
             point = np.array([*place[:2], max(point[2], self._floor)])
-        self._act("drag", kind, number, np.clip(point, -FARTHEST, FARTHEST))
+        if share > 0.0:
+            self._act("drag", kind, number, np.clip(point, -FARTHEST, FARTHEST))
 
 
 def _rgb(colour: Colour, strength: float = 1.0) -> Any:
     """Return a colour in [0, 255], paler for a strength below 1."""
     return tuple(round(255.0 * (1.0 + strength * (each - 1.0))) for each in colour)
+
+
+class Panels:
+    """Panels of one tab, drawn from its state; `act` is called with the name of what a user does and its values."""
+
+    def __init__(self, client: viser.ClientHandle, arena: Arena, scenes: Iterable[str], act: Act) -> None:
+        self._gui, self._arena, self._act = client.gui, arena, act
+        self._selection: Any = ()
+        self._plots: dict[str, Any] = {}
+        self._build_results()
+        self._build_controls(scenes)
+
+    def draw(self, state: State) -> None:
+        """Show what was decided, and set the controls."""
+        remark = state.scene.origin if state.scene is state.drawn else ""
+        limit, plan = self._arena.limit(state.scene), state.plan
+        if limit and state.method == AGENT:
+            remark += f" The agent was trained {limit}, so the geometry search decides."
+        message = MESSAGE.format("#1b7f4b" if state.good else "#c4202b", html.escape(state.message))
+        self._message.content = message + NOTE.format(html.escape(remark))
+        self._execute.label = "Stop" if state.playing else "Execute"
+        self._vias.visible = state.method != OMPL  # which takes as many as its path needs
+        self._vias.min = int(state.method == MOTION)
+        self._vias.value = n_via(self._arena, state)
+        if plan is not None and state.duration is None:
+            low, high = self._duration.min, self._duration.max
+            self._duration.value = float(np.clip(round(plan.duration, 2), low, high))
+        self._draw_selection(state)
+        self._draw_comparison(state)
+        if plan is not None and state.before is None and not state.playing:
+            self._draw_proposals(state)
+            self._draw_plots(state, plan)
+
+    def show_code(self, code: str) -> None:
+        """Show Python code with a button that copies it."""
+        with self._gui.add_modal("This scene in Python") as modal:
+            self._gui.add_html(CODE.format(html.escape(code)))
+            self._gui.add_button("Close").on_click(lambda _: modal.close())
+
+    def _draw_proposals(self, state: State) -> None:
+        rows = []
+        for i, each in enumerate(state.proposals):
+            motion = each.motion
+            reward = each.reward if motion.success else "fails"
+            number = f"#{i + 1}{' shown' * (i == state.picked)}"
+            rows.append((number, reward, each.value, _millimetres(motion.clearance), motion.duration))
+        names = "plan", "reward", "agent's value", "clearance [mm]", "time [s]"
+        first = state.proposals[0]
+        note = f"{first.maker}, decided in {1e3 * first.seconds:.0f} ms"
+        self._table.content = _table(names, rows, note)
+        self._pick.visible = len(rows) > 1
+        self._pick.options = tuple(f"#{i + 1}" for i in range(len(rows)))
+
+    def _draw_plots(self, state: State, plan: MotionPlan) -> None:
+        """Plot the plan, and the executed movement if there is one."""
+        executed, until = {}, 0.0
+        if state.movement is not None:
+            rollout = state.movement.rollout
+            until = float(rollout.time[-1])
+            executed["speed"] = norm(np.gradient(rollout.hand, rollout.time, axis=0))
+            executed["clearance"] = rollout.clearance
+        planned = profile(self._arena, state.scene, plan.plan, until)
+        time = planned["time"]
+        for name, plot in self._plots.items():
+            other = np.where(time > 0.0, np.nan, planned[name])  # one number: no line, but a plot
+            if name in executed:
+                other = np.interp(time, rollout.time, executed[name], right=np.nan)
+            lines = np.array([planned[name], other])
+            if name == "clearance":  # in millimetres, where it is small
+                lines = np.minimum(1e3 * lines, 250.0)
+            plot.data = (time, *lines)
+
+    def _draw_comparison(self, state: State) -> None:
+        rows = []
+        for name, seconds, movement in state.results:
+            info = movement.info
+            success = "yes" if info["is_success"] else "no"
+            clearance = _millimetres(info["min_clearance"])
+            decided = f"{1e3 * seconds:.0f}"
+            rows.append((name, success, movement.reward, clearance, info["jerk_ratio"], decided))
+        names = "method", "success", "reward", "clearance [mm]", "jerk", "decided in [ms]"
+        note = "Each row is simulated. Jerk is relative to the straight movement."
+        self._methods.content = _table(names, rows, note) if rows else NOTE.format(note)
+
+    def _draw_selection(self, state: State) -> None:
+        """Show the sizes of the selected obstacle; sliders that the user moves are left alone."""
+        row, shapes = state.selected, state.scene.obstacles
+        if self._selection == (row, len(shapes), id(state.drawn)):
+            return
+        self._selection = row, len(shapes), id(state.drawn)
+        values = {} if row is None else self._arena.sizes_of(shapes[row])
+        for name, slider in self._sizes.items():
+            slider.visible = name in values
+            slider.value = float(np.clip(values.get(name, 0.0), slider.min, slider.max))
+        self._remove.disabled = row is None
+        name = "Click an obstacle." if row is None else f"Selected: {shapes[row].name or f'obstacle {row}'}"
+        self._selected.content = NOTE.format(html.escape(name))
+
+    def _build_results(self) -> None:
+        gui = self._gui
+        panel = gui.add_panel()
+        with panel.add_tab("Decision"):
+            self._table = gui.add_html("")
+            self._pick = gui.add_button_group("Show", ("#1",), visible=False)
+            self._pick.on_click(lambda event: self._act("pick", int(event.target.value[1:]) - 1))
+            unit = "m/s³" if self._arena.task.space.of_hand else "rad/s³"
+            titles = "speed of the hand [m/s]", f"jerk of the plan [{unit}]", "clearance [mm]"
+            for name, title in zip(("speed", "jerk", "clearance"), titles, strict=True):
+                self._plots[name] = gui.add_uplot(
+                    (np.zeros(2), np.zeros(2), np.zeros(2)), LINES, title=title, height=126,
+                    scales={"x": {"time": False}}, legend={"show": False}, cursor={"show": True},
+                    axes=({"size": 30}, {"size": 46}), padding=(10, 10, 0, 0),
+                )  # fmt: skip
+            gui.add_html(NOTE.format("time [s]; solid: plan, dashed: executed"))
+        with panel.add_tab("Methods"):
+            self._methods = gui.add_html("")
+            self._button("Compare in this scene", "compare")
+        panel.dock_left()
+        panel.set_width(WIDTH)
+
+    def _build_controls(self, scenes: Iterable[str]) -> None:
+        gui, arena, act = self._gui, self._arena, self._act
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(WIDTH - 20)
+        arm, agent = arena.task.arm, arena.agent
+        title = arena.env_id.removeprefix("viapoint/") + (f", {arm.name}" if arm.file else "")
+        decides = "no agent" if agent is None else f"agent: {type(agent).__name__}"
+        gui.add_html(NOTE.format(f"<b>{html.escape(title)}</b><br>{decides}"))
+        self._message = gui.add_html("")
+        self._execute = self._button("Execute", "execute", color="green", icon="player-play")
+        with gui.add_folder("Scene"):
+            kinds = gui.add_button_group("", (*scenes, RESET))
+            kinds.on_click(lambda event: act("go_to", event.target.value))
+        with gui.add_folder("Decision"):
+            self._build_decision()
+        with gui.add_folder("Obstacles"):
+            self._selected, self._sizes = gui.add_html(""), {}
+            for name, (*_, least, most) in SIZES.items():
+                label = f"{name.capitalize()} [m]"
+                self._sizes[name] = gui.add_slider(label, least, most, 0.001, least, visible=False)
+                _on_slide(self._sizes[name], functools.partial(act, "resize", name))
+            shapes = gui.add_button_group("Add", tuple(arena.new_shapes()))
+            shapes.on_click(lambda event: act("add", event.target.value))
+            self._remove = self._button("Remove the selected one", "remove", disabled=True)
+        hint = "Rings turn the selected obstacle, or the tool at the goal"
+        turn = gui.add_checkbox("Turn", False, hint=hint)
+        turn.on_update(lambda event: act("show", "turning", event.target.value))
+        with gui.add_folder("Files", expand_by_default=False):
+            self._button("Save scene (JSON)", "save")
+            upload = gui.add_upload_button("Load scene (JSON)", mime_type="application/json")
+            upload.on_upload(lambda event: act("load", event.target.value.content))
+            self._button("Copy as Python", "show_code")
+            self._button("Save picture (PNG)", "save_picture")
+        drag = "Drag start, goal, via-point and obstacles with the mouse."
+        gui.add_html(NOTE.format(drag + ("" if arena.planar else " Hold Shift to move them up and down.")))
+
+    def _build_decision(self) -> None:
+        gui, act, arena, action = self._gui, self._act, self._arena, self._arena.task.action
+        anew: dict[str, Any] = {"by_hand": None, "duration": None, "n_via": None}
+        low, high = action.duration_range if arena.task.space.of_hand else (0.3, 12.0)
+        self._duration = gui.add_slider("Duration [s]", low, high, 0.01, (low * high) ** 0.5)
+        _on_slide(self._duration, lambda value: act("change", duration=value))
+        methods = gui.add_dropdown("Method", arena.methods, hint="Decides after each change of the scene")
+        methods.on_update(lambda event: act("change", method=event.target.value, **anew))
+        most = action.n_via if arena.task.replanning else max(3, action.n_via)
+        self._vias = gui.add_slider("Via-points", 0, most, 1, action.n_via, disabled=most == action.n_via)
+        _on_slide(self._vias, lambda value: act("change", n_via=value, by_hand=None))
+        if hasattr(arena.policy, "checks"):
+            hint = "Proposals whose clearance is computed"
+            checks = gui.add_dropdown("Exact checks", tuple(CHECKS), hint=hint)
+            checks.on_update(lambda event: act("change", checks=CHECKS[event.target.value]))
+        gui.add_button("Decide anew").on_click(lambda _: act("change", **anew))
+
+    def _button(self, label: str, name: str, **kwargs: Any) -> Any:
+        """Add a button that calls what is done under a name."""
+        button = self._gui.add_button(label, **kwargs)
+        button.on_click(lambda _: self._act(name))
+        return button
+
+
+def _on_slide(slider: Any, function: Callable[[Any], None]) -> None:
+    """Call a function with the values that a user gives a slider; a number that is typed may lie outside."""
+
+    def call(event: Any) -> None:
+        if event.client is not None:  # otherwise the page itself has set it
+            function(min(max(slider.value, slider.min), slider.max))
+
+    slider.on_update(call)
+
+
+def _table(names: Iterable[str], rows: Iterable[Iterable[Any]], note: str) -> str:
+    """Return an HTML table with a note below it."""
+    table = pd.DataFrame(rows, columns=list(names))
+    number = "{:.2f}".format
+    text = table.to_html(index=False, border=0, na_rep="-", float_format=number, classes="viapoint")
+    return f"{TABLE}{text}{NOTE.format(note)}"
+
+
+def _millimetres(length: float) -> str:
+    if length < -1.0:
+        return "out of reach"
+    return "far" if length >= 0.999 else f"{1e3 * length:.0f}"

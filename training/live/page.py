@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import dataclasses
 import functools
@@ -12,10 +13,9 @@ import threading
 import time
 import traceback
 import warnings
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,27 +27,24 @@ from viapoint.envs.common.arrays import Float
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.checks import DEFAULT_ENV, SHIPPED_IDS
 from viapoint.training.configs import env_of_arm
-from viapoint.training.live.arena import MOST_OBSTACLES, Arena
-from viapoint.training.live.decide import decide, describe_outcome, describe_plan, execute, propose
-from viapoint.training.live.drawing import PLANE, SPACE, ArmDrawing, View
-from viapoint.training.live.panels import RESET, Panels
-from viapoint.training.live.state import Scene, State
+from viapoint.training.live import arena as live
+from viapoint.training.live.drawing import PLANE, RESET, SPACE, ArmDrawing, Panels, View
+from viapoint.training.planning.motion_plan import MotionPlan
 
 LOOPBACK = "127.0.0.1"  # Address that only this machine reaches
-PAUSE = 0.12  # Time without other changes after which proposals and comparisons are computed, [s]
+PAUSE = 0.12  # Time without other changes after which proposals are computed, [s]
 TICK = 0.03  # Time between two pictures of a movement, [s]
 
 
 class Tab:
     """One tab: its state, and the thread in which all that a user does changes it."""
 
-    state: State
-
-    def __init__(self, client: viser.ClientHandle, make: Callable[[], tuple[Arena, ArmDrawing]]) -> None:
+    def __init__(self, client: viser.ClientHandle, make: Callable[[], tuple[live.Arena, ArmDrawing]]) -> None:
         self.client, self._make = client, make
-        self.latencies: deque[float] = deque(maxlen=200)  # from changes to messages with plans, [s]
-        self._jobs: dict[Any, tuple[float, Callable[[], None]]] = {}  # when they are due, [s], and functions
-        self._wake, self._busy, self._closed = threading.Condition(), False, False
+        self.latencies: list[float] = []  # from changes to messages with plans, [s]
+        self._loop = asyncio.new_event_loop()  # its time is in seconds
+        self._jobs: dict[Any, tuple[float, Callable[[], None]]] = {}  # when they are due, and functions
+        self._busy = self._closed = False
         self.act("change")
         self._thread = threading.Thread(target=self._run, name=f"viapoint-{client.client_id}", daemon=True)
         self._thread.start()
@@ -55,70 +52,56 @@ class Tab:
     @property
     def idle(self) -> bool:
         """True if nothing waits to be done and nothing moves."""
-        with self._wake:
-            return not (self._busy or self._jobs)
+        return not (self._busy or self._jobs)
 
     def act(self, name: str, *values: Any, delay: float = 0.0, **changes: Any) -> None:
         """Call a method by its name, such as `drag`, in the thread of the tab, after a delay, [s].
 
         A waiting call of the same kind is replaced, so that a fast drag skips positions instead of lagging behind.
         """
-        kind = name, *(value for value in values if isinstance(value, str)), *changes
-        job = functools.partial(getattr(self, name), *values, **changes)
-        with self._wake:
-            self._jobs[kind] = time.perf_counter() + delay, job
-            self._wake.notify()
+        if not self._closed:
+            kind = name, *(value for value in values if isinstance(value, str)), *changes
+            due = self._loop.time() + delay
+            self._jobs[kind] = due, functools.partial(getattr(self, name), *values, **changes)
+            self._loop.call_soon_threadsafe(self._loop.call_at, due, self._do, kind, due)
 
     def close(self, timeout: float = 0.0) -> None:
         """End the thread after what is being done, and wait for it, [s]."""
-        with self._wake:
+        if not self._closed:
             self._closed = True
-            self._wake.notify()
+            self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(timeout)
 
     # The thread
 
     def _run(self) -> None:
         self.arena, drawing = self._make()
-        try:
-            self._scenes = self.arena.scenes()
-            self.client.gui.set_panel_label("Viapoint")
-            self._panels = Panels(self.client, self.arena, self._scenes, self.act)
-            self._speed = 0.5 if self.arena.planar else 1.0  # movements in the plane are short
-            self._view = View(self.client, self.arena, drawing, self.act)
-            scene = next(self._scenes["Random"])
-            self.state = State(scene=scene, drawn=scene, method=self.arena.methods[0])
-            while not self._closed:
-                self._do_next()
-        except Exception:
-            if not self._closed:
-                traceback.print_exc()
-        finally:
-            self.arena.close()
+        self._scenes = self.arena.scenes()
+        self.client.gui.set_panel_label("Viapoint")
+        self._panels = Panels(self.client, self.arena, self._scenes, self.act)
+        self._view = View(self.client, self.arena, drawing, self.act)
+        scene = next(self._scenes["Random"])
+        self.state = live.State(scene=scene, drawn=scene, method=self.arena.methods[0])
+        self._loop.run_forever()
+        self._loop.close()
+        self.arena.close()
 
-    def _do_next(self) -> None:
-        """Wait for the job that is due first, and do it; an error is told in one sentence."""
-        with self._wake:
-            kind = min(self._jobs, key=lambda each: self._jobs[each][0], default=None)
-            patience = None if kind is None else self._jobs[kind][0] - time.perf_counter()
-            if patience is None or patience > 0.0:
-                self._busy = False
-                if not self._closed:
-                    self._wake.wait(patience)
-                return
-            self._busy = True
-            self._due, job = self._jobs.pop(kind)  # when it was due, [s]
+    def _do(self, kind: Any, due: float) -> None:
+        """Do a job, unless it has been replaced or cancelled; an error is told in one sentence."""
+        if self._closed or self._jobs.get(kind, (None,))[0] != due:
+            return
+        self._busy, self._due = True, due
+        _, job = self._jobs.pop(kind)
         try:
             job()
         except Exception as error:
-            if self._closed:
-                return
             sentence = " ".join(str(error).split())
             if not isinstance(error, ValueError | OSError):
                 traceback.print_exc()
                 sentence = f"{type(error).__name__}: {sentence}"
             self.state.playing = False
             self._say(f"{sentence[:1].upper()}{sentence[1:].rstrip('.')}.", good=False)
+        self._busy = False
 
     def _say(self, message: str, good: bool) -> None:
         self.state.message, self.state.good = message, good
@@ -137,12 +120,11 @@ class Tab:
         state.before = state.plan
         if "scene" in changes:
             state.results = ()
-        proposal = decide(self.arena, state)
-        state.proposals, state.picked = (proposal,), 0
+        state.proposals = (live.decide(self.arena, state),)
         self.state = state
-        self._say(describe_plan(proposal, state.duration), proposal.motion.success)
+        self.pick(0, before=state.before)
         self.client.flush()
-        self.latencies.append(time.perf_counter() - self._due)
+        self.latencies.append(self._loop.time() - self._due)
         self.act("propose", delay=PAUSE)
 
     def propose(self) -> None:
@@ -150,20 +132,19 @@ class Tab:
         if self.state.playing:
             self.act("propose", delay=PAUSE)
             return
-        self.state.proposals = propose(self.arena, self.state)
+        self.state.proposals = live.propose(self.arena, self.state)
         self.pick(0)
 
-    def pick(self, index: int) -> None:
-        """Show one of the proposals as the plan."""
+    def pick(self, index: int, before: MotionPlan | None = None) -> None:
+        """Show one of the proposals as the plan, and the plan before the last change, if there is one."""
         state = self.state
         if index < len(state.proposals):
-            state.picked = index
+            state.picked, state.before = index, before
             state.movement = None
             state.playing = False
-            state.before = None
             proposal = state.proposals[index]
             wanted = None if index else state.duration  # the others have durations of their own
-            self._say(describe_plan(proposal, wanted), proposal.motion.success)
+            self._say(live.describe_plan(proposal, wanted), proposal.motion.success)
 
     # Scenes
 
@@ -175,7 +156,7 @@ class Tab:
         """Go to the scene of a JSON file; an impossible one is refused."""
         self._take(self.arena.read(content))
 
-    def _take(self, scene: Scene) -> None:
+    def _take(self, scene: live.Scene) -> None:
         self.change(scene=scene, drawn=scene, by_hand=None, duration=None, selected=None)
 
     def drag(self, kind: str, number: int, place: Float) -> None:
@@ -184,31 +165,35 @@ class Tab:
         if kind == "start":
             start = arena.moved(scene.start, place, scene.obstacles)
             self.change(scene=scene._replace(start=start), by_hand=None)
-        elif kind == "goal" and state.playing and arena.task.replanning:  # the running movement follows it
-            goal = arena.moved(scene.goal, place)
-            if not arena.task.space.inside(goal):
-                raise ValueError("the goal would be out of the arm's reach")
-            state.scene = scene.with_goal(goal)
         elif kind == "goal":
             goal = arena.moved(scene.goal, place, scene.obstacles)
-            self.change(scene=scene.with_goal(goal), by_hand=None)
+            if not (state.playing and arena.task.replanning):
+                self.change(scene=scene._replace(goal=goal, jumps=()), by_hand=None)
+            elif arena.task.space.inside(goal):  # the running movement follows it
+                state.scene = scene._replace(goal=goal, jumps=())
+            else:
+                raise ValueError("the goal would be out of the arm's reach")
         elif kind == "obstacle" and number < len(scene.obstacles):
-            shape = dataclasses.replace(scene.obstacles[number], position=place)
-            self.change(scene=scene.with_obstacle(number, shape), selected=number)
+            self._alter(number, position=place)
         elif kind == "via" and state.plan is not None and number < len(state.plan.durations) - 1:
             vias = state.plan.waypoints[1:-1].copy()
             vias[number] = arena.moved(vias[number], place)
             self.change(by_hand=vias)
 
+    def _alter(self, row: int, **changes: Any) -> None:
+        """Change an obstacle, and select it."""
+        scene = self.state.scene
+        shape = dataclasses.replace(scene.obstacles[row], **changes)
+        self.change(scene=scene.with_obstacle(row, shape), selected=row)
+
     def turn(self, quaternion: Float) -> None:
         """Turn the selected obstacle, or the tool at the goal."""
-        scene, arena, row = self.state.scene, self.arena, self.state.selected
-        if row is None:
+        scene, arena = self.state.scene, self.arena
+        if self.state.selected is None:
             goal = arena.moved(scene.goal, arena.tool(scene.goal), scene.obstacles, quaternion)
-            self.change(scene=scene.with_goal(goal), by_hand=None)
+            self.change(scene=scene._replace(goal=goal, jumps=()), by_hand=None)
         else:
-            shape = dataclasses.replace(scene.obstacles[row], quaternion=quaternion)
-            self.change(scene=scene.with_obstacle(row, shape))
+            self._alter(self.state.selected, quaternion=quaternion)
 
     def show(self, name: str, value: Any) -> None:
         """Select an obstacle, unless it has been removed meanwhile, or show the rings that turn it or the goal."""
@@ -226,8 +211,8 @@ class Tab:
         """Add an obstacle."""
         scene = self.state.scene
         row = len(scene.obstacles)
-        if row >= MOST_OBSTACLES:
-            raise ValueError(f"a scene has at most {MOST_OBSTACLES} obstacles")
+        if row >= live.MOST_OBSTACLES:
+            raise ValueError(f"a scene has at most {live.MOST_OBSTACLES} obstacles")
         self.change(scene=scene.with_obstacle(row, self.arena.new_obstacle(scene, kind)), selected=row)
 
     def remove(self) -> None:
@@ -239,52 +224,48 @@ class Tab:
 
     def execute(self) -> None:
         """Begin to play the simulated movement, or stop it."""
-        state = self.state
-        state.playing = not state.playing
-        if state.playing:
-            self._movements = execute(self.arena, state)
-            state.movement = None
-            self.advance()
-        else:
-            self._draw()
+        self.state.playing = not self.state.playing
+        self._instants = self._play()
+        self._draw()
+        self.advance()
 
     def advance(self) -> None:
-        """Show the present instant of a movement; its next part is simulated when this one has been shown."""
-        state, movement = self.state, self.state.movement
-        if not state.playing:
-            return
-        if movement is None or state.instant == len(movement.rollout.time) - 1:
-            following = next(self._movements, None)
-            if following is None:
-                assert movement is not None
-                state.playing = False
-                text = describe_outcome(movement.info, in_joints=not self.arena.task.space.of_hand)
-                self._say(text, text.startswith("Success"))
-                return
-            if movement is None or len(following.rollout.time) < len(movement.rollout.time):  # a new episode
-                state.instant, self._began = 0, time.monotonic()
-            state.movement = movement = following
-        times = movement.rollout.time
-        now = int(np.searchsorted(times, (time.monotonic() - self._began) * self._speed))
-        state.instant = min(max(now, state.instant + 1), len(times) - 1)
-        self._draw()
-        self.act("advance", delay=TICK)
+        """Show the present instant of a movement, and then the next one."""
+        if self.state.playing:
+            next(self._instants, None)
+            self.act("advance", delay=TICK)
 
-    def compare(self, done: tuple[Any, ...] = ()) -> None:
-        """Compare the methods in the present scene, one after the other in pauses; some are done."""
-        state, methods = self.state, self.arena.methods
-        if state.playing:
-            self.act("compare", done, delay=PAUSE)
-            return
-        if done and done is not state.results:  # the scene has changed
-            return
-        trial = State(scene=state.scene, drawn=state.drawn, method=methods[len(done)], checks=state.checks)
-        trial.proposals = (decide(self.arena, trial, time_limit=1.0),)
-        *_, movement = execute(self.arena, trial)
-        state.results = (*done, (trial.method, trial.proposals[0].seconds, movement))
-        self._draw()
-        if len(state.results) < len(methods):
-            self.act("compare", state.results, delay=PAUSE)
+    def _play(self) -> Iterator[None]:
+        """Show instants of a movement; its next part is simulated when this one has been shown."""
+        state = self.state
+        state.movement = None
+        speed = 0.5 if self.arena.planar else 1.0  # movements in the plane are short
+        for movement in live.execute(self.arena, state):
+            times = movement.rollout.time
+            if state.movement is None or len(times) < len(state.movement.rollout.time):  # a new episode
+                state.instant, began = 0, time.monotonic()
+            state.movement = movement
+            while state.instant < len(times) - 1:
+                now = int(np.searchsorted(times, (time.monotonic() - began) * speed))
+                state.instant = min(max(now, state.instant + 1), len(times) - 1)
+                self._draw()
+                yield
+        state.playing = False
+        text = live.describe_outcome(movement.info, in_joints=not self.arena.task.space.of_hand)
+        self._say(text, text.startswith("Success"))
+
+    def compare(self) -> None:
+        """Compare the methods in the present scene, until the user does something else."""
+        state = self.state
+        state.playing, state.results = False, ()
+        for method in self.arena.methods:
+            trial = live.State(scene=state.scene, drawn=state.drawn, method=method, checks=state.checks)
+            trial.proposals = (live.decide(self.arena, trial, time_limit=1.0),)
+            *_, movement = live.execute(self.arena, trial)
+            state.results = (*state.results, (method, trial.proposals[0].seconds, movement))
+            self._draw()
+            if self._jobs.keys() - {("advance",), ("propose",)}:
+                break
 
     # Files
 
@@ -305,7 +286,7 @@ class Tab:
         self.client.send_file_download("viapoint.png", file.getvalue(), save_immediately=True)
 
 
-class LivePage:
+class LivePage(contextlib.AbstractContextManager["LivePage", None]):
     """Page in the browser on which scenes are changed by hand and the movement is planned anew.
 
     Args:
@@ -355,7 +336,7 @@ class LivePage:
         arena, _ = self._make()
         drawn = next(arena.scenes()["Random"])
         for method in arena.methods[:2]:  # a first decision takes longer than others
-            decide(arena, State(scene=drawn, drawn=drawn, method=method))
+            live.decide(arena, live.State(scene=drawn, drawn=drawn, method=method))
         arena.close()
         self._tabs: dict[int, Tab] = {}
         # A tab may be closed while its thread still draws.
@@ -393,16 +374,13 @@ class LivePage:
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _make(self) -> tuple[Arena, ArmDrawing]:
-        arena = Arena(*self._made)
+    def _make(self) -> tuple[live.Arena, ArmDrawing]:
+        arena = live.Arena(*self._made)
         file = self._model_file or arena.task.arm.file or None
-        return arena, ArmDrawing(arena.task.arm, arena.env("own").model, file)
+        return arena, ArmDrawing(arena.task.arm, file)
 
     def _connect(self, client: viser.ClientHandle) -> None:
         self._tabs[client.client_id] = Tab(client, self._make)
@@ -416,10 +394,8 @@ class LivePage:
 def run(config: Any) -> None:
     """Serve the live page until Ctrl-C; see :class:`LivePage`."""
     torch.set_num_threads(1)  # decisions are small, and the page has threads of its own
-    given = {**config.env_kwargs, "env": config.env, "port": config.port, "seed": config.seed}
-    if config.arm is not None:
-        given["arm"] = config.arm
-    with LivePage(config.agent, **given) as page:
+    given = {"arm": config.arm, **config.env_kwargs, "env": config.env}
+    with LivePage(config.agent, port=config.port, seed=config.seed, **given) as page:
         print(f"live page: {page.url} (Ctrl-C ends it)", flush=True)
         page.wait()
 

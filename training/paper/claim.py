@@ -52,13 +52,10 @@ class Claim:
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values for JSON; open ends of a range are null."""
-        names = ("row", "claim", "figure", "paper", "unit")
-        record: dict[str, Any] = {name: getattr(self, name) for name in names}
-        for name, number in (("model", self.model), ("arm", self.arm)):
-            value = expected = None
-            if number is not None:
-                value = float(number[0])
-                expected = [float(end) if np.isfinite(end) else None for end in number[1]]
-            record[name], record[f"{name}_expected"] = value, expected
+        record = {name: getattr(self, name) for name in ("row", "claim", "figure", "paper", "unit")}
+        for name in ("model", "arm"):
+            value, ends = getattr(self, name) or (None, ())
+            record[name] = None if value is None else float(value)
+            record[f"{name}_expected"] = [float(end) if np.isfinite(end) else None for end in ends] or None
         record["deviation_mm"] = None if self.deviation is None else float(self.deviation)
         return {**record, "verdict": self.verdict}

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
+from scipy.optimize import bisect
 from sympy import Poly
 from sympy.abc import tau as tau1
 
@@ -161,11 +162,11 @@ def valley_claims() -> list[Claim]:
 
 
 def _threshold_claim(along: float, exact: str, expected: float, tolerance: float) -> Claim:
-    def arm_has_valley(height: float) -> bool:
+    def arm_valleys(height: float) -> int:
         (profile,) = movements.arm_profiles(simulate(curved(*ENDS, along, -height)))
-        return bool(np.isfinite(profile.valley[0]))
+        return int(np.isfinite(profile.valley[0]))
 
-    arm = _first_height(arm_has_valley, halvings=12)
+    arm = _first_height(arm_valleys, precision=5e-5)
     return Claim(
         5, f"Not every curved movement has a valley: for d1/(d1+d2) = {along} only if d3/(d1+d2) exceeds", "1B",
         f"two peaks and a valley{exact}", (valley_threshold(along), near(expected, tolerance)),
@@ -175,16 +176,12 @@ def _threshold_claim(along: float, exact: str, expected: float, tolerance: float
 
 def valley_threshold(along: float) -> float:
     """Return the least d3 / (d1 + d2) for which the model's speed has a valley."""
-    return _first_height(lambda d3: speed_valleys(curved(*ENDS, along, -d3)).time.size > 0, halvings=30)
+    return _first_height(lambda d3: speed_valleys(curved(*ENDS, along, -d3)).time.size, precision=1e-9)
 
 
-def _first_height(holds: Callable[[float], bool], halvings: int) -> float:
-    """Return the d3 / (d1 + d2) from which a condition holds, by bisection; it holds at .5, not at .2."""
-    low, high = 0.2, 0.5
-    for _ in range(halvings):
-        middle = (low + high) / 2.0
-        low, high = (low, middle) if holds(middle) else (middle, high)
-    return (low + high) / 2.0
+def _first_height(valleys: Callable[[float], int], precision: float) -> float:
+    """Return the d3 / (d1 + d2) from which movements have valleys; they have some at .5, and none at .2."""
+    return float(bisect(lambda height: valleys(height) - 0.5, 0.2, 0.5, xtol=precision))
 
 
 def place_claims() -> list[Claim]:
