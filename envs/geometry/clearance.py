@@ -206,16 +206,25 @@ def obstacle_clearance(
     return least
 
 
-@inner
+@inlined
 def nearest_spheres(
     spheres: Spheres, placed: Placed, pair: int, least: float, floor: float
 ) -> tuple[float, int, int]:
     """Return the clearance of a pair of groups, at most `least`, [m], and the spheres that have it, -1 for none."""
     first, second = spheres.pairs[pair, 0], spheres.pairs[pair, 1]
-    nearest, partner = -1, -1
+    # Most pairs are apart, which takes less time to see than a call.
     sizes = spheres.ball_radius[first] + spheres.ball_radius[second]
     if _are_apart(placed.ball, first, placed.ball, second, sizes + least):
-        return least, nearest, partner
+        return least, -1, -1
+    return _nearest_spheres(spheres, placed, first, second, least, floor)
+
+
+@inner
+def _nearest_spheres(
+    spheres: Spheres, placed: Placed, first: int, second: int, least: float, floor: float
+) -> tuple[float, int, int]:
+    """Return the same for two groups whose bounding balls are near."""
+    nearest, partner = -1, -1
     place_group(spheres, first, placed)
     place_group(spheres, second, placed)
     # Groups that are divided leave out most pairs of parts.
