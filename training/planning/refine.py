@@ -186,7 +186,7 @@ def _pull(
         work.pull[j] += sign * way
 
 
-@inner
+@inlined
 def _add_obstacles(
     setting: Setting, obstacles: Obstacles, scene: int, time: float, wanted: float, work: _Work
 ) -> tuple[float, float]:
@@ -229,7 +229,7 @@ def _add_obstacles(
     return total, nearest
 
 
-@inner
+@inlined
 def _add_own(setting: Setting, wanted: float, work: _Work) -> tuple[float, float]:
     """Add the residuals of the placed arm from itself; return their sum of squares, and the least clearance."""
     spheres, placed, total, nearest = setting.spheres, work.placed, 0.0, wanted
@@ -252,7 +252,7 @@ def _add_own(setting: Setting, wanted: float, work: _Work) -> tuple[float, float
     return total, nearest
 
 
-@inner
+@inlined
 def _add_ranges(setting: Setting, reached: bool, work: _Work) -> tuple[float, float]:
     """Add what is missing to the margin from the joint limits; return the sum of squares, and the least distance."""
     total, nearest, joints, limits = 0.0, RANGE_MARGIN, work.joints, setting.joint_range
