@@ -299,7 +299,7 @@ def jerk_cost(table: MovementTable, times: int, gram: Float) -> float:
     return cost
 
 
-@inner
+@inlined
 def position_at(movement: Movement, instant: int, out: Float) -> None:
     """Fill in the position of a movement at an instant, shape (D,)."""
     basis, offsets = movement.table.basis, movement.offsets
@@ -310,7 +310,7 @@ def position_at(movement: Movement, instant: int, out: Float) -> None:
         out[d] = value
 
 
-@inner
+@inlined
 def joints_at(setting: Setting, movement: Movement, instant: int, position: Float, joints: Float) -> bool:
     """Fill in position, shape (D,), and joints, shape (J,), at an instant; return True within reach and ranges."""
     position_at(movement, instant, position)

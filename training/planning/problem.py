@@ -132,10 +132,6 @@ def movement_of(moves: Moves, b: int, h: int) -> Movement:
     return Movement(moves.table, moves.times[b, h], moves.start[b], moves.offsets[b, h], moves.duration[b, h])
 
 
-# A call takes longer than the few products of an instant.
-_joints_at = inlined(joints_at.py_func)  # type: ignore[attr-defined]
-
-
 @inner
 def place_at(
     setting: Setting,
@@ -148,7 +144,7 @@ def place_at(
     placed: Placed,
 ) -> bool:
     """Place the arm at an instant of a plan, and return True within reach and joint ranges."""
-    if not _joints_at(setting, movement_of(moves, b, h), instant, position, joints):
+    if not joints_at(setting, movement_of(moves, b, h), instant, position, joints):
         return False
     if setting.hand_alone:
         place_hand(position, placed)
