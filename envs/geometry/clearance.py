@@ -85,7 +85,7 @@ def bounds_memory(chain: Chain, spheres: Spheres, between: bool) -> Bounds:
     )
 
 
-@inner
+@inlined
 def place(chain: Chain, spheres: Spheres, joints: Float, placed: Placed) -> None:
     """Place links and bounding balls for joint positions of shape (J,)."""
     link_frames(chain, joints, placed.rotation, placed.origin)
