@@ -29,10 +29,8 @@ around either end, roots are sought on every scale of time, and Newton steps use
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -41,13 +39,15 @@ from ._polynomial import add, differentiate, evaluate, multiply, root_candidates
 from .array_api import FREE, Array, Floats, Namespace, like, ordered_sum, to_numpy
 from .trajectory import connect
 
-Number: TypeAlias = Any  # A float, or an array with one entry per movement; both give the same bits
+Number: TypeAlias = Any  # A NumPy scalar, or an array with one entry per movement; both give the same bits
 
 # Least fraction of a via-point apart from its neighbour; a higher power of it must not underflow
 SHORTEST = 1e-40
 
 # Newton steps; the start is within 34 % of the root everywhere, and after five the error is 2e-16 (measured).
 _STEPS = 5
+# Least divisor, where numerators are 0 as well.
+_TINY = np.finfo(np.float64).tiny
 # Distance of the via-point from an end, relative to the movement's extent, that clips the gradient.
 _FLOOR = 1e-5
 
@@ -75,26 +75,6 @@ _CONVERGED_STEP = 1e-9
 _OVERLAP = 0.75
 
 
-class Functions(NamedTuple):
-    """Elementary functions of arrays or of floats."""
-
-    where: Callable[[Any, Any, Any], Any]
-    sqrt: Callable[[Any], Any]
-    cube_root: Callable[[Any], Any]
-    minimum: Callable[[Any, Any], Any]
-    maximum: Callable[[Any, Any], Any]
-
-
-_ARRAYS = Functions(np.where, np.sqrt, np.cbrt, np.minimum, np.maximum)
-_FLOATS = Functions(
-    lambda condition, yes, no: yes if condition else no,
-    math.sqrt,
-    lambda x: float(np.cbrt(x)),  # not math.cbrt, which may round differently from NumPy's loops over arrays
-    min,
-    max,
-)
-
-
 def fractions_at_rest(points: Any) -> Any:
     """Return the fractions (N, 2) of the duration around the via-points of points (N, 3, D) of a size of about 1.
 
@@ -109,30 +89,28 @@ def fractions_at_rest(points: Any) -> Any:
     a = ordered_sum(near * whole)
     b = ordered_sum(whole * whole)
     c = np.minimum(first, second)
-    # A batch of one would spend its time in the overhead of array operations: Python floats give the same bits.
-    arguments = (a, b, c) if len(points) > 1 else (a.item(), b.item(), c.item(), _FLOATS)
-    t = nearer_fraction(*arguments)
+    # A batch of one would spend its time in the overhead of arrays: scalars give the same bits.
+    t = nearer_fraction(a, b, c) if len(points) > 1 else nearer_fraction(a[0], b[0], c[0])
     t = np.maximum(t, SHORTEST * near.any(axis=0))
     fractions = np.empty((len(points), 2))
     fractions[:, 0], fractions[:, 1] = np.where(is_late, (1.0 - t, t), (t, 1.0 - t))
     return fractions
 
 
-def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = _ARRAYS) -> Number:
+def nearer_fraction(a: Number, b: Number, c: Number) -> Number:
     """Return the root of F (Eq. 1) in [0, 1/2], for E from the nearer end, so that a <= b / 2.
 
     Newton steps from the root of c = 4 a z + 10 b z^2, z = t^3, which are the lowest terms of F for small t.
     The term 8 c brings the start to 1/2 for distant via-points.
     """
-    total = f.sqrt(4.0 * a * a + 5.0 * b * c) + 2.0 * abs(a)
+    total = np.sqrt(4.0 * a * a + 5.0 * b * c) + 2.0 * abs(a)
     # The form of the quadratic formula without cancellation, for either sign of a.
-    top = f.where(a >= 0, c, total)
-    bottom = f.where(a >= 0, 2.0 * total, 10.0 * b) + 8.0 * top
-    t = f.cube_root(top / f.where(bottom > 0, bottom, 1.0))
-    t = f.minimum(f.maximum(t, 0.0), 0.5)
+    top = np.where(a >= 0, c, total)[()]
+    bottom = np.where(a >= 0, 2.0 * total, 10.0 * b)[()] + 8.0 * top
+    t = np.minimum(np.cbrt(top / np.maximum(bottom, _TINY)), 0.5)
     for _ in range(_STEPS):
         value, slope, _ = _residual(t, a, b, c)
-        t = f.minimum(f.maximum(t - value / f.where(slope < 0, slope, -1.0), 0.5 * t), 0.5)
+        t = np.minimum(np.maximum(t - value / np.minimum(slope, -_TINY), 0.5 * t), 0.5)
     return t
 
 
