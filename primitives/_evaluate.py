@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ._hermite_tables import derivative_factors
-from .array_api import Array, Namespace, constant
+from .array_api import Array, Namespace, like
 
 # Size of the basis of one block of trajectories, which stays in a core's second-level cache.
 _BLOCK_BYTES = 1_200_000
@@ -100,7 +100,7 @@ def _current_segment(time: Array, starts: Array, xp: Namespace) -> Array:
     return reached[..., :-1, :] & ~reached[..., 1:, :]
 
 
-def derivative_coefficients(coefficients: Array, rates: Array, nu: int) -> Array:
+def derivative_coefficients(xp: Namespace, coefficients: Array, rates: Array, nu: int) -> Array:
     """Return the coefficients (..., 2m - nu, S, D) of the nu-th derivative in seconds, in unit time.
 
     Beyond the degree it is the constant zero, (..., 1, S, D).
@@ -111,7 +111,7 @@ def derivative_coefficients(coefficients: Array, rates: Array, nu: int) -> Array
         return 0.0 * coefficients[..., :1, :, :]
     table = derivative_factors(coefficients.shape[-3] // 2, nu)
     scale: Array = math.prod([rates] * (nu - 1), start=rates)
-    factors = constant(table, coefficients.dtype, coefficients.device) * scale[..., None, :]
+    factors = like(xp, table, coefficients) * scale[..., None, :]
     return coefficients[..., nu:, :, :] * factors[..., None]
 
 
@@ -132,7 +132,7 @@ def evaluate(
     powers, segments, dimension = coefficients.shape[-3:]
     weights = []
     for nu in orders:
-        weight = derivative_coefficients(coefficients, rates, nu)
+        weight = derivative_coefficients(xp, coefficients, rates, nu)
         weights.append(weight.reshape(*weight.shape[:-3], (powers - nu) * segments, dimension))
     degree = max(1, powers - 1 - min(orders))
     if xp is not np:

@@ -24,7 +24,7 @@ import numpy as np
 
 from ._hermite_tables import coefficient_table, energy_table, stiffness_table
 from ._weighted_solver import rounding_slack, weighted_coefficients
-from .array_api import FREE, Array, Namespace, broadcast_to, constant, is_given, like, to_numpy, unit_factors
+from .array_api import FREE, Array, Namespace, broadcast_to, is_given, like, to_numpy, unit_factors
 
 Entry: TypeAlias = Any  # An array or a Python float
 
@@ -203,7 +203,7 @@ def _weighted_coefficients(
 
 def _costs(order: int, coefficients: Array, lengths: Any) -> Any:
     """Return (N,) the costs of movements with durations (N, S)."""
-    table = np.array(energy_table(order, order))
+    table = energy_table(order, order)
     modes = np.einsum("ik,nksd->nisd", table, to_numpy(coefficients)[:, order:])
     return ((modes * modes).sum(axis=(1, 3)) / lengths ** (2 * order - 1)).sum(axis=-1)
 
@@ -234,7 +234,7 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
     data = xp.concat(first + last, axis=-2)
     batch = data.shape[:-2]
     data = xp.reshape(data, (*batch, 2 * order, segments * data.shape[-1]))
-    coefficients = xp.matmul(constant(coefficient_table(order), data.dtype, data.device), data)
+    coefficients = xp.matmul(like(xp, coefficient_table(order), data), data)
     return xp.reshape(coefficients, (*batch, 2 * order, segments, rest.shape[-1]))
 
 

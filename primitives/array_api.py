@@ -13,7 +13,6 @@ import operator
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import lru_cache
 from typing import Any, Final, Literal, TypeAlias, TypeGuard
 
 import numpy as np
@@ -293,18 +292,6 @@ def unit_factors(xp: Namespace, array: Array) -> Array:
     limit = largest_exponent(xp, array.dtype)
     exponent = np.clip(np.frexp(np.abs(to_numpy(array)).max(axis=-1, keepdims=True))[1], -limit, limit)
     return like(xp, np.ldexp(1.0, -exponent), array)
-
-
-@lru_cache(maxsize=512)
-def constant(table: tuple[tuple[float, ...], ...], dtype: Any, device: Any) -> Array:
-    """Return a constant matrix in the library, dtype and device of an array with this dtype and device."""
-    if isinstance(dtype, np.dtype):
-        return np.array(table, dtype=dtype)
-    import array_api_compat.torch
-
-    torch: Any = array_api_compat.torch
-    with torch.inference_mode(False):  # an inference tensor in the cache could not serve a gradient later
-        return torch.tensor(table, dtype=dtype, device=device)
 
 
 def error_state(xp: Namespace) -> AbstractContextManager[Any]:

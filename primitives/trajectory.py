@@ -20,9 +20,9 @@ from .array_api import (
     broadcast_batch,
     broadcast_to,
     check_buffers,
-    constant,
     error_state,
     leading_shape,
+    like,
     namespace_of,
     require,
     to_numpy,
@@ -248,9 +248,7 @@ class Trajectory:
         xp = self.namespace
         upper = self.coefficients[..., nu:, :, :]
         flat = xp.reshape(upper, (*upper.shape[:-2], upper.shape[-2] * upper.shape[-1]))
-        modes = xp.reshape(
-            xp.matmul(constant(energy_table(self.order, nu), flat.dtype, flat.device), flat), upper.shape
-        )
+        modes = xp.reshape(xp.matmul(like(xp, energy_table(self.order, nu), flat), flat), upper.shape)
         scale = self.durations if nu == 0 else math.prod([self.rates] * (2 * nu - 1))
         return xp.sum(xp.sum(xp.sum(modes * modes, axis=-1), axis=-2) * scale, axis=-1)
 
@@ -276,7 +274,7 @@ class Trajectory:
         """Return the coefficients of the nu-th derivative, or raise ValueError if it overflows."""
         xp, (nu,) = self.namespace, whole_orders((nu,))
         with error_state(xp):
-            coefficients = derivative_coefficients(self.coefficients, self.rates, nu)
+            coefficients = derivative_coefficients(xp, self.coefficients, self.rates, nu)
         if not xp.isfinite(coefficients).all():
             durations = to_numpy(self.durations)
             shortest = durations[durations > 0].min()
