@@ -59,20 +59,15 @@ def _numpy_basis(time: Any, starts: Any, rates: Any, degree: int) -> Any:
     else:
         current[...] = np.moveaxis(_current_segment(time, starts, np), -2, 0)
         # A product with a single 1 among zeros picks start and rate of the current segment exactly.
-        chosen = _first_inside(current)
+        chosen = np.moveaxis(current, 0, -2)
         factor = time - np.matmul(starts[..., None, :], chosen)[..., 0, :]
         factor *= np.matmul(rates[..., None, :], chosen)[..., 0, :]
         np.multiply(factor, current, out=local)
     for k in range(2, len(basis)):
         np.multiply(basis[k - 1], factor, out=basis[k])
-    rows = _first_inside(basis.reshape(len(basis) * len(current), *current.shape[1:]))
+    rows = np.moveaxis(basis.reshape(len(basis) * len(current), *current.shape[1:]), 0, -2)
     # At one to three times some products depend on the memory layout: copy to the layout of a batch of one.
     return rows if rows.shape[-1] >= _FEW else np.ascontiguousarray(rows)
-
-
-def _first_inside(array: Any) -> Any:
-    """Return a view of (rows, ..., T) as (..., rows, T)."""
-    return array.transpose(*range(1, array.ndim - 1), 0, -1)
 
 
 def _current_segment(time: Array, starts: Array, xp: Namespace) -> Array:

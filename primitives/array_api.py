@@ -267,11 +267,6 @@ def to_numpy(array: Array) -> np.ndarray[Any, Any]:
     return np.asarray(array)
 
 
-def follows_gradient(*arrays: Array) -> bool:
-    """Return True if torch records a gradient for any of the arrays."""
-    return any(getattr(array, "requires_grad", False) for array in arrays)
-
-
 def like(xp: Namespace, values: np.ndarray[Any, Any], other: Array) -> Array:
     """Convert `values` to the library, dtype and device of `other`."""
     if xp is np:

@@ -74,26 +74,6 @@ class Trajectory:
         """Return the constructor call for copy and pickle, so that copies are read-only too."""
         return type(self), tuple(getattr(self, field.name) for field in fields(self))
 
-    @classmethod
-    def from_segments(
-        cls, coefficients: Array, durations: Array, xp: Namespace, *, some_empty: bool = False
-    ) -> Trajectory:
-        """Return a trajectory of joined segments; with `some_empty`, durations may be 0 between equal points."""
-        order = coefficients.shape[-3] // 2
-        if durations.shape[-1] == 1 and not some_empty:
-            return cls(coefficients, durations, order, 0.0 * durations, 1.0 / durations, durations)
-        ends = xp.cumulative_sum(durations, axis=-1)
-        end = ends[..., -1:]
-        starts = xp.concat([0.0 * end, ends[..., :-1]], axis=-1)
-        if some_empty:
-            empty = durations <= 0
-            # An empty segment at the end must not become current at the last instant: start it later.
-            starts = xp.where(starts >= end, 2 * end, starts)
-            rates = xp.where(empty, 0.0, 1.0 / xp.where(empty, 1.0, durations))
-        else:
-            rates = 1.0 / durations
-        return cls(coefficients, durations, order, starts, rates, end)
-
     @property
     def namespace(self) -> Namespace:
         """Array API functions of the arrays."""
@@ -231,7 +211,7 @@ class Trajectory:
 
     def cost(self) -> Array:
         """Return (...,) the cost 1/2 integral of |x^(order)|^2 [m^2 / s^(2 order - 1)], in closed form."""
-        return 0.5 * self._energy(self.order)
+        return 0.5 * self.energy(self.order)
 
     def energy(self, nu: int) -> Array:
         """Return (...,) the integral of |x^(nu)|^2 [m^2 / s^(2 nu - 1)], in closed form as a sum of squares.
@@ -242,9 +222,6 @@ class Trajectory:
         (nu,) = whole_orders((nu,))
         if nu >= 2 * self.order:
             raise ValueError(f"nu must lie in 0 ... {2 * self.order - 1}, got {nu}")
-        return self._energy(nu)
-
-    def _energy(self, nu: int) -> Array:
         xp = self.namespace
         upper = self.coefficients[..., nu:, :, :]
         flat = xp.reshape(upper, (*upper.shape[:-2], upper.shape[-2] * upper.shape[-1]))
@@ -350,8 +327,19 @@ def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, state
     The arguments are those of `least_cost_coefficients`; durations may be 0 between equal waypoints.
     """
     durations = 1.0 * durations  # a copy of its own
-    some_empty = bool((durations <= 0).any())
+    empty = durations <= 0
+    some_empty = bool(empty.any())
     if some_empty:
         durations = broadcast_to(xp, durations, (*waypoints.shape[:-2], durations.shape[-1]))
     coefficients = least_cost_coefficients(xp, order, waypoints, durations, states)
-    return Trajectory.from_segments(coefficients, durations, xp, some_empty=some_empty)
+    if durations.shape[-1] == 1 and not some_empty:
+        return Trajectory(coefficients, durations, order, 0.0 * durations, 1.0 / durations, durations)
+    ends = xp.cumulative_sum(durations, axis=-1)
+    end = ends[..., -1:]
+    starts = xp.concat([0.0 * end, ends[..., :-1]], axis=-1)
+    if not some_empty:
+        return Trajectory(coefficients, durations, order, starts, 1.0 / durations, end)
+    # An empty segment at the end must not become current at the last instant: start it later.
+    starts = xp.where(starts >= end, 2 * end, starts)
+    rates = xp.where(empty, 0.0, 1.0 / xp.where(empty, 1.0, durations))
+    return Trajectory(coefficients, durations, order, starts, rates, end)
