@@ -33,9 +33,10 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from ._boundary import chosen_items
-from ._polynomial import add, differentiate, evaluate, multiply, root_candidates
+from ._polynomial import differentiate, evaluate, multiply, root_candidates
 from .array_api import FREE, Array, Floats, Namespace, like, ordered_sum, to_numpy
 from .trajectory import connect
 
@@ -182,18 +183,17 @@ class _Expansion:
     def weights(self) -> tuple[Floats, Floats]:
         """Return the coefficients of p (1 - u) g - q u g + u (1 - u) g' and of 2 u (1 - u) g, as in Eq. 3."""
         p, q = self.powers
-        both = np.array([0.0, 1.0, -1.0])  # u (1 - u)
-        weight = np.convolve(np.array([float(p), float(-p - q)]), self.factor)
-        return add(weight, np.convolve(both, differentiate(self.factor))), 2.0 * np.convolve(
-            both, self.factor
-        )
+        factor = Polynomial(self.factor)
+        both = Polynomial([0.0, 1.0, -1.0])  # u (1 - u)
+        weight = Polynomial([float(p), float(-p - q)]) * factor + both * factor.deriv()
+        return weight.coef, 2.0 * (both * factor).coef
 
     def stationary(self) -> Floats:
         """Return the coefficients of F (Eq. 3), (N, degree + 1)."""
         weight, both = self.weights()
         square = ordered_sum(multiply(self.miss, self.miss), 1)
         change = ordered_sum(multiply(self.miss, differentiate(self.miss)), 1)
-        return add(multiply(square, weight), -multiply(change, both))
+        return multiply(square, weight) - multiply(change, both)
 
     def excess(self, u: Floats) -> Floats:
         """Return J - J0 (Eq. 2) at the candidates (N, n), infinite at the ends.
@@ -300,7 +300,7 @@ def _expand(points: Floats, ends: list[Any], slack: Floats, *, from_goal: bool) 
     states = [ends[:2], ends[2:]]
     if from_goal:
         powers = (q, 5)
-        g = np.polynomial.Polynomial(g)(np.polynomial.Polynomial([1.0, -1.0])).coef
+        g = Polynomial(g)(Polynomial([1.0, -1.0])).coef
         first, last = last, first
         states = [[-v if isinstance(v, np.ndarray) else v, a] for v, a in reversed(states)]
     free = connect(np, 3, np.stack([first, last], axis=1), np.ones(1), states)

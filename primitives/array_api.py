@@ -12,7 +12,6 @@ import math
 import operator
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Final, Literal, TypeAlias, TypeGuard
 
 import numpy as np
@@ -287,8 +286,3 @@ def unit_factors(xp: Namespace, array: Array) -> Array:
     limit = largest_exponent(xp, array.dtype)
     exponent = np.clip(np.frexp(np.abs(to_numpy(array)).max(axis=-1, keepdims=True))[1], -limit, limit)
     return like(xp, np.ldexp(1.0, -exponent), array)
-
-
-def error_state(xp: Namespace) -> AbstractContextManager[Any]:
-    """Return a context without NumPy's warnings, for branches that divide by zero and are masked afterwards."""
-    return np.errstate(all="ignore") if xp is np else nullcontext()

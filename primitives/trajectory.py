@@ -20,7 +20,6 @@ from .array_api import (
     broadcast_batch,
     broadcast_to,
     check_buffers,
-    error_state,
     leading_shape,
     like,
     namespace_of,
@@ -250,7 +249,7 @@ class Trajectory:
     def _finite_derivative(self, nu: int) -> Array:
         """Return the coefficients of the nu-th derivative, or raise ValueError if it overflows."""
         xp, (nu,) = self.namespace, whole_orders((nu,))
-        with error_state(xp):
+        with np.errstate(all="ignore"):
             coefficients = derivative_coefficients(xp, self.coefficients, self.rates, nu)
         if not xp.isfinite(coefficients).all():
             durations = to_numpy(self.durations)
@@ -277,7 +276,7 @@ class Trajectory:
             require(allowed, "duration", broadcast_to(xp, duration, batch), "must be positive")
         end = duration[..., None] + 0.0 * self.end  # the leading shape of the durations
         factor = end / xp.where(self.end > 0, self.end, 1.0)
-        with error_state(xp):
+        with np.errstate(all="ignore"):
             runs = (self.rates > 0) & (factor > 0)
             rates = xp.where(runs, self.rates / xp.where(factor > 0, factor, 1.0), 0.0 * factor)
         coefficients = broadcast_to(xp, self.coefficients, (*batch, *self.coefficients.shape[-3:]))
