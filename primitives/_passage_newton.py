@@ -193,22 +193,19 @@ def _log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, 
     1 1^T, which makes the Hessian regular, changes no step.
     """
     size, count = z.shape
-    upper, lower = (_DIFFERENCE, 0.0) if size <= _MOST_SEGMENTS else (_WIDE_DIFFERENCE, -_WIDE_DIFFERENCE)
     columns = [z]
-    for shift in (upper, lower):
-        for i in range(size - 1 if shift else 0):
-            moved = z.copy()
-            moved[i] += shift
-            columns.append(moved)
+    for i in range(size - 1):
+        moved = z.copy()
+        moved[i] += _DIFFERENCE
+        columns.append(moved)
     h = _softmax(np.concatenate(columns, axis=1))
-    items = np.tile(np.arange(count), len(columns))
+    items = np.tile(np.arange(count), size)
     j, first = cost.chosen(items).derivatives(h)
     scale = 1.0 / (j + reference[items])
-    gradients = (scale * (first - h * ordered_sum(first))).reshape(size, len(columns), count)
-    gradient, above = gradients[:, 0], gradients[:, 1:size]
-    below = gradients[:, size:] if lower else gradient[:, None]
+    gradients = (scale * (first - h * ordered_sum(first))).reshape(size, size, count)
+    gradient = gradients[:, 0]
     hessian = np.empty((size, size, count))
-    hessian[:-1] = ((above - below) / (upper - lower)).swapaxes(0, 1)
+    hessian[:-1] = ((gradients[:, 1:] - gradient[:, None]) / _DIFFERENCE).swapaxes(0, 1)
     hessian[-1] = -ordered_sum(hessian[:-1])
     value: Floats = np.log(j[:count] + reference)
     return value, gradient, 0.5 * (hessian + hessian.swapaxes(0, 1)) + 1.0
