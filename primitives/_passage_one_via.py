@@ -134,34 +134,25 @@ def attach_root_gradient(fractions: Array, waypoints: Array, xp: Namespace) -> A
     The gradient grows without bound, like |E|^(-2/3), as the via-point approaches an end. It is clipped there,
     and stays finite when all points coincide.
     """
-    rates, is_late = _root_rates(
-        to_numpy(waypoints).astype(np.float64), to_numpy(fractions).astype(np.float64)
-    )
+    numbers = to_numpy(fractions).astype(np.float64)
+    is_late = numbers[..., 1] < numbers[..., 0]
     whole = waypoints[..., 2, :] - waypoints[..., 0, :]
     near = waypoints[..., 1:, :] - waypoints[..., :-1, :]
     near = (near * like(xp, np.stack([~is_late, is_late], axis=-1)[..., None], near)).sum(-2)
-    by_a, by_b, by_c = (like(xp, rate, near)[..., None] for rate in rates)
+    e, d = (np.moveaxis(to_numpy(part), -1, 0) for part in (near, whole))
+    a = ordered_sum(e * d)
+    b = ordered_sum(d * d)
+    c = ordered_sum(e * e)
+    _, slope, (s, q, w) = _residual(numbers.min(axis=-1), a, b, c)
+    extent = b + c
+    floor = _FLOOR ** (5.0 / 3.0) * extent + (extent <= 0)  # |dF/dt| falls like |E|^(5/3)
+    sign = np.where(is_late, -1.0, 1.0) / np.maximum(-slope, floor)
+    # The derivatives of the first fraction by a, b and c
+    by_a, by_b, by_c = (like(xp, sign * rate, near)[..., None] for rate in (w - q * s, -q * w, s))
     # Only the gradient of by_a a + by_b b + by_c c counts: its value is subtracted again.
     change = (near * (by_a * whole + by_c * near) + by_b * (whole * whole)).sum(-1)
     change = change - change.detach()
     return fractions + xp.stack([change, -change], axis=-1)
-
-
-def _root_rates(points: Any, fractions: Any) -> tuple[tuple[Any, Any, Any], Any]:
-    """Return d(first fraction) / d(a, b, c), each (...,), and True where the via-point is nearer to the goal."""
-    start, via, goal = (np.moveaxis(points[..., k, :], -1, 0) for k in range(3))
-    is_late = fractions[..., 1] < fractions[..., 0]
-    t = fractions.min(axis=-1)
-    near = np.where(is_late, goal - via, via - start)
-    whole = goal - start
-    a = ordered_sum(near * whole)
-    b = ordered_sum(whole * whole)
-    c = ordered_sum(near * near)
-    _, slope, (s, q, w) = _residual(t, a, b, c)
-    extent = b + c
-    floor = _FLOOR ** (5.0 / 3.0) * extent + (extent <= 0)  # |dF/dt| falls like |E|^(5/3)
-    sign = np.where(is_late, -1.0, 1.0) / np.maximum(-slope, floor)
-    return (sign * (w - q * s), -sign * q * w, sign * s), is_late
 
 
 @dataclass(frozen=True)
@@ -183,8 +174,8 @@ class _Expansion:
     def weights(self) -> tuple[Floats, Floats]:
         """Return the coefficients of p (1 - u) g - q u g + u (1 - u) g' and of 2 u (1 - u) g, as in Eq. 3."""
         p, q = self.powers
-        factor = Polynomial(self.factor)
-        both = Polynomial([0.0, 1.0, -1.0])  # u (1 - u)
+        factor: Any = Polynomial(self.factor)
+        both: Any = Polynomial([0.0, 1.0, -1.0])  # u (1 - u)
         weight = Polynomial([float(p), float(-p - q)]) * factor + both * factor.deriv()
         return weight.coef, 2.0 * (both * factor).coef
 

@@ -222,11 +222,9 @@ def _unit_sized(trajectory: Trajectory) -> Trajectory:
     xp, t = trajectory.namespace, trajectory
     if 0 in t.batch_shape:
         return t
-    size = unit_factors(xp, xp.reshape(t.coefficients, (*t.batch_shape, -1)))[..., None, None]
-    pace = unit_factors(xp, t.end)
-    return Trajectory(
-        t.coefficients * size, t.durations * pace, t.order, t.starts * pace, t.rates / pace, t.end * pace
-    )
+    size = unit_factors(xp, xp.reshape(t.coefficients, (*t.batch_shape, -1)))[..., 0]
+    pace = unit_factors(xp, t.end)[..., 0]
+    return t.transformed(scale=size).stretched(t.duration * pace)
 
 
 def _arc_length(trajectory: Trajectory, cutoff: float, threshold: float, padding: int) -> Array:
