@@ -16,6 +16,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from .array_api import Floats
+
 Table: TypeAlias = tuple[tuple[float, ...], ...]
 Exact: TypeAlias = list[list[Fraction]]
 
@@ -23,9 +25,9 @@ ORDERS = (2, 3, 4)
 
 
 @cache
-def coefficient_table(order: int) -> Table:
+def coefficient_table(order: int) -> Floats:
     """Return the matrix that maps s of Eq. 1 to the coefficients of 1, u, ..., u^(2m-1)."""
-    return _floats(_coefficients(order))
+    return np.array(_coefficients(order), dtype=float)
 
 
 @cache
@@ -65,24 +67,23 @@ def stiffness_table(order: int) -> Table:
 
 
 @cache
-def energy_table(order: int, nu: int) -> Table:
+def energy_table(order: int, nu: int) -> Floats:
     """Return L with |L c|^2 = integral over [0, 1] of the squared nu-th derivative, c the coefficients of u^nu, ...
 
     Its rows are the components along the orthonormal shifted Legendre polynomials, so that a cost is a sum of
     squares, without cancellation.
     """
-    moments = _moments(order, nu)
-    norms = [sqrt((2 * i + 1) * row[i] ** 2) for i, row in enumerate(moments)]
-    return tuple(
-        tuple(norm * float(value / row[i]) for value in row)
-        for i, (norm, row) in enumerate(zip(norms, moments, strict=True))
-    )
+    table = []
+    for i, row in enumerate(_moments(order, nu)):
+        norm = sqrt((2 * i + 1) * row[i] ** 2)
+        table.append([norm * float(value / row[i]) for value in row])
+    return np.array(table)
 
 
 @cache
-def derivative_factors(order: int, nu: int) -> Table:
+def derivative_factors(order: int, nu: int) -> Floats:
     """Return the column of factors k! / (k - nu)! of the nu-th derivative of u^k, k = nu ... 2m-1."""
-    return tuple((float(perm(k, nu)),) for k in range(nu, 2 * order))
+    return np.array([[float(perm(k, nu))] for k in range(nu, 2 * order)])
 
 
 def _coefficients(order: int) -> Exact:

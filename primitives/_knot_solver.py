@@ -24,7 +24,7 @@ import numpy as np
 
 from ._hermite_tables import coefficient_table, energy_table, stiffness_table
 from ._weighted_solver import rounding_slack, weighted_coefficients
-from .array_api import FREE, Array, Namespace, broadcast_to, constant, is_given, like, to_numpy, unit_factors
+from .array_api import FREE, Array, Namespace, broadcast_to, is_given, like, to_numpy, unit_factors
 
 Entry: TypeAlias = Any  # An array or a Python float
 
@@ -130,18 +130,14 @@ def least_cost_coefficients(
     positive = np.where(empty, numbers.max(axis=-1, keepdims=True), numbers)
     kinds = np.column_stack([empty, _is_extreme(positive, eps)])
 
-    def index(rows: Any) -> Any:
-        return rows if xp is np else xp.asarray(rows, device=waypoints.device)
-
     parts, members = [], []
     for kind in np.unique(kinds, axis=0):  # movements with the same empty segments are solved together
         where = np.flatnonzero((kinds == kind).all(axis=1))
-        rows = index(where)
-        chosen = [[value[rows] if is_given(value) else value for value in state] for state in flat_states]
-        group = (flat_points[rows], flat_durations[rows], chosen)
+        chosen = [[value[where] if is_given(value) else value for value in state] for state in flat_states]
+        group = (flat_points[where], flat_durations[where], chosen)
         parts.append(_connect_kind(xp, order, *group, kind[:-1], bool(kind[-1])))
         members.append(where)
-    joined = xp.concat(parts, axis=0)[index(np.argsort(np.concatenate(members)))]
+    joined = xp.concat(parts, axis=0)[np.argsort(np.concatenate(members))]
     return xp.reshape(joined, (*batch, *joined.shape[1:]))
 
 
@@ -203,7 +199,7 @@ def _weighted_coefficients(
 
 def _costs(order: int, coefficients: Array, lengths: Any) -> Any:
     """Return (N,) the costs of movements with durations (N, S)."""
-    table = np.array(energy_table(order, order))
+    table = energy_table(order, order)
     modes = np.einsum("ik,nksd->nisd", table, to_numpy(coefficients)[:, order:])
     return ((modes * modes).sum(axis=(1, 3)) / lengths ** (2 * order - 1)).sum(axis=-1)
 
@@ -226,7 +222,7 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
         knots = []
         for state in states:
             value = rest if state[i] is None else state[i]
-            knots.append(value if value.shape == rest.shape else xp.broadcast_to(value, rest.shape))
+            knots.append(broadcast_to(xp, value, rest.shape))
         derivative = xp.stack(knots, axis=-2)
         first.append(power * derivative[..., :-1, :])
         last.append(power * derivative[..., 1:, :])
@@ -234,7 +230,7 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
     data = xp.concat(first + last, axis=-2)
     batch = data.shape[:-2]
     data = xp.reshape(data, (*batch, 2 * order, segments * data.shape[-1]))
-    coefficients = xp.matmul(constant(coefficient_table(order), data.dtype, data.device), data)
+    coefficients = xp.matmul(like(xp, coefficient_table(order), data), data)
     return xp.reshape(coefficients, (*batch, 2 * order, segments, rest.shape[-1]))
 
 

@@ -52,8 +52,9 @@ _CONVERGED_STEP = 1e-8
 _SMALL_GAIN, _LARGE_STEP = 1e-8, 1e-2
 # Distance from a lower bound of the logarithm of the cost that is close enough.
 _REACHED = 1e-6
-_ITERATIONS = 80
-_HALVINGS = 12
+# Part of a step below which it is not shortened any more.
+_LEAST_LENGTH = 2e-5
+_ITERATIONS = 160
 
 
 @dataclass(frozen=True)
@@ -62,13 +63,12 @@ class PassageCost:
 
     Attributes:
         steps: (S, D, N) differences of the waypoints.
-        start, goal: velocity and acceleration in unit time: (D, N), None for zero, FREE (goal only).
+        ends: velocity and acceleration at start and goal in unit time: (D, N), None for zero, FREE (goal only).
         slack: (N,) tolerance of the waypoints, see `_weighted_solver`.
     """
 
     steps: Floats
-    start: list[Any]
-    goal: list[Any]
+    ends: list[Any]
     slack: Floats
 
     @classmethod
@@ -76,27 +76,24 @@ class PassageCost:
         """Return the cost of movements through points (N, S + 1, D) with four boundary values (N, D)."""
         rows = [np.ascontiguousarray(v.T) if isinstance(v, np.ndarray) else v for v in ends]
         steps = np.ascontiguousarray(np.diff(points, axis=1).transpose(1, 2, 0))
-        return cls(steps, rows[:2], rows[2:], slack)
+        return cls(steps, rows, slack)
 
     def chosen(self, items: Any) -> PassageCost:
         """Return the movements `items`, in that order."""
-        start, goal = (
-            [value[:, items] if isinstance(value, np.ndarray) else value for value in end]
-            for end in (self.start, self.goal)
-        )
-        return PassageCost(self.steps[..., items], start, goal, self.slack[items])
+        ends = [value[:, items] if isinstance(value, np.ndarray) else value for value in self.ends]
+        return PassageCost(self.steps[..., items], ends, self.slack[items])
 
     def reference(self) -> Floats:
         """Return (N,) a cost far below that of any real movement of this size, to keep logarithms finite."""
         total = ordered_sum(ordered_sum(self.steps * self.steps, -2))
-        for value in (*self.start, *self.goal):
+        for value in self.ends:
             if isinstance(value, np.ndarray):
                 total = total + ordered_sum(value * value)
         return 1e-3 * np.where(total > 0, total, 1.0)
 
     def derivatives(self, h: Floats) -> tuple[Floats, Floats]:
         """Return J (N,) and h dJ/dh (S, N) at durations h (S, N)."""
-        states = [self.start, *([FREE, FREE] for _ in range(len(h) - 1)), self.goal]
+        states = [self.ends[:2], *([FREE, FREE] for _ in range(len(h) - 1)), self.ends[2:]]
         solved, fitted = fit_modes(np, 3, h, self.steps, states, self.slack)
         weights = mode_weights(3, h, self.slack)
         # The weights are inverse durations, but that of the step, which the slack bounds.
@@ -196,22 +193,19 @@ def _log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, 
     1 1^T, which makes the Hessian regular, changes no step.
     """
     size, count = z.shape
-    upper, lower = (_DIFFERENCE, 0.0) if size <= _MOST_SEGMENTS else (_WIDE_DIFFERENCE, -_WIDE_DIFFERENCE)
     columns = [z]
-    for shift in (upper, lower):
-        for i in range(size - 1 if shift else 0):
-            moved = z.copy()
-            moved[i] += shift
-            columns.append(moved)
+    for i in range(size - 1):
+        moved = z.copy()
+        moved[i] += _DIFFERENCE
+        columns.append(moved)
     h = _softmax(np.concatenate(columns, axis=1))
-    items = np.tile(np.arange(count), len(columns))
+    items = np.tile(np.arange(count), size)
     j, first = cost.chosen(items).derivatives(h)
     scale = 1.0 / (j + reference[items])
-    gradients = (scale * (first - h * ordered_sum(first))).reshape(size, len(columns), count)
-    gradient, above = gradients[:, 0], gradients[:, 1:size]
-    below = gradients[:, size:] if lower else gradient[:, None]
+    gradients = (scale * (first - h * ordered_sum(first))).reshape(size, size, count)
+    gradient = gradients[:, 0]
     hessian = np.empty((size, size, count))
-    hessian[:-1] = ((above - below) / (upper - lower)).swapaxes(0, 1)
+    hessian[:-1] = ((gradients[:, 1:] - gradient[:, None]) / _DIFFERENCE).swapaxes(0, 1)
     hessian[-1] = -ordered_sum(hessian[:-1])
     value: Floats = np.log(j[:count] + reference)
     return value, gradient, 0.5 * (hessian + hessian.swapaxes(0, 1)) + 1.0
@@ -225,81 +219,44 @@ def _softmax(z: Floats) -> Floats:
 
 
 def _minimise(cost: PassageCost, start: Floats) -> tuple[Floats, Floats, Any]:
-    """Return local minima of log(J + reference) from durations (S, N): z (S, N), value and convergence (N,)."""
+    """Return local minima of log(J + reference) from durations (S, N): z (S, N), value and convergence (N,).
+
+    A step is accepted by the Armijo condition (Nocedal & Wright 2006, Eq. 3.4), up to rounding, and else shortened.
+    """
     z, reference = np.log(start), cost.reference()
-    active = np.arange(z.shape[1])
-    value, gradient, hessian = _log_cost(cost, z, reference)
-    converged = np.zeros(z.shape[1], dtype=bool)
-    result = value.copy()
+    value, step, gain = _newton_step(cost, z, reference)
+    length = np.ones_like(value)
+    converged = np.zeros(len(value), dtype=bool)
+    active = np.arange(len(value))
     for _ in range(_ITERATIONS):
-        step = _descent_step(gradient, hessian)
-        size = np.abs(step).max(axis=0)
-        gain = -ordered_sum(gradient * step)
+        size = np.abs(step[:, active]).max(axis=0)
         last = size < _CONVERGED_STEP
-        z[:, active[last]] += step[:, last]
+        z[:, active[last]] += step[:, active[last]]
         # Where waypoints are equal within their tolerance the cost is flat: no step counts.
-        done = last | ((gain < _SMALL_GAIN) & (size > _LARGE_STEP))
-        converged[active[done]] = True
-        active = active[~done]
-        step = step[:, ~done]
-        gain = gain[~done]
+        flat = (gain[active] < _SMALL_GAIN) & ((size > _LARGE_STEP) | (length[active] < _LEAST_LENGTH))
+        converged[active[last | flat]] = True
+        active = active[~(last | flat) & (length[active] >= _LEAST_LENGTH)]
         if not active.size:
             break
-        state = value[~done], gradient[:, ~done], hessian[..., ~done]
-        moved, value, gradient, hessian = _search(
-            cost.chosen(active), reference[active], z[:, active], step, *state
-        )
-        stays = (moved == z[:, active]).all(axis=0)
-        z[:, active], result[active] = moved, value
-        converged[active[stays & (gain < _SMALL_GAIN)]] = True
-        active, value = active[~stays], value[~stays]
-        gradient, hessian = gradient[:, ~stays], hessian[..., ~stays]
-    return z, result, converged
+        trial = z[:, active] + length[active] * step[:, active]
+        found = _newton_step(cost.chosen(active), trial, reference[active])
+        falls = found[0] <= value[active] - 1e-4 * length[active] * gain[active] + _NOISE
+        length[active] = np.where(falls, 1.0, 0.4 * length[active])
+        for kept, new in zip((z, value, step, gain), (trial, *found), strict=True):
+            kept[..., active[falls]] = new[..., falls]
+    return z, value, converged
 
 
-def _search(
-    cost: PassageCost,
-    reference: Floats,
-    z: Floats,
-    step: Floats,
-    value: Floats,
-    gradient: Floats,
-    hessian: Floats,
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return z after a backtracking line search, with value, gradient and Hessian there.
+def _newton_step(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return log(J + reference) (N,), the modified Newton step (S, N) -H^-1 g and the gain (N,) it promises.
 
-    A step is accepted by the Armijo condition (Nocedal & Wright 2006, Eq. 3.4), up to rounding. A problem
-    whose value cannot fall any more stays where it is.
+    The step is shortened so that no component is longer than 1.5.
     """
-    slope = ordered_sum(gradient * step)
-    origin, first = z, value
-    z = z.copy()
-    value = value.copy()
-    gradient = gradient.copy()
-    hessian = hessian.copy()
-    waiting = np.arange(z.shape[1])
-    length = 1.0
-    for _ in range(_HALVINGS):
-        trial = origin[:, waiting] + length * step[:, waiting]
-        found = _log_cost(cost.chosen(waiting), trial, reference[waiting])
-        falls = found[0] <= first[waiting] + 1e-4 * length * slope[waiting] + _NOISE
-        accepted = waiting[falls]
-        z[:, accepted] = trial[:, falls]
-        for kept, new in zip((value, gradient, hessian), found, strict=True):
-            kept[..., accepted] = new[..., falls]
-        waiting = waiting[~falls]
-        if not waiting.size:
-            break
-        length *= 0.4
-    return z, value, gradient, hessian
-
-
-def _descent_step(gradient: Floats, hessian: Floats) -> Floats:
-    """Return the modified Newton step -H^-1 g, shortened so that no component is longer than 1.5."""
+    value, gradient, hessian = _log_cost(cost, z, reference)
     step = -_solve_positive(hessian, gradient[:, None])[:, 0]
     longest = np.abs(step).max(axis=0)
-    shortened: Floats = step * (_LONGEST_STEP / np.maximum(longest, _LONGEST_STEP))
-    return shortened
+    step = step * (_LONGEST_STEP / np.maximum(longest, _LONGEST_STEP))
+    return value, step, -ordered_sum(gradient * step)
 
 
 def _solve_positive(matrix: Floats, right: Floats) -> Floats:
@@ -347,17 +304,13 @@ def attach_gradient(
     # Chain rule of h_i = exp(z_i) / sum_j exp(z_j): dJ/dz_i = h_i (dJ/dh_i - sum_j h_j dJ/dh_j).
     first = safe * duration_gradient(movement.coefficients, movement.rates)
     gradient = first - safe * first.sum(-1)[..., None]
+    # The inverse Hessian of the log-cost, divided by the cost.
     h = np.ascontiguousarray(to_numpy(safe).reshape(-1, segments).T)
-    inverse = np.moveaxis(_inverse_hessian(cost, h), -1, 0).reshape(*safe.shape, segments)
+    value, _, hessian = _log_cost(cost, np.log(h), cost.reference())
+    identity = np.repeat(np.eye(segments)[:, :, None], h.shape[1], axis=2)
+    inverse = np.clip(_solve_positive(hessian, identity), -_LARGEST, _LARGEST) / np.exp(value)
+    inverse = np.moveaxis(inverse, -1, 0).reshape(*safe.shape, segments)
     step = -xp.matmul(like(xp, inverse, fractions), gradient[..., None])[..., 0]  # Eq. 1
     step = step - (safe * step).sum(-1)[..., None]
     step = xp.where(whole, fractions * step, xp.zeros_like(step))
     return fractions + (step - step.detach())
-
-
-def _inverse_hessian(cost: PassageCost, h: Floats) -> Floats:
-    """Return (S, S, N) inverse Hessian of the log-cost with respect to log-durations, divided by the cost."""
-    value, _, hessian = _log_cost(cost, np.log(h), cost.reference())
-    identity = np.repeat(np.eye(len(h))[:, :, None], h.shape[1], axis=2)
-    inverse: Floats = np.clip(_solve_positive(hessian, identity), -_LARGEST, _LARGEST) / np.exp(value)
-    return inverse

@@ -29,25 +29,26 @@ around either end, roots are sought on every scale of time, and Newton steps use
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from ._boundary import chosen_items
-from ._polynomial import add, differentiate, evaluate, multiply, root_candidates
+from ._polynomial import differentiate, evaluate, multiply, root_candidates
 from .array_api import FREE, Array, Floats, Namespace, like, ordered_sum, to_numpy
 from .trajectory import connect
 
-Number: TypeAlias = Any  # A float, or an array with one entry per movement; both give the same bits
+Number: TypeAlias = Any  # A NumPy scalar, or an array with one entry per movement; both give the same bits
 
 # Least fraction of a via-point apart from its neighbour; a higher power of it must not underflow
 SHORTEST = 1e-40
 
 # Newton steps; the start is within 34 % of the root everywhere, and after five the error is 2e-16 (measured).
 _STEPS = 5
+# Least divisor, where numerators are 0 as well.
+_TINY = np.finfo(np.float64).tiny
 # Distance of the via-point from an end, relative to the movement's extent, that clips the gradient.
 _FLOOR = 1e-5
 
@@ -75,26 +76,6 @@ _CONVERGED_STEP = 1e-9
 _OVERLAP = 0.75
 
 
-class Functions(NamedTuple):
-    """Elementary functions of arrays or of floats."""
-
-    where: Callable[[Any, Any, Any], Any]
-    sqrt: Callable[[Any], Any]
-    cube_root: Callable[[Any], Any]
-    minimum: Callable[[Any, Any], Any]
-    maximum: Callable[[Any, Any], Any]
-
-
-_ARRAYS = Functions(np.where, np.sqrt, np.cbrt, np.minimum, np.maximum)
-_FLOATS = Functions(
-    lambda condition, yes, no: yes if condition else no,
-    math.sqrt,
-    lambda x: float(np.cbrt(x)),  # not math.cbrt, which may round differently from NumPy's loops over arrays
-    min,
-    max,
-)
-
-
 def fractions_at_rest(points: Any) -> Any:
     """Return the fractions (N, 2) of the duration around the via-points of points (N, 3, D) of a size of about 1.
 
@@ -109,30 +90,28 @@ def fractions_at_rest(points: Any) -> Any:
     a = ordered_sum(near * whole)
     b = ordered_sum(whole * whole)
     c = np.minimum(first, second)
-    # A batch of one would spend its time in the overhead of array operations: Python floats give the same bits.
-    arguments = (a, b, c) if len(points) > 1 else (a.item(), b.item(), c.item(), _FLOATS)
-    t = nearer_fraction(*arguments)
+    # A batch of one would spend its time in the overhead of arrays: scalars give the same bits.
+    t = nearer_fraction(a, b, c) if len(points) > 1 else nearer_fraction(a[0], b[0], c[0])
     t = np.maximum(t, SHORTEST * near.any(axis=0))
     fractions = np.empty((len(points), 2))
     fractions[:, 0], fractions[:, 1] = np.where(is_late, (1.0 - t, t), (t, 1.0 - t))
     return fractions
 
 
-def nearer_fraction(a: Number, b: Number, c: Number, f: Functions = _ARRAYS) -> Number:
+def nearer_fraction(a: Number, b: Number, c: Number) -> Number:
     """Return the root of F (Eq. 1) in [0, 1/2], for E from the nearer end, so that a <= b / 2.
 
     Newton steps from the root of c = 4 a z + 10 b z^2, z = t^3, which are the lowest terms of F for small t.
     The term 8 c brings the start to 1/2 for distant via-points.
     """
-    total = f.sqrt(4.0 * a * a + 5.0 * b * c) + 2.0 * abs(a)
+    total = np.sqrt(4.0 * a * a + 5.0 * b * c) + 2.0 * abs(a)
     # The form of the quadratic formula without cancellation, for either sign of a.
-    top = f.where(a >= 0, c, total)
-    bottom = f.where(a >= 0, 2.0 * total, 10.0 * b) + 8.0 * top
-    t = f.cube_root(top / f.where(bottom > 0, bottom, 1.0))
-    t = f.minimum(f.maximum(t, 0.0), 0.5)
+    top = np.where(a >= 0, c, total)[()]
+    bottom = np.where(a >= 0, 2.0 * total, 10.0 * b)[()] + 8.0 * top
+    t = np.minimum(np.cbrt(top / np.maximum(bottom, _TINY)), 0.5)
     for _ in range(_STEPS):
         value, slope, _ = _residual(t, a, b, c)
-        t = f.minimum(f.maximum(t - value / f.where(slope < 0, slope, -1.0), 0.5 * t), 0.5)
+        t = np.minimum(np.maximum(t - value / np.minimum(slope, -_TINY), 0.5 * t), 0.5)
     return t
 
 
@@ -155,34 +134,25 @@ def attach_root_gradient(fractions: Array, waypoints: Array, xp: Namespace) -> A
     The gradient grows without bound, like |E|^(-2/3), as the via-point approaches an end. It is clipped there,
     and stays finite when all points coincide.
     """
-    rates, is_late = _root_rates(
-        to_numpy(waypoints).astype(np.float64), to_numpy(fractions).astype(np.float64)
-    )
+    numbers = to_numpy(fractions).astype(np.float64)
+    is_late = numbers[..., 1] < numbers[..., 0]
     whole = waypoints[..., 2, :] - waypoints[..., 0, :]
     near = waypoints[..., 1:, :] - waypoints[..., :-1, :]
     near = (near * like(xp, np.stack([~is_late, is_late], axis=-1)[..., None], near)).sum(-2)
-    by_a, by_b, by_c = (like(xp, rate, near)[..., None] for rate in rates)
+    e, d = (np.moveaxis(to_numpy(part), -1, 0) for part in (near, whole))
+    a = ordered_sum(e * d)
+    b = ordered_sum(d * d)
+    c = ordered_sum(e * e)
+    _, slope, (s, q, w) = _residual(numbers.min(axis=-1), a, b, c)
+    extent = b + c
+    floor = _FLOOR ** (5.0 / 3.0) * extent + (extent <= 0)  # |dF/dt| falls like |E|^(5/3)
+    sign = np.where(is_late, -1.0, 1.0) / np.maximum(-slope, floor)
+    # The derivatives of the first fraction by a, b and c
+    by_a, by_b, by_c = (like(xp, sign * rate, near)[..., None] for rate in (w - q * s, -q * w, s))
     # Only the gradient of by_a a + by_b b + by_c c counts: its value is subtracted again.
     change = (near * (by_a * whole + by_c * near) + by_b * (whole * whole)).sum(-1)
     change = change - change.detach()
     return fractions + xp.stack([change, -change], axis=-1)
-
-
-def _root_rates(points: Any, fractions: Any) -> tuple[tuple[Any, Any, Any], Any]:
-    """Return d(first fraction) / d(a, b, c), each (...,), and True where the via-point is nearer to the goal."""
-    start, via, goal = (np.moveaxis(points[..., k, :], -1, 0) for k in range(3))
-    is_late = fractions[..., 1] < fractions[..., 0]
-    t = fractions.min(axis=-1)
-    near = np.where(is_late, goal - via, via - start)
-    whole = goal - start
-    a = ordered_sum(near * whole)
-    b = ordered_sum(whole * whole)
-    c = ordered_sum(near * near)
-    _, slope, (s, q, w) = _residual(t, a, b, c)
-    extent = b + c
-    floor = _FLOOR ** (5.0 / 3.0) * extent + (extent <= 0)  # |dF/dt| falls like |E|^(5/3)
-    sign = np.where(is_late, -1.0, 1.0) / np.maximum(-slope, floor)
-    return (sign * (w - q * s), -sign * q * w, sign * s), is_late
 
 
 @dataclass(frozen=True)
@@ -204,18 +174,17 @@ class _Expansion:
     def weights(self) -> tuple[Floats, Floats]:
         """Return the coefficients of p (1 - u) g - q u g + u (1 - u) g' and of 2 u (1 - u) g, as in Eq. 3."""
         p, q = self.powers
-        both = np.array([0.0, 1.0, -1.0])  # u (1 - u)
-        weight = np.convolve(np.array([float(p), float(-p - q)]), self.factor)
-        return add(weight, np.convolve(both, differentiate(self.factor))), 2.0 * np.convolve(
-            both, self.factor
-        )
+        factor: Any = Polynomial(self.factor)
+        both: Any = Polynomial([0.0, 1.0, -1.0])  # u (1 - u)
+        weight = Polynomial([float(p), float(-p - q)]) * factor + both * factor.deriv()
+        return weight.coef, 2.0 * (both * factor).coef
 
     def stationary(self) -> Floats:
         """Return the coefficients of F (Eq. 3), (N, degree + 1)."""
         weight, both = self.weights()
         square = ordered_sum(multiply(self.miss, self.miss), 1)
         change = ordered_sum(multiply(self.miss, differentiate(self.miss)), 1)
-        return add(multiply(square, weight), -multiply(change, both))
+        return multiply(square, weight) - multiply(change, both)
 
     def excess(self, u: Floats) -> Floats:
         """Return J - J0 (Eq. 2) at the candidates (N, n), infinite at the ends.
@@ -322,7 +291,7 @@ def _expand(points: Floats, ends: list[Any], slack: Floats, *, from_goal: bool) 
     states = [ends[:2], ends[2:]]
     if from_goal:
         powers = (q, 5)
-        g = np.polynomial.Polynomial(g)(np.polynomial.Polynomial([1.0, -1.0])).coef
+        g = Polynomial(g)(Polynomial([1.0, -1.0])).coef
         first, last = last, first
         states = [[-v if isinstance(v, np.ndarray) else v, a] for v, a in reversed(states)]
     free = connect(np, 3, np.stack([first, last], axis=1), np.ones(1), states)

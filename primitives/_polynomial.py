@@ -1,4 +1,4 @@
-"""Batched polynomials in unit time: sums, products, derivatives, values, all real roots in [0, 1], and extrema.
+"""Batched polynomials in unit time: products, derivatives, values, all real roots in [0, 1], and extrema.
 
 Coefficients are the last axis, lowest power first, in NumPy float64. Each polynomial is computed by itself,
 so results do not depend on the batch. Extrema of trajectories are at roots of a derivative and at ends of segments.
@@ -38,15 +38,6 @@ def differentiate(coefficients: Floats) -> Floats:
     if coefficients.shape[-1] == 1:
         return np.zeros_like(coefficients)
     return coefficients[..., 1:] * np.arange(1.0, coefficients.shape[-1])
-
-
-def add(p: Floats, q: Floats) -> Floats:
-    """Return the coefficients of the sum of polynomials of any degrees."""
-    batch = np.broadcast_shapes(p.shape[:-1], q.shape[:-1])
-    total: Floats = np.zeros((*batch, max(p.shape[-1], q.shape[-1])))
-    total[..., : p.shape[-1]] += p
-    total[..., : q.shape[-1]] += q
-    return total
 
 
 def multiply(p: Floats, q: Floats) -> Floats:

@@ -65,24 +65,8 @@ class _Row:
     residual: Array = None
 
 
-@dataclass(eq=False)
-class _Rotation:
-    """Elimination step, see Eqs. 2 and 3: a scaling of one row by 1 / c, or a rotation of two rows."""
-
-    first: _Row
-    second: _Row | None
-    c: Entry
-    share: Entry = None
-    t: Entry = None
-
-    def undo(self) -> None:
-        """Turn the residuals of the rows after the step into those before it."""
-        if self.second is None:
-            self.first.residual = self.c * self.first.residual
-            return
-        first, second = self.first.residual, self.second.residual
-        self.first.residual = first - self.t * second
-        self.second.residual = self.c * first + self.share * second
+# Elimination step of Eqs. 2 and 3: both rows, c, w / W and t; or a row whose residual is divided by c, and None
+Rotation: TypeAlias = tuple[_Row, _Row | None, Entry, Entry, Entry]
 
 
 def rounding_slack(points: Any, ends: Sequence[Sequence[Any]]) -> Any:
@@ -116,28 +100,27 @@ def fit_modes(
     that of Eq. 4. Returned are the states with every FREE replaced, and r_0 ... r_(m-1) per segment, (D, N) each.
     """
     origins = _origins(xp, lengths, steps, states)
+    unknown: list[list[Column]] = []
+    for k, state in enumerate(states):
+        unknown.append([(k, i) for i, value in enumerate(state) if value is FREE])
     rows: list[list[_Row]] = []
-    pivots: list[tuple[Column, _Row]] = []
+    pivots: dict[Column, _Row] = {}  # In the order of elimination
     remaining: list[_Row] = []
-    rotations: list[_Rotation] = []
-    carried: list[tuple[Column, _Row]] = []
+    rotations: list[Rotation] = []
     for s in range(len(steps)):
         rows.append(_segment_rows(order, s, lengths[s], steps[s], states, origins, slack))
-        active = [row for _, row in carried] + rows[-1]
-        for column, row in carried:
+        active = list(rows[-1])
+        for column in reversed(unknown[s] if s else []):  # what the segments before say of this knot
+            row = pivots.pop(column)
             row.entries[column] = 1.0
-        passed = []
-        for knot in (s, s + 1):
-            for column in [(knot, i) for i in range(order - 1) if states[knot][i] is FREE]:
-                pivot = _eliminate(active, column, rotations)
-                active.remove(pivot)
-                passed.append((column, pivot))
-        carried = [each for each in passed if each[0][0] == s + 1]
-        pivots += [each for each in passed if each[0][0] == s]
+            active.insert(0, row)
+        for column in unknown[s] + unknown[s + 1]:
+            pivots[column] = _eliminate(active, column, rotations)
+            active.remove(pivots[column])
         remaining += active
     solved = [list(state) for state in states]
     values: dict[Column, Array] = {}
-    for column, row in reversed(pivots + carried):
+    for column, row in reversed(pivots.items()):
         value = -row.rest
         for other, entry in row.entries.items():
             value = value - entry * values[other]
@@ -146,8 +129,13 @@ def fit_modes(
         row.residual = 0.0 * row.rest
     for row in remaining:
         row.residual = row.rest
-    for rotation in reversed(rotations):
-        rotation.undo()
+    for upper, lower, c, share, t in reversed(rotations):
+        first = upper.residual
+        if lower is None:
+            upper.residual = c * first
+        else:
+            upper.residual = first - t * lower.residual
+            lower.residual = c * first + share * lower.residual
     return solved, [[row.residual for row in segment] for segment in rows]
 
 
@@ -200,14 +188,14 @@ def _segment_rows(
     return rows
 
 
-def _eliminate(rows: list[_Row], column: Column, rotations: list[_Rotation]) -> _Row:
+def _eliminate(rows: list[_Row], column: Column, rotations: list[Rotation]) -> _Row:
     """Rotate the rows so that only one of them has an entry in the column, and return it, with 1 there (implied)."""
     pivot, *others = [row for row in rows if column in row.entries]
     own = pivot.entries.pop(column)
     pivot.weight = pivot.weight * own * own
     pivot.entries = {key: entry / own for key, entry in pivot.entries.items()}
     pivot.rest = pivot.rest / own
-    rotations.append(_Rotation(pivot, None, own))
+    rotations.append((pivot, None, own, 1.0, 0.0))
     for other in others:
         c = other.entries.pop(column)
         product = other.weight * c
@@ -222,7 +210,7 @@ def _eliminate(rows: list[_Row], column: Column, rotations: list[_Rotation]) -> 
         other.rest = rest - c * pivot.rest
         pivot.rest = share * pivot.rest + t * rest
         other.weight, pivot.weight = other.weight * share, weight
-        rotations.append(_Rotation(pivot, other, c, share, t))
+        rotations.append((pivot, other, c, share, t))
     return pivot
 
 

@@ -12,8 +12,6 @@ import math
 import operator
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from functools import lru_cache
 from typing import Any, Final, Literal, TypeAlias, TypeGuard
 
 import numpy as np
@@ -268,11 +266,6 @@ def to_numpy(array: Array) -> np.ndarray[Any, Any]:
     return np.asarray(array)
 
 
-def follows_gradient(*arrays: Array) -> bool:
-    """Return True if torch records a gradient for any of the arrays."""
-    return any(getattr(array, "requires_grad", False) for array in arrays)
-
-
 def like(xp: Namespace, values: np.ndarray[Any, Any], other: Array) -> Array:
     """Convert `values` to the library, dtype and device of `other`."""
     if xp is np:
@@ -293,20 +286,3 @@ def unit_factors(xp: Namespace, array: Array) -> Array:
     limit = largest_exponent(xp, array.dtype)
     exponent = np.clip(np.frexp(np.abs(to_numpy(array)).max(axis=-1, keepdims=True))[1], -limit, limit)
     return like(xp, np.ldexp(1.0, -exponent), array)
-
-
-@lru_cache(maxsize=512)
-def constant(table: tuple[tuple[float, ...], ...], dtype: Any, device: Any) -> Array:
-    """Return a constant matrix in the library, dtype and device of an array with this dtype and device."""
-    if isinstance(dtype, np.dtype):
-        return np.array(table, dtype=dtype)
-    import array_api_compat.torch
-
-    torch: Any = array_api_compat.torch
-    with torch.inference_mode(False):  # an inference tensor in the cache could not serve a gradient later
-        return torch.tensor(table, dtype=dtype, device=device)
-
-
-def error_state(xp: Namespace) -> AbstractContextManager[Any]:
-    """Return a context without NumPy's warnings, for branches that divide by zero and are masked afterwards."""
-    return np.errstate(all="ignore") if xp is np else nullcontext()

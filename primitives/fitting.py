@@ -14,7 +14,8 @@ import math
 import warnings
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, NamedTuple, TypeAlias
+from operator import itemgetter
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -128,14 +129,8 @@ _Recordings: TypeAlias = tuple[list[tuple[Floats, Floats]], tuple[int, ...], Arr
 """Times (N,) [s] and positions (N, D) [m] of each movement, leading shape of the results, an array of their kind."""
 
 
-class _Fit(NamedTuple):
-    """Fit of one movement."""
-
-    knots: Floats  # Times of start, via-points and goal, shape (K + 2,) [s]
-    points: Floats  # Start, via-points and goal, shape (K + 2, D) [m]
-    r_squared: float
-    noise: float
-    bic: float
+_Fit: TypeAlias = tuple[Floats, Floats, float, float, float]
+"""Fit of one movement: times of start, via-points and goal (K + 2,) [s], the points (K + 2, D) [m], R^2, noise, BIC."""
 
 
 def fit_via_points(
@@ -187,7 +182,7 @@ def fit_via_points(
     for times, positions in movements:
         _warn_of_outliers(positions)
         candidates = [_fit(times, positions, count, free_ends) for count in counts]
-        fits.append(min(candidates, key=lambda fit: fit.bic))
+        fits.append(min(candidates, key=itemgetter(-1)))
     return _record(fits, batch, kind)
 
 
@@ -408,45 +403,39 @@ def _fit(time: Floats, position: Floats, n_via: int, free_ends: bool) -> _Fit:
     count = position.size
     parameters = points.size + n_via + 2 * free_ends
     variance = max(residual / count, _ROUNDING**2) * size**2
-    return _Fit(
-        knots=first + length * knots,
-        points=centre + size * points,
-        r_squared=max(0.0, 1.0 - residual / len(time)),
-        noise=size * math.sqrt(residual / (count - parameters)),
-        bic=count * math.log(variance) + parameters * math.log(count),
-    )
+    r_squared = max(0.0, 1.0 - residual / len(time))
+    noise = size * math.sqrt(residual / (count - parameters))
+    bic = count * math.log(variance) + parameters * math.log(count)
+    return first + length * knots, centre + size * points, r_squared, noise, bic
 
 
 def _record(fits: list[_Fit], batch: tuple[int, ...], kind: Array) -> ViaPointFit:
     """Return the fits in one record with a leading shape, in the library and dtype of an array."""
-    n_via = np.array([len(fit.knots) - 2 for fit in fits])
-    most, dimension = n_via.max(), fits[0].points.shape[-1]
-    via_points = np.full((len(fits), most, dimension), np.nan)
-    passage_times = np.full((len(fits), most), np.nan)
+    times, places, *numbers = zip(*fits, strict=True)
+    n_via = np.array(list(map(len, times))) - 2
     # A goal that is repeated after no time is no via-point for `through`.
-    waypoints = np.stack([fit.points[[-1] * (most + 2)] for fit in fits])
-    durations = np.zeros((len(fits), most + 1))
-    for i, fit in enumerate(fits):
-        count = n_via[i]
-        via_points[i, :count] = fit.points[1:-1]
-        passage_times[i, :count] = fit.knots[1:-1]
-        waypoints[i, : count + 2] = fit.points
-        durations[i, : count + 1] = np.diff(fit.knots)
+    missing = n_via.max() - n_via
+    knots = np.stack([np.pad(own, (0, more), "edge") for own, more in zip(times, missing, strict=True)])
+    waypoints = np.stack(
+        [np.pad(own, ((0, more), (0, 0)), "edge") for own, more in zip(places, missing, strict=True)]
+    )
+    exists = np.arange(n_via.max()) < n_via[:, None]
 
     def shaped(values: Any) -> Array:
         array = np.asarray(values)
         return like(namespace_of(kind), array.reshape((*batch, *array.shape[1:])), kind)
 
+    r_squared, noise, bic = map(shaped, numbers)
     return ViaPointFit(
         n_via=n_via.reshape(batch),
-        via_points=shaped(via_points),
-        passage_times=shaped(passage_times),
+        via_points=shaped(np.where(exists[..., None], waypoints[:, 1:-1], np.nan)),
+        passage_times=shaped(np.where(exists, knots[:, 1:-1], np.nan)),
         start=shaped(waypoints[:, 0]),
         goal=shaped(waypoints[:, -1]),
-        onset=shaped([fit.knots[0] for fit in fits]),
-        end=shaped([fit.knots[-1] for fit in fits]),
-        r_squared=shaped([fit.r_squared for fit in fits]),
-        noise=shaped([fit.noise for fit in fits]),
-        bic=shaped([fit.bic for fit in fits]),
-        trajectory=through(shaped(waypoints), shaped(durations)),
+        onset=shaped(knots[:, 0]),
+        end=shaped(knots[:, -1]),
+        r_squared=r_squared,
+        noise=noise,
+        bic=bic,
+        trajectory=through(shaped(waypoints), shaped(np.diff(knots))),
     )

@@ -19,7 +19,6 @@ from .array_api import (
     Boundary,
     broadcast_batch,
     broadcast_to,
-    follows_gradient,
     is_given,
     like,
     ordered_sum,
@@ -97,7 +96,8 @@ def passage_durations(
     if eps > _LEAST_FRACTION:
         numbers[numbers < _LEAST_FRACTION] = 0.0
     numbers = numbers.reshape(*batch, waypoints.shape[-2] - 1)
-    if xp is np or not follows_gradient(waypoints, duration, *ends.values()):
+    recorded = any(getattr(value, "requires_grad", False) for value in (waypoints, duration, *ends.values()))
+    if not recorded:
         return like(xp, numbers, waypoints) * duration[..., None]
     cost = PassageCost.from_points(points, unit_ends, rounding_slack(points, (unit_ends[:2], unit_ends[2:])))
     given = [

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ._polynomial import differentiate, multiply, root_candidates, unit_size
-from .array_api import Array, Namespace, as_number, error_state, is_whole, like, to_numpy, unit_factors
+from .array_api import Array, Namespace, as_number, is_whole, like, to_numpy, unit_factors
 from .trajectory import Trajectory, require_trajectory
 
 # Number of speed samples for the spectral arc length, for any duration: far beyond a movement's bandwidth.
@@ -110,7 +110,7 @@ def curvature(trajectory: Trajectory, time: Array) -> Array:
         turn = xp.linalg.vector_norm(xp.linalg.cross(velocity, acceleration, axis=-1), axis=-1)
     length = xp.linalg.vector_norm(velocity, axis=-1)
     bend = _ratio(xp, turn, length * length * length)
-    with error_state(xp):
+    with np.errstate(all="ignore"):
         return bend * slower[..., 0] * (slower[..., 0] / flatter[..., 0])
 
 
@@ -118,7 +118,7 @@ def _ratio(xp: Namespace, numerator: Array, denominator: Array) -> Array:
     """Return the quotient, NaN where the denominator is 0; the gradient is 0 there."""
     # A mask of the quotient alone would not do: torch also differentiates what it hides, and 0 times infinity is NaN.
     defined = denominator != 0
-    with error_state(xp):
+    with np.errstate(all="ignore"):
         quotient = numerator / xp.where(defined, denominator, 1.0)
     return xp.where(defined, quotient, np.nan)[()]  # a number for a single movement, as operators return
 
@@ -145,7 +145,7 @@ def dimensionless_jerk(trajectory: Trajectory) -> Array:
     require_trajectory(trajectory)
     xp, trajectory = trajectory.namespace, _unit_sized(trajectory)
     duration, peak = trajectory.duration, trajectory.peak(1)
-    with error_state(xp):
+    with np.errstate(all="ignore"):
         jerk = trajectory.energy(3) * duration * duration * duration
         square = peak * peak
     return _ratio(xp, jerk, square)
@@ -222,11 +222,9 @@ def _unit_sized(trajectory: Trajectory) -> Trajectory:
     xp, t = trajectory.namespace, trajectory
     if 0 in t.batch_shape:
         return t
-    size = unit_factors(xp, xp.reshape(t.coefficients, (*t.batch_shape, -1)))[..., None, None]
-    pace = unit_factors(xp, t.end)
-    return Trajectory(
-        t.coefficients * size, t.durations * pace, t.order, t.starts * pace, t.rates / pace, t.end * pace
-    )
+    size = unit_factors(xp, xp.reshape(t.coefficients, (*t.batch_shape, -1)))[..., 0]
+    pace = unit_factors(xp, t.end)[..., 0]
+    return t.transformed(scale=size).stretched(t.duration * pace)
 
 
 def _arc_length(trajectory: Trajectory, cutoff: float, threshold: float, padding: int) -> Array:

@@ -20,9 +20,8 @@ from .array_api import (
     broadcast_batch,
     broadcast_to,
     check_buffers,
-    constant,
-    error_state,
     leading_shape,
+    like,
     namespace_of,
     require,
     to_numpy,
@@ -73,26 +72,6 @@ class Trajectory:
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the constructor call for copy and pickle, so that copies are read-only too."""
         return type(self), tuple(getattr(self, field.name) for field in fields(self))
-
-    @classmethod
-    def from_segments(
-        cls, coefficients: Array, durations: Array, xp: Namespace, *, some_empty: bool = False
-    ) -> Trajectory:
-        """Return a trajectory of joined segments; with `some_empty`, durations may be 0 between equal points."""
-        order = coefficients.shape[-3] // 2
-        if durations.shape[-1] == 1 and not some_empty:
-            return cls(coefficients, durations, order, 0.0 * durations, 1.0 / durations, durations)
-        ends = xp.cumulative_sum(durations, axis=-1)
-        end = ends[..., -1:]
-        starts = xp.concat([0.0 * end, ends[..., :-1]], axis=-1)
-        if some_empty:
-            empty = durations <= 0
-            # An empty segment at the end must not become current at the last instant: start it later.
-            starts = xp.where(starts >= end, 2 * end, starts)
-            rates = xp.where(empty, 0.0, 1.0 / xp.where(empty, 1.0, durations))
-        else:
-            rates = 1.0 / durations
-        return cls(coefficients, durations, order, starts, rates, end)
 
     @property
     def namespace(self) -> Namespace:
@@ -231,7 +210,7 @@ class Trajectory:
 
     def cost(self) -> Array:
         """Return (...,) the cost 1/2 integral of |x^(order)|^2 [m^2 / s^(2 order - 1)], in closed form."""
-        return 0.5 * self._energy(self.order)
+        return 0.5 * self.energy(self.order)
 
     def energy(self, nu: int) -> Array:
         """Return (...,) the integral of |x^(nu)|^2 [m^2 / s^(2 nu - 1)], in closed form as a sum of squares.
@@ -242,15 +221,10 @@ class Trajectory:
         (nu,) = whole_orders((nu,))
         if nu >= 2 * self.order:
             raise ValueError(f"nu must lie in 0 ... {2 * self.order - 1}, got {nu}")
-        return self._energy(nu)
-
-    def _energy(self, nu: int) -> Array:
         xp = self.namespace
         upper = self.coefficients[..., nu:, :, :]
         flat = xp.reshape(upper, (*upper.shape[:-2], upper.shape[-2] * upper.shape[-1]))
-        modes = xp.reshape(
-            xp.matmul(constant(energy_table(self.order, nu), flat.dtype, flat.device), flat), upper.shape
-        )
+        modes = xp.reshape(xp.matmul(like(xp, energy_table(self.order, nu), flat), flat), upper.shape)
         scale = self.durations if nu == 0 else math.prod([self.rates] * (2 * nu - 1))
         return xp.sum(xp.sum(xp.sum(modes * modes, axis=-1), axis=-2) * scale, axis=-1)
 
@@ -275,8 +249,8 @@ class Trajectory:
     def _finite_derivative(self, nu: int) -> Array:
         """Return the coefficients of the nu-th derivative, or raise ValueError if it overflows."""
         xp, (nu,) = self.namespace, whole_orders((nu,))
-        with error_state(xp):
-            coefficients = derivative_coefficients(self.coefficients, self.rates, nu)
+        with np.errstate(all="ignore"):
+            coefficients = derivative_coefficients(xp, self.coefficients, self.rates, nu)
         if not xp.isfinite(coefficients).all():
             durations = to_numpy(self.durations)
             shortest = durations[durations > 0].min()
@@ -302,7 +276,7 @@ class Trajectory:
             require(allowed, "duration", broadcast_to(xp, duration, batch), "must be positive")
         end = duration[..., None] + 0.0 * self.end  # the leading shape of the durations
         factor = end / xp.where(self.end > 0, self.end, 1.0)
-        with error_state(xp):
+        with np.errstate(all="ignore"):
             runs = (self.rates > 0) & (factor > 0)
             rates = xp.where(runs, self.rates / xp.where(factor > 0, factor, 1.0), 0.0 * factor)
         coefficients = broadcast_to(xp, self.coefficients, (*batch, *self.coefficients.shape[-3:]))
@@ -352,8 +326,19 @@ def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, state
     The arguments are those of `least_cost_coefficients`; durations may be 0 between equal waypoints.
     """
     durations = 1.0 * durations  # a copy of its own
-    some_empty = bool((durations <= 0).any())
+    empty = durations <= 0
+    some_empty = bool(empty.any())
     if some_empty:
         durations = broadcast_to(xp, durations, (*waypoints.shape[:-2], durations.shape[-1]))
     coefficients = least_cost_coefficients(xp, order, waypoints, durations, states)
-    return Trajectory.from_segments(coefficients, durations, xp, some_empty=some_empty)
+    if durations.shape[-1] == 1 and not some_empty:
+        return Trajectory(coefficients, durations, order, 0.0 * durations, 1.0 / durations, durations)
+    ends = xp.cumulative_sum(durations, axis=-1)
+    end = ends[..., -1:]
+    starts = xp.concat([0.0 * end, ends[..., :-1]], axis=-1)
+    if not some_empty:
+        return Trajectory(coefficients, durations, order, starts, 1.0 / durations, end)
+    # An empty segment at the end must not become current at the last instant: start it later.
+    starts = xp.where(starts >= end, 2 * end, starts)
+    rates = xp.where(empty, 0.0, 1.0 / xp.where(empty, 1.0, durations))
+    return Trajectory(coefficients, durations, order, starts, rates, end)
