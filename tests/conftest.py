@@ -19,6 +19,18 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: item.path.name not in ("test_study.py", "test_live_page.py"))
 
 
+@pytest.fixture(scope="module")
+def browser():
+    """Headless Chromium, or the test is skipped."""
+    from browser import Browser, chromium
+
+    if chromium() is None:
+        pytest.skip("there is no Chromium on this machine")
+    browser = Browser()
+    yield browser
+    browser.close()
+
+
 @pytest.fixture
 def rng():
     """Each test begins with the same numbers, whatever ran before it."""
