@@ -31,8 +31,8 @@ from viapoint.training.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS
 from viapoint.training.trainer import RunCallback, TrainingStoppedError
 from viapoint.training.video import gallery, record_video
 
-FEW = 'policy_kwargs={"candidates":32,"refinements":1,"per_refinement":16}'
-"""Hyperparameters of an agent that decides quickly."""
+FEW = "gradient_steps=1", 'policy_kwargs={"candidates":32,"refinements":1,"per_refinement":16}'
+"""Hyperparameters of an agent that learns and decides quickly."""
 
 
 def run(*words):
@@ -87,7 +87,7 @@ def trained(tmp_path_factory):
     run(
         "train", "--env", PLANE, "--n-timesteps", 64, "--n-envs", 32, "--eval-every", 64, "--eval-scenes", 8,
         "--out", folder, "--no-progress", "--env-kwargs", "threads=1",
-        "--hyperparameters", "learning_starts=32", "gradient_steps=1", FEW,
+        "--hyperparameters", "learning_starts=32", *FEW,
     )  # fmt: skip
     return folder
 
@@ -249,7 +249,7 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     folder = tmp_path / "run"
     run(
         "train", "--arm", "my_arm.xml", "--env-kwargs", "n_obstacles=2",
-        "--n-timesteps", 64, "--n-envs", 16, "--eval-every", 0, "--out", folder, "--hyperparameters", FEW,
+        "--n-timesteps", 64, "--n-envs", 16, "--eval-every", 0, "--out", folder, "--hyperparameters", *FEW,
     )  # fmt: skip
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
@@ -273,7 +273,7 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
 def test_a_run_goes_on_with_its_copy_of_an_arm(tmp_path, capsys) -> None:
     file = tmp_path / "my_arm.xml"
     shutil.copy(UR5E, file)
-    settings = ("--n-envs", 16, "--eval-every", 0, "--out", tmp_path / "run", "--hyperparameters", FEW)
+    settings = ("--n-envs", 16, "--eval-every", 0, "--out", tmp_path / "run", "--hyperparameters", *FEW)
     run("train", "--arm", file, "--n-timesteps", 16, *settings)
     shutil.copytree(tmp_path / "run", tmp_path / "same")
     decisions = 16
