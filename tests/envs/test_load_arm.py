@@ -571,8 +571,7 @@ def test_a_body_that_stands_beside_the_arm_is_told_in_a_warning():
         load_arm(changed((END, WALL.format(""))))
 
 
-@pytest.mark.parametrize("suffix", ["obj", "stl", "msh"])
-@pytest.mark.parametrize("there", [False, True])
+@pytest.mark.parametrize(("suffix", "there"), [("obj", False), ("obj", True), ("stl", True), ("msh", True)])
 def test_what_is_only_seen_may_be_missing_or_broken_and_what_collides_is_named(tmp_path, suffix, there):
     assets = (
         f'<asset><mesh name="cover" file="cover.{suffix}"/><texture name="skin" type="2d" file="skin.png"/>'
