@@ -679,9 +679,8 @@ def test_it_learns_to_revise_plans(tmp_path) -> None:
     agent = ViaRank("ViaRankPolicy", env, seed=0, gradient_steps=8, **small).learn(256)
     agent.save(tmp_path / "agent.zip")
     again = ViaRank.load(tmp_path / "agent.zip")
-    result = evaluate(
-        again, env=SENSED, env_kwargs=LOOKING, scenes="validation", n_scenes=50, baselines=["untrained"]
-    )
+    settings = {"env": SENSED, "env_kwargs": LOOKING, "scenes": "validation", "n_scenes": 50}
+    result = evaluate(again, baselines=["untrained"], time_decisions=False, **settings)
     learned, untrained = [row["success"]["rate"] for row in result.rows]
     assert learned > untrained + 0.3
 

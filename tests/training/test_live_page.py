@@ -84,8 +84,8 @@ def on_screen(tab, session, point):
     return float(left + 0.5 * width + scale * x), float(top + 0.5 * height + scale * y)
 
 
-def drag(tab, session, first, last, **kwargs):
-    tab.drag(on_screen(tab, session, first), on_screen(tab, session, last), **kwargs)
+def drag(tab, session, first, last):
+    tab.drag(on_screen(tab, session, first), on_screen(tab, session, last))
 
 
 def type_into(tab, session, number, text):
