@@ -133,8 +133,8 @@ class Tab:
             buttons=buttons, clickCount=0 if kind == "Moved" else 1,
         )  # fmt: skip
 
-    def drag(self, first, last, steps=6, hold=False):
-        """Drag from one point to another; with `hold`, the button stays pressed."""
+    def drag(self, first, last, steps=6):
+        """Drag from one point to another."""
         self.mouse("Moved", first)
         time.sleep(0.2)
         self.mouse("Pressed", first, 1)
@@ -142,14 +142,12 @@ class Tab:
             share = i / steps
             self.mouse("Moved", [a + share * (b - a) for a, b in zip(first, last, strict=True)], 1)
             time.sleep(0.06)
-        if not hold:
-            self.mouse("Released", last)
+        self.mouse("Released", last)
 
     def key(self, name):
+        pressed = {"key": name, "code": name, "windowsVirtualKeyCode": KEYS[name]}
         for kind in ("keyDown", "keyUp"):
-            self.call(
-                "Input.dispatchKeyEvent", type=kind, key=name, code=name, windowsVirtualKeyCode=KEYS[name]
-            )
+            self.call("Input.dispatchKeyEvent", type=kind, **pressed)
 
     def canvas(self):
         """Return left, top, width and height of the picture of the scene."""
@@ -166,4 +164,4 @@ class Tab:
             shutil.rmtree(self.downloads, ignore_errors=True)
 
 
-KEYS = {"ArrowRight": 39, "ArrowLeft": 37}
+KEYS = {"ArrowRight": 39}

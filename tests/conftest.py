@@ -14,9 +14,32 @@ TESTS = Path(__file__).parent
 sys.path += [str(TESTS), str(TESTS.parent / "benchmarks"), str(TESTS.parent / "docs")]
 
 
+FIRST = (
+    *("test_agents.py", "test_site.py", "test_packaging.py", "primitives"),
+    *("test_docs.py", "test_study.py", "test_live_page.py", "test_train.py", "test_cli.py"),
+)
+"""Files and folders that are run first: while one worker compiles the kernels of the agents, the other runs what needs
+none, so that few are compiled twice; long files follow, so that no worker waits for one at the end."""
+
+
 def pytest_collection_modifyitems(items):
-    """Run the longest files first, so that no worker waits for one at the end."""
-    items.sort(key=lambda item: item.path.name not in ("test_study.py", "test_live_page.py"))
+    def place(item):
+        names = {item.path.name, item.path.parent.name}.intersection(FIRST)
+        return min(map(FIRST.index, names), default=len(FIRST))
+
+    items.sort(key=place)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Headless Chromium, or the test is skipped."""
+    from browser import Browser, chromium
+
+    if chromium() is None:
+        pytest.skip("there is no Chromium on this machine")
+    browser = Browser()
+    yield browser
+    browser.close()
 
 
 @pytest.fixture

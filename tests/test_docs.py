@@ -37,7 +37,13 @@ PRELOADED = [
     "scipy.optimize",
 ]
 """Modules that take long to import; not Viapoint, whose import registers what an example may lack."""
-SHORTER = {"learn(1_000)": "learn(300)", "BUDGET = 1_000": "BUDGET = 250", "n_scenes=100": "n_scenes=20"}
+SHORTER = {
+    "learn(1_000)": "learn(128)",
+    "BUDGET = 1_000": "BUDGET = 128",
+    "n_timesteps=256": "n_timesteps=64",
+    "n_scenes=100": "n_scenes=10",
+    'eval_scenes\\": 50': 'eval_scenes\\": 10',
+}
 """Numbers with which examples are as good, and faster."""
 every_page = pytest.mark.parametrize("name", sorted(PAGES))
 

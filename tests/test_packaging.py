@@ -100,16 +100,9 @@ def clean(wheel_path, tmp_path_factory):
     """A new environment, in which only the wheel is installed."""
     folder = tmp_path_factory.mktemp("clean")
     venv.create(folder, with_pip=False)
-    install = [
-        "pip",
-        "--python",
-        str(folder / "bin" / "python"),
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-index",
-    ]
-    subprocess.run([sys.executable, "-m", *install, str(wheel_path)], check=True, capture_output=True)
+    pip = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python")]
+    install = [*pip, "install", "--quiet", "--no-deps", "--no-index", str(wheel_path)]
+    subprocess.run(install, check=True, capture_output=True)
     return folder
 
 

@@ -11,7 +11,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from browser import Browser, chromium, wait_for
+from browser import wait_for
 
 from viapoint import envs, primitives, training
 
@@ -19,7 +19,6 @@ ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("furo") is None, reason="the extra `docs` is not installed"
 )
-needs_browser = pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine")
 READ = (
     "index",
     "environments/PandaObstacles-v0",
@@ -68,10 +67,9 @@ def test_no_page_asks_for_anything_from_elsewhere(site):
     for page in site.rglob("*.html"):
         for found in loaded.findall(page.read_text()):
             assert not re.match(r"(https?:)?//", "".join(found)), (page.name, found)
+    fetched = re.compile(r"url\([\"']?(https?:)?//|@import [\"'](https?:)?//")
     for style in site.rglob("*.css"):
-        assert not re.search(r"url\([\"']?(https?:)?//|@import [\"'](https?:)?//", style.read_text()), (
-            style.name
-        )
+        assert not fetched.search(style.read_text()), style.name
 
 
 def test_every_exported_name_and_every_environment_has_a_page(site):
@@ -103,13 +101,6 @@ class Silent(http.server.SimpleHTTPRequestHandler):
         pass
 
 
-@pytest.fixture(scope="module")
-def browser():
-    browser = Browser()
-    yield browser
-    browser.close()
-
-
 @pytest.fixture
 def tab(browser, address):
     """Open a page of the site in a window of a size, and wait for it."""
@@ -132,7 +123,6 @@ def tab(browser, address):
         tab.close()
 
 
-@needs_browser
 @pytest.mark.parametrize("page", READ)
 def test_a_page_can_be_read(page, tab, address):
     wide = tab(f"{page}.html")
@@ -145,7 +135,6 @@ def test_a_page_can_be_read(page, tab, address):
         assert [url for url in opened.requests if not url.startswith((address, "data:", "about:"))] == []
 
 
-@needs_browser
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("page", ["index", "tutorials/ten-minutes", "api/viapoint.training.plan_motion"])
 def test_text_stands_out_in_both_modes(page, scheme, tab):
@@ -155,7 +144,6 @@ def test_text_stands_out_in_both_modes(page, scheme, tab):
         assert (max(text, ground) + 0.05) / (min(text, ground) + 0.05) >= CONTRAST
 
 
-@needs_browser
 @pytest.mark.parametrize(
     ("words", "page"), [("plan_motion", "plan_motion.html"), ("isochrony", "flash-hogan.html")]
 )

@@ -28,9 +28,8 @@ def ur5e(file=TEXT, **changes):
     return load_arm(file, **{**arguments, **changes})
 
 
-def changed(*pairs):
-    """Text of the file with some words replaced, which must be there."""
-    text = TEXT
+def changed(*pairs, text=TEXT):
+    """Text of a file with some words replaced, which must be there."""
     for old, new in pairs:
         assert old in text, old
         text = text.replace(old, new)
@@ -90,9 +89,6 @@ def test_it_is_the_arm_of_the_file(arm):
     assert arm.joint_names == JOINTS
     assert arm.excess <= 0.03
     np.testing.assert_allclose(arm.torque_limit, [150.0] * 3 + [28.0] * 3)
-
-
-def test_contact_with_itself_implies_that_spheres_overlap(arm):
     check_contact_implies_overlap(arm)
 
 
@@ -156,12 +152,9 @@ def test_joints_and_bodies_may_have_any_names(arm):
     assert other.compile(2).nbody == arm.compile(2).nbody
 
 
-THREE = {"tool": "tool", "joints": ("one", "two", "three"), "velocity_limit": 1.0, "torque_limit": 1e3}
-
-
 @pytest.mark.parametrize(("gap", "reason"), [(0.004, "always near"), (-0.001, "in contact at home")])
 def test_bodies_that_never_touch_or_touch_at_home_are_left_out(gap, reason):
-    arm = load_arm(near_arm(gap), **THREE)
+    arm = three(gap=gap)
     assert [pair[:2] for pair in arm.left_out if reason in pair.reason] == [("a", "c")]
 
 
@@ -208,6 +201,14 @@ def near_arm(gap):
         </body>
       </body>
     </worldbody></mujoco>"""
+
+
+THREE = {"tool": "tool", "joints": ("one", "two", "three"), "velocity_limit": 1.0, "torque_limit": 1e3}
+
+
+def three(*pairs, gap=0.02, **changes):
+    """Return the arm of three links with some words of its file replaced."""
+    return load_arm(changed(*pairs, text=near_arm(gap)), **{**THREE, **changes})
 
 
 def test_without_velocity_limits_a_warning_names_the_default():
@@ -292,31 +293,30 @@ def test_tools_are_sites_bodies_or_points(arm, tool, where):
 @pytest.mark.parametrize(("geom", "tool"), [("", "plate"), ('<geom size="0.01"/>', "c")])
 def test_a_frame_alone_on_the_last_link_is_the_tool(geom, tool):
     plate = f'<body name="plate" pos="0 0 0.1">{geom}</body><body><geom size="0.01"/></body>'
-    arm = load_arm(
-        near_arm(0.02).replace('<site name="tool" pos="0 0 0.2"/>', plate), **{**THREE, "tool": None}
-    )
+    arm = three(('<site name="tool" pos="0 0 0.2"/>', plate), tool=None)
     assert arm.notes[0] == f"tool: \"the frame of '{tool}'\""
 
 
 def test_joints_without_names_get_some_and_those_that_follow_others_are_told():
-    nameless = load_arm(re.sub(r'joint name="\w+"', "joint", near_arm(0.02)), **{**THREE, "joints": None})
+    nameless = three(*((f'joint name="{name}"', "joint") for name in THREE["joints"]), joints=None)
     assert nameless.joint_names == ("unnamed_0", "unnamed_1", "unnamed_2")
     equality = '<equality><joint joint1="three" joint2="two" polycoef="0 -1 0 0 0"/></equality></mujoco>'
     with pytest.warns(UserWarning, match="three follows"):
-        load_arm(near_arm(0.02).replace("</mujoco>", equality), **THREE)
+        three(("</mujoco>", equality))
 
 
-def test_damping_that_no_motor_could_overcome_is_left_out_and_told():
+def damped(damping):
+    """Arm whose second joint is damped."""
+    return three(('name="two"', f'name="two" damping="{damping}"'))
+
+
+def test_damping_is_that_of_the_file_unless_no_motor_could_overcome_it():
     with pytest.warns(UserWarning, match="damping"):
-        arm = load_arm(near_arm(0.02).replace('name="two"', 'name="two" damping="1e11"'), **THREE)
+        arm = damped(1e11)
     np.testing.assert_array_equal(arm.chain.damping, 0.0)
-    slow = load_arm(near_arm(0.02).replace('name="two"', 'name="two" damping="2e3"'), **THREE)
-    np.testing.assert_array_equal(slow.chain.damping, (0.0, 2e3, 0.0))
-
-
-def test_joints_with_much_damping_return_as_fast_as_others():
-    arm = load_arm(near_arm(0.02).replace('name="two"', 'name="two" damping="9"'), **THREE)
-    rate = arm.stiffness / (arm.damping + arm.chain.damping)
+    np.testing.assert_array_equal(damped(2e3).chain.damping, (0.0, 2e3, 0.0))
+    much = damped(9)  # returns as fast as others
+    rate = much.stiffness / (much.damping + much.chain.damping)
     np.testing.assert_allclose(rate, 25.0)  # half of the servos' natural frequency, [1/s]
 
 
@@ -400,13 +400,9 @@ def crane(tmp_path):
 
 
 def written(folder, *pairs):
-    """Path of the URDF with some words replaced, which must be there."""
-    text = URDF
-    for old, new in pairs:
-        assert old in text, old
-        text = text.replace(old, new)
+    """Path of the URDF with some words replaced."""
     path = folder / "urdf" / "crane.urdf"
-    path.write_text(text)
+    path.write_text(changed(*pairs, text=URDF))
     return path
 
 
@@ -443,8 +439,7 @@ def test_limits_of_a_urdf_are_kept(crane, limit, found):
 @pytest.mark.parametrize("limit", ['<limit lower="1" upper="1" effort', "<limit effort"])
 def test_a_joint_without_limits_is_told(crane, limit):
     with pytest.warns(UserWarning, match="joint tilt"):
-        arm = load_arm(written(crane, (LIMIT, limit)))
-    assert arm.continuous == ("turn", "tilt")
+        assert load_arm(written(crane, (LIMIT, limit))).continuous == ("turn", "tilt")
 
 
 @pytest.mark.parametrize(
@@ -520,14 +515,14 @@ def test_the_second_time_an_arm_comes_from_the_cache(cache, monkeypatch):
 
 
 def test_a_capsule_of_hardly_any_length_is_covered():
-    arm = load_arm(near_arm(0.02).replace('size="0.05"', 'type="capsule" size="0.05 1e-9"'), **THREE)
+    arm = three(('size="0.05"', 'type="capsule" size="0.05 1e-9"'))
     assert arm.spheres.radius.max() == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize("fault", ["broken", "file", "shape"])
 def test_a_cache_that_cannot_be_used_is_ignored(fault, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    first = load_arm(near_arm(0.02), **THREE)
+    first = three()
     (stored,) = (tmp_path / "viapoint" / "arms").iterdir()
     if fault == "broken":
         stored.write_bytes(stored.read_bytes()[:1000])
@@ -536,7 +531,7 @@ def test_a_cache_that_cannot_be_used_is_ignored(fault, tmp_path, monkeypatch):
     else:
         (tmp_path / "file").write_text("")
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    np.testing.assert_equal(parts_of(load_arm(near_arm(0.02), **THREE)), parts_of(first))
+    np.testing.assert_equal(parts_of(three()), parts_of(first))
 
 
 MOBILE = (
@@ -576,8 +571,7 @@ def test_a_body_that_stands_beside_the_arm_is_told_in_a_warning():
         load_arm(changed((END, WALL.format(""))))
 
 
-@pytest.mark.parametrize("suffix", ["obj", "stl", "msh"])
-@pytest.mark.parametrize("there", [False, True])
+@pytest.mark.parametrize(("suffix", "there"), [("obj", False), ("obj", True), ("stl", True), ("msh", True)])
 def test_what_is_only_seen_may_be_missing_or_broken_and_what_collides_is_named(tmp_path, suffix, there):
     assets = (
         f'<asset><mesh name="cover" file="cover.{suffix}"/><texture name="skin" type="2d" file="skin.png"/>'

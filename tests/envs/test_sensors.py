@@ -161,19 +161,3 @@ def test_looks_are_remembered_and_new_points_end_decisions() -> None:
             seen += 1
         before = after
     assert seen > 10
-
-
-def test_looks_do_not_depend_on_the_batch_and_are_restored() -> None:
-    many = gym.make_vec(PLANE, num_envs=3, **LOOKING)
-    alone = gym.make_vec(PLANE, num_envs=1, **LOOKING)
-    many.reset(seed=[5, 6, 7])
-    alone.reset(seed=[6])
-    action = np.full((3, many.single_action_space.shape[0]), 0.3, np.float32)
-    first, *_ = many.step(action)
-    second, *_ = alone.step(action[:1])
-    assert all(np.array_equal(first[name][1], second[name][0]) for name in first)
-    state = many.unwrapped.state()
-    once = many.step(-action)[0]
-    many.unwrapped.restore(state)
-    again = many.step(-action)[0]
-    assert all(np.array_equal(once[name], again[name]) for name in once)

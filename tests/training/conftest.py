@@ -43,11 +43,11 @@ def made():
 
 @pytest.fixture(scope="session")
 def small_scenes():
-    """Forty scenes, with the share of 32 random actions that solve each."""
+    """Forty scenes, with the share of 12 random actions that solve each."""
     simulation = SceneSimulation(PLANE, 64, threads=1)
     generator = np.random.default_rng(0)
     scenes = simulation.task.sampler()([generator] * 40)
-    actions = generator.uniform(-1.0, 1.0, (32, 40, simulation.task.action.size))
+    actions = generator.uniform(-1.0, 1.0, (12, 40, simulation.task.action.size))
     success = np.array([simulation(scenes, each)["is_success"] for each in actions])
     simulation.close()
     return FrozenScenes(

@@ -57,8 +57,6 @@ SMALL = {
     "explore_candidates": 16,
     "policy_kwargs": FEW,
 }
-
-
 NUMBER = 12
 """Number of scenes in which policies are compared."""
 
@@ -129,8 +127,7 @@ def test_it_goes_on_in_other_scenes_of_its_task_only(made):
     model.set_env(made(n_obstacles=5))
     model.learn(8, reset_num_timesteps=False)
     env = model.get_env()
-    others = ({"env_id": PANDA}, {"duration_range": (0.5, 2.0)}, {"timing": "learned"})
-    for other in others:
+    for other in ({"env_id": PANDA}, {"duration_range": (0.5, 2.0)}, {"timing": "learned"}):
         with pytest.raises(ValueError):
             model.set_env(made(**other))
         assert model.get_env() is env
@@ -228,10 +225,15 @@ def test_no_scenes_have_no_actions(env_id):
     assert agent.predict(empty)[0].shape == (0, *agent.action_space.shape)
 
 
+def some_actions(task, number):
+    """Return 8 actions, the same in each of some scenes."""
+    size = task.action.size
+    return np.broadcast_to(sobol_actions(8, size), (number, 8, size))
+
+
 def margins(policy, problem):
     """Return the margins of 8 actions in each scene, [m]."""
-    size = policy.task.action.size
-    actions = np.broadcast_to(sobol_actions(8, size), (len(problem.start), 8, size))
+    actions = some_actions(policy.task, len(problem.start))
     with torch.no_grad():
         return policy.critic(policy.inputs(problem, actions)).margin.numpy()
 
@@ -295,17 +297,18 @@ def test_it_learns_within_seconds_what_chance_does_not():
     scenes = scenes_of(simulation.task, 256, 10_000)
     observation = simulation.observe(scenes)
     random = np.random.default_rng(0).uniform(-1.0, 1.0, (256, simulation.task.action.size))
-    chance = simulation(scenes, random)["is_success"].mean()
     env = ViaVecEnv(PLANE, 64, seed=0)
     few = {"candidates": 128, "refinements": 1, "per_refinement": 32}
-    model = ViaQ("ViaQPolicy", env, seed=0, learning_starts=512, gradient_steps=16, policy_kwargs=few)
-    untrained = simulation(scenes, model.predict(observation)[0].astype(np.float64))["is_success"].mean()
-    model.learn(64 * 24)
-    alone = simulation(scenes, model.predict(observation)[0].astype(np.float64))["is_success"].mean()
+    model = ViaQ("ViaQPolicy", env, seed=0, learning_starts=512, gradient_steps=8, policy_kwargs=few)
+
+    def success(actions):
+        return simulation(scenes, actions.astype(np.float64))["is_success"].mean()
+
+    chance, untrained = success(random), success(model.predict(observation)[0])
+    model.learn(64 * 16)
+    assert success(model.predict(observation)[0]) > max(2.0 * chance, untrained)
     model.policy.checks = 16
-    checked = simulation(scenes, model.predict(observation)[0].astype(np.float64))["is_success"].mean()
-    assert alone > max(2.0 * chance, untrained)
-    assert checked > 0.7
+    assert success(model.predict(observation)[0]) > 0.7
     env.close()
     simulation.close()
 
@@ -373,7 +376,7 @@ def movements(env_id, number=6, **kwargs):
     """Return a task, problems and movements of 8 actions in each."""
     task = registered_task(env_id, **kwargs)
     problem = problem_of(task, number, 3)
-    actions = np.broadcast_to(sobol_actions(8, task.action.size), (number, 8, task.action.size))
+    actions = some_actions(task, number)
     return task, problem, actions, moves_of(task, problem, actions)
 
 
@@ -437,13 +440,10 @@ def test_an_obstacle_larger_than_all_in_training_is_seen_as_the_largest_as_far_a
 
 
 @pytest.mark.parametrize("env_id", [PLANE, PANDA])
-def test_without_obstacles_the_margin_is_constant(small, env_id):
-    task, problem, _, _ = movements(env_id)
-    model, _ = small(env_id)
-    empty = problem._replace(obstacles=no_obstacles(len(problem.start)))
-    actions = np.broadcast_to(sobol_actions(8, task.action.size), (len(problem.start), 8, task.action.size))
-    values = model.policy.critic(model.policy.inputs(empty, actions))
-    assert (values.margin == NO_OBSTACLE).all()
+def test_without_obstacles_the_margin_is_constant(env_id):
+    task = registered_task(env_id)
+    empty = problem_of(task, NUMBER)._replace(obstacles=no_obstacles(NUMBER))
+    assert (margins(policy_of(task), empty) == NO_OBSTACLE).all()
 
 
 def test_the_clearance_of_the_arm_from_itself_is_computed():
@@ -458,9 +458,8 @@ def test_the_clearance_of_the_arm_from_itself_is_computed():
         path = one.trajectory()(np.linspace(0.0, one.durations.sum(), INSTANTS))
         apart = configuration_clearances(arm, path, no_obstacles(INSTANTS))
         least = min(apart[:, 1].min(), CLEAR)
-        assert float(found.self_clearance[scene, row]) == pytest.approx(
-            least, abs=6e-3
-        )  # the table rounds passage times
+        # The table rounds passage times.
+        assert float(found.self_clearance[scene, row]) == pytest.approx(least, abs=6e-3)
 
 
 def test_only_instants_that_were_carried_out_count():
@@ -508,14 +507,14 @@ def test_as_many_plans_are_checked_as_one_says_and_the_best_of_them_is_taken(
             assert worth.max() > 0.5 * INFEASIBLE
 
 
-def test_merit_prefers_likely_success_and_orders_the_rest_by_its_probability(small):
-    model, _ = small(PLANE)
+def test_merit_prefers_likely_success_and_orders_the_rest_by_its_probability():
+    critic = policy_of(registered_task(PLANE)).critic
     zero = torch.zeros(1, 4)
     no_contact, effort = torch.tensor([[5.0, 5.0, -1.0, -3.0]]), torch.tensor([[0.0, -0.3, 9.0, 99.0]])
     values = Values(zero, zero, no_contact, zero + 5.0, zero, effort)
-    merit = model.policy.critic.merit(values)[0]
+    merit = critic.merit(values)[0]
     assert merit.argsort(descending=True).tolist() == [0, 1, 2, 3]
-    torch.testing.assert_close(merit[:2], model.policy.critic.value(values)[0, :2])
+    torch.testing.assert_close(merit[:2], critic.value(values)[0, :2])
 
 
 def test_a_saturated_prediction_is_pulled_back_but_never_pushed_out():
@@ -625,9 +624,9 @@ def test_the_nearest_pairs_are_those_of_the_closest_approach_between_the_instant
 
 @pytest.fixture(scope="module")
 def agent():
-    small = {"candidates": 128}
+    few = {"explore_candidates": 32, "labels": 16, "batch_size": 48, "policy_kwargs": {"candidates": 64}}
     env = ViaVecEnv(SENSED, 32, seed=0)
-    return ViaRank("ViaRankPolicy", env, seed=0, gradient_steps=8, policy_kwargs=small).learn(320)
+    return ViaRank("ViaRankPolicy", env, seed=0, gradient_steps=8, **few).learn(256)
 
 
 def test_it_learns_in_seconds(agent) -> None:
@@ -680,9 +679,8 @@ def test_it_learns_to_revise_plans(tmp_path) -> None:
     agent = ViaRank("ViaRankPolicy", env, seed=0, gradient_steps=8, **small).learn(256)
     agent.save(tmp_path / "agent.zip")
     again = ViaRank.load(tmp_path / "agent.zip")
-    result = evaluate(
-        again, env=SENSED, env_kwargs=LOOKING, scenes="validation", n_scenes=50, baselines=["untrained"]
-    )
+    settings = {"env": SENSED, "env_kwargs": LOOKING, "scenes": "validation", "n_scenes": 50}
+    result = evaluate(again, baselines=["untrained"], time_decisions=False, **settings)
     learned, untrained = [row["success"]["rate"] for row in result.rows]
     assert learned > untrained + 0.3
 

@@ -17,7 +17,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from helpers import MOVING, PLANE, REACH, UR5E, scenes_of
-from helpers import PLANE as ENV
 from matplotlib.image import imread
 from PIL import Image
 
@@ -31,6 +30,9 @@ from viapoint.training.files import as_plain
 from viapoint.training.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
 from viapoint.training.trainer import RunCallback, TrainingStoppedError
 from viapoint.training.video import gallery, record_video
+
+FEW = "gradient_steps=1", 'policy_kwargs={"candidates":32,"refinements":1,"per_refinement":16}'
+"""Hyperparameters of an agent that learns and decides quickly."""
 
 
 def run(*words):
@@ -93,9 +95,9 @@ def trained(tmp_path_factory):
     """A run of a few decisions."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     run(
-        "train", "--env", ENV, "--n-timesteps", 64, "--n-envs", 32, "--eval-every", 64, "--eval-scenes", 8,
+        "train", "--env", PLANE, "--n-timesteps", 64, "--n-envs", 32, "--eval-every", 64, "--eval-scenes", 8,
         "--out", folder, "--no-progress", "--env-kwargs", "threads=1",
-        "--hyperparameters", "learning_starts=32", "gradient_steps=1",
+        "--hyperparameters", "learning_starts=32", *FEW,
     )  # fmt: skip
     return folder
 
@@ -107,7 +109,7 @@ def test_train_then_evaluate_then_play(trained, shipped, tmp_path, capsys):
     assert str(results) in capsys.readouterr().out
     record = json.loads(results.read_text())
     assert [each["scenes"] for each in record["methods"].values()] == [12, 12]
-    assert record["env"] == ENV
+    assert record["env"] == PLANE
     run("evaluate", trained, "--baselines", "--checks", 0, 8, "--n-scenes", 4)
     kept = [json.loads(path.read_text()) for path in (trained / "evaluations").glob("test-*.json")]
     assert ["agent", "agent, 8 checks"] in [list(each["methods"]) for each in kept]
@@ -143,7 +145,7 @@ def test_a_run_is_continued_with_its_own_flags_only(tmp_path, capsys, failed):
     for words, named in (
         ("--seed 7 --algo ppo", ("algo viaq", "seed 3")),
         ("--seed 0", ("seed 3",)),  # as usual, but not here
-        (f"--env {ENV}", (REACH,)),
+        (f"--env {PLANE}", (REACH,)),
         ("--env-kwargs threads=2", ("threads 1",)),
         ("--hyperparameters tau=0.1", ("tau as usual",)),
         ("--n-timesteps 32", ("64 decisions", "got 32")),
@@ -257,7 +259,7 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     folder = tmp_path / "run"
     run(
         "train", "--arm", "my_arm.xml", "--env-kwargs", "n_obstacles=2",
-        "--n-timesteps", 64, "--n-envs", 16, "--eval-every", 0, "--out", folder,
+        "--n-timesteps", 64, "--n-envs", 16, "--eval-every", 0, "--out", folder, "--hyperparameters", *FEW,
     )  # fmt: skip
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
@@ -281,7 +283,7 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
 def test_a_run_goes_on_with_its_copy_of_an_arm(tmp_path, capsys) -> None:
     file = tmp_path / "my_arm.xml"
     shutil.copy(UR5E, file)
-    settings = ("--n-envs", 16, "--eval-every", 0, "--out", tmp_path / "run")
+    settings = ("--n-envs", 16, "--eval-every", 0, "--out", tmp_path / "run", "--hyperparameters", *FEW)
     run("train", "--arm", file, "--n-timesteps", 16, *settings)
     shutil.copytree(tmp_path / "run", tmp_path / "same")
     decisions = 16

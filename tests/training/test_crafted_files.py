@@ -12,8 +12,7 @@ import zipfile
 import numpy as np
 import pytest
 import torch
-from helpers import PLANE as ENV
-from helpers import SENSED
+from helpers import PLANE, SENSED
 from safetensors.numpy import load_file, save, save_file
 
 from viapoint.envs.plans import MOST_VIAS
@@ -125,7 +124,7 @@ def test_content_that_is_none_is_refused(name, content, model):
         {"hyperparameters": {"tensorboard_log": "x"}},
         {"hyperparameters": {"learning_rate": {"kind": "eval"}}},
         *({"env": {"id": name, "kwargs": {}}} for name in ("../../etc/passwd", "os:system", None, ["x"])),
-        {"env": {"id": ENV, "kwargs": {"nothing": 1}}},
+        {"env": {"id": PLANE, "kwargs": {"nothing": 1}}},
     ],
 )
 def test_a_record_of_something_else_is_refused(change, model):
@@ -162,7 +161,7 @@ def test_what_describes_more_than_its_weights_is_refused_before_memory_is_taken(
     edit(model, hyperparameters={**record["hyperparameters"], "buffer_size": 10**15})
     load_model(model)  # to decide, it needs no buffer
     for kwargs in ({"n_obstacles": [1, MOST_OBSTACLES + 1]}, {"n_via": MOST_VIAS + 1}, {"threads": 10**6}):
-        edit(model, **{**record, "env": {"id": ENV, "kwargs": kwargs}})
+        edit(model, **{**record, "env": {"id": PLANE, "kwargs": kwargs}})
         check_refused(model, RECORD)
     for name in (WEIGHTS, RECORD):
         with (model / name).open("r+b") as file:
@@ -174,9 +173,9 @@ def test_what_describes_more_than_its_weights_is_refused_before_memory_is_taken(
 @pytest.mark.parametrize(
     ("env_id", "change"),
     [
-        (ENV, {"candidates": 10**9}),
-        (ENV, {"refinements": 64, "per_refinement": 1024}),
-        (ENV, {"refine": 10**9}),
+        (PLANE, {"candidates": 10**9}),
+        (PLANE, {"refinements": 64, "per_refinement": 1024}),
+        (PLANE, {"refine": 10**9}),
         (SENSED, {"instants": 10**9}),
     ],
 )

@@ -10,8 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import MOVING, REACH, STEP, scenes_of
-from helpers import PLANE as ENV
+from helpers import MOVING, PLANE, REACH, STEP, scenes_of
 from PIL import Image
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -32,8 +31,8 @@ ZEROS = np.zeros((40, 3))
 @pytest.fixture(scope="module")
 def solutions(small_scenes):
     """Actions of a search in the small scenes, most of which succeed."""
-    simulation = SceneSimulation(ENV, 40, threads=1)
-    search = make_method("search64", ENV)
+    simulation = SceneSimulation(PLANE, 40, threads=1)
+    search = make_method("search64", PLANE)
     return search.decide(simulation.observe(small_scenes.scenes), small_scenes.scenes)
 
 
@@ -53,13 +52,13 @@ class Given:
 
 def run(methods, scenes, **kwargs):
     settings = {"env_kwargs": {"threads": 1}, "time_decisions": False, **kwargs}
-    return evaluate_methods(methods, scenes, ENV, **settings)
+    return evaluate_methods(methods, scenes, PLANE, **settings)
 
 
 def test_every_method_meets_the_same_scenes(small_scenes, solutions):
     methods = [Given("a", ZEROS), Given("b", solutions)]
     evaluation = run(methods, small_scenes, batch=16)  # results do not depend on the batch
-    simulation = SceneSimulation(ENV, 8, threads=1)
+    simulation = SceneSimulation(PLANE, 8, threads=1)
     hands = simulation.task.arm.hand(small_scenes.scenes.goal)
     for method in methods:
         assert [len(goals) for goals in method.goals] == [16, 16, 8]
@@ -210,7 +209,7 @@ def test_every_decision_of_an_episode_is_timed_where_plans_are_revised():
 
 @pytest.fixture(scope="module")
 def record(small_scenes):
-    return run([Given("still [bold]", ZEROS), make_method("search32", ENV)], small_scenes).to_dict()
+    return run([Given("still [bold]", ZEROS), make_method("search32", PLANE)], small_scenes).to_dict()
 
 
 def test_the_document_holds_every_method_and_metric(record, tmp_path):
@@ -245,7 +244,7 @@ def test_the_table_fits_a_terminal_of_80_columns(record, number):
 
 def test_fewer_scenes_than_asked_for_are_told(small_scenes, capsys):
     baselines = ["straight"]
-    result = evaluate(env=ENV, scenes=small_scenes, n_scenes=50, baselines=baselines, time_decisions=False)
+    result = evaluate(env=PLANE, scenes=small_scenes, n_scenes=50, baselines=baselines, time_decisions=False)
     assert len(result.results[0].success) == 40
     assert "40 scenes, not 50" in capsys.readouterr().err
 
@@ -417,11 +416,11 @@ def test_an_agent_of_steps_stands_in_one_table_with_the_others(env_id):
 
 
 def test_an_evaluation_has_one_row_for_each_method_and_number_of_checks():
-    search = GeometrySearch(ENV, 8)
-    result = evaluate(ENV, checks=(0, 4), baselines=["untrained", search], n_scenes=10)
+    search = GeometrySearch(PLANE, 8)
+    result = evaluate(PLANE, checks=(0, 4), baselines=["untrained", search], n_scenes=10)
     names = [row["method"] for row in result.rows]
     assert names == ["agent", "agent, 4 checks", "untrained", "untrained, 4 checks", "sobol8"]
     low, high = result.success_interval
     assert low <= result.success_rate <= high
     assert result.to_dict()["methods"]["agent"]["success"]["rate"] == result.success_rate
-    assert evaluate(search, env=ENV, n_scenes=10).success_rate == result.rows[-1]["success"]["rate"]
+    assert evaluate(search, env=PLANE, n_scenes=10).success_rate == result.rows[-1]["success"]["rate"]

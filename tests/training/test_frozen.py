@@ -6,8 +6,7 @@ import dataclasses
 import frozen_scenes as make
 import numpy as np
 import pytest
-from helpers import MOVING, REACH
-from helpers import PLANE as ENV
+from helpers import MOVING, PLANE, REACH
 
 from viapoint.envs import ENV_IDS, Task
 from viapoint.envs.scenes.scene import check_scenes
@@ -26,20 +25,20 @@ from viapoint.training.scene_sets import (
     shipped_sets,
 )
 
-FILES = sorted(shipped_path(ENV).parent.glob("*.npz"))
+FILES = sorted(shipped_path(PLANE).parent.glob("*.npz"))
 SHIPPED = {f"{path.stem} {name}": frozen for path in FILES for name, frozen in shipped_sets(path).items()}
 
 
 @pytest.fixture(scope="module")
 def simulation():
-    simulation = SceneSimulation(ENV, 250, threads=1)
+    simulation = SceneSimulation(PLANE, 250, threads=1)
     yield simulation
     simulation.close()
 
 
 @pytest.fixture
 def some():
-    return load(shipped_path(ENV), "test").take(slice(0, 5))
+    return load(shipped_path(PLANE), "test").take(slice(0, 5))
 
 
 @pytest.mark.parametrize("frozen", SHIPPED.values(), ids=SHIPPED)
@@ -77,12 +76,12 @@ def test_sets_made_again_are_the_same():
 def test_scenes_are_of_the_kind_asked_for_and_can_be_solved(simulation, monkeypatch):
     monkeypatch.setattr(make, "NUMBERS", {"test": 4, "hard": 6, "uniform": 4})
     monkeypatch.setattr(make, "TOGETHER", 25)
-    maker = make.Maker(ENV)
+    maker = make.Maker(PLANE)
     test, hard, uniform = (maker.make(name) for name in ("test", "hard", "uniform"))
     np.testing.assert_array_equal(np.bincount(test.band), [1, 1, 1, 1])
     assert sorted(hard.family) == sorted(set(hard.family))
     assert (hard.share < 0.05).all()
-    method = make_method("search4096", ENV)
+    method = make_method("search4096", PLANE)
     for each in (test, hard, uniform):
         assert len(each.share) == len(each.scenes.start) == make.NUMBERS[each.name]
         done = simulation(each.scenes, method.decide(simulation.observe(each.scenes), each.scenes))
@@ -91,7 +90,7 @@ def test_scenes_are_of_the_kind_asked_for_and_can_be_solved(simulation, monkeypa
 
 def test_the_stated_share_is_what_one_measures(simulation):
     """Other random actions give the same shares in physics, within what chance and the least clearance allow."""
-    frozen = load(shipped_path(ENV), "validation")
+    frozen = load(shipped_path(PLANE), "validation")
     few = frozen.take(np.flatnonzero(frozen.share > 0.1)[:12])
     draws = np.random.default_rng(123).uniform(-1.0, 1.0, (100, 3))
     rows = np.repeat(np.arange(12), 100)
@@ -109,17 +108,17 @@ def test_bands_by_their_edges(some):
 
 @pytest.mark.parametrize("kwargs", [{}, {"n_via": 2}, {"duration_range": (0.7, 1.3)}, {"decide_at": "steps"}])
 def test_frozen_scenes_are_met_where_they_fit(kwargs, capsys):
-    task = registered_task(ENV, **kwargs)
+    task = registered_task(PLANE, **kwargs)
     for name in SETS:
-        assert scenes_for(name, task).sha256 == load(shipped_path(ENV), name).sha256
+        assert scenes_for(name, task).sha256 == load(shipped_path(PLANE), name).sha256
     assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "rows"),
     [
-        (ENV, {"n_obstacles": 3}, 3),
-        (ENV, {"arm": "panda"}, 5),
+        (PLANE, {"n_obstacles": 3}, 3),
+        (PLANE, {"arm": "panda"}, 5),
         ("viapoint/Obstacles-v0", {"arm": "planar"}, 16),
         (MOVING, {"n_obstacles": 2}, 2),
     ],
@@ -139,13 +138,13 @@ def test_others_are_drawn_always_the_same_and_it_is_said(env_id, kwargs, rows, c
 def test_a_file_is_met_wherever_its_scenes_are_possible(some, tmp_path):
     path = tmp_path / "some.npz"
     some.save(path)
-    found = scenes_for(path, registered_task(ENV, n_obstacles=8, whole_arm=True)).scenes
+    found = scenes_for(path, registered_task(PLANE, n_obstacles=8, whole_arm=True)).scenes
     assert found.obstacles.kind.shape == (5, 8)
     np.testing.assert_array_equal(found.obstacles.centre[:, :5], some.scenes.obstacles.centre)
     assert not found.obstacles.present[:, 5:].any()
     for kwargs in ({"n_obstacles": 2}, {"arm": "panda"}, {"shapes": "sphere"}):
         with pytest.raises(ValueError):
-            scenes_for(path, registered_task(ENV, **kwargs))
+            scenes_for(path, registered_task(PLANE, **kwargs))
 
 
 def refused(path):

@@ -12,8 +12,7 @@ import pytest
 pytest.importorskip("viser", reason="the extra `live` is not installed")
 pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 
-from helpers import JUMPS, MOVING, PANDA, STEP, UR5E
-from helpers import PLANE as PLANAR
+from helpers import JUMPS, MOVING, PANDA, PLANE, STEP, UR5E
 from viser import transforms
 
 import viapoint.envs as ve
@@ -113,7 +112,7 @@ def test_every_environment_has_scenes_decisions_movements_and_a_drawing(env_id, 
     assert len(list(parts.posed(arena.task.space.joints(scene.start)))) == len(parts.parts) > 0
 
 
-@pytest.mark.parametrize("env_id", [PLANAR, MOVING])
+@pytest.mark.parametrize("env_id", [PLANE, MOVING])
 @pytest.mark.parametrize("checks", [0, 16])
 def test_the_page_chooses_what_the_agent_chooses(env_id, checks):
     agent = untrained(env_id)
@@ -133,7 +132,7 @@ def test_the_page_chooses_what_the_agent_chooses(env_id, checks):
         assert np.isfinite(first.value)
 
 
-@pytest.mark.parametrize("env_id", [PLANAR, PANDA])
+@pytest.mark.parametrize("env_id", [PLANE, PANDA])
 def test_a_plan_of_the_motion_planner_is_free_or_says_why_not(env_id, arenas):
     """Goals in contact, out of reach and outside the limits, too; where it is free, the simulation agrees."""
     arena = arenas(env_id)
@@ -168,7 +167,7 @@ def test_a_scene_that_a_later_change_makes_impossible_has_no_plan_of_another_met
         decided(arena, scene._replace(obstacles=(post,)), method)
 
 
-@pytest.mark.parametrize("env_id", [PLANAR, PANDA])
+@pytest.mark.parametrize("env_id", [PLANE, PANDA])
 def test_a_plan_by_hand_is_valued_as_the_same_decision(env_id, arenas):
     arena = arenas(env_id)
     state = with_proposals(arena, decided(arena, drawn(arena)))
@@ -251,7 +250,7 @@ def test_a_dragged_goal_jumps_no_more(arenas):
     assert not movement.scenes.jumps.any()
 
 
-@pytest.mark.parametrize("env_id", [PLANAR, PANDA])
+@pytest.mark.parametrize("env_id", [PLANE, PANDA])
 def test_a_dragged_end_is_where_it_was_dragged_to(env_id, arenas):
     arena = arenas(env_id)
     scene = drawn(arena)
@@ -265,7 +264,7 @@ def test_a_dragged_end_is_where_it_was_dragged_to(env_id, arenas):
             arena.moved(scene.goal, place + 2.0)
 
 
-@pytest.mark.parametrize("env_id", [PLANAR, PANDA])
+@pytest.mark.parametrize("env_id", [PLANE, PANDA])
 def test_obstacles_of_every_shape_are_added_resized_drawn_and_kept_in_files(env_id, arenas):
     arena = arenas(env_id)
     first = scene = drawn(arena)
@@ -367,7 +366,7 @@ GOOD_FILE = {"format": "viapoint-scene", "start": [-0.2, 0.3], "goal": [0.1, 0.4
     ],
 )
 def test_impossible_files_are_refused(change, arenas):
-    arena = arenas(PLANAR)
+    arena = arenas(PLANE)
     arena.read(json.dumps(GOOD_FILE).encode())
     with pytest.raises(ValueError):
         arena.read(json.dumps(GOOD_FILE | change).encode())
@@ -382,12 +381,12 @@ def test_what_cannot_be_served_is_refused(failed, tmp_path):
     assert "none" in failed("live", tmp_path / "none")
     assert "nowhere.xml" in failed("live", "--arm", "nowhere.xml", "--port", 0)
     with pytest.raises(ValueError):
-        LivePage(PLANAR, env=PANDA, port=0)
+        LivePage(PLANE, env=PANDA, port=0)
 
 
 def test_scenes_that_exceed_the_environment_of_the_agent_are_searched():
-    agent = untrained(PLANAR)
-    arena = Arena(PLANAR, agent, 4, {})
+    agent = untrained(PLANE)
+    arena = Arena(PLANE, agent, 4, {})
     scene = drawn(arena)
     assert not arena.limit(scene)
     crowded = scene
@@ -401,7 +400,7 @@ def test_scenes_that_exceed_the_environment_of_the_agent_are_searched():
 
 
 def test_the_page_is_private():
-    with LivePage(env=PLANAR, port=0) as page:
+    with LivePage(env=PLANE, port=0) as page:
         assert page.url.startswith("http://127.0.0.1:")
         assert page._server.request_share_url() is None
 
@@ -409,5 +408,5 @@ def test_the_page_is_private():
 def test_the_command_passes_arguments_of_the_environment_on(monkeypatch):
     seen = []
     monkeypatch.setattr(page.LivePage, "wait", lambda served: seen.append(served._make()[0].task.n_via))
-    page.run(LiveConfig(env=PLANAR, env_kwargs={"n_via": 2}, port=0))
+    page.run(LiveConfig(env=PLANE, env_kwargs={"n_via": 2}, port=0))
     assert seen == [2]

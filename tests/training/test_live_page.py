@@ -10,16 +10,13 @@ import pytest
 pytest.importorskip("viser", reason="the extra `live` is not installed")
 pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 
-from browser import Browser, chromium, wait_for
-from helpers import JUMPS, PANDA
-from helpers import PLANE as PLANAR
+from browser import wait_for
+from helpers import JUMPS, PANDA, PLANE
 from viser import transforms
 
 from viapoint.envs import Cylinder
 from viapoint.training import LivePage
 from viapoint.training.live.arena import SEARCH
-
-pytestmark = pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine")
 
 MESSAGE = "#viapoint-message"
 SHIFT, UP = np.array([0.06, 0.08]), np.array([0.0, 0.05])
@@ -29,22 +26,26 @@ UPSTREAM = "Unable to preventDefault inside passive event listener invocation."
 
 
 @pytest.fixture(scope="module")
-def browser():
-    browser = Browser()
-    yield browser
-    browser.close()
+def page():
+    """Function that opens the page of an environment once, as closing one takes seconds."""
+    pages = {}
+
+    def opened(env, seed=1):
+        if env not in pages:
+            pages[env] = LivePage(env=env, port=0, seed=seed)
+        return pages[env]
+
+    yield opened
+    for each in pages.values():
+        each.close()
 
 
 @pytest.fixture
-def opened(browser):
-    """Open pages and tabs; all are closed in the end."""
-    pages, tabs = [], []
+def open_tab(browser):
+    """Open a tab of a page; all are closed in the end."""
+    tabs = []
 
-    def page(env, seed=1):
-        pages.append(LivePage(env=env, port=0, seed=seed))
-        return pages[-1]
-
-    def tab(page):
+    def opened(page):
         before = set(page.tabs)
         tabs.append(browser.tab(page.url))
         (session,) = wait_for(lambda: set(page.tabs) - before)
@@ -55,9 +56,7 @@ def opened(browser):
         wait_for(lambda: steady(tabs[-1]))
         return tabs[-1], session
 
-    yield page, tab
-    for each in pages:
-        each.close()
+    yield opened
     for each in tabs:
         assert [error for error in each.errors if error != UPSTREAM] == []
         each.close()
@@ -85,8 +84,8 @@ def on_screen(tab, session, point):
     return float(left + 0.5 * width + scale * x), float(top + 0.5 * height + scale * y)
 
 
-def drag(tab, session, first, last, **kwargs):
-    tab.drag(on_screen(tab, session, first), on_screen(tab, session, last), **kwargs)
+def drag(tab, session, first, last):
+    tab.drag(on_screen(tab, session, first), on_screen(tab, session, last))
 
 
 def type_into(tab, session, number, text):
@@ -99,13 +98,10 @@ def type_into(tab, session, number, text):
     return float(tab.run(f"{fields}[{number}].value"))
 
 
-def test_what_a_user_does_changes_the_plan(opened):
-    open_page, open_tab = opened
-    page = open_page(PLANAR)
-    tab, session = open_tab(page)
-    assert {each.split("/")[2] for each in tab.requests if each.startswith("http")} == {
-        page.url.split("/")[2]
-    }
+def test_what_a_user_does_changes_the_plan(page, open_tab):
+    tab, session = open_tab(page(PLANE))
+    hosts = {each.split("/")[2] for each in tab.requests if each.startswith("http")}
+    assert hosts == {page(PLANE).url.split("/")[2]}
 
     before = session.state.plan.duration
     tab.run("document.querySelector('[role=slider]').focus()")
@@ -156,9 +152,8 @@ def test_what_a_user_does_changes_the_plan(opened):
 
 
 @pytest.mark.parametrize("text", ["-1", "40"])
-def test_numbers_beyond_a_slider_are_its_ends(text, opened):
-    open_page, open_tab = opened
-    tab, session = open_tab(open_page(PLANAR))
+def test_numbers_beyond_a_slider_are_its_ends(text, page, open_tab):
+    tab, session = open_tab(page(PLANE))
     low, high = session.arena.task.action.duration_range
     duration = type_into(tab, session, 0, text)
     assert duration == pytest.approx(session.state.duration)
@@ -173,10 +168,9 @@ def test_numbers_beyond_a_slider_are_its_ends(text, opened):
     assert (vias.visible, vias.min, vias.value) == (True, 0, session.arena.task.n_via)
 
 
-def test_a_scene_without_a_decision_is_not_shown(opened):
+def test_a_scene_without_a_decision_is_not_shown(page, open_tab):
     """A post stands where the target jumps to, which no method can plan for."""
-    open_page, open_tab = opened
-    tab, session = open_tab(open_page(JUMPS))
+    tab, session = open_tab(page(JUMPS))
     before = session.state
     post = Cylinder(0.02, 0.04, position=(*before.scene.jumps[0][1:], 0.0))
     session.act("change", scene=before.scene.with_obstacle(0, post))
@@ -187,9 +181,8 @@ def test_a_scene_without_a_decision_is_not_shown(opened):
     assert session.state.scene is not before.scene
 
 
-def test_an_arm_in_space_follows_what_is_dragged_and_turned(opened):
-    open_page, open_tab = opened
-    tab, session = open_tab(open_page(PANDA, seed=10))  # a scene in which nothing hides the goal
+def test_an_arm_in_space_follows_what_is_dragged_and_turned(page, open_tab):
+    tab, session = open_tab(page(PANDA, seed=10))  # a scene in which nothing hides the goal
     arm, goal = session.arena.task.arm, session.state.scene.goal
     place = arm.hand(goal)
     aside = np.array([0.0, 0.03, 0.0])
@@ -213,11 +206,11 @@ def test_an_arm_in_space_follows_what_is_dragged_and_turned(opened):
     )
 
 
-def test_tabs_are_independent_and_leave_nothing_behind(opened):
-    open_page, open_tab = opened
-    page = open_page(PLANAR)
-    first, one = open_tab(page)
-    second, two = open_tab(page)
+def test_tabs_are_independent_and_leave_nothing_behind(page, open_tab):
+    shared = page(PLANE)
+    wait_for(lambda: not shared.tabs)
+    first, one = open_tab(shared)
+    second, two = open_tab(shared)
     goal = two.state.scene.goal
     second.press("button", "Random")
     settled(two)
@@ -228,17 +221,16 @@ def test_tabs_are_independent_and_leave_nothing_behind(opened):
     first.press("button", "Random")
     settled(one)
     first.call("Page.reload")
-    wait_for(lambda: one not in page.tabs)
-    wait_for(lambda: len(page.tabs) == 2 and all(each.idle and each.state.plan for each in page.tabs))
+    wait_for(lambda: one not in shared.tabs)
+    wait_for(lambda: len(shared.tabs) == 2 and all(each.idle and each.state.plan for each in shared.tabs))
     second.close()
-    wait_for(lambda: two not in page.tabs)
+    wait_for(lambda: two not in shared.tabs)
     gc.collect()
-    assert len(page.tabs) == 1
+    assert len(shared.tabs) == 1
 
 
-def test_files_are_saved_and_impossible_ones_are_refused(opened):
-    open_page, open_tab = opened
-    tab, session = open_tab(open_page(PLANAR))
+def test_files_are_saved_and_impossible_ones_are_refused(page, open_tab):
+    tab, session = open_tab(page(PLANE))
     tab.press("div", "Files")
     time.sleep(0.6)  # it unfolds
     tab.press("button", "Save scene (JSON)")
@@ -252,9 +244,9 @@ def test_files_are_saved_and_impossible_ones_are_refused(opened):
     scene = session.state.scene
     first, *others = scene.obstacles
     there = dataclasses.replace(first, position=(*scene.goal, first.position[2]))
-    session.act("load", scene._replace(obstacles=(there, *others)).to_json(PLANAR).encode())
+    session.act("load", scene._replace(obstacles=(there, *others)).to_json(PLANE).encode())
     wait_for(lambda: "impossible" in tab.text(MESSAGE))
     assert session.state.scene is scene
-    session.act("load", scene._replace(goal=scene.goal + 0.01).to_json(PLANAR).encode())
+    session.act("load", scene._replace(goal=scene.goal + 0.01).to_json(PLANE).encode())
     wait_for(lambda: "plan" in tab.text(MESSAGE))
     np.testing.assert_allclose(session.state.scene.goal, scene.goal + 0.01, atol=1e-6)

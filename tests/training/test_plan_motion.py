@@ -77,9 +77,8 @@ def test_plans_keep_the_limits_and_use_them() -> None:
     assert 0.9 < max(share.max() for share in shares) <= 1.0
     assert np.allclose(motion.position[[0, -1]], [PANDA.home, GOAL])
     assert np.allclose(motion.velocity[[0, -1]], 0.0, atol=1e-9)
-    assert np.allclose(
-        np.gradient(motion.position, motion.time, axis=0)[5:-5], motion.velocity[5:-5], atol=1e-3
-    )
+    rates = np.gradient(motion.position, motion.time, axis=0)
+    assert np.allclose(rates[5:-5], motion.velocity[5:-5], atol=1e-3)
 
 
 def test_what_is_free_stays_straight() -> None:
@@ -492,9 +491,8 @@ def test_problems_are_read_from_the_original_files(tmp_path) -> None:
     [moved], _ = read_problems(tmp_path)
     assert np.allclose(moved.obstacles[0].position, (-0.1, -0.1, 0.2))  # relative to the robot
     world = json.loads(scene.read_text())
-    scene.write_text(
-        json.dumps(world | {"robot_state": {"attached_collision_objects": [{"link_name": "hand"}]}})
-    )
+    held = {"attached_collision_objects": [{"link_name": "hand"}]}
+    scene.write_text(json.dumps(world | {"robot_state": held}))
     with pytest.raises(ValueError):
         read_problems(tmp_path)
     write_problem(folder, 7, [SHELF | {"meshes": [{"vertices": []}]}], names, goal, goal)
@@ -554,9 +552,8 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
     pytest.importorskip("ompl")
     frozen = load(shipped_path(PLANE), "validation")
     frozen = frozen.take(np.concatenate([np.flatnonzero(frozen.band == band)[:3] for band in range(4)]))
-    result = evaluate_methods(
-        [make_method("ompl", PLANE)], frozen, PLANE, batch=20, time_decisions=False
-    ).results[0]
+    method = make_method("ompl", PLANE)
+    (result,) = evaluate_methods([method], frozen, PLANE, batch=20, time_decisions=False).results
     summary = result.summary()
     assert summary["success"]["rate"] >= 0.9
     assert summary["collision"]["rate"] <= 0.1
@@ -599,11 +596,11 @@ def test_where_no_seed_is_free_a_path_is_followed():
     pytest.importorskip("ompl")
     arm = benchmark_panda()
     problem = next(each for each in benchmark_problems() if each.name == "bookshelf_thin 20")
-    plan = plan_motion(arm, problem.start, problem.goal, problem.obstacles, seeds=0, n_via=1, time_limit=20.0)
+    given = {"start": problem.start, "goal": problem.goal, "obstacles": problem.obstacles}
+    given |= {"arm": arm, "seeds": 0, "n_via": 1}
+    plan = plan_motion(**given, time_limit=20.0)
     assert (plan.success, plan.source) == (True, "ompl")
-    assert not plan_motion(
-        arm, problem.start, problem.goal, problem.obstacles, seeds=0, n_via=1, ompl=False
-    ).success
+    assert not plan_motion(**given, ompl=False).success
 
 
 def test_points_lie_on_the_path_and_keep_its_corners():

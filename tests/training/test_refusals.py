@@ -10,8 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.wrappers import FlattenObservation, NormalizeObservation, RescaleAction
-from helpers import JUMPS, MOVING, PANDA, REACH, SENSED, STEP
-from helpers import PLANE as ENV
+from helpers import JUMPS, MOVING, PANDA, PLANE, REACH, SENSED, STEP
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
@@ -73,13 +72,13 @@ CONFIGURATIONS = [
     *((TrainConfig, {"stop_when_stalled": share}) for share in (0.0, 1.0, True, "0.3", math.nan)),
     (TrainConfig, STALLING),  # the preset has no more decisions than it must make
     (TrainConfig, {**STALLING, "n_timesteps": 10**5, "eval_every": 0}),
-    *((EvaluateConfig, {"env": ENV, "checks": checks}) for checks in ((8,), ())),
-    (EvaluateConfig, {"agent": "runs/x", "pretrained": ENV}),
+    *((EvaluateConfig, {"env": PLANE, "checks": checks}) for checks in ((8,), ())),
+    (EvaluateConfig, {"agent": "runs/x", "pretrained": PLANE}),
     (PlayConfig, {"agent": "a", "video": "film.gif"}),
     (LiveConfig, {"port": 70_000}),
     (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}),
     *((kind, {"out": ""}) for kind in (TrainConfig, DemoConfig, PaperConfig)),
-    (EvaluateConfig, {"env": ENV, "json": ""}),
+    (EvaluateConfig, {"env": PLANE, "json": ""}),
 ]
 
 
@@ -150,15 +149,15 @@ def test_what_cannot_be_trained_leaves_no_folder(changes, tmp_path):
 
 @functools.cache
 def agent():
-    return load_agent(ENV)
+    return load_agent(PLANE)
 
 
 def plan(**changes):
-    return GeometrySearch(ENV, 8).plan(**{"start": (-0.2, 0.3), "goal": (0.1, 0.4), **changes})
+    return GeometrySearch(PLANE, 8).plan(**{"start": (-0.2, 0.3), "goal": (0.1, 0.4), **changes})
 
 
 def predicted(**changes):
-    observation, _ = gym.make(ENV).reset(seed=0)
+    observation, _ = gym.make(PLANE).reset(seed=0)
     return agent().predict({**observation, **changes})
 
 
@@ -191,11 +190,11 @@ def many_points():
 
 
 def scenes(number):
-    return SceneSimulation(ENV, 1).task.sampler()([np.random.default_rng(0)] * number)
+    return SceneSimulation(PLANE, 1).task.sampler()([np.random.default_rng(0)] * number)
 
 
 def film(path="film.mp4", number=1, mode="rgb_array_list"):
-    record_video(path, gym.make(ENV, render_mode=mode), scenes(number), lambda *_: np.zeros((1, 3)))
+    record_video(path, gym.make(PLANE, render_mode=mode), scenes(number), lambda *_: np.zeros((1, 3)))
 
 
 class Decides:
@@ -210,43 +209,43 @@ class Decides:
 
 ZERO = np.zeros((2, 3))
 CALLS = [
-    *(lambda name=name: make_method(name, ENV) for name in ("magic", "search", "search3", "sobol0")),
+    *(lambda name=name: make_method(name, PLANE) for name in ("magic", "search", "search3", "sobol0")),
     *(lambda name=name: make_method(name, MOVING) for name in ("constant", "rest:ompl", "ompl")),
-    lambda: SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2, replay_buffer_class=HerReplayBuffer),
+    lambda: SAC("MultiInputPolicy", ViaVecEnv(PLANE, 1), buffer_size=2, replay_buffer_class=HerReplayBuffer),
     lambda: benchmark_planner("search99999999999"),
-    *(lambda more=more: GeometrySearch(ENV, **more) for more in (
+    *(lambda more=more: GeometrySearch(PLANE, **more) for more in (
         {"n_checks": 10**6}, {"refinements": 64, "per_round": 2048}, {"n_checks": 1.5}, {"refinements": -1},
     )),
     *(lambda name=name, value=value: setattr(agent().policy, name, value) for name, value in (
         ("checks", -1), ("checks", 1.5), ("refine", True), ("candidates", 0), ("refinements", 10**9),
     )),
     lambda: setattr(load_agent(SENSED).policy, "belief", "magic"),
-    lambda: agent_method("agent", SAC("MultiInputPolicy", ViaVecEnv(ENV, 1), buffer_size=2), 8),
-    lambda: evaluate_methods([], load(shipped_path(ENV), "test"), ENV),
-    lambda: evaluate(ENV, env=REACH),
-    lambda: evaluate(5, env=ENV),
-    *(lambda given=given: evaluate(env=ENV, baselines=given) for given in (
+    lambda: agent_method("agent", SAC("MultiInputPolicy", ViaVecEnv(PLANE, 1), buffer_size=2), 8),
+    lambda: evaluate_methods([], load(shipped_path(PLANE), "test"), PLANE),
+    lambda: evaluate(PLANE, env=REACH),
+    lambda: evaluate(5, env=PLANE),
+    *(lambda given=given: evaluate(env=PLANE, baselines=given) for given in (
         5, [3], [None], ["straight", "straight"], [Decides("a", ZERO), Decides("a", ZERO)],
     )),
-    *(lambda checks=checks: evaluate(ENV, checks=checks) for checks in ([4, 4], [0, 1.5], [-1])),
-    *(lambda scenes=scenes: evaluate(ENV, scenes=scenes) for scenes in (5, None, ["test"], "nowhere.npz")),
-    *(lambda given=given: evaluate(env=ENV, baselines=[Decides("a", given)], n_scenes=2) for given in (
+    *(lambda checks=checks: evaluate(PLANE, checks=checks) for checks in ([4, 4], [0, 1.5], [-1])),
+    *(lambda scenes=scenes: evaluate(PLANE, scenes=scenes) for scenes in (5, None, ["test"], "nowhere.npz")),
+    *(lambda given=given: evaluate(env=PLANE, baselines=[Decides("a", given)], n_scenes=2) for given in (
         None, "left", ZERO[0], ZERO[:1], ZERO[:, :2], ZERO + math.nan, ZERO.astype(object),
     )),
     lambda: evaluate(baselines=["straight"]),
-    lambda: evaluate(env=ENV, baselines=["untrained"]),
-    *(lambda name=name: make_method(name, ENV) for name in ("cautious64", "thick:search64")),
+    lambda: evaluate(env=PLANE, baselines=["untrained"]),
+    *(lambda name=name: make_method(name, PLANE) for name in ("cautious64", "thick:search64")),
     *(lambda name=name: make_method(name, SENSED) for name in (
         "cautious0", "thin:search64", "thick:straight", "thick:cautious64", "thick:points:search64",
     )),
     lambda: evaluate("nowhere"),
     *(lambda path=path: load_agent(path) for path in (Path(__file__), Path(__file__).parent)),
-    *(lambda wrap=wrap: evaluate(SAC("MlpPolicy", NormalizeObservation(wrap(FlattenObservation(gym.make(ENV))))))
+    *(lambda wrap=wrap: evaluate(SAC("MlpPolicy", NormalizeObservation(wrap(FlattenObservation(gym.make(PLANE))))))
       for wrap in (lambda env: env, Monitor)),
-    lambda: evaluate(SAC("MlpPolicy", VecExtractDictObs(ViaVecEnv(ENV, 2), "goal"))),
-    lambda: evaluate(SAC("MultiInputPolicy", RescaleAction(gym.make(ENV), np.float32(0), np.float32(1)))),
-    lambda: evaluate(ENV, baselines="straight"),
-    lambda: evaluate(ENV, n_scenes=0),
+    lambda: evaluate(SAC("MlpPolicy", VecExtractDictObs(ViaVecEnv(PLANE, 2), "goal"))),
+    lambda: evaluate(SAC("MultiInputPolicy", RescaleAction(gym.make(PLANE), np.float32(0), np.float32(1)))),
+    lambda: evaluate(PLANE, baselines="straight"),
+    lambda: evaluate(PLANE, n_scenes=0),
     *(lambda goal=goal: plan(goal=goal) for goal in ((0.1, 0.2, 0.3), (0.9, 0.4), (-0.2, 0.3))),
     lambda: plan(obstacles=[Sphere(0.02, position=(-0.2, 0.3, 0.0), name="can")]),  # touches the arm
     lambda: agent().plan((-0.2, 0.3), (0.1, 0.4), [Sphere(0.01, position=(0.5, 0.1 * i, 0.0)) for i in range(9)]),
@@ -256,7 +255,7 @@ CALLS = [
     lambda: agent().learn(8),  # loaded for decisions
     lambda: predicted(wind=np.zeros(2)),
     lambda: predicted(goal=np.array([np.nan, 0.3])),
-    lambda: predicted(goal=gym.make(ENV).reset(seed=0)[0]["hand"]),
+    lambda: predicted(goal=gym.make(PLANE).reset(seed=0)[0]["hand"]),
     *(lambda changes=changes: sensed(**changes) for changes in (
         {"ranges": np.full((2, 192), np.nan)}, {"ranges": np.ones((2, 100))},
         {"points": np.ones((2, 576))}, {"obstacles": np.zeros((2, 3))},
@@ -268,15 +267,15 @@ CALLS = [
     lambda: Task.from_dict({**agent().get_env().get_attr("task")[0].as_dict(), "arm": "octopus"}),
     *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, SENSED)),
     lambda: ViaQ("ViaQPolicy", make_vec_env("Pendulum-v1")),
-    *(lambda wrapper=wrapper: ViaQ("ViaQPolicy", make_vec_env(ENV, 2, wrapper_class=wrapper))
+    *(lambda wrapper=wrapper: ViaQ("ViaQPolicy", make_vec_env(PLANE, 2, wrapper_class=wrapper))
       for wrapper in (FlattenObservation, lambda env: RescaleAction(env, np.float32(-2), np.float32(2)))),
     lambda: sensed(ranges=np.full((2, 192), 50.0)),
     lambda: evaluate(load_agent(SENSED), scenes="validation", n_scenes=2, env_kwargs={"sensor": shorter()}),
-    *(lambda changes=changes: evaluate(ENV, scenes="validation", n_scenes=2, env_kwargs=changes)
+    *(lambda changes=changes: evaluate(PLANE, scenes="validation", n_scenes=2, env_kwargs=changes)
       for changes in ({"shapes": ["box", "cylinder"]}, {"duration_range": (0.3, 0.6)}, {"n_obstacles": 8})),
     *(lambda wrapped=wrapped: ViaQ("ViaQPolicy", wrapped)
-      for wrapped in (VecNormalize(ViaVecEnv(ENV, 2)), VecFrameStack(ViaVecEnv(ENV, 2), 2))),
-    lambda: ViaRank("ViaRankPolicy", ViaVecEnv(ENV, 1)),
+      for wrapped in (VecNormalize(ViaVecEnv(PLANE, 2)), VecFrameStack(ViaVecEnv(PLANE, 2), 2))),
+    lambda: ViaRank("ViaRankPolicy", ViaVecEnv(PLANE, 1)),
     *(lambda labels=labels: ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1), labels=labels)
       for labels in (100, "all")),
     lambda: ViaRank("ViaRankPolicy", make_vec_env("Pendulum-v1")),
@@ -297,7 +296,7 @@ CALLS = [
     lambda: moved(obstacles=[many_points()]).execute(force=True),
     lambda: scenes_for("tests", Task.of()),
     *(lambda env_id=env_id: scenes_for(load(shipped_path(env_id), "validation"), Task.of()) for env_id in CHANGING),
-    *(lambda name=name: evaluate(env=ENV, baselines=["straight"], scenes=load(shipped_path(name), "test"))
+    *(lambda name=name: evaluate(env=PLANE, baselines=["straight"], scenes=load(shipped_path(name), "test"))
       for name in (PANDA, *CHANGING)),
     *(lambda changes=changes: film(**changes)
       for changes in ({"path": "film.gif"}, {"mode": None}, {"number": 0})),
@@ -334,8 +333,8 @@ def test_what_copies_of_an_environment_cannot_share(call, error, env):
 
 
 def test_an_environment_of_another_task_is_named():
-    with pytest.raises(ValueError, match=f"{ENV}, .*{PANDA} {{'n_via': 2}}") as raised:
-        load_agent(ENV, env=ViaVecEnv(PANDA, 1, n_via=2))
+    with pytest.raises(ValueError, match=f"{PLANE}, .*{PANDA} {{'n_via': 2}}") as raised:
+        load_agent(PLANE, env=ViaVecEnv(PANDA, 1, n_via=2))
     assert not isinstance(raised.value, BadFileError)  # the file is not to blame
 
 
@@ -392,13 +391,16 @@ COMMANDS = [
     ("evaluate --scenes motionbenchmaker --baselines", "at least one planner"),
     ("evaluate --problems nowhere", "nowhere"),
     ("evaluate --problems . --scenes hard", "not both"),
-    (f"evaluate --env {ENV} --baselines straight --scenes nowhere.npz", "nowhere.npz"),
+    (f"evaluate --env {PLANE} --baselines straight --scenes nowhere.npz", "nowhere.npz"),
     (f"evaluate --env {SENSED} --baselines search16 --env-kwargs sensor=nose", "hand_rays"),
-    (f"evaluate --env {ENV} --json /proc/x", "--json /proc/x cannot be written"),
-    (f"evaluate --env {ENV} --json full/notes.txt", "full/notes.txt: exists and was not written by viapoint"),
-    (f"evaluate --env {ENV} --baselines untrained", "untrained needs an agent"),
+    (f"evaluate --env {PLANE} --json /proc/x", "--json /proc/x cannot be written"),
+    (
+        f"evaluate --env {PLANE} --json full/notes.txt",
+        "full/notes.txt: exists and was not written by viapoint",
+    ),
+    (f"evaluate --env {PLANE} --baselines untrained", "untrained needs an agent"),
     *(
-        (f"evaluate --env {ENV} --baselines {name}", f"{name} needs a task with a sensor")
+        (f"evaluate --env {PLANE} --baselines {name}", f"{name} needs a task with a sensor")
         for name in ("points:search16", "cautious16")
     ),
     *((f"fit nothing.csv --n-via {numbers}", "--n-via must be") for numbers in ("2 1", "0 1 2", "9", "-1")),

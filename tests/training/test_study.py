@@ -13,26 +13,28 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import yaml
-from helpers import PLANE as ENV
+from helpers import PLANE
 
 from viapoint.training import Study, run_study
 from viapoint.training.study import COLUMNS, StudyFailedError, _connected, _import_ray
 
 FEW = {"learning_starts": 64, "gradient_steps": 1}
 TRAINING = {
-    "n_timesteps": 256, "n_envs": 32, "eval_every": 64, "eval_scenes": 8, "checkpoint_every": 64,
+    "n_timesteps": 128, "n_envs": 32, "eval_every": 64, "eval_scenes": 8, "checkpoint_every": 64,
     "hyperparameters": FEW, "env_kwargs": {"threads": 1},
 }  # fmt: skip
+QUICK = {**FEW, "policy_kwargs": {"candidates": 32, "refinements": 0}}
+VIAQ = {"viaq": {**TRAINING, "hyperparameters": QUICK}}
 GIVEN = {
-    "environments": [ENV],
+    "environments": [PLANE],
     "scenes": ["test"],
     "n_scenes": 12,
     "seeds": [0, 1],
-    "agents": {"viaq": TRAINING, "sac": {"algo": "sac", "seeds": [0], **TRAINING}},
+    "agents": {**VIAQ, "sac": {"algo": "sac", "seeds": [0], **TRAINING}},
     "baselines": ["straight", "search64"],
 }
 GAMMA = {"parameters": {"hyperparameters.gamma": [0.9]}}
-ONE_AGENT = {**GIVEN, "agents": {"viaq": TRAINING}, "baselines": []}
+ONE_AGENT = {**GIVEN, "agents": VIAQ, "baselines": []}
 
 
 def results_in(folder):
@@ -78,7 +80,7 @@ def test_tables_hold_every_row_and_a_second_call_does_nothing(whole):
     assert ((rows.low <= rows.success) & (rows.success <= rows.high)).all()
     assert rows.success["search64"] > 0.5
     assert rows.success["straight"] == 0.0
-    assert rows.decisions["viaq"] == 256
+    assert rows.decisions["viaq"] == 128
     pd.testing.assert_frame_equal(pd.read_csv(folder / "results.csv"), table, check_dtype=False)
     assert "| straight" in (folder / "results.md").read_text()
     assert (folder / "PlanarObstacles-v0.png").stat().st_size > 10_000
@@ -93,7 +95,7 @@ def test_tables_hold_every_row_and_a_second_call_does_nothing(whole):
 def test_other_settings_of_a_trained_row_are_an_error_and_its_run_stays(whole):
     folder = whole[0]
     before = results_in(folder)
-    changed = {**TRAINING, "hyperparameters": {**FEW, "batch_size": 8}}
+    changed = {**TRAINING, "hyperparameters": {**QUICK, "batch_size": 8}}
     other = {**ONE_AGENT, "seeds": [0], "agents": {"viaq": changed}}
     with pytest.raises(StudyFailedError, match="other settings"):
         run_study(Study.from_dict(other), out=folder)
@@ -127,9 +129,9 @@ def test_a_search_writes_its_best_settings_and_a_command_for_them(ray, tmp_path)
         "hyperparameters.batch_size": [16, 32],
     }
     first = [{"hyperparameters.learning_rate": 1e-3, "hyperparameters.batch_size": 32}]
-    search = {**TRAINING, "n_timesteps": 128, "algo": "sac", "trials": 2}
+    search = {**TRAINING, "algo": "sac", "trials": 2}
     search |= {"parameters": parameters, "first": first}
-    study = Study.from_dict({"environments": [ENV], "searches": {"tuned": search}})
+    study = Study.from_dict({"environments": [PLANE], "searches": {"tuned": search}})
     told = []
     assert run_study(study, out=tmp_path / "out", told=told.append).empty
     place = tmp_path / "out" / "PlanarObstacles-v0" / "tuned"
@@ -148,7 +150,7 @@ def test_a_search_writes_its_best_settings_and_a_command_for_them(ray, tmp_path)
 
 def test_grids_and_checks_make_rows():
     grid = {"hyperparameters.batch_size": [64, 128], "env_kwargs.n_via": [1, 2]}
-    given = {"environments": [ENV], "seeds": [3], "agents": {"sac": {"algo": "sac", "grid": grid}}}
+    given = {"environments": [PLANE], "seeds": [3], "agents": {"sac": {"algo": "sac", "grid": grid}}}
     trials = Study.from_dict(given).trials
     assert [trial.row for trial in trials] == [
         f"sac-batch_size={size}-n_via={number}" for size in (64, 128) for number in (1, 2)
@@ -181,11 +183,11 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     "change",
     [
         {"environments": []},
-        *({"environments": given} for given in (5, [{"id": ENV}])),
-        *({"agents": {"viaq": {"environments": given}}} for given in (5, [{"id": ENV}], ["PandaReach"])),
+        *({"environments": given} for given in (5, [{"id": PLANE}])),
+        *({"agents": {"viaq": {"environments": given}}} for given in (5, [{"id": PLANE}], ["PandaReach"])),
         {"environments": {"a": {"id": "CartPole-v1"}}},
-        {"environments": {"a": {"id": ENV, "env_kwargs": {"num_envs": 3}}}},
-        {"environments": {"../a": {"id": ENV}}},
+        {"environments": {"a": {"id": PLANE, "env_kwargs": {"num_envs": 3}}}},
+        {"environments": {"../a": {"id": PLANE}}},
         {"seed": [0]},
         {"seeds": [0, 0]},
         {"n_scenes": 0},

@@ -267,8 +267,9 @@ class ViaRank(PlanAlgorithm):
     Example:
         >>> from viapoint.training import ViaRank, ViaVecEnv
         >>> env = ViaVecEnv("viapoint/PlanarSensed-v0", 16, seed=0)
-        >>> agent = ViaRank("ViaRankPolicy", env, learning_starts=16, batch_size=16).learn(32)
-        >>> agent.num_timesteps
+        >>> few = {"candidates": 32, "refinements": 0}
+        >>> agent = ViaRank("ViaRankPolicy", env, learning_starts=16, batch_size=16, policy_kwargs=few)
+        >>> agent.learn(32).num_timesteps
         32
     """
 
