@@ -195,7 +195,7 @@ def _study(
     name: str,
     folder: Path,
     *,
-    environments: Entries,
+    environments: Entries | None = None,
     out: str = "",
     seeds: Numbers = (0,),
     agents: Entries | None = None,
@@ -206,7 +206,7 @@ def _study(
 ) -> Study:
     """Return a study; the fields are those of the file."""
     known = {}
-    for env, fields in _entries(environments):
+    for env, fields in _entries(environments or {}):
         fields = {"scenes": scenes, "n_scenes": n_scenes, **fields}
         known[env] = _made(f"environments.{env}", _environment, fields, env, folder)
     found: list[Trial] = []

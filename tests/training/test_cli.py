@@ -48,9 +48,10 @@ def test_every_command_has_help(command, capsys):
     assert f"viapoint {command}" in re.search("Example: (.+)", shown).group(1)
 
 
-def test_the_help_fits_a_screen(capsys):
+@pytest.mark.parametrize("words", [(), ("help",), ("--help",)])
+def test_the_help_fits_a_screen(words, capsys):
     with pytest.raises(SystemExit) as end:
-        run("--help")
+        run(*words)
     lines = capsys.readouterr().out.splitlines()
     assert not end.value.code
     assert all(any(line.strip().startswith(command) for line in lines) for command in cli.COMMANDS)

@@ -363,7 +363,6 @@ def test_folders_that_are_no_runs(tmp_path):
 
 
 COMMANDS = [
-    ("", "train"),
     ("trian", "did you mean 'train'"),
     ("train --env viapoint/PlanarObstacle-v0", "Did you mean: `PlanarObstacles`"),
     ("train --n-timesteps -5", "--n-timesteps must be a whole number, from 1"),

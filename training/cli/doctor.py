@@ -8,13 +8,14 @@ VERSIONS = "import sys, {0}; print(sys.version[:7], *(f'{{m.__name__}} {{m.__ver
 ENV = "import gymnasium, viapoint.envs as v; env = gymnasium.make(v.ENV_IDS[1], render_mode='rgb_array'); env.reset(); "
 STEP = ENV + "print(f'{env.step(env.action_space.sample())[4][\"duration\"]:.3f} s of movement')"
 AGENT = "from viapoint.training import load_agent; print(load_agent('viapoint/PlanarObstacles-v0').env_id)"
-EXTRAS = "from importlib.util import find_spec; print(*(name for name in {} if find_spec(name)))"
+EXTRAS = "from importlib.util import find_spec as f; print(*(n if f(n) else f'(no {{n}}: extra {{e}})' for n, e in {}))"
+PACKAGES = {"torch": "training", "ompl": "planning", "viser": "live", "minari": "minari", "ray": "study"}
 # Script that fails, or prints what it found, and remedy, by the name of what is checked
 CHECKS = {
     "packages": (VERSIONS.format("numpy, gymnasium, mujoco, numba"), "pip install viapoint"),
     "MuJoCo": (STEP, "pip install 'mujoco>=4'"),
-    "agents": (AGENT, "environments, primitives and plan_motion work without it"),
-    "extras": (EXTRAS.format(("torch", "ompl", "viser", "minari", "ray", "optuna")), ""),
+    "agents": (AGENT, "pip install 'viapoint[training]'; the planner works without it"),
+    "extras": (EXTRAS.format((*PACKAGES.items(),)), ""),
     "pictures": (ENV + "print(*env.render().shape)", "on Debian: apt-get install libegl1 libgl1"),
 }
 

@@ -93,11 +93,11 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
     from viapoint.training import checks, configs
 
     kinds = {name: getattr(configs, f"{name.capitalize()}Config") for name in COMMANDS}
-    if words and words[0] in ("-h", "--help"):
+    if not words or words[0] in ("-h", "--help", "help"):
         lines = [f"  {name:<10}{str(kind.__doc__).splitlines()[0]}" for name, kind in kinds.items()]
         print(OVERVIEW.format(commands="\n".join(lines)))
         raise SystemExit(0)
-    command, *options = words or ("",)
+    command, *options = words
     if command not in COMMANDS:
         raise ValueError(f"{checks.unknown_name('command', command, COMMANDS)} (viapoint --help)")
     kind = kinds[command]
