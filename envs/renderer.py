@@ -189,8 +189,12 @@ class SceneView:
         self._camera = mujoco.MjvCamera()
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
         if width < height:  # a wider field of view keeps the whole workspace in upright pictures
-            half = np.tan(np.radians(self.model.cam_fovy[camera]) / 2.0)
-            self.model.cam_fovy[camera] = 2.0 * np.degrees(np.arctan(half * height / width))
+            field = self.model.cam_fovy[camera]  # an angle, without perspective a length
+            if self._flat:
+                self.model.cam_fovy[camera] = field * height / width
+            else:
+                half = np.tan(np.radians(field) / 2.0)
+                self.model.cam_fovy[camera] = 2.0 * np.degrees(np.arctan(half * height / width))
 
     def write(self, picture: Picture) -> None:
         """Set up one picture."""
