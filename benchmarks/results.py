@@ -244,7 +244,10 @@ def draw(rows: list[dict[str, Any]]) -> None:
         for row in rows:
             name = row["method"] if row["method"].startswith("agent") else row["method"].partition(",")[0]
             shown = row["env"] == f"viapoint/{heading}-v0" and row["scenes"] == "test"
-            if not shown or is_detail(row["method"]) or name not in STYLES:
+            untrained = (
+                ", 0 of " in row["method"]
+            )  # by validation, the best model of this training is untrained
+            if not shown or untrained or is_detail(row["method"]) or name not in STYLES:
                 continue
             kind, mark = STYLES[name]
             color = METHOD_COLOURS[kind]

@@ -254,7 +254,7 @@ def _checked(time_name: str, time: Any, name: str, position: Any, fewest: int) -
     if count < fewest:
         raise ValueError(
             f"{name} must have {fewest} or more samples for {(fewest - 5) // 2} via-points, got {count}: measure at a "
-            "higher rate, or lower n_via"
+            "higher rate, or give a lower n_via"
         )
     if 0 in batch:
         raise ValueError(f"{name} must hold one movement or more, got shape {tuple(position.shape)}")

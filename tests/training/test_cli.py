@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import gymnasium as gym
@@ -57,6 +58,12 @@ def test_the_help_fits_a_screen(words, capsys):
     assert all(any(line.strip().startswith(command) for line in lines) for command in cli.COMMANDS)
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 80
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit) as end:
+        run("--version")
+    assert (end.value.code, capsys.readouterr().out) == (0, f"viapoint {version('viapoint')}\n")
 
 
 def test_output_that_nobody_reads_ends_the_command_without_a_word():

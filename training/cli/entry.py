@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib
+import importlib.metadata
 import io
 import os
 import re
@@ -85,9 +85,12 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
     """Return the configuration that a command line stands for, with defaults of `usual` where it is given.
 
     Raises:
-        SystemExit: Help was asked for; code 0.
+        SystemExit: Help or the version was asked for; code 0.
         ValueError: A word is not understood or not allowed.
     """
+    if words[:1] == ["--version"]:
+        print(f"viapoint {importlib.metadata.version('viapoint')}")
+        raise SystemExit(0)
     import tyro
 
     from viapoint.training import checks, configs
