@@ -244,9 +244,8 @@ def draw(rows: list[dict[str, Any]]) -> None:
         for row in rows:
             name = row["method"] if row["method"].startswith("agent") else row["method"].partition(",")[0]
             shown = row["env"] == f"viapoint/{heading}-v0" and row["scenes"] == "test"
-            untrained = (
-                ", 0 of " in row["method"]
-            )  # by validation, the best model of this training is untrained
+            # By validation, the best model of such a training is the untrained one.
+            untrained = ", 0 of " in row["method"]
             if not shown or untrained or is_detail(row["method"]) or name not in STYLES:
                 continue
             kind, mark = STYLES[name]

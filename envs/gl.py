@@ -162,7 +162,7 @@ def _gl_context() -> Any:
     context = gl_context.GLContext(1, 1)
     # GLFW without a display warns, and makes a context of no window.
     if not getattr(context, "_context", True):
-        raise RuntimeError("GLFW finds no display, and EGL is not installed")
+        raise RuntimeError("GLFW needs a display")
     return context
 
 

@@ -189,8 +189,8 @@ class SceneView:
         self._camera = mujoco.MjvCamera()
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
         if width < height:  # a wider field of view keeps the whole workspace in upright pictures
-            field = self.model.cam_fovy[camera]  # an angle, without perspective a length
-            if self._flat:
+            field = self.model.cam_fovy[camera]  # an angle, or a length without perspective
+            if self.model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
                 self.model.cam_fovy[camera] = field * height / width
             else:
                 half = np.tan(np.radians(field) / 2.0)
