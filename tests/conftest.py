@@ -1,11 +1,17 @@
-"""Settings for tests that start Ray, modules that tests import, the order of the files, and random numbers."""
+"""Settings for tests that start Ray, modules that tests import, order of the files, what each test finds again."""
 
 import os
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
+import gymnasium as gym
 import numpy as np
 import pytest
+
+from viapoint.envs.arms import registry
+from viapoint.envs.geometry.shapes import REGISTERED_MESHES
+from viapoint.envs.scenes.families_registry import FAMILIES
 
 # Ray reads this once, when it is imported; otherwise it replaces 127.0.0.1 by another address.
 os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
@@ -28,6 +34,18 @@ def pytest_collection_modifyitems(items):
         return min(map(FIRST.index, names), default=len(FIRST))
 
     items.sort(key=place)
+
+
+@pytest.fixture(autouse=True)
+def registries():
+    """What a test or an example registers under a name is gone afterwards, as the next may take the name."""
+    with (
+        patch.dict(gym.registry),
+        patch.dict(REGISTERED_MESHES),
+        patch.dict(FAMILIES),
+        patch.dict(registry._OWN),
+    ):
+        yield
 
 
 @pytest.fixture(scope="module")

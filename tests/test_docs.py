@@ -16,7 +16,6 @@ import notebooks
 import pytest
 
 from viapoint import envs, primitives, training
-from viapoint.envs.scenes import families_registry
 from viapoint.training import configs
 from viapoint.training.cli import entry as cli
 
@@ -197,16 +196,9 @@ def test_docstrings_begin_with_a_whole_sentence(path):
 EXPORTS = [(package, name) for package in (primitives, envs, training) for name in package.__all__]
 
 
-@pytest.fixture
-def registered(monkeypatch):
-    """Leave shapes and families as they were, to which an example may add."""
-    monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(families_registry, "FAMILIES", dict(families_registry.FAMILIES))
-
-
 @pytest.mark.parametrize(("package", "name"), EXPORTS)
-@pytest.mark.usefixtures("registered")
-def test_examples_of_docstrings_run(package, name):
+def test_examples_of_docstrings_run(package, name, monkeypatch):
+    monkeypatch.chdir(ROOT)
     try:
         value = getattr(package, name)
     except ImportError:

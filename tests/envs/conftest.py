@@ -1,4 +1,4 @@
-"""Fixtures of the tests of environments: families of a test alone, and how pictures are made."""
+"""Fixtures of the tests of environments: how pictures are made."""
 
 import gymnasium as gym
 import pytest
@@ -6,13 +6,6 @@ from helpers import PLANE
 
 from viapoint.envs import renderer
 from viapoint.envs.gl import GLUnavailableError
-from viapoint.envs.scenes import families_registry
-
-
-@pytest.fixture
-def registry(monkeypatch):
-    """Scene families that a test registers are gone afterwards."""
-    monkeypatch.setattr(families_registry, "FAMILIES", dict(families_registry.FAMILIES))
 
 
 @pytest.fixture

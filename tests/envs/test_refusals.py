@@ -272,7 +272,6 @@ ROWS = [
 ]
 
 
-@pytest.mark.usefixtures("registry")
 @pytest.mark.parametrize(("call", "arguments", "error"), ROWS)
 def test_arguments_of_classes_and_functions(call, arguments, error):
     for each in arguments:

@@ -334,7 +334,6 @@ def test_layouts_grow_with_the_arm_around_its_foot():
         np.testing.assert_allclose(two[:, 4:13], one[:, 4:13])
 
 
-@pytest.mark.usefixtures("registry")
 def test_own_family_of_shapes_and_places_is_drawn():
     def ball(rng, room):
         return [ve.Sphere(0.1, position=(0.45, 0.0, 0.45))], [

@@ -21,7 +21,7 @@ from viapoint.envs.geometry.obstacles import (
     quaternions_of,
     unpack,
 )
-from viapoint.envs.geometry.shapes import REGISTERED_MESHES, check_kinds
+from viapoint.envs.geometry.shapes import check_kinds
 
 ALL = pytest.mark.parametrize("kind", KINDS)
 CUBE = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]) / 10
@@ -34,10 +34,9 @@ TWISTED = [(0, 1, 2), (5, 4, 3), (0, 3, 1), (3, 4, 1), (1, 4, 2), (4, 5, 2), (2,
 
 @pytest.fixture
 def wedge():
-    """A registered mesh, which is gone afterwards."""
+    """Name of a registered mesh."""
     ve.register_mesh("wedge", WEDGE)
-    yield "wedge"
-    del REGISTERED_MESHES["wedge"]
+    return "wedge"
 
 
 def some_shapes(rng, kinds=KINDS, number=3):

@@ -20,7 +20,6 @@ CUSTOM = "test/TwoPosts-v0"
 def folder(tmp_path, monkeypatch):
     """Keep datasets in a temporary folder, and a custom id in the registry of the test."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
-    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
     gym.register(
         CUSTOM,
         entry_point="viapoint.envs.env:ReachEnv",

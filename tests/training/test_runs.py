@@ -77,8 +77,7 @@ def test_arguments_of_an_environment_may_be_objects(make, kwargs, tmp_path):
     assert config.task.as_dict() == task.as_dict()
 
 
-def test_an_agent_of_ones_own_arm_is_loaded_by_whoever_makes_the_arm_known(tmp_path, monkeypatch):
-    monkeypatch.setattr(registry, "_OWN", {})
+def test_an_agent_of_ones_own_arm_is_loaded_by_whoever_makes_the_arm_known(tmp_path):
     own = dataclasses.replace(arm_of("panda"), name="mine")
     register_arm(own)
     env = ViaVecEnv("viapoint/Reach-v0", 1, arm=own, threads=1)

@@ -4,6 +4,7 @@ import doctest
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -92,8 +93,8 @@ def test_tables_hold_every_row_and_a_second_call_does_nothing(whole):
     assert len(lines) == 2
 
 
-def test_other_settings_of_a_trained_row_are_an_error_and_its_run_stays(whole):
-    folder = whole[0]
+def test_other_settings_of_a_trained_row_are_an_error_and_its_run_stays(whole, tmp_path):
+    folder = shutil.copytree(whole[0], tmp_path / "out")
     before = results_in(folder)
     changed = {**TRAINING, "hyperparameters": {**QUICK, "batch_size": 8}}
     other = {**ONE_AGENT, "seeds": [0], "agents": {"viaq": changed}}

@@ -54,17 +54,17 @@ def test_it_is_the_vector_environment(env_id, steps):
     env.close()
 
 
-def register(monkeypatch, *, control_step=0.04, **kwargs):
+def register(*, control_step=0.04, **kwargs):
     """Register an id of one's own for the test alone."""
     usual = {"arm": "planar", "decide_at": "steps", "control_step": control_step}
     spec = EnvSpec("me/Own-v0", "viapoint.envs.env:ReachEnv", kwargs=usual, **kwargs)
-    monkeypatch.setitem(gym.registry, spec.id, spec)
+    gym.registry[spec.id] = spec
     return spec.id
 
 
 def test_an_own_id_has_the_limit_of_decisions_of_gymnasium(tmp_path, monkeypatch):
     vector = "viapoint.envs.vector_env:ReachVectorEnv"
-    env_id = register(monkeypatch, vector_entry_point=vector, max_episode_steps=3)
+    env_id = register(vector_entry_point=vector, max_episode_steps=3)
     env = ViaVecEnv(env_id, 2, seed=0, threads=1)
     env.reset()
     cut = [[info["TimeLimit.truncated"] for info in env.step(actions(env))[-1]] for _ in range(6)]
@@ -78,13 +78,13 @@ def test_an_own_id_has_the_limit_of_decisions_of_gymnasium(tmp_path, monkeypatch
         again = evaluate(run.best, scenes="validation", n_scenes=4)
     for each in (result, again):
         assert (each.results[0].outcomes["decisions"] == 3).all()
-    register(monkeypatch, vector_entry_point=vector, control_step=0.08)  # nor another task by this id
+    register(vector_entry_point=vector, control_step=0.08)  # nor another task by this id
     with pytest.raises(BadFileError):
         load_agent(run.folder)
 
 
-def test_an_own_id_needs_a_vector_environment(monkeypatch):
-    env_id = register(monkeypatch)
+def test_an_own_id_needs_a_vector_environment():
+    env_id = register()
     for refused in (lambda: TrainConfig(env=env_id), lambda: evaluate(env=env_id, baselines=["straight"])):
         with pytest.raises(ValueError):
             refused()
