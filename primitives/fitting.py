@@ -250,11 +250,17 @@ def _checked(time_name: str, time: Any, name: str, position: Any, fewest: int) -
         raise ValueError(f"{error}{advice}") from None
     batch = leading_shape(name, position, None, None)
     count, dimension = position.shape[-2:]
+    if time.ndim and time.shape[-1] != count:
+        raise ValueError(
+            f"{time_name} and {name} must have as many samples as one another, got {time.shape[-1]} and {count}"
+        )
     batch = broadcast_batch(**{name: batch, time_name: leading_shape(time_name, time, count)})
     if count < fewest:
+        most = (fewest - 5) // 2
+        fewer = f", or give n_via={(count - 5) // 2} at most" if count >= 5 else ""
         raise ValueError(
-            f"{name} must have {fewest} or more samples for {(fewest - 5) // 2} via-points, got {count}: measure at a "
-            "higher rate, or give a lower n_via"
+            f"{name} must have {fewest} or more samples for n_via up to {most}, got {count}: "
+            f"measure at a higher rate{fewer}"
         )
     if 0 in batch:
         raise ValueError(f"{name} must hold one movement or more, got shape {tuple(position.shape)}")

@@ -1,6 +1,7 @@
 """Fits of via-points: what was put in comes out, in any frame, and nothing near it fits better."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -113,6 +114,17 @@ def test_a_sample_far_from_its_neighbours_is_told():
     position[20, 1] += 1.0
     with pytest.warns(UserWarning, match="sample 20 "):
         fit_via_points(time, position, 1)
+
+
+@pytest.mark.parametrize("count", [5, 6, 7, 9, 10])
+def test_too_few_samples_are_told_with_the_via_points_that_they_allow(count, rng):
+    time, position = samples(movement(rng, 0)[2], False, rng, count)
+    with pytest.raises(ValueError, match=r"n_via=\d") as told:
+        fit_via_points(time, position)
+    most = int(re.search(r"n_via=(\d)", str(told.value))[1])
+    assert fit_via_points(time, position, (0, most)).n_via == 0
+    with pytest.raises(ValueError):
+        fit_via_points(time, position, most + 1)
 
 
 @pytest.mark.parametrize("part", [slice(0, 50), slice(50, 100), slice(30, 70)])

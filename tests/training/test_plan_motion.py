@@ -238,7 +238,7 @@ def test_results_depend_on_neither_threads_nor_the_form_of_obstacles() -> None:
 @pytest.mark.parametrize("kwargs", [{"arm": "panda"}, {"arm": "planar", "whole_arm": True}], ids=str)
 def test_gradient_of_the_objective(kwargs) -> None:
     task, starts, goals, obstacles = drawn(5, **kwargs)
-    aim = module.AIMS[0]._replace(clearance=0.2)  # many residuals
+    aim = refine.SEED._replace(clearance=0.2)  # many residuals
     setting, table = module._setting(task.arm, task.space.of_hand), movement_table(2)
     dimension = task.space.dimension
     generator = np.random.default_rng(0)

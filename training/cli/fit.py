@@ -97,7 +97,7 @@ def _warn(movements: Movements, fits: Fits, config: FitConfig) -> None:
         if extent > WIDE:
             print(f"movement {name}: the hand moves {extent:g} m; positions are in metres", file=sys.stderr)
         if fewest < most == fits[name].n_via:
-            told = "allow more by --n-via, or cut a recording of several movements"
+            told = "see whether more fit better (--n-via), and cut a recording of several movements"
             print(f"movement {name}: {most} via-points, the most allowed, fit best; {told}", file=sys.stderr)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -45,7 +46,6 @@ from viapoint.training.planning.movements import (
 )
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl, path_around, points_on
 from viapoint.training.planning.refine import (
-    AIMS,
     SMOOTH,
     STRAIGHT_COST,
     Found,
@@ -55,8 +55,9 @@ from viapoint.training.planning.refine import (
     unit_of_jerk,
 )
 
-# Relative jerk cost above which more seeds are tried after a free movement, and how many of them
-ROUGH, MORE = 2.0, 8
+# Once enough movements are free, more seeds are tried around the one with the least jerk: MORE for each doubling of its
+# relative jerk cost beyond ROUGH, and at most MOST_MORE.
+ROUGH, MORE, MOST_MORE = 1.3, 8, 16
 # Spread of the first random seeds around the straight line, and of later ones, [rad]
 SPREADS = 0.8, 1.0
 HAND_SPREADS = 0.15, 0.3  # Spreads of the same seeds in hand space, [m]
@@ -149,10 +150,11 @@ def plan_motion(
 
     The straight movement is taken if it is free. Otherwise via-points are refined by the gradient of clearance and jerk
     (see `viapoint.training.planning.refine`), from the straight line first, and then from random seeds, until
-    `enough` free movements are found. Each is checked at 256 instants and polished; the one with the least jerk is
-    taken. The duration is the shortest that keeps 97 % of the velocity and torque limits, 0.25 s or more, if none is
-    given. Among moving obstacles, movements with via-points are tried with 1.3 times the duration of the straight one,
-    and then with longer ones, each 1.3 times as long as the one before, up to five times.
+    `enough` free movements are found; if all are rough, from some more seeds around the best one. Each is checked at
+    256 instants and polished; the one with the least jerk is taken. The duration is the shortest that keeps 97 % of the
+    velocity and torque limits, 0.25 s or more, if none is given. Among moving obstacles, movements with via-points are
+    tried with 1.3 times the duration of the straight one, and then with longer ones, each 1.3 times as long as the one
+    before, up to five times.
 
     Args:
         arm: Arm, or name of one.
@@ -560,10 +562,10 @@ def _search(
     table, fine = movement_table(n_via), fine_table(n_via)
     best, least = None, np.inf
     tight, widest = None, problem.margin  # the best of those that keep the margin and nothing more
-    tried = free = 0
+    tried = free = since = 0
     total = len(given) + 1 + number
     while tried < total and time.perf_counter() < until:
-        if free >= enough and least <= ROUGH * unit:
+        if free >= enough and tried - since >= _more(least / unit):
             break
         seeds = np.empty((min(CHUNKS[min(tried, len(CHUNKS) - 1)], total - tried), *straight.shape))
         for k in range(len(seeds)):
@@ -571,8 +573,12 @@ def _search(
             if rank < 0:
                 seeds[k] = given[tried + k] - problem.start
                 continue
-            spread = 0.0 if rank == 0 else near if rank < NARROW else far
-            seeds[k] = straight + spread * problem.generator.uniform(-1.0, 1.0, straight.shape)
+            away = problem.generator.uniform(-1.0, 1.0, straight.shape)
+            if best is not None and (free >= enough or rank % 2):  # what is free is seldom alone
+                seeds[k] = best[0].offsets[:n_via] + near * away
+            else:
+                spread = 0.0 if rank == 0 else near if rank < NARROW else far
+                seeds[k] = straight + spread * away
         wanted = max(enough - free, 1)
         done, found = _refined(problem, kept, table, fine, seeds, duration, enough=wanted)
         for k in range(done):
@@ -585,8 +591,8 @@ def _search(
                     tight = movement, "random", None
                 continue
             free += 1
-            if free == enough:  # a rough movement is worth some more seeds
-                total = min(total, tried + k + 1 + MORE)
+            if free == enough:
+                since = tried + k + 1
             if found.cost[k] < least:
                 rank = tried + k - len(given)
                 least = float(found.cost[k])
@@ -598,6 +604,11 @@ def _search(
         return None, tried
     movement, source, known = chosen
     return _known(problem, movement, source, problem.least, clearance=known), tried
+
+
+def _more(cost: float) -> int:
+    """Return how many more seeds a free movement is worth by its relative jerk cost: rough ones are worth many."""
+    return min(int(MORE * math.log2(max(cost / ROUGH, 1.0))), MOST_MORE)
 
 
 def _refined(
@@ -615,7 +626,7 @@ def _refined(
     fixed = problem.movement(seeds[:0, 0], table, 0, duration).offsets
     unit = unit_of_jerk(problem.goal - problem.start, problem.space.of_hand)
     return refine_seeds(
-        problem.setting, table, fine, problem.start, fixed, seeds, duration, problem.obstacles, 0, kept, AIMS,
+        problem.setting, table, fine, problem.start, fixed, seeds, duration, problem.obstacles, 0, kept,
         unit, smooth, enough,
     )  # fmt: skip
 

@@ -72,21 +72,20 @@ class Aim(NamedTuple):
     stride: int  # Step between the instants that are looked at
 
 
-# Aims of the refinements. The first one, of a seed, has little weight of jerk, and ends as soon as the movement is
-# free; the others polish free movements.
-AIMS = (
-    Aim(clearance=0.04, jerk=0.1, iterations=20, gain=1.0, stride=2),
-    Aim(clearance=0.02, jerk=1.0, iterations=20, gain=0.02, stride=2),
-    Aim(clearance=0.02, jerk=0.3, iterations=20, gain=0.01, stride=2),
-    Aim(clearance=0.015, jerk=1.5, iterations=20, gain=0.01, stride=2),
-)
+# Aim of the refinement of a seed: it has little weight of jerk, and ends as soon as the movement is free.
+SEED = Aim(clearance=0.04, jerk=0.1, iterations=20, gain=1.0, stride=2)
 # Aim of a second refinement of movements that are nearly free: in a narrow passage, a wide clearance on one side is
 # paid for with contact on the other.
 NARROW = Aim(clearance=0.008, jerk=0.02, iterations=20, gain=1.0, stride=2)
 NEARLY = -0.03  # Least clearance of movements that are nearly free, [m]
+# Aim of the first attempt to polish a free movement. The weight of jerk is that at which the movement is smooth and
+# still free: it grows after an attempt whose movement is free and smoother, and falls after others.
+POLISH = Aim(clearance=0.02, jerk=1.0, iterations=20, gain=0.01, stride=2)
+ATTEMPTS, HEAVIER, LIGHTER = 8, 2.0, 0.3
+LITTLE = 0.97  # Least factor on the jerk cost by an attempt after which another one is worth its time
 # Clearance beyond the margin that is asked for: distances of point clouds that are cut off there are rounded, [m]
 ROUNDING = 1e-6
-SMOOTH = 1.5  # Relative jerk cost with which a movement is polished no more
+SMOOTH = 1.1  # Relative jerk cost with which a movement that was polished is polished no more
 
 
 class Found(NamedTuple):
@@ -463,7 +462,6 @@ def refine_seeds(
     obstacles: Obstacles,
     scene: int,
     margin: float,
-    aims: tuple[Aim, ...],
     unit: float,
     smooth: float,
     enough: int,
@@ -481,7 +479,6 @@ def refine_seeds(
         obstacles: Obstacles, of which those of the scene `scene` count.
         scene: Index of the scene.
         margin: Least clearance of movements that count as free, [m].
-        aims: Aims of the first refinement of each seed, and of those that polish a free movement.
         unit: Unit of jerk costs in unit time.
         smooth: Jerk cost in this unit with which a movement that was polished once is smooth enough.
         enough: Number of free movements after which to stop.
@@ -490,17 +487,16 @@ def refine_seeds(
     work = _work(setting, vias + 3, dimension, obstacles, scene)
     found = Found(seeds.copy(), np.zeros(number, np.int64), np.full(number, np.inf), np.full(number, -1.0))
     # The refined movement, and the polished ones, each of which is smoother than the one before.
-    stages = len(aims)
-    offsets = np.empty((stages, vias + 3, dimension))
-    for stage in range(stages):
+    offsets = np.empty((ATTEMPTS + 1, vias + 3, dimension))
+    for stage in range(ATTEMPTS + 1):
         _copy(fixed, offsets[stage, vias:])
-    times = np.empty(stages, np.int64)
+    times = np.empty(ATTEMPTS + 1, np.int64)
     trial = np.empty((vias + 3, dimension))
     free, tried = 0, 0
     for each in range(number):
         tried += 1
         _copy(seeds[each], offsets[0])
-        for aim in (aims[0], NARROW):
+        for aim in (SEED, NARROW):
             movement = Movement(table, 0, start, offsets[0], duration)
             times[0] = _refine(setting, movement, obstacles, scene, aim, unit, work)
             movement = Movement(table, times[0], start, offsets[0], duration)
@@ -515,20 +511,25 @@ def refine_seeds(
                 exact = exact_clearance(setting, movement, obstacles, scene, margin)
                 found.clearance[each] = min(exact, apart)
             continue
-        stage = 0
+        stage, weight = 0, POLISH.jerk
         _, cost = best_times(table, offsets[0], work.gram)
-        for later in range(1, stages):
-            if later > 1 and cost < smooth * unit:
-                break
+        for _ in range(ATTEMPTS):
             _copy(offsets[stage], trial)
             movement = Movement(table, 0, start, trial, duration)
-            other = _refine(setting, movement, obstacles, scene, aims[later], unit, work)
+            aim = Aim(POLISH.clearance, weight, POLISH.iterations, POLISH.gain, POLISH.stride)
+            other = _refine(setting, movement, obstacles, scene, aim, unit, work)
             _, less = best_times(table, trial, work.gram)
             movement = Movement(table, other, start, trial, duration)
-            if less < cost and is_free(setting, movement, obstacles, scene, margin):
-                stage += 1
-                _copy(trial, offsets[stage])
-                times[stage], cost = other, less
+            if less >= cost or not is_free(setting, movement, obstacles, scene, margin):
+                weight *= LIGHTER
+                continue
+            little = less > LITTLE * cost
+            stage += 1
+            _copy(trial, offsets[stage])
+            times[stage], cost = other, less
+            weight *= HEAVIER
+            if little or cost < smooth * unit:
+                break
         while stage >= 0:
             movement = Movement(fine, times[stage], start, offsets[stage], duration)
             clearance = exact_clearance(setting, movement, obstacles, scene, margin)

@@ -43,7 +43,7 @@ from viapoint.training.planning.problem import (
     setting_of,
     worth_of,
 )
-from viapoint.training.planning.refine import AIMS, SMOOTH, refine_seeds, unit_of_jerk
+from viapoint.training.planning.refine import SMOOTH, refine_seeds, unit_of_jerk
 
 # Least planned clearance of a movement that the search prefers, [m]; 1 to 8 mm make no difference
 CLEARANCE_MARGIN = 0.001
@@ -251,7 +251,7 @@ def refined_actions(task: Task, problem: Problem, actions: Numbers) -> Numbers:
         fixed = moves.offsets[b, 0, number:].copy()
         _, better = refine_seeds(
             setting, table, fine, start, fixed, seeds, moves.duration[b, 0], problem.obstacles, b, CLEARANCE_MARGIN,
-            AIMS, unit_of_jerk(line, setting.of_hand), SMOOTH, len(seeds),
+            unit_of_jerk(line, setting.of_hand), SMOOTH, len(seeds),
         )  # fmt: skip
         waypoints = np.zeros((len(seeds), number + 2, len(start)))
         waypoints[:, 1:-1] = better.vias
