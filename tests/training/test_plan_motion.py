@@ -376,6 +376,19 @@ def test_first_problems_of_the_benchmark() -> None:
     assert outcome.is_success.all()
 
 
+def test_more_free_movements_are_hardly_smoother() -> None:
+    arm = benchmark_panda()
+    ratios = []
+    for problem in benchmark_problems():
+        if problem.number == 12:  # one of each set
+            given = arm, problem.start, problem.goal, problem.obstacles
+            one, best = (
+                plan_motion(*given, enough=enough, ompl=False, time_limit=30.0) for enough in (1, 30)
+            )
+            ratios.append(one.jerk / best.jerk)
+    assert np.mean(ratios) < 1.2
+
+
 def test_limits_are_those_of_a_dense_movement() -> None:
     # Also at the very end, where the torque of a quick movement changes most.
     arm, rng = load_arm(UR5E), np.random.default_rng(0)
