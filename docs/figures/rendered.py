@@ -47,8 +47,8 @@ SHELVES, MOMENT = (39, 82), 0.6
 """Rows of the validation set that are shown in space, and the moment, as a fraction of the duration."""
 CORNER: dict[str, Any] = {
     "camera": np.array([2.2, -1.5, 1.05]),
-    "look_at": np.array([0.28, 0.02, 0.42]),
-    "field": 31.0,
+    "look_at": np.array([0.28, 0.02, 0.41]),
+    "field": 24.5,
 }
 """View of the scenes in space."""
 UR5E = ROOT / "docs" / "ur5e.xml"
@@ -125,7 +125,7 @@ def own_arm(path: Path) -> None:
     goal = Pose((0.45, 0.45, 0.20), down)
     plan = plan_motion(arm, start, goal, [board, shelf], margin=0.01, enough=16, rng=0)
     print(plan)
-    view_of = {"camera": np.array([1.9, -1.1, 1.05]), "look_at": np.array([0.25, 0.06, 0.36]), "field": 37.0}
+    view_of = {"camera": np.array([1.9, -1.1, 1.05]), "look_at": np.array([0.25, 0.06, 0.22]), "field": 31.0}
     frames = pictures(plan, [WOOD] * 2, (0.5, 1.0), (480, 360), **view_of)
     side_by_side(frames).save(path, optimize=True)
 
