@@ -43,6 +43,8 @@ LIMITS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 """Time limits of plan_motion, [ms]."""
 CHECKS = (16, 64, 256, 1024, 4096, 16384)
 """Numbers of plans that the search checks."""
+
+
 def main() -> None:
     """Measure what the command line names."""
     parser = argparse.ArgumentParser(

@@ -43,7 +43,9 @@ def reach() -> None:
         for nu, axis in enumerate(axes):
             # The colours of the same three movements on the page of the paper
             colour = {2: PALETTE.via, 3: PALETTE.plan, 4: PALETTE.goal}[order]
-            axis.plot(time, movement(time, nu)[:, 0], label=label, color=colour, lw=2.2 if order == 3 else 1.2)
+            axis.plot(
+                time, movement(time, nu)[:, 0], label=label, color=colour, lw=2.2 if order == 3 else 1.2
+            )
     for axis, name in zip(axes, names, strict=True):
         axis.set_title(name)
     for axis in axes[2:]:
@@ -87,7 +89,9 @@ def passage() -> None:
         costs.semilogy(t, cost / 360, color=colour, label=f"{along}")
         costs.semilogy(best[0], through(waypoints, best).cost() / 360, "o", color=colour, ms=3.6)
     costs.set(xlabel="passage time / duration", title="jerk cost / straight reach")
-    costs.legend(title="place of the via-point", loc="upper center", ncols=3, handlelength=1.0, columnspacing=0.8)
+    costs.legend(
+        title="place of the via-point", loc="upper center", ncols=3, handlelength=1.0, columnspacing=0.8
+    )
     costs.set_ylim(top=3000.0)
     along = np.linspace(0, 1, 401)
     for height in (0.0, 0.1, 0.3, 1.0):
