@@ -255,7 +255,7 @@ class SceneView:
                 geom.rgba = np.array((*PALETTE.contact, 1.0), dtype=np.float32)
 
     def _add_shadows(self) -> None:
-        """Let smaller bodies inside those that are shown cast their shadows."""
+        """Add smaller bodies, inside those that are shown, which cast the shadows in their place."""
         for geom in self.scene.geoms[: self.scene.ngeom]:
             if geom.castshadow and geom.type in SOLID:
                 inner = _new_geom(self.scene, geom.type, (1.0,) * 3, geom.pos, PALETTE.joint, MATT)
