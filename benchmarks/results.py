@@ -256,7 +256,7 @@ def draw(rows: list[dict[str, Any]]) -> None:
         for axes in panels:  # what is left holds the legend
             axes.axis("off")
             order = [name for name in SHOWN if name in marks]
-            legend = axes.legend([marks[name] for name in order], order, loc="center")
+            legend = axes.legend([marks[name] for name in order], order, loc="center", labelspacing=0.15)
             legend.set_in_layout(False)
         figure.supxlabel("time of a decision [ms]")
         figure.supylabel("success in test [%]")

@@ -126,6 +126,7 @@ def replanning() -> None:
     jerks.plot(grid, smooth(grid, 3)[:, 0], "k:", label="without noise")
     jerks.set(title="jerk [m/s³]", xlabel="time [s]", xlim=(0.0, arrival))
     jerks.set_yscale("symlog", linthresh=100.0)
+    jerks.set_ylim(-2e4, 5e2)
     jerks.legend(loc="lower left")
     save(figure, "replanning")
 
