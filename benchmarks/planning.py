@@ -1,7 +1,7 @@
 """Planners on the problems of MotionBenchMaker: the table of docs/planning.md, and the curves of its figure.
 
 python benchmarks/planning.py table   # problems 21 to 100 of each set, about five minutes
-python benchmarks/planning.py curves  # each fourth of these, about twelve minutes
+python benchmarks/planning.py curves  # each fourth of these, about six minutes
 python benchmarks/planning.py data FOLDER  # the problems of the package again, from a folder of the original files
 """
 

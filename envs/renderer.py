@@ -190,6 +190,7 @@ class SceneView:
         self._option = mujoco.MjvOption()
         self._flat = simulator.arm.space == "hand"
         self._floor = float(self.model.geom("table").pos[2])
+        self._hand = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_GEOM, "hand")  # -1 without one
         camera = self.model.camera(CAMERA).id
         self._camera = mujoco.MjvCamera()
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
@@ -247,6 +248,8 @@ class SceneView:
                 geom.rgba[3], geom.transparent = GLASSY, True
                 geom.castshadow = False
         if not self._flat:  # from above nothing is speckled
+            for geom in self._shown({self._hand}):
+                geom.size = 1.1 * geom.size  # its surface and that of the finger would be in one place
             self._add_shadows()
         if picture.touched < len(picture.done):
             mujoco.mj_collision(model, data)
