@@ -1,7 +1,7 @@
 """Planners on the problems of MotionBenchMaker: the table of docs/planning.md, and the curves of its figure.
 
 python benchmarks/planning.py table   # problems 21 to 100 of each set, about five minutes
-python benchmarks/planning.py curves  # problems 1 to 20, about twelve minutes
+python benchmarks/planning.py curves  # each fourth of these, about six minutes
 python benchmarks/planning.py data FOLDER  # the problems of the package again, from a folder of the original files
 """
 
@@ -11,15 +11,17 @@ import argparse
 import sys
 from pathlib import Path
 
-import matplotlib.pyplot as plt
+import matplotlib.style
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 from viapoint.envs.geometry.obstacles import pack
+from viapoint.training.files import write_figure
 from viapoint.training.planning import benchmark
 from viapoint.training.planning.benchmark import BenchmarkProblem, benchmark_panda, benchmark_problems
 from viapoint.training.planning.plan_motion import plan_motion
-from viapoint.training.plots import METHOD_COLOURS
+from viapoint.training.plots import COLUMN, METHOD_STYLES, STYLE, style_axes
 
 DOCS = Path(__file__).parents[1] / "docs"
 TABLE = DOCS / "planning.csv"
@@ -31,18 +33,16 @@ PUBLISHED = (
     "| *cuRobo (published; on a GPU, 800 problems)* | 100 | | | 38 | | 1.3 | | |",
 )
 """Rows from the papers on VAMP (Thomason et al. 2024) and cuRobo (Sundaralingam et al. 2023)."""
-FIGURE = DOCS / "images" / "planning.png"
+CURVES, FIGURE = DOCS / "planning_curves.csv", DOCS / "images" / "planning.png"
 DEVELOPED_ON = 20
 """Greatest number of the problems that were looked at during development."""
 EVERY, PATIENCE = 4, 0.5
-"""Step between the problems whose jerk is compared with the least that is found in some time, [s]."""
+"""Step between the problems of the curves, and of the comparison with the least jerk in a longer time, [s]."""
 PLANNERS = ("straight", "plan_motion", "plan_motion+ompl", "search512", "ompl")
 LIMITS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 """Time limits of plan_motion, [ms]."""
 CHECKS = (16, 64, 256, 1024, 4096, 16384)
 """Numbers of plans that the search checks."""
-CURVES = {"plan_motion": "plan_motion", "search": "search", "OMPL": "ompl"}
-"""Curves of the figure, with the names of their colours."""
 
 
 def main() -> None:
@@ -58,11 +58,14 @@ def main() -> None:
             parser.error("data needs a folder")
         write_problems(asked.folder)
         return
-    problems = benchmark_problems()
+    problems = [each for each in benchmark_problems() if each.number > DEVELOPED_ON]
     if asked.what == "table":
-        write_table([each for each in problems if each.number > DEVELOPED_ON])
+        write_table(problems)
     else:
-        draw_curves([each for each in problems if each.number <= DEVELOPED_ON])
+        measure_curves(problems[::EVERY]).to_csv(
+            CURVES, index=False, float_format="%.4g", lineterminator="\n"
+        )
+        draw_curves()
 
 
 def write_problems(folder: Path) -> None:
@@ -138,10 +141,10 @@ def page_table(found: pd.DataFrame) -> str:
     return "\n".join([*lines, *PUBLISHED])
 
 
-def draw_curves(problems: list[BenchmarkProblem]) -> None:
-    """Draw share solved and jerk against the time that planners are given."""
+def measure_curves(problems: list[BenchmarkProblem]) -> pd.DataFrame:
+    """Return the share solved and the median jerk of each planner against the time that it is given, [ms]."""
     arm, scenes = benchmark_panda(), [pack([each.obstacles]) for each in problems]
-    curves: dict[str, list[tuple[float, float, float]]] = {name: [] for name in CURVES}
+    points: list[tuple[str, float, float, float]] = []
     for limit in LIMITS:
         plans = [
             plan_motion(
@@ -158,33 +161,41 @@ def draw_curves(problems: list[BenchmarkProblem]) -> None:
         ]
         solved = [plan.jerk for plan in plans if plan.success]
         taken = float(np.median([plan.milliseconds for plan in plans]))
-        curves["plan_motion"].append((taken, len(solved) / len(plans), float(np.median(solved))))
-        print(f"plan_motion {limit} ms", curves["plan_motion"][-1], file=sys.stderr)
+        points.append(("plan_motion", taken, len(solved) / len(plans), float(np.median(solved))))
+        print(points[-1], file=sys.stderr)
     for checks in CHECKS:
         lines = benchmark.measure_planner(f"search{checks}", problems, benchmark_panda(), physics=False)
-        curves["search"].append(
-            (lines.milliseconds.median(), lines.solved.mean(), lines[lines.solved].jerk.median())
-        )
+        jerk = lines[lines.solved].jerk.median()
+        points.append(("search", lines.milliseconds.median(), lines.solved.mean(), jerk))
     # A path is found or not: the curve is the share of those that took less than a time.
     lines = benchmark.measure_planner("ompl", problems, benchmark_panda(), physics=False)
     for limit in LIMITS:
         found = lines[lines.solved & (lines.milliseconds <= limit)]
         if len(found):
-            curves["OMPL"].append((limit, len(found) / len(lines), found.jerk.median()))
-    figure, (left, right) = plt.subplots(1, 2, figsize=(8.0, 3.2), layout="constrained")
-    for name, points in curves.items():
-        time, share, jerk = np.array(points).T
-        left.plot(time, 100.0 * share, "o-", color=METHOD_COLOURS[CURVES[name]], label=name, markersize=4)
-        right.plot(time, jerk, "o-", color=METHOD_COLOURS[CURVES[name]], markersize=4)
-    left.set(xscale="log", xlabel="time [ms]", ylabel="solved [%]", ylim=(0, 103))
-    right.set(xscale="log", yscale="log", xlabel="time [ms]", ylabel="jerk, relative to straight")
-    right.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])
-    right.minorticks_off()
-    for axes in (left, right):
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
-    left.legend(frameon=False)
-    figure.savefig(FIGURE, dpi=130)
+            points.append(("ompl", limit, len(found) / len(lines), found.jerk.median()))
+    return pd.DataFrame(points, columns=["planner", "ms", "solved", "jerk"])
+
+
+def draw_curves() -> None:
+    """Draw share solved and jerk against the time that planners are given."""
+    with matplotlib.style.context(str(STYLE)):
+        figure = Figure(figsize=(COLUMN / 2.54, 5.6 / 2.54))
+        left, right = figure.subplots(1, 2)
+        for name, points in pd.read_csv(CURVES).groupby("planner", sort=False):
+            style = {**METHOD_STYLES[str(name)], "markersize": 3.0}
+            left.plot(points.ms, 100.0 * points.solved, label=name, **style)
+            right.plot(points.ms, points.jerk, **style)
+        for axes in (left, right):
+            style_axes(axes)
+            axes.set(xscale="log", xlabel="time [ms]", xticks=[1, 10, 100, 1000])
+            axes.set_xticklabels(["1", "10", "100", "1000"])
+        left.set(ylabel="solved [%]", ylim=(0, 103))
+        right.set(yscale="log", ylabel="jerk, relative to straight")
+        right.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])
+        right.minorticks_off()
+        handles, names = left.get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside upper center", ncols=len(names))
+        write_figure(FIGURE, figure)
 
 
 if __name__ == "__main__":

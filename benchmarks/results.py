@@ -17,14 +17,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import matplotlib.style
 import torch
 import tyro
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from viapoint.training import Run, evaluate, load_agent
 from viapoint.training.checks import SHIPPED_IDS
+from viapoint.training.files import write_figure
 from viapoint.training.planning.search import registered_task
-from viapoint.training.plots import METHOD_COLOURS, style_axes
+from viapoint.training.plots import COLUMN, METHOD_STYLES, STYLE, style_axes
 from viapoint.training.scene_sets import SETS, shipped_set
 
 BASELINES = ("untrained", "straight", "sobol64", "search512", "plan_motion", "ompl")
@@ -61,20 +64,20 @@ PAGES = Path("docs/results.md"), Path("docs/results-details.md")
 PICTURE = Path("docs/images/results.png")
 DETAILS = ("points:", "fitted:", "agent, seed", "untrained, ")
 """Beginnings of methods that are on the second page or in the file only."""
-STYLES = {
-    "plan_motion": ("plan_motion", "D"),
-    "known:plan_motion": ("plan_motion", "D"),
-    "ompl": ("ompl", "P"),
-    "search512": ("search", "s"),
-    "cautious512": ("search", "X"),
-    "thick:search512": ("search", "<"),
-    "agent": ("agent", "o"),
-    "agent, 4 refined": ("agent", ">"),
-    "untrained": ("untrained", "o"),
-    "SAC": ("sac", "o"),
-    "PPO": ("ppo", "^"),
+SHOWN: dict[str, dict[str, Any]] = {
+    "plan_motion": METHOD_STYLES["plan_motion"],
+    "known:plan_motion": METHOD_STYLES["plan_motion"],
+    "ompl": METHOD_STYLES["ompl"],
+    "search512": METHOD_STYLES["search"],
+    "cautious512": {**METHOD_STYLES["search"], "marker": "X"},
+    "thick:search512": {**METHOD_STYLES["search"], "marker": "<"},
+    "agent": METHOD_STYLES["agent"],
+    "agent, 4 refined": {**METHOD_STYLES["agent"], "marker": "*"},
+    "untrained": METHOD_STYLES["untrained"],
+    "SAC": METHOD_STYLES["sac"],
+    "PPO": METHOD_STYLES["ppo"],
 }
-"""Colours, by their names, and marks of the methods in the figure."""
+"""Styles of the methods in the figure."""
 PRIVILEGED = "known:"
 """Beginning of methods that know more than a sensor tells, which have hollow marks."""
 FIELDS = ("env", "scenes", "method", "success", "low", "high", "count", "jerk_ratio", "milliseconds")
@@ -237,40 +240,47 @@ def write_pages(rows: list[dict[str, Any]]) -> None:
 def draw(rows: list[dict[str, Any]]) -> None:
     """Draw success in `test` against the time of a decision, a panel for each task with obstacles."""
     headings = re.findall(r"### (.*)", PAGES[0].read_text(encoding="utf-8"))
-    figure = Figure(figsize=(9.0, 11.0), layout="constrained")
-    panels = figure.subplots(4, 2, sharex=True, sharey=True).flat
-    marks: dict[str, Any] = {}
-    for heading, axes in zip(headings, panels, strict=False):
-        for row in rows:
-            name = row["method"] if row["method"].startswith("agent") else row["method"].partition(",")[0]
-            shown = row["env"] == f"viapoint/{heading}-v0" and row["scenes"] == "test"
-            # By validation, the best model of such a training is the untrained one.
-            untrained = ", 0 of " in row["method"]
-            if not shown or untrained or is_detail(row["method"]) or name not in STYLES:
-                continue
-            kind, mark = STYLES[name]
-            color = METHOD_COLOURS[kind]
-            success = float(row["success"])
-            bars = [[success - float(row["low"])], [float(row["high"]) - success]]
-            hollow = name.startswith(PRIVILEGED)
-            marks[name] = axes.errorbar(
-                float(row["milliseconds"]), success, bars, color=color, marker=mark, markersize=7.0,
-                markerfacecolor="white" if hollow else color, linestyle="none", elinewidth=1.2,
-            )  # fmt: skip
-        axes.set_title(heading, fontsize=11)
-        axes.set_xscale("log")
+    with matplotlib.style.context(str(STYLE)):
+        figure = Figure(figsize=(COLUMN / 2.54, 14.0 / 2.54))
+        panels = figure.subplots(4, 2, sharex=True, sharey=True).flat
+        marks: dict[str, Any] = {}
+        for heading, axes in zip(headings, panels, strict=False):
+            mine = [row for row in rows if row["env"] == f"viapoint/{heading}-v0" and row["scenes"] == "test"]
+            for name, row in shown_methods(mine):
+                marks[name] = draw_method(axes, name, row)
+            axes.set_title(heading)
+            axes.tick_params(labelbottom=True)
+            style_axes(axes)
+        axes.set(xscale="log", xlim=(0.5, 200.0), ylim=(-6.0, 108.0), yticks=[0, 50, 100])
         axes.set_xticks([1, 10, 100], ["1", "10", "100"])
-        axes.tick_params(labelbottom=True, labelleft=True)
-        axes.set_ylim(0.0, 103.0)
-        axes.grid(alpha=0.25)
-        style_axes(axes)
-    for axes in panels:  # what is left holds the legend
-        axes.axis("off")
-        order = [name for name in STYLES if name in marks]
-        axes.legend([marks[name] for name in order], order, loc="center", frameon=False, ncols=2, fontsize=10)
-    figure.supxlabel("time of a decision [ms]")
-    figure.supylabel("success in test [%]")
-    figure.savefig(PICTURE, dpi=110)
+        for axes in panels:  # what is left holds the legend
+            axes.axis("off")
+            order = [name for name in SHOWN if name in marks]
+            legend = axes.legend([marks[name] for name in order], order, loc="center", labelspacing=0.15)
+            legend.set_in_layout(False)
+        figure.supxlabel("time of a decision [ms]")
+        figure.supylabel("success in test [%]")
+        write_figure(PICTURE, figure)
+
+
+def shown_methods(rows: list[dict[str, Any]]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the methods of the figure among the rows of one task and set, by their names in SHOWN."""
+    for row in rows:
+        name = row["method"] if row["method"].startswith("agent") else row["method"].partition(",")[0]
+        # By validation, the best model of such a training is the untrained one.
+        untrained = ", 0 of " in row["method"]
+        if name in SHOWN and not untrained and not is_detail(row["method"]):
+            yield name, row
+
+
+def draw_method(axes: Axes, name: str, row: dict[str, Any]) -> Any:
+    """Draw success and time of a method, and return the mark for the legend."""
+    style = {**SHOWN[name], "linestyle": "none", "markersize": 5.0, "elinewidth": 1.0}
+    if name.startswith(PRIVILEGED):
+        style["markerfacecolor"] = "white"
+    success = float(row["success"])
+    bars = [[success - float(row["low"])], [float(row["high"]) - success]]
+    return axes.errorbar(float(row["milliseconds"]), success, bars, **style)
 
 
 def in_order(rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -19,12 +19,14 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import matplotlib.style
 import tyro
 from matplotlib.figure import Figure
 from stable_baselines3.common.callbacks import BaseCallback
 
 from viapoint.training import TrainConfig, train
-from viapoint.training.plots import METHOD_COLOURS, style_axes
+from viapoint.training.files import write_figure
+from viapoint.training.plots import COLUMN, METHOD_STYLES, STYLE, style_axes
 
 TASKS = (
     "PlanarObstacles",
@@ -96,27 +98,26 @@ def curves_of(folder: Path) -> list[dict[str, Any]]:
 
 def draw(rows: list[dict[str, Any]]) -> None:
     """Draw success on the validation scenes against decisions, a panel for each task."""
-    figure = Figure(figsize=(10.0, 4.6), layout="constrained")
     tasks = [name for name in TASKS if any(row["task"] == name for row in rows)]
-    panels = figure.subplots(2, 4, sharey=True).ravel()
-    for panel, task in itertools.zip_longest(panels, tasks):
-        if task is None:
-            panel.set_axis_off()
-            continue
-        for algo in ALGORITHMS:
-            mine = [row for row in rows if row["task"] == task and row["algo"] == algo]
-            decisions = [row["decisions"] / 1000.0 for row in mine]
-            panel.plot(
-                decisions, [row["success"] for row in mine], color=METHOD_COLOURS[algo], label=algo.upper()
-            )
-        panel.set_title(task, fontsize=10)
-        panel.set_ylim(0.0, 100.0)
-        panel.set_xlim(left=0.0)
-        style_axes(panel)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="lower right", bbox_to_anchor=(0.93, 0.2))
-    figure.supxlabel("decisions [1,000]", fontsize=10)
-    figure.supylabel("success on validation scenes [%]", fontsize=10)
-    figure.savefig(PICTURE, dpi=130)
+    with matplotlib.style.context(str(STYLE)):
+        figure = Figure(figsize=(COLUMN / 2.54, 14.0 / 2.54))
+        panels = figure.subplots(4, 2, sharey=True).flat
+        for task, panel in zip(tasks, panels, strict=False):
+            for algo in ALGORITHMS:
+                mine = [row for row in rows if row["task"] == task and row["algo"] == algo]
+                decisions = [row["decisions"] / 1000.0 for row in mine]
+                success = [row["success"] for row in mine]
+                style = {**METHOD_STYLES[algo], "markersize": 2.5}
+                panel.plot(decisions, success, label=algo.upper(), **style)
+            panel.set_title(task)
+            panel.set(ylim=(-4.0, 100.0), yticks=[0, 50, 100])
+            style_axes(panel)
+        for empty in panels:  # what is left holds the legend
+            empty.axis("off")
+            empty.legend(*panel.get_legend_handles_labels(), loc="center")
+        figure.supxlabel("decisions [1,000]")
+        figure.supylabel("success on validation scenes [%]")
+        write_figure(PICTURE, figure)
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 TUTORIALS = Path(__file__).parent / "tutorials"
-DOTS = 80
+DOTS = 100
 """Resolution of stored figures, [dots per inch]."""
 
 

@@ -25,14 +25,19 @@ POINTS = 60  # Points along a planned path
 Geom = Any  # Decorative geom of a scene
 MATT, GLOWING = 0.0, 1.0  # Emission relative to the colour: lines glow, bodies are lit
 CAMERA = "view"
+# Types of geoms that have a smaller copy inside
+SOLID = tuple(getattr(mujoco.mjtGeom, f"mjGEOM_{name}") for name in ("SPHERE", "CAPSULE", "CYLINDER", "BOX"))
 # Radii of the planned, the executed and a replaced path, [m]; the planned one shows as a rim of the executed
 PLAN, DONE, REPLACED = 0.0065, 0.0030, 0.0045
-SPACING = 0.011  # Distance of the points of a drawn path, [m]
+SPACING = 0.02  # Distance of the points of a drawn path, [m]
 # Radius of the points that a sensor has met, [m], and how many of them are drawn at most
 SEEN, MOST_SEEN = 0.004, 600
 # Half lengths of the board that stands for a half-space, [m], and its opacity
 HALF_SPACE_BOARD, GLASSY = (1.0, 1.0, 0.002), 0.4
 BELOW_SURFACE = 0.008  # Depth of this board, [m]: a floor at the height of the table is hidden by it
+# Depth below its surface from which a body casts its shadow, [m]. The map of shadows has pixels of 1.2 mm; a surface
+# that cast the shadow itself would be speckled.
+SHADOW_DEPTH = 0.004
 ABOVE_TABLE = 0.001  # Height of paths of the plane above the table, [m]
 # Colour of a replaced plan
 FADED: Colour = tuple(0.6 * a + 0.4 * b for a, b in zip(PALETTE.plan, PALETTE.table, strict=True))  # type: ignore[assignment]
@@ -185,6 +190,7 @@ class SceneView:
         self._option = mujoco.MjvOption()
         self._flat = simulator.arm.space == "hand"
         self._floor = float(self.model.geom("table").pos[2])
+        self._hand = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_GEOM, "hand")  # -1 without one
         camera = self.model.camera(CAMERA).id
         self._camera = mujoco.MjvCamera()
         self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera
@@ -228,6 +234,9 @@ class SceneView:
         mujoco.mj_camlight(model, data)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self.scene)
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = (
+            True  # the floor of arms in space fades into the background
+        )
         table = model.geom("table").id
         for geom in self._shown({table}):
             geom.castshadow = False  # there is nothing below it, and its own surface would be speckled
@@ -238,11 +247,25 @@ class SceneView:
                 geom.pos = geom.pos - BELOW_SURFACE * geom.mat[:, 2]
                 geom.rgba[3], geom.transparent = GLASSY, True
                 geom.castshadow = False
+        if not self._flat:  # from above nothing is speckled
+            for geom in self._shown({self._hand}):
+                geom.size = 1.1 * geom.size  # its surface and that of the finger would be in one place
+            self._add_shadows()
         if picture.touched < len(picture.done):
             mujoco.mj_collision(model, data)
             pairs = data.contact.geom[: data.ncon].ravel()
             for geom in self._shown({int(each) for each in pairs}):
                 geom.rgba = np.array((*PALETTE.contact, 1.0), dtype=np.float32)
+
+    def _add_shadows(self) -> None:
+        """Add smaller bodies, inside those that are shown, which cast the shadows in their place."""
+        for geom in self.scene.geoms[: self.scene.ngeom]:
+            if geom.castshadow and geom.type in SOLID:
+                inner = _new_geom(self.scene, geom.type, (1.0,) * 3, geom.pos, PALETTE.joint, MATT)
+                if inner is not None:
+                    inner.mat = geom.mat
+                    inner.size = np.maximum(geom.size - SHADOW_DEPTH, 0.2 * geom.size)
+                    geom.castshadow = False
 
     def _shown(self, numbers: set[int]) -> list[Any]:
         """Return the scene's geoms that show some geoms of the model."""

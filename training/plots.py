@@ -18,15 +18,26 @@ from viapoint.training.files import write_figure
 from viapoint.training.scene_sets import BANDS
 
 BLUE = "#1f5fa8"
-# Colours of methods in all figures of results
-METHOD_COLOURS = {
-    "agent": BLUE, "untrained": "#9dc3e6", "plan_motion": "#c0504d", "ompl": "#4f8f4f", "search": "#7f7f7f",
-    "sac": "#2a9d8f", "tqc": "#8e6bb0", "ppo": "#d1812f",
-}  # fmt: skip
+AGENT = {"color": BLUE, "marker": "o"}
+# Colour and marker of each method in all figures
+METHOD_STYLES: dict[str, dict[str, Any]] = {
+    "agent": AGENT,
+    "viaq": AGENT,
+    "viarank": AGENT,
+    "untrained": {"color": "#9dc3e6", "marker": "o"},
+    "plan_motion": {"color": "#c0504d", "marker": "D"},
+    "ompl": {"color": "#4f8f4f", "marker": "P"},
+    "search": {"color": "#7f7f7f", "marker": "s"},
+    "straight": {"color": "#404040", "marker": "x"},
+    "sac": {"color": "#2a9d8f", "marker": "v"},
+    "tqc": {"color": "#8e6bb0", "marker": "<"},
+    "ppo": {"color": "#d1812f", "marker": "^"},
+}
 OTHER_COLOURS = "#c9b458", "#d9a6c2", "#b5a08c", "#a8c686", "#5c5c8a"  # Of methods that are not among them
 DOTS_PER_INCH = 130
 STYLE = files("viapoint.training") / "paper" / "paper.mplstyle"  # Style of figures in centimetres
 WIDTH, HEIGHT, LEGEND = 17.0, 5.4, 0.7  # Of a figure of fits, each movement, the legend, [cm]
+COLUMN = 8.5  # Width of a figure in STYLE that can be read on a narrow page, [cm]
 # Style of the fit: a wide light line below the samples
 FITTED: dict[str, Any] = {"color": PALETTE.plan, "linewidth": 2.2, "label": "fitted"}
 POINT: dict[str, Any] = {"linestyle": "none", "markeredgecolor": "white", "markeredgewidth": 0.6}
@@ -65,7 +76,7 @@ def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
         shown = [(j, bands[band]) for j, band in enumerate(BANDS) if band in bands]
         x = np.array([j + (i - (len(summaries) - 1) / 2.0) * width for j, _ in shown])
         rate, low, high = _percent([each for _, each in shown])
-        ax.bar(x, rate, width=0.9 * width, label=name, **_bar_style(name, list(summaries)))
+        ax.bar(x, rate, width=0.9 * width, label=name, **_colour(name, list(summaries)))
         ax.errorbar(x, rate, yerr=(rate - low, high - rate), fmt="none", ecolor="0.25", elinewidth=1.0)
     ax.set_xticks(range(len(BANDS)), BANDS)
     ax.set_xlabel("solution share: random actions whose plan is clear (easy to hard)")
@@ -97,10 +108,10 @@ def success_of_rows(
     axes.set_xlim(-2.0, 102.0)
     axes.set_xlabel("success [%], 95 % interval")
     for ax in others:
-        for i, (row, runs) in enumerate(curves.items()):
+        for row, runs in curves.items():
             for j, curve in enumerate(each for each in runs if each):
                 decisions, rate = np.array(curve).T
-                ax.plot(decisions, 100.0 * rate, color=f"C{i}", label=None if j else row)
+                ax.plot(decisions, 100.0 * rate, label=None if j else row, **_colour(row, list(curves)))
         ax.set_xlabel("decisions")
         ax.set_ylabel("success in validation [%]")
         ax.set_ylim(-2.0, 102.0)
@@ -155,14 +166,14 @@ def style_axes(ax: Any) -> None:
     ax.set_axisbelow(True)
 
 
-def _bar_style(name: str, names: Sequence[str]) -> dict[str, Any]:
+def _colour(name: str, names: Sequence[str]) -> dict[str, Any]:
     """Return the colour of a method; of its variants, such as numbers of checks, the first ones are paler."""
-    kind = next((known for known in METHOD_COLOURS if name.startswith(known)), None)
+    kind = next((known for known in METHOD_STYLES if name.startswith(known)), None)
     if kind is None:
-        others = [each for each in names if not each.startswith(tuple(METHOD_COLOURS))]
+        others = [each for each in names if not each.startswith(tuple(METHOD_STYLES))]
         return {"color": OTHER_COLOURS[others.index(name) % len(OTHER_COLOURS)]}
     variants = [each for each in names if each.startswith(kind)]
-    return {"color": METHOD_COLOURS[kind], "alpha": (1 + variants.index(name)) / len(variants)}
+    return {"color": METHOD_STYLES[kind]["color"], "alpha": (1 + variants.index(name)) / len(variants)}
 
 
 def _percent(rates: Sequence[Mapping[str, float]]) -> tuple[Float, Float, Float]:

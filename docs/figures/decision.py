@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import matplotlib.style
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch
-from top_view import View, draw_movement, footprint, planned_only
+from top_view import View, draw_movement, footprint, legend, planned_only
 
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.palette import PALETTE
@@ -23,18 +22,18 @@ from viapoint.envs.geometry.obstacles import unpack
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training import load_agent
+from viapoint.training.files import write_figure
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import plan_clearances
+from viapoint.training.plots import COLUMN, STYLE
 from viapoint.training.scene_sets import scenes_for
 
 ENV_ID, SCENE = "viapoint/PlanarObstacles-v0", 19
 """Environment, and row of its `validation` set."""
 CHECKS = 4
 """Number of plans that are checked by computed geometry."""
-SIZE, WIDTH, BOTTOM, HEIGHT = (12.6, 3.3), 0.176, 0.17, 0.66
-"""Size of the figure, [inch]; width, lower edge and height of a panel in fractions of it."""
-ASPECT = HEIGHT * SIZE[1] / (WIDTH * SIZE[0])
-"""Height of a panel divided by its width."""
+HEIGHT, ASPECT = 7.8, 0.92
+"""Height of the figure, [cm], and height of a panel divided by its width."""
 MARGIN = 0.035
 """Margin around a scene, [m]."""
 GREY = (0.45, 0.47, 0.52)
@@ -59,7 +58,7 @@ class Decision(NamedTuple):
     @property
     def view(self) -> View:
         """Part of the plane that is shown, [m]."""
-        return window(self.recorded.scene, self.paths[self.checked].reshape(-1, 2), ASPECT)
+        return window(self.recorded.scene, self.paths.reshape(-1, 2), ASPECT)
 
 
 def decide(agent: str) -> Decision:
@@ -87,67 +86,62 @@ def decide(agent: str) -> Decision:
 
 def draw(path: Path, data: Decision) -> None:
     """Draw the figure to a PNG file."""
-    figure = Figure(figsize=SIZE, dpi=110, facecolor="white")
-    FigureCanvasAgg(figure)
-    for number, (title, panel) in enumerate(PANELS):
-        left = 0.012 + number * 0.2
-        axes = figure.add_axes((left, BOTTOM, WIDTH, HEIGHT))
-        base(axes, data)
-        text = panel(axes, data)
-        figure.text(
-            left, BOTTOM + HEIGHT + 0.06, title, fontsize=12, fontweight="bold", color=PALETTE.executed
-        )
-        figure.text(left, BOTTOM - 0.04, text, fontsize=9, color=PALETTE.joint, va="top", linespacing=1.3)
-        if number:
-            ends = (left - 0.033, BOTTOM + HEIGHT + 0.085), (left - 0.008, BOTTOM + HEIGHT + 0.085)
-            arrow = FancyArrowPatch(*ends, arrowstyle="-|>", mutation_scale=13, lw=2, color=PALETTE.plan)
-            arrow.set_transform(figure.transFigure)
-            figure.add_artist(arrow)
-    figure.savefig(path)
+    with matplotlib.style.context(str(STYLE)):
+        figure = Figure(figsize=(COLUMN / 2.54, HEIGHT / 2.54))
+        every = figure.subplots(2, 3).flat
+        for number, (title, panel) in enumerate(PANELS, start=1):
+            axes = next(every)
+            base(axes, data)
+            axes.set_title(f"{number}  {title}")
+            axes.set_xlabel(panel(axes, data))
+        rest = next(every)
+        rest.axis("off")
+        rest.legend(handles=legend("contact\npredicted"), loc="center left")
+        write_figure(path, figure)
 
 
 def base(axes: Axes, data: Decision) -> None:
     """Draw the scene."""
     scene = planned_only(data.recorded.scene)
-    draw_movement(axes, data.task, scene, arm_shown=False, view=data.view, scale=0.9)
+    draw_movement(axes, data.task, scene, arm_shown=False, view=data.view, scale=0.6)
 
 
 def observation(axes: Axes, data: Decision) -> str:
     """Draw the straight line, and return the caption."""
     scene = data.recorded.scene
     ends = data.task.space.coordinates(np.concatenate((scene.start, scene.goal)))
-    axes.plot(*ends.T, ":", color=GREY, lw=1.4)
-    return "hand, goal, obstacles;\nthe straight line is blocked"
+    axes.plot(*ends.T, ":", color=GREY, lw=1.2)
+    return "the straight line\nis blocked"
 
 
 def candidates(axes: Axes, data: Decision) -> str:
     """Draw the planned path of every candidate, and return the caption."""
     for path in data.paths:
-        axes.plot(*path.T, color=PALETTE.plan, lw=0.6, alpha=0.35, zorder=1)
-    return f"{len(data.paths)} plans: a fixed set, and\nmore around the best of them"
+        axes.plot(*path.T, color=PALETTE.plan, lw=0.4, alpha=0.35, zorder=1)
+    return f"{len(data.paths)} plans, more\naround the best"
 
 
 def critic(axes: Axes, data: Decision) -> str:
     """Draw the candidates coloured by the sign of their predicted clearance, and return the caption."""
     for row in data.margin.argsort():
         colour = PALETTE.plan if data.margin[row] > 0.0 else PALETTE.contact
-        axes.plot(*data.paths[row].T, color=colour, lw=0.7, alpha=0.5, zorder=4)
-    return "learned: minimum over obstacles\nand times (red: contact predicted)"
+        axes.plot(*data.paths[row].T, color=colour, lw=0.4, alpha=0.5, zorder=4)
+    return "learned: clearance\nof each plan"
 
 
 def checks(axes: Axes, data: Decision) -> str:
     """Draw the checked candidates, and return the caption with their clearances."""
     for row in data.checked:
-        axes.plot(*data.paths[row].T, color=PALETTE.plan, lw=1.6, zorder=4)
+        axes.plot(*data.paths[row].T, color=PALETTE.plan, lw=1.2, zorder=4)
     values = ", ".join(f"{1e3 * each:.0f}" for each in data.clearance)
-    return f"{CHECKS} of the best: computed clearance\n{values} mm (optional)"
+    return f"computed clearance\n{values} mm"
 
 
 def action(axes: Axes, data: Decision) -> str:
     """Draw the executed movement, and return the caption."""
-    draw_movement(axes, data.task, data.recorded, view=data.view, scale=0.9)
+    draw_movement(axes, data.task, data.recorded, view=data.view, scale=0.6)
     result = "success" if data.info["is_success"] else "failure"
-    return f"the via-point and the duration;\nexecuted: {result}, {1e3 * data.info['min_clearance']:.0f} mm clear"
+    return f"executed: {result},\n{1e3 * data.info['min_clearance']:.0f} mm clear"
 
 
 PANELS: tuple[tuple[str, Callable[[Axes, Decision], str]], ...] = (

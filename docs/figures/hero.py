@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -77,42 +76,34 @@ def pictures(
     size: tuple[int, int] = SIZE,
     **view_of: Any,
 ) -> list[Frame]:
-    """Return pictures of the executed movement at shares of its duration; `view_of` are arguments of `stage`."""
+    """Return pictures of the executed movement at shares of its duration; `view_of` are arguments of `look_from`."""
     outcome, episodes = execute_plans([plan])
     if not outcome.is_success[0]:
         raise RuntimeError("the movement touches something")
     recorded = episodes.recorded(0)
     view = SceneView(episodes.simulator.single(), *size)
-    stage(view.model, **view_of)
+    look_from(view.model, **view_of)
     for number, colour in enumerate(colours):
         view.model.geom(f"obstacle_{number}").rgba[:] = colour
-    view.model.geom("hand").size[0] *= 1.1  # its surface and that of the finger would be in one place
     canvas = Canvas(view.model, *size, supersampling=2)
     view.scene = canvas.scene
     found = []
     for share in shares:
         view.write(picture_of(episodes.task, recorded, round(share * len(recorded.rollout.time))))
-        canvas.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
         found.append(canvas.draw())
     canvas.close()
     return found
 
 
-def stage(model: Any, camera: Float = CAMERA, look_at: Float = LOOK_AT, field: float = FIELD) -> None:
-    """Place the camera, and make a floor without end under a far light, with fine shadows."""
+def look_from(model: Any, camera: Float = CAMERA, look_at: Float = LOOK_AT, field: float = FIELD) -> None:
+    """Place the camera of a model."""
     back = (camera - look_at) / np.linalg.norm(camera - look_at)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     axes = np.stack((right, np.cross(back, right), back), axis=1)
-    seen, lamp = model.camera("view"), model.light("lamp").id
+    seen = model.camera("view")
     seen.pos[:], seen.fovy[:] = camera, field
     seen.quat[:] = Rotation.from_matrix(axes).as_quat(scalar_first=True)
-    model.light_type[lamp] = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    model.light_dir[lamp], model.light_diffuse[lamp] = (-0.35, 0.25, -0.9), (0.40, 0.39, 0.37)
-    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.52, 0.25
-    model.geom("table").size[:2] = 0.0
-    model.vis.rgba.haze[:], model.vis.map.haze = 1.0, 0.2
-    model.vis.quality.shadowsize = 8192
 
 
 def main() -> None:

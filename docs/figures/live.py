@@ -16,8 +16,8 @@ ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs" / "images"
 SIZE = 1320, 850
 """Size of the window, [pixels]."""
-SEED, OBSTACLE = 11, 0
-"""Seed of the scene, and the obstacle that has a number."""
+SEED, OBSTACLE = 11, 12
+"""Seed of the scene, and the obstacle that has a number, a tall box in the shelf."""
 LEFT, RIGHT = 352, 988
 """Columns of the numbers beside the panels, [pixels]."""
 PANELS = (
@@ -30,8 +30,8 @@ PANELS = (
     (RIGHT, 525),
 )
 """Places of the numbers of the panels' parts, [pixels]."""
-ASIDE = 24
-"""Distance of a number from what it marks in the scene, [pixels]."""
+ASIDE, RADIUS = 26, 16
+"""Distance of the via-point's number from it to the right and down, and radius of numbers, [pixels]."""
 
 
 def main() -> None:
@@ -62,10 +62,11 @@ def main() -> None:
         obstacle = on_screen(tab, session, session.state.scene.obstacles[OBSTACLE].position)
         plain = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")
     window.close()
-    marked, font = plain.copy(), ImageFont.truetype(findfont("DejaVu Sans:bold"), 15)
+    marked, font = plain.copy(), ImageFont.truetype(findfont("DejaVu Sans:bold"), 20)
     draw = ImageDraw.Draw(marked)
-    for number, place in enumerate((*PANELS, *((x + ASIDE, y + ASIDE) for x, y in (via, obstacle))), start=1):
-        draw.circle(place, 12, fill=(20, 33, 69), outline="white", width=2)
+    beside_via = via[0] + ASIDE, via[1] + ASIDE
+    for number, place in enumerate((*PANELS, beside_via, obstacle), start=1):
+        draw.circle(place, RADIUS, fill=(20, 33, 69), outline="white", width=2)
         draw.text(place, str(number), fill="white", font=font, anchor="mm")
     marked.save(IMAGES / "live_annotated.webp", quality=82, method=6)
 

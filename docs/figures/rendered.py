@@ -8,18 +8,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import mujoco
 import numpy as np
-from hero import WOOD, pictures, stage
+from hero import WOOD, pictures
 from PIL import Image
 
 from viapoint.envs import Box, Pose, inverse_kinematics, load_arm
-from viapoint.envs.arms.arm import asset
 from viapoint.envs.common.arrays import Frame
-from viapoint.envs.common.palette import PALETTE
-from viapoint.envs.geometry.obstacles import add_to_model, unpack
-from viapoint.envs.gl import Canvas
-from viapoint.envs.renderer import GLOWING, PLAN, add_ball, add_line
+from viapoint.envs.geometry.obstacles import unpack
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training import GeometrySearch, load_agent, plan_motion
 from viapoint.training.checks import SHIPPED_IDS
@@ -38,7 +33,7 @@ STILLS = {
     "planar_target_jump.png": ("viapoint/PlanarTargetJump-v0", 0),
     "planar_moving_obstacles.png": ("viapoint/PlanarMovingObstacles-v0", 0),
     "panda_reach.png": ("viapoint/PandaReach-v0", 0),
-    "panda_moving_obstacles.png": ("viapoint/PandaMovingObstacles-v0", 0),
+    "panda_moving_obstacles.png": ("viapoint/PandaMovingObstacles-v0", 4),
     "panda_sensed.png": ("viapoint/PandaSensed-v0", 6),
 }
 """Tasks of the pictures of single movements, and which of the scenes that show something."""
@@ -48,17 +43,16 @@ CLEAREST = 0.012
 """Least clearance of a movement that is shown, [m]."""
 GAP = 6
 """Gap between frames side by side, [pixels]."""
-SHELVES, MOMENT = (39, 82, 71), 0.6
+SHELVES, MOMENT = (39, 82), 0.6
 """Rows of the validation set that are shown in space, and the moment, as a fraction of the duration."""
 CORNER: dict[str, Any] = {
-    "camera": np.array([1.75, -1.25, 1.05]),
-    "look_at": np.array([0.28, 0.02, 0.40]),
-    "field": 30.0,
+    "camera": np.array([2.2, -1.5, 1.05]),
+    "look_at": np.array([0.28, 0.02, 0.41]),
+    "field": 24.5,
 }
 """View of the scenes in space."""
 UR5E = ROOT / "docs" / "ur5e.xml"
 UR5E_HOME = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
-ARM_COLOUR, JOINT_COLOUR = (0.80, 0.83, 0.87, 1.0), (0.36, 0.55, 0.75, 1.0)
 
 
 class Shown(NamedTuple):
@@ -117,7 +111,7 @@ def in_space(path: Path) -> None:
     for row in SHELVES:
         obstacles = unpack(scenes.obstacles, row)
         plan = plan_motion(task.arm, scenes.start[row], scenes.goal[row], obstacles, rng=0)
-        frames += pictures(plan, [WOOD] * len(obstacles), [MOMENT], (318, 300), **CORNER)
+        frames += pictures(plan, [WOOD] * len(obstacles), [MOMENT], (480, 400), **CORNER)
     side_by_side(frames).save(path, optimize=True)
 
 
@@ -131,31 +125,8 @@ def own_arm(path: Path) -> None:
     goal = Pose((0.45, 0.45, 0.20), down)
     plan = plan_motion(arm, start, goal, [board, shelf], margin=0.01, enough=16, rng=0)
     print(plan)
-    spec = mujoco.MjSpec.from_string(asset("stage.xml"))
-    spec.attach(mujoco.MjSpec.from_file(str(UR5E)), prefix="arm_", frame=spec.worldbody.add_frame())
-    add_to_model(spec, [board, shelf], rgba=WOOD)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    stage(model, np.array([1.80, -0.95, 1.10]), np.array([0.25, 0.06, 0.42]), 37.0)
-    for number in range(model.ngeom):
-        geom = model.geom(number)
-        if not geom.name.startswith(("table", "obstacle")):
-            geom.rgba[:] = ARM_COLOUR if geom.contype[0] else JOINT_COLOUR
-    motion = plan.joints(rate=200)
-    canvas = Canvas(model, 480, 360, supersampling=2)
-    frames = []
-    for moment in (0.5, 1.0):
-        data.qpos[:] = motion.position[round(moment * (len(motion.time) - 1))]
-        mujoco.mj_forward(model, data)
-        camera = mujoco.MjvCamera()
-        camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera("view").id
-        everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, everything, canvas.scene)
-        canvas.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
-        add_line(canvas.scene, arm.hand(motion.position), PLAN, PALETTE.plan)
-        add_ball(canvas.scene, arm.hand(plan.waypoints[-1:])[0], 0.018, PALETTE.goal, GLOWING)
-        frames.append(canvas.draw())
-    canvas.close()
+    view_of = {"camera": np.array([1.9, -1.1, 1.05]), "look_at": np.array([0.25, 0.06, 0.22]), "field": 31.0}
+    frames = pictures(plan, [WOOD] * 2, (0.5, 1.0), (480, 360), **view_of)
     side_by_side(frames).save(path, optimize=True)
 
 

@@ -6,12 +6,14 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+import matplotlib.style
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Polygon
-from top_view import footprint
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, Polygon
+from top_view import footprint, legend
 
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.geometry.obstacles import unpack
@@ -20,6 +22,8 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training import load_agent
+from viapoint.training.files import write_figure
+from viapoint.training.plots import COLUMN, METHOD_STYLES, STYLE, style_axes
 from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import scenes_for
 
@@ -54,7 +58,7 @@ def draw_scene(axes: Axes, task: Task, scene: Scenes, agent: Any) -> None:
     met = found.seen[0] >= 0
     for end in found.points[0][met]:
         axes.plot(*np.stack((origin, end[:2])).T, color=RAY, linewidth=0.5, zorder=1)
-    axes.scatter(*found.points[0][met][:, :2].T, s=7, color=PALETTE.executed, zorder=4)
+    axes.scatter(*found.points[0][met][:, :2].T, s=3, linewidths=0.0, color=PALETTE.executed, zorder=4)
     start, goal = task.space.coordinates(scene.start), task.space.coordinates(scene.goal)
     goals = scene.goal, task.arm.hand(scene.goal)
     hand = task.arm.hand(scene.start)
@@ -62,16 +66,26 @@ def draw_scene(axes: Axes, task: Task, scene: Scenes, agent: Any) -> None:
     actions, _ = agent.predict(seen, deterministic=True)
     plan = task.action.decode(actions.astype(np.float64), start, goal)
     path = Movements.of(plan).sample(plan.duration[:, None] * np.linspace(0.0, 1.0, 100)).position[0]
-    axes.plot(*np.stack((start[0], goal[0])).T, color="0.4", linestyle=":", linewidth=1.2, zorder=3)
-    axes.plot(*path.T, color=PALETTE.plan, linewidth=2.5, zorder=5)
-    axes.add_patch(Circle(plan.waypoints[0, 1], 0.012, color=PALETTE.via, zorder=6))
-    axes.add_patch(Circle(start[0], 0.014, color=PALETTE.start, zorder=6))
-    axes.add_patch(Circle(goal[0], 0.016, color=PALETTE.goal, zorder=6))
+    axes.plot(*np.stack((start[0], goal[0])).T, color="0.4", linestyle=":", linewidth=1.0, zorder=3)
+    axes.plot(*path.T, color=PALETTE.plan, linewidth=2.0, zorder=5)
+    axes.add_patch(Circle(plan.waypoints[0, 1], 0.018, color=PALETTE.via, zorder=6))
+    axes.add_patch(Circle(start[0], 0.018, fill=False, linewidth=1.2, color=PALETTE.start, zorder=6))
+    axes.add_patch(Circle(goal[0], 0.020, color=PALETTE.goal, zorder=6))
     axes.add_patch(Circle(origin, 0.02, color=PALETTE.joint, zorder=6))
     axes.set(xlim=LIMITS[0], ylim=LIMITS[1], aspect="equal", xticks=[], yticks=[])
     axes.set_facecolor("#e9e9ec")
     for spine in axes.spines.values():
         spine.set_visible(False)
+
+
+def seen_legend() -> list[Artist]:
+    """Return the handles of the legend of scenes."""
+    return [
+        Patch(label="obstacle", facecolor="white", edgecolor=PALETTE.obstacle, hatch="/////"),
+        Line2D([], [], label="ray", color=RAY),
+        Line2D([], [], label="seen point", color=PALETTE.executed, linestyle="none", marker="."),
+        *legend()[:4],
+    ]
 
 
 def draw_calibration(axes: Axes, env_id: str, agent: Any) -> None:
@@ -87,10 +101,12 @@ def draw_calibration(axes: Axes, env_id: str, agent: Any) -> None:
     y = np.array([success[rows].mean() for rows in bins])
     error = float((np.abs(x - y) * [len(rows) for rows in bins]).sum() / len(order))
     axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
-    axes.plot(x, y, "o-", color=PALETTE.executed, markersize=5)
-    axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", xlabel="predicted success", ylabel="success")
+    axes.plot(x, y, "-", markersize=4.0, **METHOD_STYLES["agent"])
+    axes.set(xlim=(0, 1.03), ylim=(0, 1.03), aspect="equal", xlabel="predicted success", ylabel="success")
+    axes.set(xticks=[0, 0.5, 1], yticks=[0, 0.5, 1])
+    style_axes(axes)
     name = env_id.removeprefix("viapoint/").removesuffix("-v0")
-    axes.set_title(f"{name}: expected calibration error {error:.2f}", fontsize=9)
+    axes.set_title(f"{name}: {error:.2f}")
     print(f"{name}: predicted {predicted.mean():.3f}, success {success.mean():.3f}, error {error:.3f}")
 
 
@@ -104,16 +120,19 @@ def main() -> None:
     agent = load_agent(given.agent)
     task: Task = agent.policy.task
     frozen = scenes_for("validation", task)
-    figure = Figure(figsize=(3.6 * len(given.scenes), 3.1), layout="constrained")
-    FigureCanvasAgg(figure)
-    for axes, row in zip(figure.subplots(1, len(given.scenes)), given.scenes, strict=True):
-        draw_scene(axes, task, frozen.scenes.take([row]), agent)
-    figure.savefig(given.out, dpi=130)
-    figure = Figure(figsize=(6.4, 3.1), layout="constrained")
-    FigureCanvasAgg(figure)
-    for axes, env_id in zip(figure.subplots(1, 2), (ENV_ID, "viapoint/PandaSensed-v0"), strict=True):
-        draw_calibration(axes, env_id, load_agent(env_id))
-    figure.savefig(given.out.with_name("sensed_calibration.png"), dpi=130)
+    with matplotlib.style.context(str(STYLE)):
+        figure = Figure(figsize=(COLUMN / 2.54, 6.4 / 2.54))
+        every = figure.subplots(2, 2).flat
+        for row, axes in zip(given.scenes, every, strict=False):
+            draw_scene(axes, task, frozen.scenes.take([row]), agent)
+        for rest in every:
+            rest.axis("off")
+            rest.legend(handles=seen_legend(), loc="center")
+        write_figure(given.out, figure)
+        figure = Figure(figsize=(COLUMN / 2.54, 4.8 / 2.54))
+        for axes, env_id in zip(figure.subplots(1, 2), (ENV_ID, "viapoint/PandaSensed-v0"), strict=True):
+            draw_calibration(axes, env_id, load_agent(env_id))
+        write_figure(given.out.with_name("sensed_calibration.png"), figure)
 
 
 if __name__ == "__main__":

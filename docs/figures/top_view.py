@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 from scipy.spatial import ConvexHull
 
@@ -79,6 +80,19 @@ def draw_movement(
         axes.add_patch(Circle(_xy(picture.done[-1]), HAND_RADIUS, color=colour, linewidth=0, zorder=7))
     if contact is not None:
         _draw_cross(axes, contact[1], scale)
+
+
+def legend(*more: str) -> list[Line2D]:
+    """Return the handles of a legend; lines of contact have the names of `more`."""
+    dot: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 5.0}
+    return [
+        Line2D([], [], label="start", color=PALETTE.start, markerfacecolor="none", **dot),
+        Line2D([], [], label="goal", color=PALETTE.goal, **dot),
+        Line2D([], [], label="via-point", color=PALETTE.via, **dot),
+        Line2D([], [], label="plan", color=PALETTE.plan, linewidth=2.2),
+        Line2D([], [], label="executed", color=PALETTE.executed),
+        *(Line2D([], [], label=name, color=PALETTE.contact) for name in more),
+    ]
 
 
 def planned_only(scene: Scenes, plan: Plan | None = None) -> Recorded:

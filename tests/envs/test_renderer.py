@@ -87,6 +87,17 @@ def test_a_half_space_below_the_table_is_hidden_by_it(make):
     assert (np.abs(frames[0] - frames[1]).max(axis=-1) > 20).mean() < 0.15
 
 
+def test_a_surface_does_not_speckle_itself_with_its_shadow(make):
+    env, home = make(PANDA, side=240), arm_of("panda").home
+    board = Box((0.056, 0.12, 0.19), position=(-0.45, 0.0, 0.8), quaternion=(0.94, 0.0, 0.0, -0.34))
+    env.reset(options={"start": home, "goal": home + 0.2, "obstacles": [board]})
+    frame = env.render().astype(int)
+    orange = frame[..., 0] - frame[..., 2] > 60
+    row, column = np.argwhere(orange).mean(axis=0).astype(int)
+    face = frame[row - 10 : row + 10, column - 8 : column + 8]
+    assert np.ptp(face, axis=(0, 1)).max() < 8
+
+
 def test_points_that_a_sensor_sees_are_drawn(make):
     yellow = []
     for name in (PLANE, SENSED):

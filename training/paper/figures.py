@@ -20,8 +20,9 @@ from viapoint.training.paper.movements import TARGETS, Profile, curved, passage_
 from viapoint.training.paper.obstacles import ObstacleMovements, features
 from viapoint.training.paper.one_via import ENDS
 from viapoint.training.paper.point_to_point import DIAGONALS, DURATION, diagonals
+from viapoint.training.plots import COLUMN
 
-WIDTH = 8.5  # Width of a column, [cm]
+COVERED = 0.04  # Distance of a target from a row of lights up to which it is not drawn, [m]
 # Style of the model: a wide light line that stays visible beside the arm
 MODEL: dict[str, Any] = {"color": PALETTE.plan, "linewidth": 2.2, "solid_capstyle": "round"}
 # Style of the simulated arm
@@ -37,7 +38,7 @@ def sheet(
     rows: int, columns: int, height: float, titles: Sequence[str] = "ABCDEFGH", **options: Any
 ) -> tuple[Figure, Any]:
     """Return a figure of one column and `height` centimetres, and its titled axes, shape (rows, columns)."""
-    figure = Figure(figsize=(WIDTH / 2.54, height / 2.54))
+    figure = Figure(figsize=(COLUMN / 2.54, height / 2.54))
     axes = figure.subplots(rows, columns, squeeze=False, **options)
     for ax, title in zip(axes.flat, titles, strict=False):
         ax.set_title(title)
@@ -55,7 +56,7 @@ def plane(ax: Axes, *, names: tuple[str, ...] = tuple(TARGETS)) -> None:
             ha="center", va="top" if low else "bottom", color=GREY, zorder=4,
             path_effects=[withStroke(linewidth=1.5, foreground="white")],
         )  # fmt: skip
-    ax.set(aspect="equal", xlim=(-39.0, 15.0), ylim=(15.0, 66.0))
+    ax.set(aspect="equal", xlim=(-39.0, 15.0), ylim=(15.0, 71.0))
     ax.set(xlabel="$x$ [cm]", ylabel="$y$ [cm]", xticks=[-30, -15, 0], yticks=[20, 40, 60])
 
 
@@ -229,9 +230,11 @@ def around_lights(avoidance: ObstacleMovements) -> Figure:
         via = profile.place(profile.bend[0])
         duration = avoidance.motion.duration[row]
         (model,) = movements.model_profiles(movements.minimum_jerk_through((start, via, goal), duration))
-        plane(ax[0])
-        paths(ax[0], model.position, profile.position)
         (lights,) = unpack(avoidance.scenes.obstacles, row)
+        away = lights.distance(np.array([[*place, 0.0] for place in TARGETS.values()]))
+        clear = [name for name, distance in zip(TARGETS, away, strict=True) if distance > COVERED]
+        plane(ax[0], names=tuple(clear))  # labels of the others would lie on the lights
+        paths(ax[0], model.position, profile.position)
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * lights.packed_size[:2]
         outline = corners @ lights.rotation[:2, :2].T + lights.position[:2]
         ax[0].fill(*(100.0 * outline.T), color=PALETTE.obstacle)
@@ -323,7 +326,7 @@ def orders_and_spaces() -> Figure:
     axes[0, 0].axhspan(1.805 - 0.153, 1.805 + 0.153, color="0.9", zorder=0)
     axes[0, 0].annotate("peak of\nsubjects", (0.02, 1.8), fontsize=5.5, va="center")
     axes[0, 0].set(ylabel=r"$T\;t_f/A$", xlabel="$t/t_f$", xlim=(0, 1), ylim=(0, 2.4))
-    axes[0, 1].set(ylabel=r"$\ddot{x}\;t_f^2/A$", xlabel="$t/t_f$", xlim=(0, 1), ylim=(-9, 19))
+    axes[0, 1].set(ylabel=r"$\ddot{x}\;t_f^2/A$", xlabel="$t/t_f$", xlim=(0, 1), ylim=(-9, 27))
     zero(axes[0, 1])
     axes[0, 1].legend(title="least", loc="upper right", handlelength=1.2)
     motions = (simulate(diagonals()), point_to_point.joint_space(DIAGONALS))
