@@ -57,7 +57,7 @@ from viapoint.training.planning.refine import (
 
 # Once enough movements are free, more seeds are tried around the one with the least jerk: MORE for each doubling of its
 # relative jerk cost beyond ROUGH, and at most MOST_MORE.
-ROUGH, MORE, MOST_MORE = 1.3, 8, 16
+ROUGH, MORE, MOST_MORE = 1.4, 8, 16
 # Spread of the first random seeds around the straight line, and of later ones, [rad]
 SPREADS = 0.8, 1.0
 HAND_SPREADS = 0.15, 0.3  # Spreads of the same seeds in hand space, [m]
@@ -564,10 +564,13 @@ def _search(
     tight, widest = None, problem.margin  # the best of those that keep the margin and nothing more
     tried = free = since = 0
     total = len(given) + 1 + number
-    while tried < total and time.perf_counter() < until:
-        if free >= enough and tried - since >= _more(least / unit):
+    while time.perf_counter() < until:
+        left = total - tried
+        if free >= enough:
+            left = min(left, since + _more(least / unit) - tried)
+        if left <= 0:
             break
-        seeds = np.empty((min(CHUNKS[min(tried, len(CHUNKS) - 1)], total - tried), *straight.shape))
+        seeds = np.empty((min(CHUNKS[min(tried, len(CHUNKS) - 1)], left), *straight.shape))
         for k in range(len(seeds)):
             rank = tried + k - len(given)
             if rank < 0:
