@@ -30,12 +30,14 @@ def import_all(package):
 BASE = """
 import_all("viapoint.primitives")
 import_all("viapoint.envs")
-import numpy, gymnasium
-from viapoint.training import plan_motion
+import gymnasium, numpy, viapoint.envs
+from viapoint.training import plan_motion, write_motion
 env = gymnasium.make("viapoint/PlanarReach-v0")
 env.reset(seed=0)
 env.step(numpy.zeros(3))
-assert plan_motion("planar", (-0.2, 0.3), (0.1, 0.4)).success
+tetrahedron = viapoint.envs.ConvexMesh([(0.0, 0.0, 1.0), (0.1, 0.0, 1.0), (0.0, 0.1, 1.0), (0.0, 0.0, 1.1)])
+plan = plan_motion("planar", (-0.2, 0.3), (0.1, 0.4), [tetrahedron])
+write_motion(plan, "plan.yaml")
 """
 TRAINING = """
 import viapoint.training.cli.entry
