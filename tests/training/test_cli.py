@@ -532,7 +532,10 @@ TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
         ([*TABLE[:3], "", "  ", "0.2,0.1"], "line 6, column y: nothing"),
         ([*TABLE[:2], "", "0.1,far,0.2"], "line 4, column x: far"),
         (["y", "0.1"], "no column time"),
-        (["t;px;py", "0.0;0.1;0.2"], "must name the columns time, x, y, and optionally z and movement, got t, px, py"),
+        (
+            ["t;px;py", "0.0;0.1;0.2"],
+            "must name the columns time, x, y, and optionally z and movement, got t, px, py",
+        ),
         ([TABLE[0], *(f"{-time},0.1,0.2" for time in range(12))], "goes back in time in line 3"),
         ([*TABLE, *TABLE[1:]], "add a column `movement`"),
         (["time,x,y", "s,m,m", *TABLE[1:]], "leave out lines of units"),
