@@ -17,7 +17,7 @@ sys.path.insert(0, str(DOCS))
 import generated  # noqa: E402
 import notebooks  # noqa: E402
 
-project, author, project_copyright = "Viapoint", "Viapoint contributors", "Viapoint contributors"
+project, author, project_copyright = "Viapoint", "Viapoint maintainers", "Viapoint maintainers"
 version = release = tomllib.loads((DOCS.parent / "pyproject.toml").read_text())["project"]["version"]
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]

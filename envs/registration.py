@@ -6,6 +6,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from viapoint.envs.common.validation import did_you_mean
+
 # Events that end a decision in the tasks with replanning
 EVENTS = ("horizon", "target", "course", "clearance")
 # Keyword arguments that turn a task of whole movements into one of control steps
@@ -62,11 +64,11 @@ def check_registered(env_id: str) -> None:
     """Check that Gymnasium knows an id.
 
     Raises:
-        ValueError: No such environment is registered; the message lists the ids of this package.
+        ValueError: No such environment is registered; the message names the closest id.
     """
     try:
         gym.spec(env_id)
-    except gym.error.UnregisteredEnv as error:
-        raise ValueError(
-            f"there is no environment {env_id!r} ({error}); `import viapoint.envs` registers {', '.join(ENV_IDS)}"
-        ) from None
+    except gym.error.UnregisteredEnv:
+        ours = [each for each in gym.registry if each.startswith("viapoint/")]
+        hint = did_you_mean(env_id, ours) or "; viapoint.envs.ENV_IDS lists those of viapoint"
+        raise ValueError(f"there is no environment {env_id!r}{hint}") from None

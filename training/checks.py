@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import tempfile
 from collections.abc import Collection, Mapping
@@ -10,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from viapoint.envs.common.validation import whole_number
+from viapoint.envs.common.validation import did_you_mean, whole_number
 from viapoint.training.files import check_ours
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
@@ -43,9 +42,7 @@ RANGES: dict[str, tuple[int, int | None]] = {
 
 def unknown_name(what: str, value: object, allowed: Collection[str]) -> str:
     """Return the message about an unknown name, with the closest allowed one."""
-    close = difflib.get_close_matches(str(value), list(allowed), n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    return f"{what} must be one of {', '.join(allowed)}, got {value!r}{hint}"
+    return f"{what} must be one of {', '.join(allowed)}, got {value!r}{did_you_mean(value, allowed)}"
 
 
 def check_env_kwargs(kwargs: Mapping[str, Any]) -> None:

@@ -28,6 +28,8 @@ from viapoint.training.vec_env import LOGGED, ViaVecEnv
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
 
+# Form of the progress bar; narrow terminals cut its end, so success, the description, is first
+PROGRESS = "{desc}{percentage:.0f}%|{bar}| {elapsed}<{remaining}, {n_fmt}/{total_fmt} decisions"
 LOG_EVERY = 1_000  # Decisions between two entries of the log
 RATES = ("collision", "reachable")  # Metrics that are true or false
 # Metrics of a validation in the log and in the learning curve; medians in [m] and [s]
@@ -250,11 +252,9 @@ class RunCallback(CallbackList):
         return time.monotonic() - self._began
 
     def __enter__(self) -> RunCallback:
-        task = self.config.env.rpartition("/")[2]
         self._bar = progress_bar(
             total=self.config.total_timesteps,
-            unit=" decisions",
-            desc=f"{self.config.algo} on {task}",
+            bar_format=PROGRESS,
             disable=None if self.config.progress else True,
         )
         self._handler: Any = None
@@ -361,9 +361,9 @@ class RunCallback(CallbackList):
 
     def _show_progress(self) -> None:
         self._bar.update(min(self.num_timesteps, self.config.total_timesteps) - self._bar.n)
-        shown = {}
+        shown = []
         if self.model.ep_success_buffer:
-            shown["success"] = f"{100.0 * np.mean(self.model.ep_success_buffer):.0f} %"
+            shown.append(f"success {100.0 * np.mean(self.model.ep_success_buffer):.0f} %")
         if self.curve:
-            shown["validation"] = f"{100.0 * self.curve[-1]['success']['rate']:.1f} %"
-        self._bar.set_postfix(shown, refresh=False)
+            shown.append(f"validation {100.0 * self.curve[-1]['success']['rate']:.1f} %")
+        self._bar.set_description(", ".join(shown), refresh=False)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
 from typing import Any, TypeVar, cast
 
@@ -26,6 +27,12 @@ def record_of(name: str, kind: type[Record], value: Any) -> Record:
             f"{name} must be a {kind.__name__} or a mapping with some of {', '.join(known)}, got {value!r}"
         )
     return kind(**value)
+
+
+def did_you_mean(value: Any, allowed: Iterable[str]) -> str:
+    """Return the end of a message about an unknown name: the closest allowed one, or nothing if none is close."""
+    close = difflib.get_close_matches(str(value), list(allowed), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def is_whole(value: Any) -> bool:

@@ -496,6 +496,12 @@ def test_a_plane_movement_needs_no_other_columns_and_is_that_of_the_function(tmp
     written = pd.read_csv(tmp_path / "fit.csv").iloc[0]
     np.testing.assert_allclose(written[["via1_x", "via1_y"]].astype(float), fit.via_points[0], atol=1e-9)
     assert "via1_z" not in written
+    for format_ in ({"sep": ";", "decimal": ","}, {"sep": "\t"}):
+        table.assign(movement="1,5").to_csv(path, index=False, **format_)
+        run("fit", path, "--out", tmp_path, "--n-via", 1, "--no-free-ends")
+        again = pd.read_csv(tmp_path / "fit.csv", dtype={"movement": str}).iloc[0]
+        assert again.pop("movement") == "1,5"
+        pd.testing.assert_series_equal(again, written.drop("movement"), check_dtype=False)
 
 
 @pytest.mark.parametrize("column", ["time", "x"])
@@ -526,7 +532,10 @@ TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
         ([*TABLE[:3], "", "  ", "0.2,0.1"], "line 6, column y: nothing"),
         ([*TABLE[:2], "", "0.1,far,0.2"], "line 4, column x: far"),
         (["y", "0.1"], "no column time"),
-        (["time;x;y", "0.0;0.1;0.2"], "separate columns by commas"),
+        (
+            ["t;px;py", "0.0;0.1;0.2"],
+            "must name the columns time, x, y, and optionally z and movement, got t, px, py",
+        ),
         ([TABLE[0], *(f"{-time},0.1,0.2" for time in range(12))], "goes back in time in line 3"),
         ([*TABLE, *TABLE[1:]], "add a column `movement`"),
         (["time,x,y", "s,m,m", *TABLE[1:]], "leave out lines of units"),

@@ -364,7 +364,7 @@ def test_folders_that_are_no_runs(tmp_path):
 
 COMMANDS = [
     ("trian", "did you mean 'train'"),
-    ("train --env viapoint/PlanarObstacle-v0", "Did you mean: `PlanarObstacles`"),
+    ("train --env viapoint/PlanarObstacle-v0", "did you mean 'viapoint/PlanarObstacles-v0'"),
     ("train --n-timesteps -5", "--n-timesteps must be a whole number, from 1"),
     ("train --n-timesteps 1e5", "--n-timesteps: must be a whole number, got '1e5'"),
     ("train --n-timesteps 16 --n-envs 16 --out=", "--out: must be a path, got ''"),
@@ -380,6 +380,7 @@ COMMANDS = [
     ("live --env nothing", "nothing"),
     ("evaluate nowhere", "nowhere"),
     ("evaluate --pretrained nobody", "nobody"),
+    ("record --agent random", "viapoint record AGENT"),
     ("plan --position 0.4 0.3", "position must have shape (3,)"),
     ("plan --arm panda --velocity-limit 0.3 --position 0.4 0.3 0.3", "--velocity-limit"),
     ("plan --arm nowhere.xml --position 0.4 0.3 0.3", "nowhere.xml"),

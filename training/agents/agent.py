@@ -14,6 +14,7 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from viapoint.envs.common.validation import did_you_mean
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training.agents.model_io import ALGORITHMS, load_model, save_model
 from viapoint.training.checks import SHIPPED, SHIPPED_IDS
@@ -209,9 +210,8 @@ def find_model(source: str | Path) -> Path:
         raise BadFileError(
             folder, "is an archive of Stable-Baselines3, which may hold code: use `load` of its class"
         )
-    raise BadFileError(
-        folder, f"is no run folder or model folder; ids of environments with a shipped agent are {known}"
-    )
+    hint = did_you_mean(source, SHIPPED_IDS) or f"; agents are shipped for {known}"
+    raise BadFileError(folder, f"is no run folder, model folder or id of a shipped agent{hint}")
 
 
 def best_model(run: Path) -> Path:

@@ -14,7 +14,7 @@ PACKAGES = {"torch": "training", "ompl": "planning", "viser": "live", "minari": 
 CHECKS = {
     "packages": (VERSIONS.format("numpy, gymnasium, mujoco, numba"), "pip install viapoint"),
     "MuJoCo": (STEP, "pip install 'mujoco>=4'"),
-    "agents": (AGENT, "pip install 'viapoint[training]'; the planner works without it"),
+    "agents": (AGENT, "the planner works without them"),
     "extras": (EXTRAS.format((*PACKAGES.items(),)), ""),
     "pictures": (ENV + "print(*env.render().shape)", "on Debian: apt-get install libegl1 libgl1"),
 }

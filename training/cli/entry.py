@@ -133,6 +133,8 @@ def _complaint(text: str, command: str, kind: type[Any]) -> str:
     said = re.sub(
         rf"^Error parsing ({kind.__name__}: )?|( Argument helptext: .*)? For full helptext, .*", "", said
     )
+    if said.startswith("Unrecognized options: --agent") and hasattr(kind, "agent"):
+        said = f"--agent is no option; name the agent alone: viapoint {command} AGENT"
     for each in dataclasses.fields(kind):
         said = re.sub(rf"^{each.name}\b", f"--{each.name.replace('_', '-')}", said)
     return f"{said} (viapoint {command} --help)"

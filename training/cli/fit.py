@@ -18,6 +18,7 @@ from viapoint.training.files import BadFileError, check_ours, read_bytes, write_
 from viapoint.training.plots import fitted_movements
 
 REQUIRED = ("time", "x", "y")  # Columns that a file of movements must have
+EXPECTED = "its first line must name the columns time, x, y, and optionally z and movement"
 COORDINATES = ("x", "y", "z")  # Names of the coordinates; z may be left out
 # Distances of samples, [s], and extents of movements, [m], above which the units are probably others
 SLOW, WIDE = 0.5, 5.0
@@ -56,9 +57,7 @@ def read_movements(path: Path) -> Movements:
     missing = [name for name in REQUIRED if name not in table]
     if missing:
         found = ", ".join(map(str, table.columns))
-        advice = "separate columns by commas" if len(table.columns) == 1 else "names must be the same"
-        reason = f"has no column {', '.join(missing)}; its first line names the columns {found}"
-        raise BadFileError(path, f"{reason}; {advice}")
+        raise BadFileError(path, f"has no column {', '.join(missing)}; {EXPECTED}, got {found}")
     names = [name for name in ("time", *COORDINATES) if name in table]
     numbers = table[names].apply(pd.to_numeric, errors="coerce")
     wrong = np.argwhere(~np.isfinite(numbers.to_numpy(dtype=float)))
@@ -110,19 +109,24 @@ def _read_table(path: Path) -> pd.DataFrame:
         text = content.decode("utf-8-sig")
         begun = text.lstrip()
         file = io.StringIO(begun)
-        table = pd.read_csv(file, header=None, dtype=str, skipinitialspace=True, skip_blank_lines=False)
+        separator = next((each for each in ";\t" if each in begun.partition("\n")[0]), ",")
+        table = pd.read_csv(
+            file, sep=separator, header=None, dtype=str, skipinitialspace=True, skip_blank_lines=False
+        )
     except ValueError as error:
         reason = f"cannot be read as CSV in UTF-8 ({str(error).strip()})"
-        advice = "its first line must name the columns, commas separate them, and decimals have points"
-        raise BadFileError(path, f"{reason}; {advice}") from None
+        raise BadFileError(path, f"{reason}; {EXPECTED}, separated by commas or semicolons") from None
     blank_lines = text[: len(text) - len(begun)].count("\n")
     table.index += 1 + blank_lines
     head = table.iloc[0].str.strip()
     twice = [name for name in ("time", *COORDINATES, "movement") if (head == name).sum() > 1]
     if twice:
         raise BadFileError(path, f"has several columns {twice[0]}")
-    samples = table.iloc[1:].dropna(how="all")  # without blank lines
-    return samples.set_axis(head, axis="columns")
+    samples = table.iloc[1:].dropna(how="all").set_axis(head, axis="columns")  # without blank lines
+    if separator == ";":  # of spreadsheets where decimals have commas
+        numbers = samples.columns != "movement"
+        samples.loc[:, numbers] = samples.loc[:, numbers].replace(",", ".", regex=True)
+    return samples
 
 
 def _printed(fits: Fits) -> str:
