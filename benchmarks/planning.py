@@ -29,8 +29,8 @@ PAGE = DOCS / "planning.md"
 BEGIN, END = "<!-- table -->", "<!-- end of table -->"
 HARDEST = ("cage", "table_under_pick")
 PUBLISHED = (
-    "| *VAMP, RRT-Connect (published; not smooth, not timed)* | 100 | | 0.035 | | | | | |",
-    "| *cuRobo (published; on a GPU, 800 problems)* | 100 | | | 38 | | 1.3 | | |",
+    "| *VAMP, RRT-Connect (published; not smooth, not timed)* | 100 | | 0.035 | | | | | | |",
+    "| *cuRobo (published; on a GPU, 800 problems)* | 100 | | | 38 | | 1.3 | | | |",
 )
 """Rows from the papers on VAMP (Thomason et al. 2024) and cuRobo (Sundaralingam et al. 2023)."""
 CURVES, FIGURE = DOCS / "planning_curves.csv", DOCS / "images" / "planning.png"
@@ -130,12 +130,13 @@ def page_table(found: pd.DataFrame) -> str:
         "motion s",
         "jerk",
         "length rad",
+        "clearance mm",
     ]
     lines = ["| " + " | ".join(heads) + " |", "|---" + "|---:" * (len(heads) - 1) + "|"]
     for row in rows.to_dict("records"):
         name = row["planner"] if row["set"] == "all" else f"{row['planner']}, {row['set']}"
         numbers = [row[head] for head in heads[1:]]
-        digits = (1, 1, 1, 1, 1, 2, 2, 2)
+        digits = (1, 1, 1, 1, 1, 2, 2, 2, 1)
         cells = ["-" if np.isnan(n) else f"{n:.{d}f}" for n, d in zip(numbers, digits, strict=True)]
         lines.append("| " + " | ".join([name, *cells]) + " |")
     return "\n".join([*lines, *PUBLISHED])

@@ -101,8 +101,10 @@ class Arm:
         return "\n".join(lines)
 
     def __repr__(self) -> str:
-        """Return name, joints and size."""
-        return f"Arm({self.name!r}, joints={self.joint_names}, spheres={len(self.spheres.radius)})"
+        """Return name, joints, size, and what was chosen for the arm when it was loaded."""
+        parts = [repr(self.name), f"joints={self.joint_names}", f"spheres={len(self.spheres.radius)}"]
+        parts += [note for note in self.notes if note.startswith(("tool: ", "velocity limits: ", "home: "))]
+        return f"Arm({', '.join(parts)})"
 
     def hand(self, joints: Any) -> Float:
         """Return places of the tool, shape (..., 3), [m], for joint positions of shape (..., J)."""

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from viapoint.envs.arms.urdf import WARNING
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.validation import finite_array
 
@@ -23,6 +24,7 @@ TOOL_NAMES = (
 )  # fmt: skip
 GRIPPERS = re.compile(r"grip|jaw|finger|fngr|claw|knuckle", re.IGNORECASE)
 """Words in the names of bodies and joints of a gripper, which is not part of a chain whose tool has no usual name."""
+SAME_PLACE = 1e-3  # Greatest distance of two frames that are the same tool, [m]
 LEAST_CHAIN = 3  # Least number of joints of a branch that is an arm and not a finger
 KNOWN_VELOCITIES: dict[str, tuple[float, ...]] = {
     "panda": (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),
@@ -57,7 +59,7 @@ class Tool(NamedTuple):
     name: str  # Name of the site or the body, for the report
 
 
-def choose_tool(model: mujoco.MjModel, given: Any, base: str | None) -> Tool:
+def choose_tool(model: mujoco.MjModel, given: Any, base: str | None, notes: list[str]) -> Tool:
     """Return the tool: the given site, body, or body and point; else one with a usual name; else the tip of the chain.
 
     Raises:
@@ -82,7 +84,7 @@ def choose_tool(model: mujoco.MjModel, given: Any, base: str | None) -> Tool:
         tool = _named(name, bodies)
         tool = tool._replace(position=finite_array("tool", point, (3,)), name=f"a point of {name!r}")
     else:
-        usual = _usual_tool(model, sites, bodies, root)
+        usual = _usual_tool(model, sites, bodies, root, notes)
         tip = usual or bodies[_tip(model, root) - 1]
         tool = usual or tip._replace(name=f"the frame of {tip.name!r}")
     if root not in (tool.body, *ancestors(model, tool.body)):
@@ -99,7 +101,9 @@ def _named(name: Any, parts: Sequence[Tool]) -> Tool:
     raise ValueError(f"there is no site or body {name!r} in the file; there are: {named}")
 
 
-def _usual_tool(model: mujoco.MjModel, sites: list[Tool], bodies: list[Tool], root: int) -> Tool | None:
+def _usual_tool(
+    model: mujoco.MjModel, sites: list[Tool], bodies: list[Tool], root: int, notes: list[str]
+) -> Tool | None:
     """Return the site or body with the most telling of the usual names on a chain from a body, None for none.
 
     Raises:
@@ -111,15 +115,19 @@ def _usual_tool(model: mujoco.MjModel, sites: list[Tool], bodies: list[Tool], ro
         if root in (body, *ancestors(model, body)) and len(chain) >= LEAST_CHAIN:
             chains[body] = chain
     matches: list[dict[int, Tool]] = []
+    alike: list[list[Tool]] = []  # all parts with the names of each match
     for pattern, parts in itertools.product(TOOL_NAMES, (sites, bodies)):
         found: dict[int, Tool] = {}
+        fitting = []
         for part in parts:
             # The name of the robot may be its prefix.
             fits = re.fullmatch(rf"(.*[_/:])?{pattern}", part.name, re.IGNORECASE)
             if fits and part.body in chains:
                 found.setdefault(part.body, part)
+                fitting.append(part)
         if found:
             matches.append(found)
+            alike.append(fitting)
     if not matches:
         return None
     # Of several on one chain, the last one counts.
@@ -131,6 +139,18 @@ def _usual_tool(model: mujoco.MjModel, sites: list[Tool], bodies: list[Tool], ro
     if rivals:
         listed = ", ".join(dict.fromkeys([tool.name, *rivals]))
         raise ValueError(f"there are several tools: {listed}; name one with tool=, or a side with base=")
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    apart = []
+    for part in alike[0]:
+        way = data.xpos[part.body] - data.xpos[tool.body] + data.xmat[part.body].reshape(3, 3) @ part.position
+        way -= data.xmat[tool.body].reshape(3, 3) @ tool.position
+        if chains[part.body] == chains[last] and np.linalg.norm(way) > SAME_PLACE:
+            apart.append(part.name)
+    if apart:
+        notes.append(
+            f"{WARNING}the tool is {tool.name!r}, but could be {', '.join(apart)}: name one with tool="
+        )
     return tool
 
 

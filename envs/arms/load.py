@@ -179,7 +179,7 @@ def _load(
     given: Mapping[str, Any],
 ) -> Arm:
     """Return the arm of a model and the given arguments; see :func:`load_arm`."""
-    chosen = choose_tool(whole, given["tool"], given["base"])
+    chosen = choose_tool(whole, given["tool"], given["base"], notes)
     notes.insert(0, f"tool: {chosen.name!r}")
     names = given["joints"]
     if names is None:
@@ -499,12 +499,16 @@ def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[Pair], notes: l
     if model.nkey:
         address = [int(model.joint(name).qposadr[0]) for name in joints]
         candidates = {"the file's keyframe": model.key_qpos[0, address].copy(), **candidates}
+    refused = ""
     for origin, configuration in candidates.items():
-        inside = (configuration >= low) & (configuration <= high)
-        if inside.all() and apart(configuration) >= LEAST_GAP:
-            notes.append(f"home: {origin}")
+        if not ((configuration >= low) & (configuration <= high)).all():
+            refused += f"; {origin}: outside the ranges"
+        elif apart(configuration) < LEAST_GAP:
+            refused += f"; {origin}: it nearly touches itself"
+        else:
+            notes.append(f"home: {origin}{refused and f' (not{refused[1:]})'}")
             return np.asarray(configuration)
-    notes.append("home: the one that is farthest from touching itself, of random ones")
+    notes.append(f"home: the one that is farthest from touching itself, of random ones (not{refused[1:]})")
     inset = INSET * (high - low)
     drawn = np.random.default_rng(0).uniform(low + inset, high - inset, (HOMES, len(low)))
     return max(drawn, key=apart)
@@ -516,8 +520,8 @@ def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: li
     for i in range(1, len(joints)):
         if carriers[i - 1] not in ancestors(model, carriers[i]):
             raise ValueError(
-                "joints must be in order from the base, each on a body of its own: "
-                f"{joints[i - 1]!r} does not carry {joints[i]!r}"
+                "the joints must each be on a body of its own, in order from the base, but "
+                f"{joints[i - 1]!r} does not carry {joints[i]!r}: split their body in the file, or change joints="
             )
     moves_with = np.zeros(model.nbody, int)
     for body in range(1, model.nbody):

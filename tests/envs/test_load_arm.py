@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import re
+import warnings
 
 import mujoco
 import numpy as np
@@ -209,6 +210,19 @@ THREE = {"tool": "tool", "joints": ("one", "two", "three"), "velocity_limit": 1.
 def three(*pairs, gap=0.02, **changes):
     """Return the arm of three links with some words of its file replaced."""
     return load_arm(changed(*pairs, text=near_arm(gap)), **{**THREE, **changes})
+
+
+def test_one_of_two_tools_on_a_wrist_is_taken_with_a_warning(tmp_path):
+    site = '<site name="hand" pos="0 0 0.2596"/>'
+    for other, told in (("0 -0.1 0.1", 1), ("0 0.1 0.1", 0)):  # where both are in one place, it is one tool
+        file = tmp_path / f"two{told}.xml"
+        two = f'<site name="left_tcp" pos="0 0.1 0.1"/><site name="right_tcp" pos="{other}"/>'
+        file.write_text(TEXT.replace(site, two))
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            arm = load_arm(file, name="ur5e")
+        assert "tool: 'left_tcp'" in repr(arm)
+        assert len([each for each in found if "right_tcp" in str(each.message)]) == told
 
 
 def test_without_velocity_limits_a_warning_names_the_default():

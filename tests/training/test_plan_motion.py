@@ -355,6 +355,17 @@ def test_plans_succeed_among_all_shapes_at_rest_and_moving(arm, obstacle) -> Non
     assert plan.execute().is_success.all()
 
 
+@pytest.mark.parametrize("speed", [0.3, 0.5, 0.7])
+def test_no_obstacle_comes_while_the_arm_settles(speed) -> None:
+    start, goal = (-0.2, 0.3), (0.1, 0.4)
+    end = plan_motion("planar", start, goal).duration
+    for late in (0.02, 0.05, 0.08):  # when it would be at the goal after the straight movement, [s]
+        place = (0.1 + 0.05 + speed * (end + late), 0.4, 0.0)
+        post = Cylinder(0.025, 0.04, position=place, velocity=(-speed, 0.0, 0.0))
+        plan = plan_motion("planar", start, goal, [post])
+        assert not plan.success or plan.execute().is_success.all()
+
+
 def test_the_benchmark_is_that_of_the_literature() -> None:
     arm, problems = benchmark_panda(), benchmark_problems()
     assert len(problems) == 700

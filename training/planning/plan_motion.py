@@ -30,6 +30,7 @@ from viapoint.envs.common.validation import (
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape
+from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import Plan, SpaceName
 from viapoint.envs.scenes.options import Pose, as_pose
 from viapoint.envs.spaces import Space, space_of
@@ -699,6 +700,14 @@ def _timed(problem: _Problem, movement: Movement, least: float | None) -> tuple[
     return factor * duration, limits, beyond
 
 
+def _clearance_at_rest(problem: _Problem, end: float) -> float:
+    """Return the least clearance at the goal while the arm comes to rest after the end of a movement, [m]."""
+    obstacles = problem.obstacles
+    later = obstacles._replace(centre=obstacles.centre + end * obstacles.velocity)
+    rest = Movement(fine_table(0), 0, problem.goal, np.zeros((3, len(problem.goal))), SETTLING)
+    return exact_clearance(problem.setting, rest, later, 0, problem.margin)
+
+
 def _known(
     problem: _Problem,
     movement: Movement,
@@ -714,6 +723,8 @@ def _known(
     movement = problem.movement(vias, table, times, duration)
     if clearance is None:
         clearance = exact_clearance(problem.setting, movement, problem.obstacles, 0, problem.margin)
+    if problem.obstacles.velocity[0].any():
+        clearance = min(clearance, _clearance_at_rest(problem, duration))
     cost = np.einsum("ij,id,jd->", table.cost[times], movement.offsets, movement.offsets)
     line = problem.goal - problem.start
     straight_cost = STRAIGHT_COST * float(line @ line)
