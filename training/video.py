@@ -94,7 +94,9 @@ def _scenes(env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, name: str, f
     for i in range(number):
         info = play(env, scenes.take([i]), decide)
         left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
-        yield from _with_captions(env.unwrapped.render(), left, info, fps)
+        task = env.get_wrapper_attr("task")
+        told = "only the hand must clear" if task.space.of_hand and not task.whole_arm else ""
+        yield from _with_captions(env.unwrapped.render(), left, info, fps, told)
 
 
 def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
@@ -152,11 +154,13 @@ def play(env: gym.Env[Any, Any], scene: Scenes, decide: Decide) -> dict[str, Any
             return {name: value[0] for name, value in decision.info.items()}
 
 
-def _with_captions(frames: Any, left: str, info: dict[str, Any], fps: float) -> Iterator[Frame]:
-    """Yield frames with a caption, and the last one for a pause with the outcome in it."""
+def _with_captions(
+    frames: Any, left: str, info: dict[str, Any], fps: float, told: str = ""
+) -> Iterator[Frame]:
+    """Yield frames with a caption that tells something, and the last one for a pause with the outcome in its place."""
     outcome, colour = describe_outcome(info)
     frames = list(frames)
-    plain = _caption(frames[0].shape[1], left, "", colour)
+    plain = _caption(frames[0].shape[1], left, told, PALETTE.start)
     final = _caption(frames[0].shape[1], left, outcome, colour)
     for frame in frames:
         yield _stacked(frame, plain)

@@ -4,6 +4,7 @@ import errno
 import io
 import json
 import os
+import pty
 import re
 import shlex
 import shutil
@@ -47,6 +48,16 @@ def test_every_command_has_help(command, capsys):
     assert not end.value.code
     shown = capsys.readouterr().out
     assert f"viapoint {command}" in re.search("Example: (.+)", shown).group(1)
+
+
+def test_errors_of_options_are_the_same_on_a_terminal(capsys):
+    words = "play", "--out", "x.mp4"
+    with pytest.raises(SystemExit):
+        run(*words)
+    shown, terminal = pty.openpty()
+    command = [sys.executable, "-c", "from viapoint.training.cli.entry import main; main()", *words]
+    subprocess.run(command, stdin=terminal, stdout=terminal, stderr=terminal)
+    assert os.read(shown, 10_000).decode().splitlines() == capsys.readouterr().err.splitlines()
 
 
 @pytest.mark.parametrize("words", [(), ("help",), ("--help",)])

@@ -3,20 +3,19 @@
 import subprocess
 import sys
 
-LIMIT = 180.0  # Time limit of a check, [s]; the first one on a machine compiles machine code
+LIMIT = 180.0  # Time limit of a check, [s]; the first one compiles machine code
 VERSIONS = "import sys, {0}; print(sys.version[:7], *(f'{{m.__name__}} {{m.__version__}}' for m in ({0})))"
-ENV = "import gymnasium, viapoint.envs as v; env = gymnasium.make(v.ENV_IDS[1], render_mode='rgb_array'); env.reset(); "
-STEP = ENV + "print(f'{env.step(env.action_space.sample())[4][\"duration\"]:.3f} s of movement')"
+ENV = "import gymnasium as g, viapoint.envs as v; e = g.make(v.ENV_IDS[1], render_mode='rgb_array'); e.reset(seed=0); "
+STEP = ENV + "print(f'{e.step(0 * e.action_space.sample())[4][\"duration\"]:.3f} s of movement')"
 AGENT = "from viapoint.training import load_agent; print(load_agent('viapoint/PlanarObstacles-v0').env_id)"
 EXTRAS = "from importlib.util import find_spec as f; print(*(n if f(n) else f'(no {{n}}: extra {{e}})' for n, e in {}))"
 PACKAGES = {"torch": "training", "ompl": "planning", "viser": "live", "minari": "minari", "ray": "study"}
-# Script that fails, or prints what it found, and remedy, by the name of what is checked
-CHECKS = {
-    "packages": (VERSIONS.format("numpy, gymnasium, mujoco, numba"), "pip install viapoint"),
+CHECKS = {  # Script that fails, or prints what it found, and remedy, by the name of what is checked
+    "packages": (VERSIONS.format("numpy, gymnasium, mujoco, numba"), "pip install . in a clone"),
     "MuJoCo": (STEP, "pip install 'mujoco>=4'"),
     "agents": (AGENT, "the planner works without them"),
     "extras": (EXTRAS.format((*PACKAGES.items(),)), ""),
-    "pictures": (ENV + "print(*env.render().shape)", "on Debian: apt-get install libegl1 libgl1"),
+    "pictures": (ENV + "print(*e.render().shape)", "on Debian: apt-get install libegl1 libgl1"),
 }
 
 
@@ -25,7 +24,8 @@ def run(config: object) -> None:
     code = 0
     for name, (script, remedy) in CHECKS.items():
         works, found = outcome(script)
-        print(f"{name:<9} {'works:' if works else 'fails:'} {found}{'' if works else f'; {remedy}'}")
+        verdict = "there:" if name == "extras" else "works:" if works else "fails:"
+        print(f"{name:<9} {verdict} {found}{'' if works else f'; {remedy}'}")
         code |= not works and name in ("packages", "MuJoCo")
     raise SystemExit(code)
 

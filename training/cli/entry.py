@@ -35,8 +35,8 @@ COMMANDS = {
 }
 OVERVIEW = """usage: viapoint COMMAND [OPTIONS]
 
-Agents that reach around obstacles by placing via-points of minimum-jerk
-movements.
+Smooth movements of robot arms around obstacles, through via-points: planned
+in milliseconds, or learned in Gymnasium.
 
 {commands}
 
@@ -128,7 +128,7 @@ def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
 
 def _complaint(text: str, command: str, kind: type[Any]) -> str:
     """Return what tyro says below a title, in a frame or in ASCII, as one line with the flags of fields."""
-    _, _, body = text.strip().partition("\n")
+    _, _, body = re.sub(r"\x1b\[[0-9;]*m", "", text).strip().partition("\n")  # without colours
     said = " ".join(re.sub("[│╰╯─]|-{3,}", " ", body).split())
     said = re.sub(
         rf"^Error parsing ({kind.__name__}: )?|( Argument helptext: .*)? For full helptext, .*", "", said
