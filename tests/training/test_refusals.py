@@ -380,7 +380,6 @@ COMMANDS = [
     ("live --env nothing", "nothing"),
     ("evaluate nowhere", "nowhere"),
     ("evaluate --pretrained nobody", "nobody"),
-    ("record --agent random", "viapoint record AGENT"),
     ("plan --position 0.4 0.3", "position must have shape (3,)"),
     ("plan --arm panda --velocity-limit 0.3 --position 0.4 0.3 0.3", "--velocity-limit"),
     ("plan --arm nowhere.xml --position 0.4 0.3 0.3", "nowhere.xml"),

@@ -104,6 +104,8 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
     if command not in COMMANDS:
         raise ValueError(f"{checks.unknown_name('command', command, COMMANDS)} (viapoint --help)")
     kind = kinds[command]
+    if issubclass(kind, configs.AgentConfig):  # the agent is a word by its place, which may be named
+        options = [word for word in options if word != "--agent"]
     default = {} if usual is None else {"default": usual}
     complaint = io.StringIO()
     try:
@@ -133,8 +135,6 @@ def _complaint(text: str, command: str, kind: type[Any]) -> str:
     said = re.sub(
         rf"^Error parsing ({kind.__name__}: )?|( Argument helptext: .*)? For full helptext, .*", "", said
     )
-    if said.startswith("Unrecognized options: --agent") and hasattr(kind, "agent"):
-        said = f"--agent is no option; name the agent alone: viapoint {command} AGENT"
     for each in dataclasses.fields(kind):
         said = re.sub(rf"^{each.name}\b", f"--{each.name.replace('_', '-')}", said)
     return f"{said} (viapoint {command} --help)"
