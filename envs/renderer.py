@@ -30,7 +30,7 @@ SOLID = tuple(getattr(mujoco.mjtGeom, f"mjGEOM_{name}") for name in ("SPHERE", "
 # Radii of the planned, the executed and a replaced path, [m]; the planned one shows as a rim of the executed
 PLAN, DONE, REPLACED = 0.0065, 0.0030, 0.0045
 SPACING = 0.02  # Distance of the points of a drawn path, [m]
-# Radius of the points that a sensor has met, [m], and how many of them are drawn at most
+# Radius of the points that a sensor has met, twice as much in space, [m], and how many of them are drawn at most
 SEEN, MOST_SEEN = 0.004, 600
 # Half lengths of the board that stands for a half-space, [m], and its opacity
 HALF_SPACE_BOARD, GLASSY = (1.0, 1.0, 0.002), 0.4
@@ -217,7 +217,7 @@ class SceneView:
             centre, half = bounding_boxes(picture.obstacles)
             seen[:, 2] = (centre + half)[0, picture.obstacles.present[0], 2].max()
         for point in seen:
-            add_ball(self.scene, point, SEEN, PALETTE.seen, GLOWING)
+            add_ball(self.scene, point, SEEN if self._flat else 2.0 * SEEN, PALETTE.seen, GLOWING)
         free = picture.touched
         done = self._lowered(picture.done)
         for part, colour in ((done[: free + 1], PALETTE.executed), (done[free:], PALETTE.contact)):
