@@ -114,35 +114,31 @@ def _usual_tool(
         chain = set(chain_joints(model, body, root))
         if root in (body, *ancestors(model, body)) and len(chain) >= LEAST_CHAIN:
             chains[body] = chain
-    matches: list[dict[int, Tool]] = []
-    alike: list[list[Tool]] = []  # all parts with the names of each match
+    matches: list[list[Tool]] = []
     for pattern, parts in itertools.product(TOOL_NAMES, (sites, bodies)):
-        found: dict[int, Tool] = {}
-        fitting = []
+        found = []
         for part in parts:
             # The name of the robot may be its prefix.
             fits = re.fullmatch(rf"(.*[_/:])?{pattern}", part.name, re.IGNORECASE)
             if fits and part.body in chains:
-                found.setdefault(part.body, part)
-                fitting.append(part)
+                found.append(part)
         if found:
             matches.append(found)
-            alike.append(fitting)
     if not matches:
         return None
-    # Of several on one chain, the last one counts.
-    last = max(reversed(matches[0]), key=lambda body: len(chains[body]))
-    rivals = [part.name for body, part in matches[0].items() if not chains[body] <= chains[last]]
+    # Of several on one chain, the first one on the last body counts.
+    last = max(reversed(matches[0]), key=lambda part: len(chains[part.body])).body
+    tool = next(part for part in matches[0] if part.body == last)
+    rivals = [part.name for part in matches[0] if not chains[part.body] <= chains[last]]
     for others in matches[1:]:  # less telling names matter on other arms alone
-        rivals += [part.name for body, part in others.items() if chains[body].isdisjoint(chains[last])]
-    tool = matches[0][last]
+        rivals += [part.name for part in others if chains[part.body].isdisjoint(chains[last])]
     if rivals:
         listed = ", ".join(dict.fromkeys([tool.name, *rivals]))
         raise ValueError(f"there are several tools: {listed}; name one with tool=, or a side with base=")
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     apart = []
-    for part in alike[0]:
+    for part in matches[0]:
         way = data.xpos[part.body] - data.xpos[tool.body] + data.xmat[part.body].reshape(3, 3) @ part.position
         way -= data.xmat[tool.body].reshape(3, 3) @ tool.position
         if chains[part.body] == chains[last] and np.linalg.norm(way) > SAME_PLACE:
