@@ -231,6 +231,11 @@ class Task:
         )
 
     @property
+    def hand_alone(self) -> bool:
+        """True if there may be obstacles, and only the hand must clear them."""
+        return self.n_obstacles[1] > 0 and self.space.of_hand and not self.whole_arm
+
+    @property
     def action_names(self) -> tuple[str, ...]:
         """Names of the components of an action."""
         return self.steering.names if self.stepwise else self.action.names

@@ -94,8 +94,7 @@ def _scenes(env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, name: str, f
     for i in range(number):
         info = play(env, scenes.take([i]), decide)
         left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
-        task = env.get_wrapper_attr("task")
-        told = "only the hand must clear" if task.space.of_hand and not task.whole_arm else ""
+        told = "only the hand must clear" if env.get_wrapper_attr("task").hand_alone else ""
         yield from _with_captions(env.unwrapped.render(), left, info, fps, told)
 
 

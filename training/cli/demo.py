@@ -100,8 +100,7 @@ def _show_movements(folder: Path, agent: Agent, frozen: FrozenScenes) -> None:
     chosen = frozen.take(np.argsort(-frozen.share, kind="stable")).spread(PICTURES)
     titles = [f"share {BANDS[band]}" for band in chosen.band]
     heading = f"The agent alone in {frozen.name} scenes, easy to hard"
-    task = registered_task(agent.env_id, **agent.env_kwargs)
-    if task.n_obstacles[1] and task.space.of_hand and not task.whole_arm:
+    if registered_task(agent.env_id, **agent.env_kwargs).hand_alone:
         heading += "; only the hand must clear the obstacles, links may cross them"
     env = gym.make(agent.env_id, render_mode="rgb_array", **agent.env_kwargs)
     gallery(folder / "gallery.png", env, chosen.scenes, decide, titles, heading=heading)
