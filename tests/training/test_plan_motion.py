@@ -235,6 +235,29 @@ def test_results_depend_on_neither_threads_nor_the_form_of_obstacles() -> None:
     assert all(np.array_equal(first.waypoints, other.waypoints) for other in others)
 
 
+def test_within_bounds_no_allowed_direction_is_better() -> None:
+    """Where refinement ends, the gradient vanishes, or points out of the bounds (Karush-Kuhn-Tucker)."""
+    table, scene = movement_table(2), pack([[]])
+    setting = module._setting(PANDA, False)
+    aim = refine.Aim(clearance=0.0, jerk=1.0, iterations=60, gain=0.0, stride=2)
+    generator = np.random.default_rng(0)
+    line = GOAL - PANDA.home
+    gradient = np.empty(14)
+    for _ in range(20):
+        offsets = np.concatenate((generator.uniform(-0.5, 0.5, (2, 7)), [line], np.zeros((2, 7))))
+        low = offsets[:2] - generator.uniform(0.0, 0.3, (2, 7))
+        high = offsets[:2] + generator.uniform(0.0, 0.3, (2, 7))
+        movement = Movement(table, 0, PANDA.home, offsets, 1.0)
+        work = refine._work(setting, 5, 7, scene, 0)
+        row = refine._refine(setting, movement, np.stack((low, high)), scene, 0, aim, 360.0, work)
+        assert ((offsets[:2] >= low) & (offsets[:2] <= high)).all()
+        objective(setting, table, row, PANDA.home, offsets, scene, aim, gradient)
+        wanted = np.where(gradient.reshape(2, 7) > 0.0, low, high)
+        free = offsets[:2] != wanted
+        assert 0 < free.sum() < 14
+        assert np.abs(gradient.reshape(2, 7)[free]).max() < 1e-3 * np.abs(gradient).max()
+
+
 @pytest.mark.parametrize("kwargs", [{"arm": "panda"}, {"arm": "planar", "whole_arm": True}], ids=str)
 def test_gradient_of_the_objective(kwargs) -> None:
     task, starts, goals, obstacles = drawn(5, **kwargs)

@@ -17,15 +17,21 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
 from viapoint.envs.common.validation import whole_number
+from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
 from viapoint.training.agents.model_io import check_arguments, check_same_task
+from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
+from viapoint.training.planning.movements import FINE_INSTANTS
+from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.vec_env import check_spaces, check_unwrapped
 
 N_ELITES = 8  # Number of candidates around which each round of refinement samples
 # Standard deviation of the first round of refinement, in the action space; each round halves it
 SPREAD = 0.15
+# Number of candidates that are looked at together for one within reach, after the best one
+LOOKED_AT = 32
 
 Observation = Mapping[str, NDArray[Any]]
 Numbers = NDArray[np.floating[Any]]
@@ -120,6 +126,34 @@ class PlanPolicy(BasePolicy):
             actions = np.concatenate((actions, some), axis=1)
             value = np.concatenate((value, values(some)), axis=1)
         return actions, value
+
+    def best_within_reach(self, problem: Problem, actions: Numbers, values: Numbers) -> NDArray[np.intp]:
+        """Return the index of the best of H actions in each of B problems, shape (B,), by values of shape (B, H).
+
+        Movements from rest are looked at once more, as they will be executed: where kinematics says that the best one
+        leaves reach or joint ranges, or that the arm touches itself, the best of those is taken that do not.
+        """
+        best = np.asarray(values.argmax(axis=1))
+        rows = np.arange(0 if self.replanning else len(best))
+        order = np.argsort(-values, axis=1, kind="stable")
+        first, count = 0, 1
+        while rows.size and first < order.shape[1]:
+            some = order[rows, first : first + count]
+            within = self._within_reach(problem.take(rows), actions[rows[:, None], some])
+            found = within.any(axis=1)
+            best[rows[found]] = some[found, within[found].argmax(axis=1)]
+            rows = rows[~found]
+            first += count
+            # Candidates of a round are close together: where the best is out of reach, so are many of the next.
+            count = LOOKED_AT
+        return best
+
+    def _within_reach(self, problem: Problem, actions: Numbers) -> NDArray[np.bool_]:
+        """Return True for actions whose movement stays within reach and joint ranges, and clear of the arm itself."""
+        alone = problem._replace(obstacles=no_obstacles(len(actions)))
+        moves = moves_of(self.task, alone, actions, exact=True)
+        pairs = pairs_of(self.task, alone, moves, np.arange(FINE_INSTANTS), exact=True)
+        return np.asarray(pairs.inside & (pairs.self_clearance > 0.0))
 
     def around(self, centres: Numbers, each: int) -> Numbers:
         """Return candidates of a round around some of shape (B, ., m), shape (B, per_refinement, m)."""

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from viapoint.envs.common.arrays import Float, norm
-from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import turned
 from viapoint.envs.task import Task
 from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.agents.plan_agent import Numbers, Observation, PlanPolicy
 from viapoint.training.agents.viaq_critic import PlanInputs, ViaQCritic
-from viapoint.training.planning.movements import FINE_INSTANTS, INSTANTS
+from viapoint.training.planning.movements import INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import INFEASIBLE, best_of, merits, refined_actions
 
@@ -29,9 +28,6 @@ PROPOSALS = 32
 # Least distance of the via-points of two candidates that are refined, in the action space. Of .2 to 1.8, .5 solved most
 # of the `validation` scenes of PandaObstacles.
 APART = 0.5
-# Greatest number of candidates, best first, that are looked at for one within reach. Candidates of a round are close
-# together: where the best is out of reach, so are many of the next.
-REACHED = 64
 LOCAL_ROUNDS = 4  # Rounds of checks around the best checked plans
 SPARE = 0.2  # Greatest time that is left after a movement, or missing for it, at the input of the critic, [s]
 BLOCK = 64  # Scenes that are decided together
@@ -148,7 +144,8 @@ class ViaQPolicy(PlanPolicy):
         """Return the chosen actions of B problems, shape (B, m)."""
         actions, values = self.propose(problem)
         if not self.checks and not self.refine:
-            return self._best_within_reach(problem, actions, values.copy())
+            first = self.best_within_reach(problem, actions, values)
+            return np.asarray(actions[np.arange(len(first)), first])
         count = min(max(self.checks, self.refine), values.shape[1])
         local = max(count - PROPOSALS, 0) if self.checks else 0
         promising = self._promising(values, count - local)
@@ -163,25 +160,6 @@ class ViaQPolicy(PlanPolicy):
         if local and rows.size:
             best[rows] = self._improved(problem.take(rows), checked[rows], worth[rows], local)
         return best
-
-    def _best_within_reach(self, problem: Problem, actions: Numbers, values: Numbers) -> Numbers:
-        """Return the best actions of B problems, shape (B, m).
-
-        Movements from rest are looked at once more, as they will be executed: where kinematics says that one leaves
-        reach or joint ranges, or that the arm touches itself, the best of the others is taken.
-        """
-        best = values.argmax(axis=1)
-        rows = np.arange(0 if self.replanning else len(best))
-        for _ in range(REACHED):
-            if not rows.size:
-                break
-            alone = problem.take(rows)._replace(obstacles=no_obstacles(len(rows)))
-            moves = moves_of(self.task, alone, actions[rows, best[rows]][:, None], exact=True)
-            pairs = pairs_of(self.task, alone, moves, np.arange(FINE_INSTANTS), exact=True)
-            rows = rows[~(pairs.inside & (pairs.self_clearance > 0.0)).numpy()[:, 0]]
-            values[rows, best[rows]] = -np.inf
-            best[rows] = values[rows].argmax(axis=1)
-        return np.asarray(actions[np.arange(len(best)), best])
 
     def _improved(self, problem: Problem, checked: Numbers, worth: Numbers, count: int) -> Numbers:
         """Return the best of checked actions and of `count` further ones around the best of them, shape (B, m)."""

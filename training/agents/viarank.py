@@ -184,7 +184,7 @@ class ViaRankPolicy(PlanPolicy):
                 refined = refined_actions(self.task, there, seeds)
                 actions = np.concatenate((actions, refined), axis=1)
                 value = np.concatenate((value, rank(refined)), axis=1)
-            best = np.arange(len(value)), value.argmax(axis=1)
+            best = np.arange(len(value)), self.best_within_reach(there, actions, value)
             taken = actions[best]
             moves = moves_of(self.task, there, taken[:, None])
             worth = _worth(self.task, there, taken[:, None], moves)[:, 0]

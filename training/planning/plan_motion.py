@@ -629,9 +629,10 @@ def _refined(
     """Refine seeds, shape (S, K, D); see :func:`~viapoint.training.planning.refine.refine_seeds`."""
     fixed = problem.movement(seeds[:0, 0], table, 0, duration).offsets
     unit = unit_of_jerk(problem.goal - problem.start, problem.space.of_hand)
+    endless = np.full(seeds.shape[1:], np.inf)
     return refine_seeds(
-        problem.setting, table, fine, problem.start, fixed, seeds, duration, problem.obstacles, 0, kept,
-        unit, smooth, enough,
+        problem.setting, table, fine, problem.start, fixed, seeds, np.stack((-endless, endless)),
+        duration, problem.obstacles, 0, kept, unit, smooth, enough,
     )  # fmt: skip
 
 

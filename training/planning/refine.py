@@ -383,7 +383,14 @@ def _copy(source: Float, target: Float) -> None:
 
 @compiled
 def _refine(
-    setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, aim: Aim, unit: float, work: _Work
+    setting: Setting,
+    movement: Movement,
+    bounds: Float,
+    obstacles: Obstacles,
+    scene: int,
+    aim: Aim,
+    unit: float,
+    work: _Work,
 ) -> int:
     """Move the via-points of a movement, the first rows of its offsets, and return the index of its passage times."""
     table, _, start, offsets, duration = movement
@@ -410,6 +417,13 @@ def _refine(
             for j in range(i + 1):
                 system[i, j] = hessian[i, j]
             system[i, i] += damping * (FLAT * CONTACT_WEIGHT + hessian[i, i])
+        for i in range(size):
+            a, d = i // dimension, i % dimension
+            outward = bounds[0, a, d] if gradient[i] > 0.0 else bounds[1, a, d]
+            if offsets[a, d] == outward:  # the others do not count on what a bound forbids
+                step[i] = 0.0
+                for j in range(size):
+                    system[max(i, j), min(i, j)] = 1.0 if i == j else 0.0
         solve_symmetric(system, step, size)
         for i in range(size):
             largest = max(largest, abs(step[i]))
@@ -418,11 +432,12 @@ def _refine(
             break
         for a in range(vias):
             for d in range(dimension):
-                trial[a, d] = offsets[a, d] + factor * step[a * dimension + d]
+                wanted = offsets[a, d] + factor * step[a * dimension + d]
                 if not setting.of_hand:
                     low = setting.joint_range[d, 0] - start[d]
                     high = setting.joint_range[d, 1] - start[d]
-                    trial[a, d] = min(max(trial[a, d], low), high)
+                    wanted = min(max(wanted, low), high)
+                trial[a, d] = min(max(wanted, bounds[0, a, d]), bounds[1, a, d])
         other, _ = best_times(table, trial, work.gram)
         movement = Movement(table, other, start, trial, duration)
         value, apart = _assemble(
@@ -458,6 +473,7 @@ def refine_seeds(
     start: Float,
     fixed: Float,
     seeds: Float,
+    bounds: Float,
     duration: float,
     obstacles: Obstacles,
     scene: int,
@@ -475,6 +491,7 @@ def refine_seeds(
         start: Start, shape (D,).
         fixed: Offsets of the goal, initial velocity and acceleration, shape (3, D).
         seeds: Via-points as offsets from the start, shape (S, K, D).
+        bounds: Least and greatest offsets of the via-points beside joint limits, shape (2, K, D).
         duration: Duration during which obstacles move, [s].
         obstacles: Obstacles, of which those of the scene `scene` count.
         scene: Index of the scene.
@@ -498,7 +515,7 @@ def refine_seeds(
         _copy(seeds[each], offsets[0])
         for aim in (SEED, NARROW):
             movement = Movement(table, 0, start, offsets[0], duration)
-            times[0] = _refine(setting, movement, obstacles, scene, aim, unit, work)
+            times[0] = _refine(setting, movement, bounds, obstacles, scene, aim, unit, work)
             movement = Movement(table, times[0], start, offsets[0], duration)
             apart = _clearance(setting, movement, obstacles, scene, margin, NEARLY)
             if not NEARLY < apart < margin:
@@ -517,7 +534,7 @@ def refine_seeds(
             _copy(offsets[stage], trial)
             movement = Movement(table, 0, start, trial, duration)
             aim = Aim(POLISH.clearance, weight, POLISH.iterations, POLISH.gain, POLISH.stride)
-            other = _refine(setting, movement, obstacles, scene, aim, unit, work)
+            other = _refine(setting, movement, bounds, obstacles, scene, aim, unit, work)
             _, less = best_times(table, trial, work.gram)
             movement = Movement(table, other, start, trial, duration)
             if less >= cost or not is_free(setting, movement, obstacles, scene, margin):

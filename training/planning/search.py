@@ -236,8 +236,8 @@ def merits(
 def refined_actions(task: Task, problem: Problem, actions: Numbers) -> Numbers:
     """Return actions of shape (B, H, m) after a refinement of their via-points by the gradient of clearance and jerk.
 
-    Movements begin at rest. Durations relative to the shortest movement stay as they are, and what lies outside the
-    action space is clipped.
+    Movements begin at rest. Durations relative to the shortest movement stay as they are. In joint space via-points
+    stay within the action space; in hand space what lies outside is clipped.
     """
     table, fine = movement_table(task.n_via), fine_table(task.n_via)
     setting = setting_of(task, problem.obstacles, exact=True)
@@ -249,9 +249,13 @@ def refined_actions(task: Task, problem: Problem, actions: Numbers) -> Numbers:
         line = problem.goal[b] - problem.start[b]
         seeds = moves.offsets[b, :, :number].copy()
         fixed = moves.offsets[b, 0, number:].copy()
+        bounds = np.full((2, number, len(start)), [[[-np.inf]], [[np.inf]]])
+        if not setting.of_hand:
+            middle = line * np.arange(1, number + 1)[:, None] / (number + 1)
+            bounds = np.stack((middle - task.action.via_scale, middle + task.action.via_scale))
         _, better = refine_seeds(
-            setting, table, fine, start, fixed, seeds, moves.duration[b, 0], problem.obstacles, b, CLEARANCE_MARGIN,
-            unit_of_jerk(line, setting.of_hand), SMOOTH, len(seeds),
+            setting, table, fine, start, fixed, seeds, bounds, moves.duration[b, 0], problem.obstacles, b,
+            CLEARANCE_MARGIN, unit_of_jerk(line, setting.of_hand), SMOOTH, len(seeds),
         )  # fmt: skip
         waypoints = np.zeros((len(seeds), number + 2, len(start)))
         waypoints[:, 1:-1] = better.vias
