@@ -290,8 +290,8 @@ class LivePage(contextlib.AbstractContextManager["LivePage", None]):
     """Page in the browser on which scenes are changed by hand and the movement is planned anew.
 
     Args:
-        agent: Agent, run folder, model folder, or id of an environment with a shipped agent; it decides at first. None for
-            the agent that is shipped for `env`, if there is one; then the motion planner decides at first.
+        agent: Agent, run folder, model folder, or id of an environment with a shipped agent; it decides at first. None
+            for the agent that is shipped for `env`, if there is one; then the motion planner decides at first.
         env: Id of the environment; by default that of the agent.
         port: Port to listen on; 0 for a free one.
         arm: Arm of the environment: the name of one, an MJCF or URDF file, or an arm. Without `env`, it moves among
