@@ -34,7 +34,6 @@ VIA: dict[str, Any] = {
 SECOND = PALETTE.goal
 THIRD = PALETTE.via
 GREY = PALETTE.start
-NAMES = ("model", "simulated arm")
 JOINTS = (("shoulder $S$", SECOND), ("elbow $E$", THIRD))
 
 
@@ -186,9 +185,9 @@ def _two_movements(rows: int, height: float, titles: Sequence[str]) -> tuple[Fig
     return figure, axes
 
 
-def profiles(axes: Any, model: Profile, arm: Profile, end: float, names: Any = NAMES) -> None:
+def profiles(axes: Any, model: Profile, arm: Profile, end: float) -> None:
     """Draw speed, curvature and velocities on as many axes as there are."""
-    for profile, style, name in zip((model, arm), (MODEL, ARM), names, strict=True):
+    for profile, style, name in ((model, MODEL, "model"), (arm, ARM, "simulated arm")):
         quantities = (profile.speed, profile.curvature, *profile.velocity.T)
         for ax, values in zip(axes, quantities, strict=False):
             ax.plot(end * profile.time, values, label=name, **style)
