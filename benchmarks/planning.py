@@ -179,7 +179,7 @@ def measure_curves(problems: list[BenchmarkProblem]) -> pd.DataFrame:
 
 def draw_curves() -> None:
     """Draw share solved and jerk against the time that planners are given."""
-    with matplotlib.style.context(str(STYLE)):
+    with matplotlib.style.context(STYLE):
         figure = Figure(figsize=(COLUMN / 2.54, 5.6 / 2.54))
         left, right = figure.subplots(1, 2)
         for name, points in pd.read_csv(CURVES).groupby("planner", sort=False):

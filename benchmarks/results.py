@@ -240,7 +240,7 @@ def write_pages(rows: list[dict[str, Any]]) -> None:
 def draw(rows: list[dict[str, Any]]) -> None:
     """Draw success in `test` against the time of a decision, a panel for each task with obstacles."""
     headings = re.findall(r"### (.*)", PAGES[0].read_text(encoding="utf-8"))
-    with matplotlib.style.context(str(STYLE)):
+    with matplotlib.style.context(STYLE):
         figure = Figure(figsize=(COLUMN / 2.54, 14.0 / 2.54))
         panels = figure.subplots(4, 2, sharex=True, sharey=True).flat
         marks: dict[str, Any] = {}

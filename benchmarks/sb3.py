@@ -99,7 +99,7 @@ def curves_of(folder: Path) -> list[dict[str, Any]]:
 def draw(rows: list[dict[str, Any]]) -> None:
     """Draw success on the validation scenes against decisions, a panel for each task."""
     tasks = [name for name in TASKS if any(row["task"] == name for row in rows)]
-    with matplotlib.style.context(str(STYLE)):
+    with matplotlib.style.context(STYLE):
         figure = Figure(figsize=(COLUMN / 2.54, 14.0 / 2.54))
         panels = figure.subplots(4, 2, sharey=True).flat
         for task, panel in zip(tasks, panels, strict=False):

@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any
 
 TUTORIALS = Path(__file__).parent / "tutorials"
-DOTS = 100
-"""Resolution of stored figures, [dots per inch]."""
 
 
 def run(path: Path) -> list[dict[str, Any]]:
@@ -67,7 +65,7 @@ def figures() -> list[str]:
     found = []
     for number in plt.get_fignums():
         drawn, small = io.BytesIO(), io.BytesIO()
-        plt.figure(number).savefig(drawn, dpi=DOTS, bbox_inches="tight")
+        plt.figure(number).savefig(drawn, dpi="figure", bbox_inches="tight")
         Image.open(drawn).convert("RGB").quantize(64, dither=Image.Dither.NONE).save(
             small, "PNG", optimize=True
         )

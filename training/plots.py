@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,7 @@ METHOD_STYLES: dict[str, dict[str, Any]] = {
 }
 OTHER_COLOURS = "#c9b458", "#d9a6c2", "#b5a08c", "#a8c686", "#5c5c8a"  # Of methods that are not among them
 DOTS_PER_INCH = 130
-STYLE = files("viapoint.training") / "paper" / "paper.mplstyle"  # Style of figures in centimetres
+STYLE = "viapoint.training.style"  # Style of figures in centimetres, for Matplotlib's `style.use`
 WIDTH, HEIGHT, LEGEND = 17.0, 5.4, 0.7  # Of a figure of fits, each movement, the legend, [cm]
 COLUMN = 8.5  # Width of a figure in STYLE that can be read on a narrow page, [cm]
 # Style of the fit: a wide light line below the samples
@@ -128,7 +127,7 @@ def fitted_movements(
 
     Movements are times, shape (N,), [s], and positions, shape (N, D), [m], by name; `fits` has one for each of them.
     """
-    with matplotlib.style.context(str(STYLE)):
+    with matplotlib.style.context(STYLE):
         figure = Figure(figsize=(WIDTH / 2.54, (HEIGHT * len(movements) + LEGEND) / 2.54))
         axes = figure.subplots(len(movements), 2, squeeze=False)
         for (left, right), (name, (time, position)) in zip(axes, movements.items(), strict=True):

@@ -86,7 +86,7 @@ def decide(agent: str) -> Decision:
 
 def draw(path: Path, data: Decision) -> None:
     """Draw the figure to a PNG file."""
-    with matplotlib.style.context(str(STYLE)):
+    with matplotlib.style.context(STYLE):
         figure = Figure(figsize=(COLUMN / 2.54, HEIGHT / 2.54))
         every = figure.subplots(2, 3).flat
         for number, (title, panel) in enumerate(PANELS, start=1):

@@ -30,14 +30,14 @@ def draw_families(path: Path) -> None:
     """Draw a scene of each family, with a movement that a search found, to a PNG file."""
     search = GeometrySearch(ENV_ID, CHECKS)
     frozen = scenes_for("hard", search.task)
-    with matplotlib.style.context(str(STYLE)):
+    with matplotlib.style.context(STYLE):
         figure = Figure(figsize=(COLUMN / 2.54, HEIGHT / 2.54))
         every = figure.subplots(3, 2).flat
         for family, axes in zip(FAMILIES, every, strict=False):
             some = frozen.take(np.flatnonzero(frozen.family == family)[:TRIED])
             episodes = play(ENV_ID, some.scenes, search.decide)
             first = next(row for row, (_, success) in enumerate(episodes) if success)
-            draw_movement(axes, search.task, episodes[first][0], view=VIEW, scale=0.6)
+            draw_movement(axes, search.task, episodes[first][0], arm_shown=False, view=VIEW, scale=0.6)
             axes.set_title(f"{family}, {100.0 * some.share[first]:.1f} %")
         for rest in every:
             rest.axis("off")

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from viapoint.envs import Box, Capsule, Cylinder, Shape, arm_of
 from viapoint.envs.common.arrays import Float, Frame
+from viapoint.envs.episodes import Episodes
 from viapoint.envs.gl import Canvas
 from viapoint.envs.renderer import SceneView, frame_steps, picture_of
 from viapoint.training import MotionPlan, plan_motion
@@ -80,11 +81,16 @@ def pictures(
     outcome, episodes = execute_plans([plan])
     if not outcome.is_success[0]:
         raise RuntimeError("the movement touches something")
-    recorded = episodes.recorded(0)
     view = SceneView(episodes.simulator.single(), *size)
     look_from(view.model, **view_of)
     for number, colour in enumerate(colours):
         view.model.geom(f"obstacle_{number}").rgba[:] = colour
+    return drawn(view, episodes, shares, size)
+
+
+def drawn(view: SceneView, episodes: Episodes, shares: Iterable[float], size: tuple[int, int]) -> list[Frame]:
+    """Return pictures of the first of some episodes at shares of its duration."""
+    recorded = episodes.recorded(0)
     canvas = Canvas(view.model, *size, supersampling=2)
     view.scene = canvas.scene
     found = []

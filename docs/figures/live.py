@@ -16,18 +16,18 @@ ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs" / "images"
 SIZE = 1320, 850
 """Size of the window, [pixels]."""
-SEED, OBSTACLE = 11, 12
-"""Seed of the scene, and the obstacle that has a number, a tall box in the shelf."""
+SEED, OBSTACLE = 3, 8
+"""Seed of the scene, and the obstacle that has a number."""
 LEFT, RIGHT = 352, 988
 """Columns of the numbers beside the panels, [pixels]."""
 PANELS = (
     (LEFT, 100),
-    (LEFT, 225),
-    (RIGHT, 128),
-    (RIGHT, 167),
-    (RIGHT, 233),
-    (RIGHT, 360),
-    (RIGHT, 525),
+    (LEFT, 350),
+    (RIGHT, 110),
+    (RIGHT, 152),
+    (RIGHT, 215),
+    (RIGHT, 342),
+    (RIGHT, 507),
 )
 """Places of the numbers of the panels' parts, [pixels]."""
 ASIDE, RADIUS = 26, 16
@@ -42,7 +42,7 @@ def main() -> None:
 
     browser.SIZE = SIZE
     window = browser.Browser()
-    with LivePage(env="viapoint/PandaObstacles-v0", port=0, seed=SEED) as page:
+    with LivePage("viapoint/PandaObstacles-v0", port=0, seed=SEED) as page:
         tab = window.tab(page.url)
         tab.call(
             "Emulation.setDeviceMetricsOverride",

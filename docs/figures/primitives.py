@@ -16,8 +16,6 @@ from viapoint.training.plots import COLUMN, STYLE, style_axes
 
 FOLDER = Path(__file__).parents[1] / "images"
 COLOURS = mpl.colormaps["viridis"]
-# The colours of all pictures, in the order in which lines of one axis are drawn
-LINES = (PALETTE.plan, PALETTE.via, PALETTE.goal, PALETTE.contact)
 
 
 def sheet(height: float) -> Figure:
@@ -71,8 +69,12 @@ def family() -> None:
         speeds.plot(valley.time, valley.speed, "v", color=colour, ms=3.6)
         inner = time[20:-20]
         bends.plot(inner, -curvature(movement, inner), color=colour)
+    paths.plot([], [], "o", color="0.3", ms=3.6, label="via-point")
+    speeds.plot([], [], "v", color="0.3", ms=3.6, label="valley")
+    paths.legend(loc="upper right", handlelength=0.8)
+    speeds.legend(loc="upper left", handlelength=0.8)
     paths.set(title="path [m]", xlabel="along the straight line [m]", aspect="equal")
-    speeds.set(title="speed [m/s]", xlabel="time [s]", xlim=(0, 1))
+    speeds.set(title="speed [m/s]", xlabel="time [s]", xlim=(0, 1), ylim=(-0.1, 3.1))
     bends.set(title="curvature [1/m]", xlabel="time [s]", xlim=(0, 1), ylim=(-1, 12), yticks=[0, 5, 10])
     save(figure, "family")
 
@@ -132,6 +134,6 @@ def replanning() -> None:
 
 
 if __name__ == "__main__":
-    with matplotlib.style.context([str(STYLE), {"axes.prop_cycle": mpl.cycler(color=LINES)}]):
+    with matplotlib.style.context(STYLE):
         for draw in (reach, family, passage, replanning):
             draw()

@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from hero import WOOD, pictures
+from hero import WOOD, drawn, pictures
 from PIL import Image
 
 from viapoint.envs import Box, Pose, inverse_kinematics, load_arm
 from viapoint.envs.common.arrays import Frame
 from viapoint.envs.geometry.obstacles import unpack
+from viapoint.envs.renderer import SceneView
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training import GeometrySearch, load_agent, plan_motion
 from viapoint.training.checks import SHIPPED_IDS
@@ -27,16 +28,19 @@ from viapoint.training.video import play
 ROOT = Path(__file__).parents[2]
 IN_PLANE, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
 STILLS = {
-    "planar_reach.png": ("viapoint/PlanarReach-v0", 0),
-    "planar_obstacles.png": (IN_PLANE, 9),
-    "planar_whole_arm.png": ("viapoint/PlanarWholeArm-v0", 0),
-    "planar_target_jump.png": ("viapoint/PlanarTargetJump-v0", 0),
-    "planar_moving_obstacles.png": ("viapoint/PlanarMovingObstacles-v0", 0),
-    "panda_reach.png": ("viapoint/PandaReach-v0", 0),
-    "panda_moving_obstacles.png": ("viapoint/PandaMovingObstacles-v0", 4),
-    "panda_sensed.png": ("viapoint/PandaSensed-v0", 6),
+    "planar_reach.png": ("viapoint/PlanarReach-v0", 0, 1.0),
+    "planar_obstacles.png": (IN_PLANE, 9, 1.0),
+    "planar_whole_arm.png": ("viapoint/PlanarWholeArm-v0", 0, 1.0),
+    "planar_target_jump.png": ("viapoint/PlanarTargetJump-v0", 0, 1.0),
+    "planar_moving_obstacles.png": ("viapoint/PlanarMovingObstacles-v0", 0, 1.0),
+    "panda_reach.png": ("viapoint/PandaReach-v0", 0, 0.6),
+    "panda_moving_obstacles.png": ("viapoint/PandaMovingObstacles-v0", 4, 0.7),
+    "panda_sensed.png": ("viapoint/PandaSensed-v0", 6, 0.6),
 }
-"""Tasks of the pictures of single movements, and which of the scenes that show something."""
+"""Tasks of the pictures of single movements, which of the scenes that show something, and the moment, as a share of the
+duration: at the end, the hand of an arm in space hides the goal."""
+SIZE = 480, 480
+"""Width and height of them, [pixels]."""
 TRIED = 100
 """Scenes among which those that are shown are chosen."""
 CLEAREST = 0.012
@@ -87,12 +91,14 @@ def shown(env_id: str, number: int) -> Shown:
     return Shown(method, plain, scenes.take(rows))
 
 
-def still(path: Path, env_id: str, number: int) -> None:
-    """Render one movement of a task."""
+def still(path: Path, env_id: str, number: int, share: float) -> None:
+    """Render one movement of a task at a share of its duration."""
     some = shown(env_id, number + 1)
-    env = gym.make(env_id, render_mode="rgb_array")
+    env = gym.make(env_id)
     play(env, some.scenes.take([number]), some.method.decide)
-    frame: Any = env.unwrapped.render()
+    (episodes,) = env.unwrapped.batch._episodes  # type: ignore[attr-defined]
+    view = SceneView(episodes.simulator.single(), *SIZE)
+    (frame,) = drawn(view, episodes, [share], SIZE)
     env.close()
     Image.fromarray(frame).save(path, optimize=True)
 
@@ -136,8 +142,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/images"), help="folder to write to")
     out: Path = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
-    for name, (env_id, number) in STILLS.items():
-        still(out / name, env_id, number)
+    for name, shown_as in STILLS.items():
+        still(out / name, *shown_as)
     in_space(out / "panda_obstacles.png")
     own_arm(out / "own_arm.png")
     for path in sorted(out.iterdir()):

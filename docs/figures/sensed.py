@@ -120,7 +120,7 @@ def main() -> None:
     agent = load_agent(given.agent)
     task: Task = agent.policy.task
     frozen = scenes_for("validation", task)
-    with matplotlib.style.context(str(STYLE)):
+    with matplotlib.style.context(STYLE):
         figure = Figure(figsize=(COLUMN / 2.54, 6.4 / 2.54))
         every = figure.subplots(2, 2).flat
         for row, axes in zip(given.scenes, every, strict=False):

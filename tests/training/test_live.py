@@ -410,3 +410,9 @@ def test_the_command_passes_arguments_of_the_environment_on(monkeypatch):
     monkeypatch.setattr(page.LivePage, "wait", lambda served: seen.append(served._make()[0].task.n_via))
     page.run(LiveConfig(env=PLANE, env_kwargs={"n_via": 2}, port=0))
     assert seen == [2]
+
+
+@pytest.mark.parametrize(("named", "first"), [({"agent": PLANE}, AGENT), ({"env": PLANE}, MOTION)])
+def test_an_agent_decides_at_first_where_it_is_named(named, first):
+    with LivePage(**named, port=0) as served:
+        assert served._make()[0].methods[0] == first

@@ -104,8 +104,8 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
     if command not in COMMANDS:
         raise ValueError(f"{checks.unknown_name('command', command, COMMANDS)} (viapoint --help)")
     kind = kinds[command]
-    if issubclass(kind, configs.AgentConfig):  # the agent is a word by its place, which may be named
-        options = [word for word in options if word != "--agent"]
+    if issubclass(kind, configs.AgentConfig):
+        options = _agent_first(options)
     default = {} if usual is None else {"default": usual}
     complaint = io.StringIO()
     try:
@@ -117,6 +117,21 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
         if not end.code:
             raise
         raise ValueError(_complaint(complaint.getvalue(), command, kind)) from None
+
+
+def _agent_first(options: Sequence[str]) -> list[str]:
+    """Return options with the agent at the front, a word by its place, which --agent NAME or --agent=NAME may name."""
+    for place, word in enumerate(options):
+        flag, equals, name = word.partition("=")
+        if flag != "--agent":
+            continue
+        rest = options[place + 1 :]
+        if not equals:
+            name, *rest = rest or [""]
+        if not name or name.startswith("-"):
+            raise ValueError("--agent needs a name: a run folder, a model folder or the id of an environment")
+        return [name, *options[:place], *rest]
+    return list(options)
 
 
 def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:

@@ -160,7 +160,12 @@ class Arena:
     """Arm, task, agent (or None) and environments of one tab."""
 
     def __init__(
-        self, env_id: str, agent: Agent | None, seed: int | None, env_kwargs: Mapping[str, Any]
+        self,
+        env_id: str,
+        agent: Agent | None,
+        seed: int | None,
+        env_kwargs: Mapping[str, Any],
+        agent_first: bool = False,
     ) -> None:
         self.env_id, self.agent, self._seed = env_id, agent, seed
         self.policy: Any = getattr(agent, "policy", None)
@@ -183,7 +188,8 @@ class Arena:
         planner = () if revising else (MOTION,)
         own_agent = () if agent is None else (AGENT,)
         library = () if revising or importlib.util.find_spec("ompl") is None else (OMPL,)
-        self.methods = (*planner, *own_agent, SEARCH, STRAIGHT, *library)  # the first one is the default
+        first = (*own_agent, *planner) if agent_first else (*planner, *own_agent)
+        self.methods = (*first, SEARCH, STRAIGHT, *library)  # the first one is the default
 
     def env(self, name: str) -> ve.ReachVectorEnv:
         """Return a batch of one environment, `own`, `any` or `whole`, which is made once."""

@@ -35,6 +35,7 @@ HANDLES = {name: trimesh.creation.icosphere(3, radius) for name, radius in RADII
 # First views: position of the camera, point that it looks at, [m], direction up, and field of view, [rad]
 PLANE = (-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), math.radians(33.0)
 SPACE = (2.6, -2.0, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), math.radians(38.0)
+NARROW = 0.75  # Width of a window relative to its height, below which the view is wider
 OPACITY, GHOST = 0.45, 0.16  # Of what hides others, and of the arm at the goal
 POINT = 0.005  # Size of the points that a sensor sees, [m]
 LARGE = 0.16  # Greatest size of obstacles in space that are not large, [m]
@@ -137,6 +138,10 @@ class View:
     def __init__(self, client: viser.ClientHandle, arena: Arena, arm: ArmDrawing, act: Act) -> None:
         self._scene, self._arena, self._arm, self._act = client.scene, arena, arm, act
         self._planar = arena.planar
+        if client.camera.aspect < NARROW:
+            *_, field = PLANE if self._planar else SPACE
+            wider = math.tan(0.5 * field) * NARROW / client.camera.aspect
+            client.camera.fov = 2.0 * math.atan(wider)
         self._floor = float(arena.env("own").model.geom("table").pos[2])
         self._levels = (self._floor, TALL if arena.task.whole_arm else LOW) if self._planar else None
         self._nodes: dict[str, Any] = {}
@@ -328,6 +333,8 @@ class Panels:
         self._message.content = message + NOTE.format(html.escape(remark))
         self._execute.label = "Stop" if state.playing else "Execute"
         self._vias.visible = state.method != OMPL  # which takes as many as its path needs
+        if self._checks is not None:
+            self._checks.visible = state.method == AGENT
         self._vias.min = int(state.method == MOTION)
         self._vias.value = n_via(self._arena, state)
         if plan is not None and state.duration is None:
@@ -354,7 +361,8 @@ class Panels:
             rows.append((number, reward, each.value, _millimetres(motion.clearance), motion.duration))
         names = "plan", "reward", "agent's value", "clearance [mm]", "time [s]"
         first = state.proposals[0]
-        note = f"{first.maker}, decided in {1e3 * first.seconds:.0f} ms"
+        kind = f" ({type(self._arena.agent).__name__})" if first.maker == AGENT else ""
+        note = f"{first.maker}{kind}, decided in {1e3 * first.seconds:.0f} ms"
         self._table.content = _table(names, rows, note)
         self._pick.visible = len(rows) > 1
         self._pick.options = tuple(f"#{i + 1}" for i in range(len(rows)))
@@ -412,7 +420,7 @@ class Panels:
             self._pick = gui.add_button_group("Show", ("#1",), visible=False)
             self._pick.on_click(lambda event: self._act("pick", int(event.target.value[1:]) - 1))
             unit = "m/s³" if self._arena.task.space.of_hand else "rad/s³"
-            titles = "speed of the hand [m/s]", f"jerk of the plan [{unit}]", "clearance [mm]"
+            titles = "speed of the hand [m/s]", f"jerk of the plan [{unit}]", "clearance of obstacles [mm]"
             for name, title in zip(("speed", "jerk", "clearance"), titles, strict=True):
                 self._plots[name] = gui.add_uplot(
                     (np.zeros(2), np.zeros(2), np.zeros(2)), LINES, title=title, height=126,
@@ -430,10 +438,9 @@ class Panels:
         gui, arena, act = self._gui, self._arena, self._act
         gui.main_panel.dock_right()
         gui.main_panel.set_width(WIDTH - 20)
-        arm, agent = arena.task.arm, arena.agent
+        arm = arena.task.arm
         title = arena.env_id.removeprefix("viapoint/") + (f", {arm.name}" if arm.file else "")
-        decides = "no agent" if agent is None else f"agent: {type(agent).__name__}"
-        gui.add_html(NOTE.format(f"<b>{html.escape(title)}</b><br>{decides}"))
+        gui.add_html(NOTE.format(f"<b>{html.escape(title)}</b>"))
         self._message = gui.add_html("")
         self._execute = self._button("Execute", "execute", color="green", icon="player-play")
         with gui.add_folder("Scene"):
@@ -473,10 +480,11 @@ class Panels:
         most = action.n_via if arena.task.replanning else max(3, action.n_via)
         self._vias = gui.add_slider("Via-points", 0, most, 1, action.n_via, disabled=most == action.n_via)
         _on_slide(self._vias, lambda value: act("change", n_via=value, by_hand=None))
+        self._checks: Any = None
         if hasattr(arena.policy, "checks"):
             hint = "Proposals whose clearance is computed"
-            checks = gui.add_dropdown("Exact checks", tuple(CHECKS), hint=hint)
-            checks.on_update(lambda event: act("change", checks=CHECKS[event.target.value]))
+            self._checks = gui.add_dropdown("Exact checks", tuple(CHECKS), hint=hint)
+            self._checks.on_update(lambda event: act("change", checks=CHECKS[event.target.value]))
         gui.add_button("Decide anew").on_click(lambda _: act("change", **anew))
 
     def _button(self, label: str, name: str, **kwargs: Any) -> Any:
@@ -497,8 +505,8 @@ def _on_slide(slider: Any, function: Callable[[Any], None]) -> None:
 
 
 def _table(names: Iterable[str], rows: Iterable[Iterable[Any]], note: str) -> str:
-    """Return an HTML table with a note below it."""
-    table = pd.DataFrame(rows, columns=list(names))
+    """Return an HTML table with a note below it; a column without any value is left out."""
+    table = pd.DataFrame(rows, columns=list(names)).dropna(axis="columns", how="all")
     number = "{:.2f}".format
     text = table.to_html(index=False, border=0, na_rep="-", float_format=number, classes="viapoint")
     return f"{TABLE}{text}{NOTE.format(note)}"

@@ -290,8 +290,8 @@ class LivePage(contextlib.AbstractContextManager["LivePage", None]):
     """Page in the browser on which scenes are changed by hand and the movement is planned anew.
 
     Args:
-        agent: Agent, run folder, model folder, or id of an environment with a shipped agent. None for the agent that is
-            shipped for `env` or, if there is none, the geometry search.
+        agent: Agent, run folder, model folder, or id of an environment with a shipped agent; it decides at first. None
+            for the agent that is shipped for `env`, if there is one; then the motion planner decides at first.
         env: Id of the environment; by default that of the agent.
         port: Port to listen on; 0 for a free one.
         arm: Arm of the environment: the name of one, an MJCF or URDF file, or an arm. Without `env`, it moves among
@@ -331,7 +331,7 @@ class LivePage(contextlib.AbstractContextManager["LivePage", None]):
         if loaded is None and env in SHIPPED_IDS and not env_kwargs and not argument:
             loaded = load_agent(env)
         own = {} if loaded is None else loaded.env_kwargs
-        self._made = env, loaded, seed, {**(env_kwargs or own), **argument}
+        self._made = env, loaded, seed, {**(env_kwargs or own), **argument}, agent is not None
         self._model_file = model_file
         arena, _ = self._make()
         drawn = next(arena.scenes()["Random"])

@@ -27,10 +27,13 @@ COVERED = 0.04  # Distance of a target from a row of lights up to which it is no
 MODEL: dict[str, Any] = {"color": PALETTE.plan, "linewidth": 2.2, "solid_capstyle": "round"}
 # Style of the simulated arm
 ARM: dict[str, Any] = {"color": PALETTE.executed, "linewidth": 0.9, "linestyle": (0, (4, 1.5))}
+# Style of via-points
+VIA: dict[str, Any] = {
+    "color": PALETTE.via, "linestyle": "none", "marker": "o", "markersize": 3.6, "zorder": 5
+}  # fmt: skip
 SECOND = PALETTE.goal
 THIRD = PALETTE.via
 GREY = PALETTE.start
-NAMES = ("model", "simulated arm")
 JOINTS = (("shoulder $S$", SECOND), ("elbow $E$", THIRD))
 
 
@@ -73,7 +76,7 @@ def paths(ax: Axes, planned: Float, hand: Float) -> None:
 
 def _dot(ax: Axes, point: Any) -> None:
     """Draw a via-point, shape (2,), [m]."""
-    ax.plot(*(100.0 * point), marker="o", color=PALETTE.via, markersize=3.6, zorder=5)
+    ax.plot(*(100.0 * point), **VIA)
 
 
 def zero(ax: Axes) -> None:
@@ -91,7 +94,7 @@ def model() -> Figure:
         plane(ax[0])
         path(ax[0], profile.position, zorder=2.1, **MODEL)
         ax[1].plot(profile.time, profile.speed / profile.speed.max(), **MODEL)
-        ax[1].set(ylabel="$T/V_M$", ylim=(0, 1.08))
+        ax[1].set(ylabel="speed / peak", ylim=(0, 1.08))
     via = second(float(second.knots[1]))
     _dot(axes[1, 0], via)
     # The construction of d1, d2 and d3, in centimetres
@@ -105,7 +108,7 @@ def model() -> Figure:
     label("$d_3$", (x + 1.0, y + 4.0), ha="left", va="center")
     axes[2, 0].plot(profile.time, profile.curvature, **MODEL)
     axes[2, 0].axvline(profile.valley[0], color="0.6", linewidth=0.7, linestyle=":")
-    axes[2, 0].set(ylabel="$C$ [1/m]", ylim=(0, 1.15 * profile.bend[1]))
+    axes[2, 0].set(ylabel="curvature [1/m]", ylim=(0, 1.15 * profile.bend[1]))
     for values, name, colour in zip(profile.velocity.T, ("$V_x$", "$V_y$"), (SECOND, THIRD), strict=True):
         axes[2, 1].plot(profile.time, values, color=colour, label=name, linewidth=1.6)
     axes[2, 1].set(ylabel="velocity [m/s]", ylim=(-0.7, 1.5))
@@ -182,9 +185,9 @@ def _two_movements(rows: int, height: float, titles: Sequence[str]) -> tuple[Fig
     return figure, axes
 
 
-def profiles(axes: Any, model: Profile, arm: Profile, end: float, names: Any = NAMES) -> None:
+def profiles(axes: Any, model: Profile, arm: Profile, end: float) -> None:
     """Draw speed, curvature and velocities on as many axes as there are."""
-    for profile, style, name in zip((model, arm), (MODEL, ARM), names, strict=True):
+    for profile, style, name in ((model, MODEL, "model"), (arm, ARM, "simulated arm")):
         quantities = (profile.speed, profile.curvature, *profile.velocity.T)
         for ax, values in zip(axes, quantities, strict=False):
             ax.plot(end * profile.time, values, label=name, **style)
@@ -239,7 +242,8 @@ def around_lights(avoidance: ObstacleMovements) -> Figure:
         outline = corners @ lights.rotation[:2, :2].T + lights.position[:2]
         ax[0].fill(*(100.0 * outline.T), color=PALETTE.obstacle)
         _dot(ax[0], via)
-        profiles(ax[1:], model, profile, 1.0, ("model through $\\bullet$", avoidance.name))
+        profiles(ax[1:], model, profile, 1.0)
+        ax[1].plot([], [], label="via-point", **VIA)
         ax[2].set_xlabel("$t/t_f$")
     _finish(axes[1:], 1.0)
     return figure
@@ -282,12 +286,12 @@ def isochrony(avoidance: ObstacleMovements) -> Figure:
     shares, lengths = one_via.SHARES, one_via.LENGTHS
     alongs = np.linspace(0.001, 0.999, 400)
     heights = np.linspace(0.02, 1.0, 200)
-    for height, width in ((0.1, 0.6), (-one_via.HEIGHT, 2.2), (1.0, 1.1)):
+    for height, colour in ((1.0, SECOND), (-one_via.HEIGHT, PALETTE.plan), (0.1, THIRD)):
         share = passage_share(curved(*ENDS, alongs, height))
-        over_place.plot(alongs, share, color=PALETTE.plan, linewidth=width, label=f"{height:g}")
+        over_place.plot(alongs, share, color=colour, label=f"{height:g}")
     found = features(avoidance.profiles, avoidance.plan)
     over_place.plot(found.along, found.bend, **FAINT)
-    place_residual.plot(found.along, found.residual, label=avoidance.name, **FAINT)
+    place_residual.plot(found.along, found.residual, label="around lights", **FAINT)
     arm, _ = one_via.arm_shares(shares, one_via.HEIGHT)
     over_place.plot(shares, arm, **DOTS)
     residual = arm - passage_share(curved(*ENDS, shares, one_via.HEIGHT))
@@ -325,8 +329,8 @@ def orders_and_spaces() -> Figure:
             ax.plot(time, movement(time, nu)[:, 0] / 0.4, **style)
     axes[0, 0].axhspan(1.805 - 0.153, 1.805 + 0.153, color="0.9", zorder=0)
     axes[0, 0].annotate("peak of\nsubjects", (0.02, 1.8), fontsize=5.5, va="center")
-    axes[0, 0].set(ylabel=r"$T\;t_f/A$", xlabel="$t/t_f$", xlim=(0, 1), ylim=(0, 2.4))
-    axes[0, 1].set(ylabel=r"$\ddot{x}\;t_f^2/A$", xlabel="$t/t_f$", xlim=(0, 1), ylim=(-9, 27))
+    axes[0, 0].set(ylabel="speed / mean speed", xlabel="$t/t_f$", xlim=(0, 1), ylim=(0, 2.4))
+    axes[0, 1].set(ylabel="acceleration $t_f^2/A$", xlabel="$t/t_f$", xlim=(0, 1), ylim=(-9, 27))
     zero(axes[0, 1])
     axes[0, 1].legend(title="least", loc="upper right", handlelength=1.2)
     motions = (simulate(diagonals()), point_to_point.joint_space(DIAGONALS))
@@ -346,7 +350,9 @@ def limits() -> Figure:
     speed = motion.speed()[0] * (point_to_point.SWING / point_to_point.LENGTHS[0])
     repetitive.plot(motion.time / point_to_point.SWING, speed, **MODEL, label="least jerk, arm")
     repetitive.plot(cycles, np.pi / 2 * np.abs(np.sin(np.pi * cycles)), label="sinusoid", **ARM)
-    repetitive.set(xlabel="half cycles", ylabel=r"$T\;t_f/A$", xlim=(0, point_to_point.SWINGS), ylim=(0, 2.5))
+    repetitive.set(
+        xlabel="half cycles", ylabel="speed / mean speed", xlim=(0, point_to_point.SWINGS), ylim=(0, 2.5)
+    )
     repetitive.legend(loc="upper right", ncols=1)
     fastest = point_to_point.torque_limited()
     for ax, factor, dashes in zip(torques, (1.0, point_to_point.HURRY), ("-", (0, (2, 1))), strict=True):

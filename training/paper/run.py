@@ -43,8 +43,8 @@ ROWS: dict[int, tuple[str, Callable[..., list[Claim]]]] = {
 
 # Captions and functions of the figures by their file names, in the order of the paper
 DRAWINGS: dict[str, tuple[str, Callable[..., Figure]]] = {
-    "fig01_model": ("The model (Fig. 1). A: straight movement, speed T relative to its peak V_M. B: through a "
-        "via-point; path with d1, d2, d3, speed, curvature C (valley of the speed dotted) and velocities.",
+    "fig01_model": ("The model (Fig. 1). A: straight movement, speed relative to its peak. B: through a "
+        "via-point; path with d1, d2, d3, speed, curvature (valley of the speed dotted) and velocities.",
         figures.model),
     "fig03_straight": ("Straight movements (Fig. 3): path, speed and accelerations. Wide: model; dashed: "
         "simulated arm, here and in the following figures.", figures.straight_movements),
@@ -96,7 +96,7 @@ def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], dict[Path, st
         claims += result_of(compute)
     pictures = {}
     for name, (caption, draw) in progress_bar(iterable=DRAWINGS.items(), desc="figures"):
-        with matplotlib.style.context(str(STYLE)):
+        with matplotlib.style.context(STYLE):
             figure = result_of(draw)
             pictures[write_figure(out / f"{name}.png", figure)] = caption
             figure.set_layout_engine("none")  # the same layout for both files, computed once
