@@ -1,4 +1,7 @@
-"""Errors of fitted via-points against noise: `python benchmarks/fit.py` writes the table of docs/fit.md."""
+"""Errors of fitted via-points against noise: `python benchmarks/fit.py` writes the table of docs/fit.md.
+
+It also writes docs/reach.csv, two movements that are made up, as if they had been recorded.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ import pandas as pd
 from viapoint.primitives import ViaPointFit, fit_via_points, passage_durations, through
 
 PAGE = Path(__file__).parents[1] / "docs" / "fit.md"
+RECORDED = PAGE.with_name("reach.csv")
 BEGIN, END = "<!-- table -->", "<!-- end of table -->"
 NOISE = (0.5, 1.0, 2.0, 5.0)
 """Standard deviations of the noise of a coordinate, [mm]."""
@@ -74,8 +78,25 @@ def row(noise: float, free_ends: bool) -> dict[str, str]:
     return cells
 
 
+def write_recorded() -> None:
+    """Write movements with rest before and after them, at 50 Hz, with noise of 0.5 mm."""
+    movements = {
+        "around": through([[-0.1, 0.3], [0.12, 0.45], [0.25, 0.3]], [0.6, 0.45]),
+        "two turns": through([[-0.1, 0.3], [0.1, 0.42], [0.22, 0.25], [0.3, 0.35]], [0.55, 0.4, 0.3]),
+    }
+    rng = np.random.default_rng(0)
+    parts = []
+    for name, movement in movements.items():
+        times = np.arange(0.0, movement.duration + 2.0 * REST, 0.02)
+        position = movement(times - REST) + rng.normal(0.0, 5e-4, (len(times), 2))
+        columns = {"movement": name, "time": times.round(3), "x": position[:, 0], "y": position[:, 1]}
+        parts.append(pd.DataFrame(columns))
+    pd.concat(parts).to_csv(RECORDED, index=False, float_format="%.5f")
+
+
 def main() -> None:
     """Measure, and write the table into the page."""
+    write_recorded()
     rows = [row(noise, free_ends) for free_ends in (False, True) for noise in NOISE]
     table = pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True)
     one, chosen = (1e3 * np.median(SECONDS[given]) for given in (1, None))

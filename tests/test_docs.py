@@ -115,6 +115,14 @@ def test_the_readme_shows_what_its_first_example_prints(in_a_new_process):
     check_printed("".join(output["text"]), printed)
 
 
+@pytest.mark.parametrize("name", ["README.md", "docs/fit.md"])
+def test_pages_show_what_fit_prints(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    line, printed = re.search(r"\$ viapoint (fit .*)\n([^`]*)```", text(name)).groups()
+    cli.main([*shlex.split(line), "--out", str(tmp_path)])
+    check_printed(capsys.readouterr().out.partition("\n\n")[0], printed)
+
+
 def check_printed(text, stored):
     """Check that words are equal, and numbers about so: the last digits of another processor change what is found."""
     number = r"-?\d+(?:\.\d*)?"
