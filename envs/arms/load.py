@@ -225,7 +225,9 @@ def _load(
     at_home = dict(zip(pairs, _distances(parsed, home, pairs).tolist(), strict=True))
     close = [pair for pair in pairs if pair not in exclude and 0.0 < at_home[pair] < LEAST_GAP]
     exclude |= dict.fromkeys(_apart(parsed, close, drawn), never)
-    distances = {pair: away for pair, away in at_home.items() if away > 0.0 and pair not in exclude}
+    touching = [pair for pair in pairs if pair not in exclude and at_home[pair] <= 0.0]
+    exclude |= dict.fromkeys(touching, "in contact at home")
+    distances = {pair: away for pair, away in at_home.items() if pair not in exclude}
     tolerances = dict.fromkeys(parsed.geoms, given["tolerance"])
     for pair in near.difference(apart):
         tolerances.update(dict.fromkeys(pair, FINE))
