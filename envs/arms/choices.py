@@ -135,15 +135,16 @@ def _usual_tool(
         rivals += [part.name for part in others if chains[part.body].isdisjoint(chains[last])]
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    inner = []
+    apart = []
     for part in matches[0]:
         way = data.xpos[part.body] - data.xpos[tool.body] + data.xmat[part.body].reshape(3, 3) @ part.position
         way -= data.xmat[tool.body].reshape(3, 3) @ tool.position
-        if chains[part.body] != chains[last] or np.linalg.norm(way) <= SAME_PLACE:
-            continue
-        # One that carries the other is a flange, as in one of the 61 files of benchmarks/arms.py, a TIAGo. None of them
-        # has tools side by side.
-        (inner if part.body in ancestors(model, tool.body) else rivals).append(part.name)
+        if chains[part.body] == chains[last] and np.linalg.norm(way) > SAME_PLACE:
+            apart.append(part)
+    # One that carries the other is a flange, as in one of the 61 files of benchmarks/arms.py, a TIAGo. None of them has
+    # tools side by side.
+    inner = [part.name for part in apart if part.body in ancestors(model, tool.body)]
+    rivals += [part.name for part in apart if part.name not in inner]
     if rivals:
         listed = ", ".join(dict.fromkeys([tool.name, *rivals]))
         raise ValueError(f"there are several tools: {listed}; name one with tool=, or a side with base=")

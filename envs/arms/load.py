@@ -276,7 +276,10 @@ def read_model(file: str | Path) -> mujoco.MjModel:
 
     In a URDF, geoms that collide are in a hidden group where their link has visual ones.
     """
-    spec, _, urdf = _read(file, (), visual=True)
+    try:
+        spec, _, urdf = _read(file, (), visual=True)
+    except ValueError:  # a visual element that MuJoCo refuses, such as a colour
+        spec, _, urdf = _read(file, ())
     model = _compiled(spec, [])
     if urdf.text:  # both are in groups that are drawn
         collides = (model.geom_contype | model.geom_conaffinity) > 0

@@ -62,14 +62,9 @@ def read_urdf(path: Path, packages: Packages, visual: bool = False) -> Urdf:
         raise ValueError(f"{path} has no links; expand a xacro file first: xacro FILE > arm.urdf")
     notes: list[str] = []
     assets: dict[str, bytes] = {}
-    for name in LEFT_OUT:
+    for name in LEFT_OUT if visual else (*LEFT_OUT, "material"):
         for element in root.findall(name):
             root.remove(element)
-    for material in root.iter("material"):
-        material.set("name", material.get("name", ""))
-        for colour in material.findall("color"):
-            if len(colour.get("rgba", "").split()) != 4:
-                material.remove(colour)
     velocity = {}
     unseen: list[str] = []
     find = functools.partial(_find, path, packages)
@@ -269,9 +264,9 @@ def _srdf(path: Path, urdf: ET.Element, notes: list[str]) -> tuple[tuple[str, st
             notes.append(f"{place.name} is not used: it is for robot {root.get('name')!r}, not {robot!r}")
             continue
         notes.append(f"pairs of links that are not compared: those of {place.name}")
-        pairs = []
-        for pair in root.findall("disable_collisions"):
-            pairs.append((pair.get("link1", ""), pair.get("link2", "")))
+        pairs = [
+            (pair.get("link1", ""), pair.get("link2", "")) for pair in root.findall("disable_collisions")
+        ]
         links = {link.get("name") for link in urdf.findall("link")}
         unknown = dict.fromkeys(name for name in itertools.chain(*pairs) if name not in links)
         if unknown:

@@ -523,9 +523,7 @@ def test_links_of_an_srdf_that_the_urdf_does_not_have_are_told(crane):
 
 
 VISUAL = '<visual><geometry><mesh filename="../meshes/{}"/></geometry><material name="red"/></visual>'
-RED = (
-    '<material name="red"><color rgba="1 0 0 1"/></material><material><color rgba="red"/></material></robot>'
-)
+RED = '<material name="red"><color rgba="1 0 0 1"/></material></robot>'
 
 
 def test_visual_geoms_of_a_urdf_are_drawn_and_count_for_nothing_else(crane):
@@ -547,6 +545,9 @@ def test_visual_geoms_of_a_urdf_are_drawn_and_count_for_nothing_else(crane):
     assert bodies == ["base", "post", "boom", "wrist"]  # others of them show what collides
     np.testing.assert_array_equal(model.geom_rgba[shown[2]], (1.0, 0.0, 0.0, 1.0))
     assert model.geom_rbound[shown[2]] > 4.0  # all of the file
+    path.write_text(path.read_text().replace("1 0 0 1", "red"))
+    assert read_model(path).nmesh == 1
+    np.testing.assert_equal(parts_of(load_arm(path)), parts_of(arm))
 
 
 def test_packages_are_looked_for_in_given_folders(crane, tmp_path):
