@@ -533,7 +533,8 @@ def test_visual_geoms_of_a_urdf_are_drawn_and_count_for_nothing_else(crane):
     (crane / "meshes" / "broken.obj").write_text("version https://git-lfs.github.com/spec/v1")
     visuals = VISUAL.format("two.obj") + VISUAL.format("broken.obj")
     collision = '<collision><origin xyz="0.2 0 0"/>'
-    path = written(crane, (collision, visuals + collision), ("</robot>", RED))
+    alone = '<link name="tool0"/>', f'<link name="tool0">{VISUAL.format("wrist.obj")}</link>'
+    path = written(crane, (collision, visuals + collision), ("</robot>", RED), alone)
     arm = load_arm(path)
     assert arm.xml == plain.xml
     (told,) = (note for note in arm.notes if "not drawn" in note)
@@ -542,7 +543,13 @@ def test_visual_geoms_of_a_urdf_are_drawn_and_count_for_nothing_else(crane):
     model = read_model(path)
     shown = np.flatnonzero(model.geom_group < 3)
     bodies = [model.body(model.geom_bodyid[geom]).name for geom in shown]
-    assert bodies == ["base", "post", "boom", "wrist"]  # others of them show what collides
+    assert bodies == [
+        "base",
+        "post",
+        "boom",
+        "wrist",
+        "tool0",
+    ]  # the first two and the wrist show what collides
     np.testing.assert_array_equal(model.geom_rgba[shown[2]], (1.0, 0.0, 0.0, 1.0))
     assert model.geom_rbound[shown[2]] > 4.0  # all of the file
     path.write_text(path.read_text().replace("1 0 0 1", "red"))
