@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.arms.kinematics import Chain, Spheres, forward, inverse_dynamics
-from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, overlapping, touching_at_home
+from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, overlapping
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import add_to_model
@@ -173,9 +173,7 @@ def arm_from_xml(
     chain, links, frames = _chain(model, data, joints, tool)
     capsules = _capsules(model, data, links, frames)
     home = np.array(home, dtype=np.float64)
-    move(data, joints, home)
-    touching = touching_at_home(model, data, links)
-    names, spheres, left_out, excess = cover(chain, capsules, links, home, touching, exclude or {})
+    names, spheres, left_out, excess = cover(chain, capsules, links, home, exclude or {})
     # Pairs that touch in none of many configurations are not compared, either.
     ranges = np.array([model.joint(each).range for each in joints])
     low, high = ranges.T

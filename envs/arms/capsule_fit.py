@@ -60,14 +60,10 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
     Raises:
         ValueError: The geom is of another type, or is flat.
     """
-    size = model.geom_size[geom]
-    kind = Geom(int(model.geom_type[geom]))
-    if kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE):
-        half = size[1] if kind == Geom.mjGEOM_CAPSULE else 0.0
-        ends = np.array([(0.0, 0.0, -half), (0.0, 0.0, half)])
-        return [FittedCapsule(ends, float(size[0]), 0.0, np.empty((0, 3)), geom)]
     try:
-        corners, larger = polytope_around(model, geom)
+        corners, radius, larger = hull_of(model, geom)
+        if radius > 0.0:
+            return [FittedCapsule(corners, radius, 0.0, np.empty((0, 3)), geom)]
         found = _cover_points(corners, tolerance - larger, SMALL - larger)
     except ValueError as error:
         raise ValueError(f"geom {model.geom(geom).name or geom}: {error}") from None
@@ -76,33 +72,37 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
 
 def split(model: mujoco.MjModel, capsule: FittedCapsule) -> list[FittedCapsule]:
     """Return two capsules with less excess that together contain what a capsule of :func:`cover_geom` contains."""
-    corners, larger = polytope_around(model, capsule.geom)
+    corners, _, larger = hull_of(model, capsule.geom)
     halves = _best_halves(capsule.corners, ConvexMesh.hull(corners), 0.5 * (capsule.excess - larger))
     return [each._replace(excess=each.excess + larger, geom=capsule.geom) for each in halves]
 
 
-def polytope_around(model: mujoco.MjModel, geom: int) -> tuple[Float, float]:
-    """Return the corners, shape (n, 3), of a polytope that contains a geom, in the geom's frame, and its excess, [m].
+def hull_of(model: mujoco.MjModel, geom: int) -> tuple[Float, float, float]:
+    """Return corners, shape (n, 3), and a radius, [m]: the convex hull of balls around them contains the geom.
 
-    The excess bounds the distance of the corners from the geom. It is 0 for boxes and the convex hulls of meshes.
+    The last number bounds how far the hull reaches beyond the geom, [m]. It is 0 for spheres, capsules, boxes and the
+    convex hulls of meshes. The frame is that of the geom.
 
     Raises:
         ValueError: The geom is neither of these, nor a cylinder or an ellipsoid.
     """
     size = model.geom_size[geom]
     kind = Geom(int(model.geom_type[geom]))
+    if kind in (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE):
+        half = size[1] if kind == Geom.mjGEOM_CAPSULE else 0.0
+        return np.array([(0.0, 0.0, -half), (0.0, 0.0, half)]), float(size[0]), 0.0
     if kind == Geom.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
         first = model.mesh_vertadr[mesh]
         vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
-        return np.asarray(vertices, np.float64), 0.0
+        return np.asarray(vertices, np.float64), 0.0, 0.0
     if kind == Geom.mjGEOM_BOX:
         signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-        return np.asarray(size * signs), 0.0
+        return np.asarray(size * signs), 0.0, 0.0
     if kind == Geom.mjGEOM_CYLINDER:
         rim = _rim(2 * RIM_POINTS)
         rings = [size[0] * rim + (0.0, 0.0, side * size[1]) for side in (-1.0, 1.0)]
-        return np.concatenate(rings), float(size[0] * (rim[0, 0] - 1.0))
+        return np.concatenate(rings), 0.0, float(size[0] * (rim[0, 0] - 1.0))
     if kind == Geom.mjGEOM_ELLIPSOID:
         rim = _rim(RIM_POINTS)
         heights = np.sin(np.pi * (np.arange(1, RIM_POINTS // 2) / (RIM_POINTS // 2) - 0.5))
@@ -110,7 +110,7 @@ def polytope_around(model: mujoco.MjModel, geom: int) -> tuple[Float, float]:
         poles = np.array([(0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])
         wide = rim[0, 0]
         larger = float(size.max() * (wide**2 - 1.0))
-        return np.asarray(size * wide * np.concatenate((*rings, poles))), larger
+        return np.asarray(size * wide * np.concatenate((*rings, poles))), 0.0, larger
     raise ValueError(
         "a link may have geoms of the types sphere, capsule, cylinder, ellipsoid, box and mesh, not "
         f"{kind.name.removeprefix('mjGEOM_').lower()}"

@@ -10,12 +10,15 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from viapoint.envs.arms.capsule_fit import hull_of
 from viapoint.envs.arms.urdf import WARNING
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.validation import finite_array
 
 # Types of joints that an arm may have
 MOVES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+# Types of geoms that are left out
+GROUNDS = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 # Usual names of tools, the most telling first; prefixes that end in `_`, `/` or `:` may precede them
 TOOL_NAMES = (
     r"attachment(_site)?", r"tcp", r"tool\d*(_?center)?(_?(point|frame|link))?", r"ee(f|_?site|_?link|_?frame)?",
@@ -60,7 +63,7 @@ class Tool(NamedTuple):
 
 
 def choose_tool(model: mujoco.MjModel, given: Any, base: str | None, notes: list[str]) -> Tool:
-    """Return the tool: the given site, body, or body and point; else one with a usual name; else the tip of the chain.
+    """Return the tool: the given site, body, or body and point; else one with a usual name; else the tip of the arm.
 
     Raises:
         ValueError: There is no such part, or there are several arms and neither `tool` nor `base` tells which.
@@ -84,9 +87,7 @@ def choose_tool(model: mujoco.MjModel, given: Any, base: str | None, notes: list
         tool = _named(name, bodies)
         tool = tool._replace(position=finite_array("tool", point, (3,)), name=f"a point of {name!r}")
     else:
-        usual = _usual_tool(model, sites, bodies, root, notes)
-        tip = usual or bodies[_tip(model, root) - 1]
-        tool = usual or tip._replace(name=f"the frame of {tip.name!r}")
+        tool = _usual_tool(model, sites, bodies, root, notes) or _tip(model, bodies, root)
     if root not in (tool.body, *ancestors(model, tool.body)):
         raise ValueError(f"the tool {tool.name!r} is not carried by base={base!r}; name one of both")
     return tool
@@ -107,7 +108,7 @@ def _usual_tool(
     """Return the site or body with the most telling of the usual names on a chain from a body, None for none.
 
     Raises:
-        ValueError: There are several arms with such names.
+        ValueError: There are several arms with such names, or equally telling ones side by side on one wrist.
     """
     chains = {}
     for body in range(model.nbody):
@@ -132,9 +133,6 @@ def _usual_tool(
     rivals = [part.name for part in matches[0] if not chains[part.body] <= chains[last]]
     for others in matches[1:]:  # less telling names matter on other arms alone
         rivals += [part.name for part in others if chains[part.body].isdisjoint(chains[last])]
-    if rivals:
-        listed = ", ".join(dict.fromkeys([tool.name, *rivals]))
-        raise ValueError(f"there are several tools: {listed}; name one with tool=, or a side with base=")
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     apart = []
@@ -142,10 +140,17 @@ def _usual_tool(
         way = data.xpos[part.body] - data.xpos[tool.body] + data.xmat[part.body].reshape(3, 3) @ part.position
         way -= data.xmat[tool.body].reshape(3, 3) @ tool.position
         if chains[part.body] == chains[last] and np.linalg.norm(way) > SAME_PLACE:
-            apart.append(part.name)
-    if apart:
+            apart.append(part)
+    # One that carries the other is a flange, as in one of the 61 files of benchmarks/arms.py, a TIAGo. None of them has
+    # tools side by side.
+    inner = [part.name for part in apart if part.body in ancestors(model, tool.body)]
+    rivals += [part.name for part in apart if part.name not in inner]
+    if rivals:
+        listed = ", ".join(dict.fromkeys([tool.name, *rivals]))
+        raise ValueError(f"there are several tools: {listed}; name one with tool=, or a side with base=")
+    if inner:
         notes.append(
-            f"{WARNING}the tool is {tool.name!r}, but could be {', '.join(apart)}: name one with tool="
+            f"{WARNING}the tool is {tool.name!r}, but could be {', '.join(inner)}: name one with tool="
         )
     return tool
 
@@ -207,8 +212,12 @@ def ancestors(model: mujoco.MjModel, body: int) -> list[int]:
     return found
 
 
-def _tip(model: mujoco.MjModel, root: int) -> int:
-    """Return the last body of the longest chain of joints, or its flange, before it branches into fingers.
+def _tip(model: mujoco.MjModel, bodies: list[Tool], root: int) -> Tool:
+    """Return the tip of the last link of the longest chain of joints, before it branches into fingers.
+
+    It is the only frame without geoms on the link, its flange. Elsewhere it is on an axis of the link's frame, as far
+    away as geoms of the link reach: on the axis, and to the side, where their bounding box has its centre farthest off.
+    Where this box is centred, it is the frame itself.
 
     Raises:
         ValueError: There are several arms, or no chain.
@@ -226,14 +235,56 @@ def _tip(model: mujoco.MjModel, root: int) -> int:
             body = moving[0]
         else:  # nothing more that moves, or fingers
             break
-    while not moving:  # the only frame without geoms on the last link is its flange
-        frames = [each for each in _children(model, body) if not model.body_geomnum[each]]
-        if len(frames) != 1:
-            break
-        body = frames[0]
     if len(chain_joints(model, body, root)) < 2:
         raise ValueError("no chain of two or more hinges and slides leads to a tool; name one with tool=")
-    return body
+    flange = body
+    while not moving:
+        frames = [each for each in _children(model, flange) if not model.body_geomnum[each]]
+        if len(frames) != 1:
+            break
+        flange = frames[0]
+    tip = bodies[flange - 1]
+    low, high = _bounds(model, body)
+    middle = np.round(low + high, 6)
+    axis = int(np.abs(middle).argmax())
+    if flange != body or abs(middle[axis]) <= SAME_PLACE:
+        return tip._replace(name=f"the frame of {tip.name!r}")
+    sign, end = ("", high) if middle[axis] > 0.0 else ("-", low)
+    away = f"{abs(end[axis]):.3g} m along {sign}{'xyz'[axis]} of its frame"
+    tip.position[axis] = end[axis]
+    return tip._replace(name=f"the tip of {tip.name!r}, {away}")
+
+
+def _bounds(model: mujoco.MjModel, body: int) -> tuple[Float, Float]:
+    """Return lowest and highest coordinates of a body's origin and the geoms of its link, in its frame, [m]."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    axes = data.xmat[body].reshape(3, 3)
+    link = np.flatnonzero(model.body_weldid == model.body_weldid[body]).tolist()
+    bounds = [np.zeros((1, 3))]
+    for geom in itertools.chain(*collision_geoms(model, dict.fromkeys(link, 1)).values()):
+        corners, radius, _ = hull_of(model, geom)
+        places = data.geom_xpos[geom] + corners @ data.geom_xmat[geom].reshape(3, 3).T
+        places = (places - data.xpos[body]) @ axes
+        bounds += [places - radius, places + radius]
+    everything = np.concatenate(bounds)
+    return everything.min(axis=0), everything.max(axis=0)
+
+
+def collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, list[int]]:
+    """Return the geoms of each body: those that collide, or all of a link of which none does; grounds are left out."""
+    collides = (model.geom_contype | model.geom_conaffinity) > 0
+    solid = ~np.isin(model.geom_type, GROUNDS)
+    link = np.array([links.get(int(body), -1) for body in model.geom_bodyid])
+    found = {}
+    for body in sorted(links, key=lambda body: links[body]):
+        used = solid & (link == links[body])
+        if (used & collides).any():
+            used &= collides
+        geoms = np.flatnonzero(used & (model.geom_bodyid == body)).tolist()
+        if geoms:
+            found[body] = geoms
+    return found
 
 
 def _branches(model: mujoco.MjModel, body: int) -> tuple[list[int], list[int]]:

@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.arm import Arm, arm_from_xml, asset, move
+from viapoint.envs.arms.arm import HIDDEN_GROUP, Arm, arm_from_xml, asset, move
 from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
 from viapoint.envs.arms.choices import (
+    GROUNDS,
     KNOWN_TORQUES,
     KNOWN_VELOCITIES,
     MOVES,
@@ -27,11 +28,12 @@ from viapoint.envs.arms.choices import (
     arm_joints,
     chain_joints,
     choose_tool,
+    collision_geoms,
     known_limits,
 )
 from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.arms.stored import cached_arm
-from viapoint.envs.arms.urdf import WARNING, Urdf, read_urdf
+from viapoint.envs.arms.urdf import WARNING, Packages, Urdf, read_urdf
 from viapoint.envs.common.arrays import Float, frame_matrices
 from viapoint.envs.common.validation import finite_array, number_of_at_least
 from viapoint.envs.geometry.obstacles import quaternions_of
@@ -62,8 +64,6 @@ MIN_INERTIA = 1e-12  # Least principal moment of inertia of a body, [kg m^2]
 INERTIA_MARGIN = 2e-5  # Relative margin of the triangle inequality of principal moments
 # Transmissions of actuators that drive a joint directly
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-# Types of geoms that are left out
-GROUNDS = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 RESERVED = ("", "world", "meshes")  # Names that bodies of the arm cannot have, beside those of obstacles
 
 Pair = tuple[int, int]  # Numbers of two bodies, that of the lower link first
@@ -116,7 +116,7 @@ def load_arm(
     Args:
         file: MJCF or URDF file, the text of an MJCF file, or a specification.
         tool: Site or body of the tool, or a pair of body and point, (3,), [m]; by default a site or body with a usual
-            name, or else the tip of the chain.
+            name, or else the tip of the last link.
         joints: Names of the hinges and slides from the base to the tool, two or more; by default all of the chain.
         base: Body that the chain begins at; needed where a file has two arms.
         packages: Folder or folders for `package://` in a URDF; the folders above the file are always looked in.
@@ -161,7 +161,7 @@ def load_arm(
     }
     notes = list(urdf.notes)
     whole = _compiled(spec, notes)
-    arguments = {**given, "name": name, "notes": notes, "urdf": urdf[2:]}
+    arguments = {**given, "name": name, "notes": notes, "urdf": urdf[3:]}
     known_as = f"{name} {spec.modelname}"
     arm = cached_arm(whole, arguments, lambda: _load(whole, name, known_as, urdf, notes, given))
     for note in arm.notes:
@@ -225,7 +225,9 @@ def _load(
     at_home = dict(zip(pairs, _distances(parsed, home, pairs).tolist(), strict=True))
     close = [pair for pair in pairs if pair not in exclude and 0.0 < at_home[pair] < LEAST_GAP]
     exclude |= dict.fromkeys(_apart(parsed, close, drawn), never)
-    distances = {pair: away for pair, away in at_home.items() if away > 0.0 and pair not in exclude}
+    touching = [pair for pair in pairs if pair not in exclude and at_home[pair] <= 0.0]
+    exclude |= dict.fromkeys(touching, "in contact at home")
+    distances = {pair: away for pair, away in at_home.items() if pair not in exclude}
     tolerances = dict.fromkeys(parsed.geoms, given["tolerance"])
     for pair in near.difference(apart):
         tolerances.update(dict.fromkeys(pair, FINE))
@@ -270,12 +272,23 @@ def _load(
 
 
 def read_model(file: str | Path) -> mujoco.MjModel:
-    """Return the model of an MJCF or URDF file as :func:`load_arm` reads it; visual meshes may be missing."""
-    spec, _, _ = _read(file, ())
-    return _compiled(spec, [])
+    """Return the model of an MJCF or URDF file for drawings; visual meshes may be missing.
+
+    In a URDF, geoms that collide are in a hidden group where their link has visual ones.
+    """
+    try:
+        spec, _, urdf = _read(file, (), visual=True)
+    except ValueError:  # a visual element that MuJoCo refuses, such as a colour
+        spec, _, urdf = _read(file, ())
+    model = _compiled(spec, [])
+    if urdf.text:  # both are in groups that are drawn
+        collides = (model.geom_contype | model.geom_conaffinity) > 0
+        hidden = collides & np.isin(model.geom_bodyid, model.geom_bodyid[~collides])
+        model.geom_group[hidden] = HIDDEN_GROUP
+    return model
 
 
-def _read(file: Any, packages: tuple[str | Path, ...]) -> tuple[mujoco.MjSpec, str, Urdf]:
+def _read(file: Any, packages: Packages, visual: bool = False) -> tuple[mujoco.MjSpec, str, Urdf]:
     """Return a specification that may be changed, its name, and what MuJoCo does not take from a URDF."""
     nothing = Urdf("", "", {}, {}, (), ())
     if isinstance(file, mujoco.MjSpec):
@@ -289,7 +302,7 @@ def _read(file: Any, packages: tuple[str | Path, ...]) -> tuple[mujoco.MjSpec, s
     if not is_text and not path.is_file():
         raise ValueError(f"there is no file {text!r}")
     if not is_text and (path.suffix.lower() == ".urdf" or b"<robot" in path.read_bytes()[:4096]):
-        urdf = read_urdf(path, packages)
+        urdf = read_urdf(path, packages, visual)
     try:
         if urdf.text:
             spec = mujoco.MjSpec.from_string(urdf.text, assets=urdf.assets)
@@ -547,7 +560,7 @@ def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: li
             while name in taken:
                 name += "_"
         names[body] = name
-    geoms = _collision_geoms(model, links)
+    geoms = collision_geoms(model, links)
     if not any(links[body] for body in geoms):
         raise ValueError(
             f"no geom moves with any of {', '.join(joints)}: nothing of the arm can collide; {'; '.join(notes)}"
@@ -593,22 +606,6 @@ def _note_rest(
         notes.append(
             f"{WARNING}{followers} follows another joint in the file, but not in plans; joints= without it fixes it"
         )
-
-
-def _collision_geoms(model: mujoco.MjModel, links: dict[int, int]) -> dict[int, list[int]]:
-    """Return the geoms of each body: those that collide, or all of a link of which none does; grounds are left out."""
-    collides = (model.geom_contype | model.geom_conaffinity) > 0
-    solid = ~np.isin(model.geom_type, GROUNDS)
-    link = np.array([links.get(int(body), -1) for body in model.geom_bodyid])
-    found = {}
-    for body in sorted(links, key=lambda body: links[body]):
-        used = solid & (link == links[body])
-        if (used & collides).any():
-            used &= collides
-        geoms = np.flatnonzero(used & (model.geom_bodyid == body)).tolist()
-        if geoms:
-            found[body] = geoms
-    return found
 
 
 def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> dict[Pair, str]:

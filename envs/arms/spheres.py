@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 
 from viapoint.envs.arms.kinematics import PART, Chain, Spheres
@@ -35,19 +34,17 @@ def cover(
     capsules: dict[str, list[Capsule]],
     links: dict[str, int],
     home: Float,
-    touching: Collection[frozenset[str]],
     exclude: Mapping[frozenset[str], str],
 ) -> tuple[tuple[str, ...], Spheres, list[LeftOut], float]:
     """Return groups of spheres that contain all capsules: names of bodies, spheres, pairs left out, and excess, [m].
 
-    Capsules of each body are in the frame of its link. Pairs that are in contact at home, `touching`, or named in
-    `exclude` with the reason, may pass through one another.
+    Capsules of each body are in the frame of its link. Pairs in `exclude`, with a reason, may pass through one another.
 
     Raises:
         ValueError: Spheres of bodies that are apart at home overlap there, however small they are.
     """
     names = tuple(capsules)
-    pairs, left_out = _pairs(names, links, touching, exclude)
+    pairs, left_out = _pairs(names, links, exclude)
     excess = dict.fromkeys(names, LARGEST_EXCESS)
     for _ in range(SHRINKING):
         centres, radii, beyond = [], [], 0.0
@@ -70,28 +67,9 @@ def cover(
     )
 
 
-def touching_at_home(
-    model: mujoco.MjModel, data: mujoco.MjData, names: Collection[str]
-) -> set[frozenset[str]]:
-    """Return the pairs of bodies whose geoms are in contact in the present configuration."""
-    bodies: dict[int, str] = {}
-    for geom in range(model.ngeom):
-        name = model.body(model.geom_bodyid[geom]).name
-        if name in names and (model.geom_contype[geom] or model.geom_conaffinity[geom]):
-            bodies[geom] = name
-    found = set()
-    for one, other in itertools.combinations(bodies, 2):
-        pair = frozenset((bodies[one], bodies[other]))
-        apart = len(pair) == 1 or mujoco.mj_geomDistance(model, data, one, other, 0.01, None) > 0.0
-        if not apart:
-            found.add(pair)
-    return found
-
-
 def _pairs(
     names: Sequence[str],
     links: dict[str, int],
-    touching: Collection[frozenset[str]],
     exclude: Mapping[frozenset[str], str],
 ) -> tuple[list[tuple[int, int]], list[LeftOut]]:
     """Return the pairs of groups that are compared, and those of different links that are not.
@@ -108,8 +86,6 @@ def _pairs(
             left_out.append(LeftOut(first, second, "consecutive links"))
         elif pair in exclude:
             left_out.append(LeftOut(first, second, exclude[pair]))
-        elif pair in touching:
-            left_out.append(LeftOut(first, second, "in contact at home"))
         else:
             pairs.append((i, j))
     return pairs, left_out

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +18,7 @@ COMPILER = {
     "balanceinertia": "true",
     "boundmass": "1e-4",
     "boundinertia": "1e-7",
-    "discardvisual": "true",
+    "discardvisual": "false",
     "fusestatic": "false",
     "strippath": "false",
 }
@@ -24,10 +26,13 @@ INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")  # Entries of an inertia
 BALL = 0.05  # Radius of the ball whose inertia a link gets that has none, [m]
 LIMITED = ("revolute", "prismatic")  # Types of joints that have limits
 MOVING = (*LIMITED, "continuous")  # Types of joints that an arm may have
+SEVERAL_WAYS = ("floating", "planar")  # Types of joints that move in several ways at once; they are fixed
 WARNING = "warning: "  # Beginning of notes that are told as warnings, too
-LEFT_OUT = ("transmission", "gazebo", "material")  # Elements that MuJoCo does not need
+OBJECT = re.compile(rb"(?m)^[og]\b.*$")  # Line of an OBJ file that begins an object or a group
+LEFT_OUT = ("transmission", "gazebo")  # Elements that MuJoCo does not need
 
 Packages = tuple[str | Path, ...]  # Folders in which packages are looked for
+Find = Callable[[str], Path]  # Function that returns the place of a mesh
 
 
 class Urdf(NamedTuple):
@@ -42,8 +47,10 @@ class Urdf(NamedTuple):
     notes: tuple[str, ...]  # Parts that were left out
 
 
-def read_urdf(path: Path, packages: Packages) -> Urdf:
-    """Return the content of a URDF file; paths of meshes, which :func:`_places` looks for, become absolute ones.
+def read_urdf(path: Path, packages: Packages, visual: bool = False) -> Urdf:
+    """Return the content of a URDF file; paths of meshes, which :func:`_find` looks for, become absolute ones.
+
+    Geoms that are only `visual` are kept for drawings. Elsewhere they would count for links without others.
 
     Raises:
         ValueError: The file is no URDF, or a mesh for collisions is missing.
@@ -55,15 +62,17 @@ def read_urdf(path: Path, packages: Packages) -> Urdf:
         raise ValueError(f"{path} has no links; expand a xacro file first: xacro FILE > arm.urdf")
     notes: list[str] = []
     assets: dict[str, bytes] = {}
-    for name in LEFT_OUT:
+    for name in LEFT_OUT if visual else (*LEFT_OUT, "material"):
         for element in root.findall(name):
             root.remove(element)
     velocity = {}
+    unseen: list[str] = []
+    find = functools.partial(_find, path, packages)
     for element in (*root.findall("link"), *root.findall("joint")):
         name = element.get("name", "")
         try:
             if element.tag == "link":
-                _prepare_link(element, path, packages, assets, notes)
+                unseen += _prepare_link(element, find, assets, visual, notes)
             else:
                 velocity[name] = _prepare_joint(element, notes)
         except ValueError as error:
@@ -77,7 +86,9 @@ def read_urdf(path: Path, packages: Packages) -> Urdf:
     compiler.attrib.pop("meshdir", None)
     compiler.attrib.update(COMPILER)
     text = ET.tostring(root, encoding="unicode")
-    never_touch = _srdf(path, root.get("name"), notes)
+    if unseen:
+        notes.append(f"visual geoms that are not drawn: {len(unseen)}, the first because {unseen[0]}")
+    never_touch = _srdf(path, root, notes)
     return Urdf(text, root.get("name") or path.stem, assets, velocity, never_touch, tuple(notes))
 
 
@@ -102,15 +113,15 @@ def _prepare_joint(joint: ET.Element, notes: list[str]) -> float:
     Raises:
         ValueError: A limit is not a number, or the lower one is greater than the upper one.
     """
-    name, limit = joint.get("name"), joint.find("limit")
-    if joint.get("type") == "floating":  # MuJoCo has such joints of the first body only
+    name, limit, kind = joint.get("name"), joint.find("limit"), joint.get("type")
+    if kind in SEVERAL_WAYS:
         joint.set("type", "fixed")
-        notes.append(f"fixed: {name}, which floats")
-    if joint.get("type") not in MOVING:
+        notes.append(f"fixed: {name}, which is {kind}")
+    if kind not in MOVING:
         return 0.0
     given = {} if limit is None else limit.attrib
     lower, upper, velocity = (float(given.get(key, 0.0)) for key in ("lower", "upper", "velocity"))
-    limited = joint.get("type") in LIMITED
+    limited = kind in LIMITED
     if not np.isfinite((lower, upper, velocity)).all() or (limited and lower > upper):
         raise ValueError(f"limits must be finite, the lower one less than the upper one, got {given}")
     if limited and lower == upper:
@@ -121,18 +132,26 @@ def _prepare_joint(joint: ET.Element, notes: list[str]) -> float:
 
 
 def _prepare_link(
-    link: ET.Element, path: Path, packages: Packages, assets: dict[str, bytes], notes: list[str]
-) -> None:
-    """Mend the inertia of a link, and leave out its visual geoms and those for collisions that cannot be used."""
+    link: ET.Element, find: Find, assets: dict[str, bytes], visual: bool, notes: list[str]
+) -> list[str]:
+    """Mend the inertia of a link, leave out geoms that cannot be used, and return the faults of visual ones."""
     _mend_inertia(link, notes)
-    for visual in link.findall("visual"):
-        link.remove(visual)
-    for collision in link.findall("collision"):
-        geometry = collision.find("geometry")
-        fault = "no geometry" if geometry is None else _prepared(geometry, path, packages, assets)
-        if fault:
-            link.remove(collision)
+    faults = []
+    for part in (*link.findall("visual"), *link.findall("collision")):
+        collides = part.tag == "collision"
+        try:
+            fault = _prepared(part.find("geometry"), find, assets if collides or visual else None)
+        except ValueError as error:
+            if collides:
+                raise
+            fault = str(error)
+        if fault and collides:
             notes.append(f"{WARNING}a collision geom of {link.get('name')} is left out: {fault}")
+        elif fault:
+            faults.append(fault)
+        if fault or not (collides or visual):
+            link.remove(part)
+    return faults
 
 
 def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
@@ -157,8 +176,10 @@ def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
             notes.append(f"inertia of {name}, which is missing or not positive: that of a ball of {BALL:g} m")
 
 
-def _prepared(geometry: ET.Element, path: Path, packages: Packages, assets: dict[str, bytes]) -> str:
+def _prepared(geometry: ET.Element | None, find: Find, assets: dict[str, bytes] | None) -> str:
     """Make the path of a mesh absolute, and return what is wrong with a geometry, empty for nothing."""
+    if geometry is None:
+        return "no geometry"
     for element in geometry:
         sizes = " ".join(element.get(name, "") for name in ("size", "radius", "length")).split()
         if any(float(size) <= 0.0 for size in sizes):
@@ -168,49 +189,65 @@ def _prepared(geometry: ET.Element, path: Path, packages: Packages, assets: dict
         file = element.get("filename", "")
         if not file.lower().endswith(READ_MESHES):
             return (
-                f"MuJoCo reads {', '.join(READ_MESHES)}, not {Path(file).name}; convert it, for example with "
+                f"MuJoCo reads {', '.join(READ_MESHES)}, not {Path(file).name}: convert it, for example with "
                 "trimesh: trimesh.load(FILE, force='mesh').export('x.stl')"
             )
-        found = next((place for place in _places(file, path, packages) if place.is_file()), None)
-        if found is None:
-            raise ValueError(f"there is no file {file!r}; packages= names folders to look in")
+        found = find(file)
         element.set("filename", str(found.resolve()))
-        if found.suffix.lower() == ".stl":
-            content = found.read_bytes()
-            if content[:5].lower() == b"solid":
-                _add_text_stl(element, content, assets)
-            elif not any(content[80:84]):  # the number of triangles
-                return f"there is no triangle in {found.name}"
+        with found.open("rb") as content:
+            begin = content.read(84)
+        is_binary_stl = found.suffix.lower() == ".stl" and begin[:5].lower() != b"solid"
+        if is_binary_stl and not any(begin[80:]):  # the number of triangles
+            return f"there is no triangle in {found.name}"
+        if assets is not None and not is_binary_stl:
+            _add_rewritten(element, found, assets)
     return ""
 
 
-def _add_text_stl(mesh: ET.Element, content: bytes, assets: dict[str, bytes]) -> None:
-    """Add a mesh to assets as binary STL, which MuJoCo reads, if its file is text."""
-    corners = np.array(re.findall(rb"(?i)vertex\s+(\S+)\s+(\S+)\s+(\S+)", content), "<f4").reshape(-1, 9)
-    if len(corners):  # many binary files begin like text
+def _add_rewritten(mesh: ET.Element, file: Path, assets: dict[str, bytes]) -> None:
+    """Add a mesh to assets in a form that MuJoCo reads, if it is STL as text, or OBJ with several objects.
+
+    MuJoCo reads STL as binary only, and the faces of the first object only.
+    """
+    content = file.read_bytes()
+    if file.suffix.lower() == ".stl":
+        corners = np.array(re.findall(rb"(?i)vertex\s+(\S+)\s+(\S+)\s+(\S+)", content), "<f4").reshape(-1, 9)
+        if not len(corners):  # many binary files begin like text
+            return
         facets = np.zeros(len(corners), [("normal", "<f4", 3), ("corners", "<f4", 9), ("spare", "<u2")])
         facets["corners"] = corners
-        name = f"text_{len(assets)}.stl"
-        assets[name] = bytes(80) + np.uint32(len(corners)).tobytes() + facets.tobytes()
-        mesh.set("filename", name)
+        content = bytes(80) + np.uint32(len(corners)).tobytes() + facets.tobytes()
+    elif len(OBJECT.findall(content)) > 1:
+        content = OBJECT.sub(b"", content)
+    else:
+        return
+    name = f"rewritten_{len(assets)}{file.suffix.lower()}"
+    assets[name] = content
+    mesh.set("filename", name)
 
 
-def _places(file: str, path: Path, packages: Packages) -> Iterator[Path]:
-    """Yield the places where a mesh of a URDF may be.
+def _find(path: Path, packages: Packages, file: str) -> Path:
+    """Return the place of a mesh of a URDF.
 
-    A relative path begins at the file. `package://NAME/REST`, then REST, then what is left without the first folder of
-    it, and so on, are looked for in the folders of `packages` and above the file: copies often have other names.
+    A relative path begins at the URDF. `package://NAME/REST`, then REST, then what is left without the first folder of
+    it, and so on, are looked for in the folders of `packages` and above the URDF: copies often have other names.
+
+    Raises:
+        ValueError: There is no such file.
     """
     parts = file.removeprefix("package://").removeprefix("file://").split("/")
-    if not file.startswith("package://"):
-        yield path.parent / "/".join(parts)
+    places = [] if file.startswith("package://") else [path.parent / "/".join(parts)]
     folders = [*(Path(each).expanduser() for each in packages), *path.resolve().parents]
     for first in range(len(parts)):
-        for folder in folders:
-            yield folder / "/".join(part for part in parts[first:] if part != "..")
+        rest = "/".join(part for part in parts[first:] if part != "..")
+        places += [folder / rest for folder in folders]
+    for place in places:
+        if place.is_file():
+            return place
+    raise ValueError(f"there is no file {file!r}; packages= names folders to look in")
 
 
-def _srdf(path: Path, robot: str | None, notes: list[str]) -> tuple[tuple[str, str], ...]:
+def _srdf(path: Path, urdf: ET.Element, notes: list[str]) -> tuple[tuple[str, str], ...]:
     """Return the pairs of links that an SRDF file of the same robot does not compare.
 
     It has the same name and is beside the URDF or in the folder srdf beside that folder; or it is the only one beside.
@@ -218,13 +255,23 @@ def _srdf(path: Path, robot: str | None, notes: list[str]) -> tuple[tuple[str, s
     beside = list(path.parent.glob("*.srdf"))
     places = [path.with_suffix(".srdf"), path.resolve().parents[1] / "srdf" / f"{path.stem}.srdf"]
     places += beside if len(beside) == 1 else []
+    robot = urdf.get("name")
     for place in dict.fromkeys(places):
         if not place.is_file():
             continue
         root = _root(place)
-        if root.get("name") == robot:
-            notes.append(f"pairs of links that are not compared: those of {place.name}")
-            pairs = root.findall("disable_collisions")
-            return tuple((pair.get("link1", ""), pair.get("link2", "")) for pair in pairs)
-        notes.append(f"{place.name} is not used: it is for robot {root.get('name')!r}, not {robot!r}")
+        if root.get("name") != robot:
+            notes.append(f"{place.name} is not used: it is for robot {root.get('name')!r}, not {robot!r}")
+            continue
+        notes.append(f"pairs of links that are not compared: those of {place.name}")
+        pairs = [
+            (pair.get("link1", ""), pair.get("link2", "")) for pair in root.findall("disable_collisions")
+        ]
+        links = {link.get("name") for link in urdf.findall("link")}
+        unknown = dict.fromkeys(name for name in itertools.chain(*pairs) if name not in links)
+        if unknown:
+            notes.append(
+                f"{WARNING}{place.name} names links that the URDF does not have: {', '.join(unknown)}"
+            )
+        return tuple(pairs)
     return ()

@@ -12,7 +12,7 @@ from helpers import (
     random_shape,
 )
 
-from viapoint.envs.arms.capsule_fit import cover_geom, polytope_around
+from viapoint.envs.arms.capsule_fit import cover_geom, hull_of
 from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.arms.spheres import grouped
@@ -142,7 +142,7 @@ def points_in(model, geom, rng, number=3000):
         disc = rng.normal(size=(number, 2))
         disc *= np.sqrt(rng.random((number, 1))) / np.linalg.norm(disc, axis=1, keepdims=True)
         return np.concatenate((size[0] * disc, size[1] * rng.uniform(-1, 1, (number, 1))), axis=1)
-    corners, _ = polytope_around(model, geom)
+    corners = hull_of(model, geom)[0]
     weights = rng.dirichlet(np.full(len(corners), 0.2), number)
     return np.concatenate((corners, weights @ corners))
 
@@ -162,7 +162,7 @@ def test_capsules_contain_a_geom_and_reach_no_farther_beyond_it_than_the_toleran
     found = cover_geom(model, geom, tolerance)
     points = points_in(model, geom, rng)
     assert np.min([depth(each, points) for each in found], axis=0).max() <= 0.0
-    corners, larger = polytope_around(model, geom)
+    corners, _, larger = hull_of(model, geom)
     body = ConvexMesh.hull(corners)
     ball = rng.normal(size=(4000, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import re
-import warnings
 
 import mujoco
 import numpy as np
@@ -14,7 +13,7 @@ from helpers import UR5E, check_contact_implies_overlap
 from viapoint.envs.arms import load
 from viapoint.envs.arms.choices import KNOWN_VELOCITIES, known_limits
 from viapoint.envs.arms.kinematics import forward, sphere_centres, torques
-from viapoint.envs.arms.load import load_arm
+from viapoint.envs.arms.load import load_arm, read_model
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import pack
@@ -212,17 +211,22 @@ def three(*pairs, gap=0.02, **changes):
     return load_arm(changed(*pairs, text=near_arm(gap)), **{**THREE, **changes})
 
 
-def test_one_of_two_tools_on_a_wrist_is_taken_with_a_warning(tmp_path):
-    site = '<site name="hand" pos="0 0 0.2596"/>'
-    for other, told in (("0 -0.1 0.1", 1), ("0 0.1 0.1", 0)):  # where both are in one place, it is one tool
-        file = tmp_path / f"two{told}.xml"
-        two = f'<site name="left_tcp" pos="0 0.1 0.1"/><site name="right_tcp" pos="{other}"/>'
-        file.write_text(TEXT.replace(site, two))
-        with warnings.catch_warnings(record=True) as found:
-            warnings.simplefilter("always")
-            arm = load_arm(file, name="ur5e")
-        assert "tool: 'left_tcp'" in repr(arm)
-        assert len([each for each in found if "right_tcp" in str(each.message)]) == told
+@pytest.mark.parametrize(("other", "tools"), [("0 -0.1 0.1", 2), ("0 0.1 0.1", 1)])
+def test_two_tools_side_by_side_on_a_wrist_are_refused(other, tools):
+    """Where both are in one place, it is one tool."""
+    two = f'<site name="left_tcp" pos="0 0.1 0.1"/><site name="right_tcp" pos="{other}"/>'
+    text = changed((HAND_OF_TEXT, two))
+    if tools == 1:
+        assert "tool: 'left_tcp'" in load_arm(text).notes
+        return
+    with pytest.raises(ValueError, match="left_tcp, right_tcp; name one with tool="):
+        load_arm(text)
+
+
+def test_of_two_tools_of_which_one_carries_the_other_the_outer_one_is_taken_with_a_warning():
+    outer = '<body name="arm_tool" pos="0 0 .1"><body name="hand_tool" pos="0 0 .1"/></body>'
+    with pytest.warns(UserWarning, match="'hand_tool', but could be arm_tool"):
+        load_arm(changed((HAND_OF_TEXT, outer)))
 
 
 def test_without_velocity_limits_a_warning_names_the_default():
@@ -304,11 +308,36 @@ def test_tools_are_sites_bodies_or_points(arm, tool, where):
     np.testing.assert_allclose(other.hand(HOME), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(("geom", "tool"), [("", "plate"), ('<geom size="0.01"/>', "c")])
-def test_a_frame_alone_on_the_last_link_is_the_tool(geom, tool):
-    plate = f'<body name="plate" pos="0 0 0.1">{geom}</body><body><geom size="0.01"/></body>'
+def test_a_frame_alone_on_the_last_link_is_the_tool():
+    plate = '<body name="plate" pos="0 0 0.1"/><body><geom size="0.01"/></body>'
     arm = three(('<site name="tool" pos="0 0 0.2"/>', plate), tool=None)
-    assert arm.notes[0] == f"tool: \"the frame of '{tool}'\""
+    assert arm.notes[0] == "tool: \"the frame of 'plate'\""
+
+
+ONLY_SEEN = 'contype="0" conaffinity="0"'
+BALL = '<geom size=".02" mass=".1" {1}/>'
+FAR_BALL = f'<geom pos="0 1 0" size=".1" mass="0" {ONLY_SEEN}/>'
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("geoms", "seen", "away"),
+    [
+        ('<geom type="capsule" fromto="0 0 0 .03 {0} .02" size=".01" mass=".1" {1}/>', "", 0.21),
+        ('<geom type="capsule" fromto="0 0 0 .03 {0} .02" size=".01" mass=".1" {1}/>', ONLY_SEEN, 0.21),
+        ('<geom type="box" pos="0 {0} 0" euler="0 0 45" size=".1 .1 .02" mass=".1" {1}/>', "", 0.341421),
+        (BALL + '<body pos="0 {0} 0"><geom size=".03" mass=".1" {1}/></body>', "", 0.23),
+        (BALL + FAR_BALL, "", 0.0),
+    ],
+)
+def test_the_tip_of_the_last_link_is_where_its_geoms_end_and_is_mirrored_with_them(geoms, seen, away, side):
+    geoms = geoms.format(0.2 * side, seen)
+    text = re.sub(r'(?s)<geom type="box".*?<site[^>]*/>', geoms, near_arm(0.02))
+    arm = load_arm(text, **{**THREE, "tool": None})
+    np.testing.assert_allclose(arm.hand(np.zeros(3)), (0.0, side * away, 0.5), atol=1e-6)
+    sign = "-" if side < 0.0 else ""
+    tip = f"the tip of 'c', {away:.3g} m along {sign}y of its frame" if away else "the frame of 'c'"
+    assert arm.notes[0] == f'tool: "{tip}"'
 
 
 def test_joints_without_names_get_some_and_those_that_follow_others_are_told():
@@ -486,6 +515,48 @@ def test_pairs_of_an_srdf_of_the_same_robot_beside_it_are_not_compared(crane, ro
     assert note in "\n".join(arm.notes)
 
 
+def test_links_of_an_srdf_that_the_urdf_does_not_have_are_told(crane):
+    pair = '<disable_collisions link1="wrist" link2="psot"/>'
+    (crane / "urdf" / "crane.srdf").write_text(f'<robot name="crane">{pair}</robot>')
+    with pytest.warns(UserWarning, match=r"crane\.srdf .* psot$"):
+        load_arm(written(crane))
+
+
+VISUAL = '<visual><geometry><mesh filename="../meshes/{}"/></geometry><material name="red"/></visual>'
+RED = '<material name="red"><color rgba="1 0 0 1"/></material></robot>'
+
+
+def test_visual_geoms_of_a_urdf_are_drawn_and_count_for_nothing_else(crane):
+    plain = load_arm(written(crane))
+    boxes = [trimesh.creation.box(bounds=((x, 0, 0), (x + 1, 1, 1))) for x in (0, 7)]
+    trimesh.Scene(boxes).export(crane / "meshes" / "two.obj")  # MuJoCo reads the first object only
+    (crane / "meshes" / "broken.obj").write_text("version https://git-lfs.github.com/spec/v1")
+    visuals = VISUAL.format("two.obj") + VISUAL.format("broken.obj")
+    collision = '<collision><origin xyz="0.2 0 0"/>'
+    alone = '<link name="tool0"/>', f'<link name="tool0">{VISUAL.format("wrist.obj")}</link>'
+    path = written(crane, (collision, visuals + collision), ("</robot>", RED), alone)
+    arm = load_arm(path)
+    assert arm.xml == plain.xml
+    (told,) = (note for note in arm.notes if "not drawn" in note)
+    assert "1, the first because" in told
+    assert "boom.dae" in told
+    model = read_model(path)
+    shown = np.flatnonzero(model.geom_group < 3)
+    bodies = [model.body(model.geom_bodyid[geom]).name for geom in shown]
+    assert bodies == [
+        "base",
+        "post",
+        "boom",
+        "wrist",
+        "tool0",
+    ]  # the first two and the wrist show what collides
+    np.testing.assert_array_equal(model.geom_rgba[shown[2]], (1.0, 0.0, 0.0, 1.0))
+    assert model.geom_rbound[shown[2]] > 4.0  # all of the file
+    path.write_text(path.read_text().replace("1 0 0 1", "red"))
+    assert read_model(path).nmesh == 1
+    np.testing.assert_equal(parts_of(load_arm(path)), parts_of(arm))
+
+
 def test_packages_are_looked_for_in_given_folders(crane, tmp_path):
     path = tmp_path / "other" / "crane.urdf"
     path.parent.mkdir()
@@ -622,6 +693,12 @@ ODD = [
     ("0.2 0.2 0.1", "0 0 0"),
     ('<link name="base">', f'<link name="odom"/>{FLOATING}<link name="base">'),
 ]
+
+
+def test_planar_joints_of_a_urdf_are_fixed(crane):
+    arm = load_arm(written(crane, ('"tilt" type="revolute"', '"tilt" type="planar"')))
+    assert arm.joint_names == ("lift", "turn")
+    assert "fixed: tilt, which is planar" in arm.notes
 
 
 def test_urdf_files_with_odd_parts_load(crane):
