@@ -44,6 +44,8 @@ PANDA = arm_of("panda")
 GOAL = PANDA.home + np.array([0.8, 0.5, 0.0, 0.6, 0.0, 0.3, 0.0])
 POST = Box((0.05, 0.05, 0.4), position=(0.5, 0.15, 0.4))
 """Obstacle in the way from home to GOAL."""
+BAR = Box((0.01, 0.05, 0.04), position=(-0.05, 0.35, 0.0))
+"""Obstacle in the way of the hand of the arm in the plane."""
 WALL = [Box((0.02, 2.0, 2.0), position=(0.45, 0.2, 0.0), quaternion=(0.924, 0.0, 0.0, 0.383))]
 """Obstacle that nothing leads around; the goal is inside it."""
 
@@ -152,6 +154,35 @@ def test_movements_in_motion_begin_as_given_and_are_as_clear_as_they_say() -> No
     scenes = pack([[POST]]).take(np.zeros(500, np.int64))
     least = configuration_clearances(PANDA, path, scenes).min()
     assert plan.clearance == pytest.approx(least, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["panda", "planar"])
+def test_movements_that_begin_in_motion_are_executed_as_planned(name: str) -> None:
+    ends, bar = ((PANDA.home, GOAL), POST) if name == "panda" else (((-0.2, 0.3), (0.1, 0.4)), BAR)
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        velocity, acceleration = rng.uniform(-0.3, 0.3, (2, len(ends[0])))
+        given = {"velocity": velocity, "acceleration": acceleration, "ompl": False}
+        plan = plan_motion(name, *ends, [bar], **given)
+        done = plan.execute()
+        assert plan.success
+        assert done.is_success[0]
+        assert done.stretch[0] == 1.0
+        assert done.tracking_error[0] < 1e-3
+        assert done.planned_clearance[0] == pytest.approx(plan.clearance, abs=1e-3)
+        blocked = plan_motion(name, *ends, [bar], **given, time_limit=0.0)
+        assert blocked.success or blocked.execute(force=True).collision[0]
+
+
+def test_movements_in_motion_use_all_of_their_limits_and_nothing_more() -> None:
+    # From rest, limits are kept by slowing down; in motion, that would be another movement.
+    fast = 0.99 * PANDA.velocity_limit[0] * np.eye(7)[0]
+    goal = PANDA.home + 1.2 * np.eye(7)[0]
+    for share in (1.0, 1.05):
+        plan = plan_motion(PANDA, PANDA.home, goal, velocity=share * fast, duration=1.0)
+        done = plan.execute(force=True)
+        assert plan.success == done.is_success[0] == (share == 1.0)
+        assert done.duration[0] == pytest.approx(plan.duration)
 
 
 def test_a_plan_that_leaves_the_joint_limits_has_no_success() -> None:

@@ -172,12 +172,9 @@ class MotionPlan:
             force: True for plans without success, too.
 
         Raises:
-            UnsafePlanError: The plan has no success.
-            ValueError: The movement does not begin at rest.
+            UnsafePlanError: The plan has no success, or there is no movement at all.
         """
         self.refuse_unsafe(force)
-        if self.velocity.any() or self.acceleration.any():
-            raise ValueError("a movement that begins in motion cannot be executed from rest")
         outcome, _ = execute_plans([self])
         return outcome
 
@@ -196,23 +193,31 @@ def joint_motion(space: Space, position: Float, velocity: Float, acceleration: F
 def execute_plans(plans: Sequence[MotionPlan]) -> tuple[Outcome, Episodes]:
     """Execute plans of one arm in MuJoCo, each among its obstacles.
 
-    All plans must have equally many via-points; plans without success are executed, too. The results are the metrics,
-    shape (N,) each, and the simulations, which hold the records of the movements until the next ones.
+    All plans must have equally many via-points; plans without success are executed, too. Beyond a limit of the arm,
+    plans from rest are slowed down, and plans that begin in motion, which cannot be, have no success. The results are
+    the metrics, shape (N,) each, and the simulations, which hold the records of the movements until the next ones.
     """
+    for each in plans:
+        each.refuse_unsafe(force=True)
     first, number = plans[0], len(plans)
     solids = [_solids(plan.obstacles) for plan in plans]
     rows = max(each.kind.shape[1] for each in solids)
     meshes = sorted({name for each in solids for name in mesh_names(each.meshes)})
     episodes = _episodes(first.arm, first.space, len(first.durations) - 1, rows, number, tuple(meshes))
+    plan = Plan(*(np.stack(parts) for parts in zip(*(each.plan for each in plans), strict=True)))
+    begin = Motion(plan.waypoints[:, 0], plan.velocity, plan.acceleration)
     space = episodes.task.space
-    waypoints = np.stack([plan.waypoints for plan in plans])
-    start, goal = (np.ascontiguousarray(space.joints(waypoints[:, end])) for end in (0, -1))
+    start, goal = (np.ascontiguousarray(space.joints(plan.waypoints[:, end])) for end in (0, -1))
     obstacles = no_obstacles(number, rows)
     for i, each in enumerate(solids):
         obstacles = obstacles.put([i], each.with_rows(rows))
     episodes.start(np.arange(number), resting(start, goal, obstacles))
-    decision = episodes.execute(Plan.at_rest(waypoints, np.stack([plan.durations for plan in plans])))
-    return Outcome(**{name: decision.info[name] for name in Outcome._fields}), episodes
+    episodes.simulator.batch.bind("qvel")[:] = space.joint_motion(begin).velocity
+    decision = episodes.execute(plan)
+    outcome = Outcome(**{name: decision.info[name] for name in Outcome._fields})
+    moving = plan.velocity.any(axis=-1) | plan.acceleration.any(axis=-1)
+    beyond = np.array([max(each.limits) > 1.0 for each in plans])
+    return outcome._replace(is_success=outcome.is_success & ~(moving & beyond)), episodes
 
 
 def _solids(obstacles: Obstacles) -> Obstacles:
@@ -248,4 +253,4 @@ def _episodes(
     """Return simulations of an arm among up to some obstacles, which may be some registered meshes."""
     shapes = (*PLAIN_KINDS, *meshes)
     task = Task.of(arm=arm, space=space, n_via=n_via, n_obstacles=(0, rows), shapes=shapes)
-    return Episodes(task, number)
+    return Episodes(task, number, prolong=False)
