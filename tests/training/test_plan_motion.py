@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import sys
 
 import numpy as np
@@ -292,14 +293,45 @@ def test_gradient_of_the_objective(kwargs) -> None:
         assert np.abs(computed - measured).max() < 0.03 * np.abs(measured).max()
 
 
-def test_a_batch_goes_on_after_problems_that_are_refused() -> None:
-    starts = [PANDA.home, PANDA.home[:6], PANDA.home * np.nan, PANDA.home, PANDA.home]
-    goals = [Pose((2.0, 0.0, 0.5)), *[GOAL] * 4]
-    plans = plan_motions(PANDA, starts, goals, [[], [], [], [{"shape": "blob"}], []])
-    assert [plan.success for plan in plans] == [False] * 4 + [True]
-    for number, word in enumerate(("reached", "shape (7,)", "finite", "blob")):
-        assert plans[number].reason.startswith(f"problem {number}: ")
-        assert word in plans[number].reason
+REFUSED = [
+    ({"goal": Pose((2.0, 0.0, 0.5))}, "cannot be reached"),
+    ({"start": PANDA.home[:6]}, r"shape \(7,\)"),
+    ({"start": PANDA.home * np.nan}, "finite"),
+    ({"start": None}, "real numbers"),
+    ({"goal": "home"}, "real numbers"),
+    ({"goal": {"place": (0.5, 0.2, 0.4)}}, "position"),
+    ({"goal": [Pose((0.5, 0.2, 0.4)), None]}, "position"),
+    ({"obstacles": [{"shape": "blob"}]}, "blob"),
+    ({"obstacles": 5}, "obstacles must be"),
+]
+UNSOLVED = [
+    ({"obstacles": [Sphere(0.1, position=PANDA.hand(GOAL))]}, "goal is in contact"),
+    ({"goal": GOAL + 9.0 * np.eye(7)[2]}, "outside the limits"),
+    ({"obstacles": WALL}, "in contact"),
+]
+
+
+def test_a_batch_goes_on_after_problems_that_are_refused(tmp_path) -> None:
+    problems = [changes for changes, _ in (*REFUSED, *UNSOLVED)] + [{}]
+    given = [{"start": PANDA.home, "goal": GOAL, "obstacles": [], **changes} for changes in problems]
+    parts = ([each[name] for each in given] for name in ("start", "goal", "obstacles"))
+    plans = plan_motions(PANDA, *parts)
+    assert [plan.success for plan in plans] == [False] * (len(plans) - 1) + [True]
+    for number, (_, reason) in enumerate((*REFUSED, *UNSOLVED)):
+        assert re.match(f"problem {number}: .*{reason}", plans[number].reason)
+        assert (plans[number].source == "refused") == (number < len(REFUSED))
+    refused = plans[0]
+    assert "cannot be reached" in repr(refused)
+    uses = (
+        lambda: refused.joints(force=True),
+        lambda: refused.execute(force=True),
+        lambda: write_motion(refused, tmp_path / "plan.csv", force=True),
+        lambda: execute_plans(plans),
+        refused.trajectory,
+    )
+    for use in uses:
+        with pytest.raises(UnsafePlanError, match="no movement"):
+            use()
     assert plan_motion(PANDA, PANDA.home, [Pose((2.0, 0.0, 0.5)), Pose((0.5, 0.2, 0.4))]).success
 
 

@@ -267,9 +267,10 @@ def plan_motions(
     """Plan N movements on threads; the other arguments are those of :func:`plan_motion`.
 
     Each movement is planned as :func:`plan_motion` plans it alone, whatever the number of threads is, except where the
-    time limit is reached, and where a path of OMPL is followed: all threads have its random generator in common. A
-    problem with an argument that is not allowed, or a pose out of reach, gives a plan without success that stays at
-    home; `reason` tells why.
+    time limit is reached, and where a path of OMPL is followed: all threads have its random generator in common. The
+    `reason` of each plan without success begins with the number of its problem, such as `problem 3: `, from 0. A
+    problem with an argument that is not allowed, or a pose out of reach, is refused: its plan has the source `refused`
+    and no waypoints, and raises UnsafePlanError when it is executed or exported, also with `force=True`.
 
     Args:
         arm: Arm, or name of one.
@@ -287,6 +288,8 @@ def plan_motions(
         >>> plans = plan_motions("planar", [(-0.2, 0.3), (-0.2, 0.4)], [(0.1, 0.4), (0.2, 0.3)], [[], []])
         >>> [plan.success for plan in plans]
         [True, True]
+        >>> plan_motions("planar", [(-0.2, 0.3, 0.0)], [(0.1, 0.4)], [[]])
+        [MotionPlan('planar', refused: problem 0: start must have shape (2,), got (3,))]
     """
     arm = arm_of(arm)
     if threads is not None:
@@ -304,15 +307,22 @@ def plan_motions(
     # What is a fault of all problems is raised here.
     number_of_at_least("time_limit", kwargs.get("time_limit", LONGEST_SEARCH), 0.0)
     seed = None if isinstance(rng, np.random.Generator) else rng
-    nothing = plan_motion(arm, home, home, **{**kwargs, "time_limit": 0.0, "rng": seed})
+    rest = plan_motion(arm, home, home, **{**kwargs, "time_limit": 0.0, "rng": seed})
+    refused = dataclasses.replace(
+        rest, waypoints=rest.waypoints[:0], durations=rest.durations[:0], success=False, clearance=np.nan,
+        limits=Limits(np.nan, np.nan), jerk=np.nan, source="refused", milliseconds=0.0,
+    )  # fmt: skip
 
     def plan(number: int) -> MotionPlan:
         try:
-            return plan_motion(
+            found = plan_motion(
                 arm, starts[number], goals[number], obstacles[number], rng=rngs[number], **kwargs
             )
-        except ValueError as error:
-            return dataclasses.replace(nothing, success=False, reason=f"problem {number}: {error}")
+        except (ValueError, TypeError) as error:
+            found = dataclasses.replace(refused, reason=str(error))
+        if found.success:
+            return found
+        return dataclasses.replace(found, reason=f"problem {number}: {found.reason}")
 
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(plan, range(len(starts))))
