@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
 from numba.core.caching import IndexDataCacheFile
+from numba.extending import intrinsic
 
 TINY = 1e-12  # Length below which a vector has no direction, [m]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -56,6 +60,26 @@ def inlined(function: Function) -> Function:
     A call with packed obstacles passes 150 numbers, which takes longer than a distance.
     """
     return cast("Function", njit(inline="always", **KERNEL)(function))
+
+
+@intrinsic
+def clock(context: Any) -> Any:
+    """Return the time of a steady clock, [s], in compiled functions; always 0 on systems without `clock_gettime`."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number, real = ir.IntType(64), ir.DoubleType()
+        if not hasattr(time, "clock_gettime"):
+            return ir.Constant(real, 0.0)
+        moment = cgutils.alloca_once(builder, number, size=2)  # seconds and nanoseconds
+        kind = ir.FunctionType(ir.IntType(32), [ir.IntType(32), number.as_pointer()])
+        read = cgutils.get_or_insert_function(builder.module, kind, "clock_gettime")
+        builder.call(read, [ir.Constant(ir.IntType(32), time.CLOCK_MONOTONIC), moment])
+        seconds = builder.load(moment)
+        nanoseconds = builder.load(builder.gep(moment, [ir.Constant(ir.IntType(32), 1)]))
+        fraction = builder.fmul(builder.sitofp(nanoseconds, real), ir.Constant(real, 1e-9))
+        return builder.fadd(builder.sitofp(seconds, real), fraction)
+
+    return types.float64(), generate
 
 
 _read_index: Callable[[Any], Any] = IndexDataCacheFile._load_index

@@ -35,7 +35,7 @@ from viapoint.training.planning import plan_motion as module
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems, read_problems
 from viapoint.training.planning.motion_plan import execute_plans
-from viapoint.training.planning.movements import OUTSIDE, Movement, movement_table
+from viapoint.training.planning.movements import OUTSIDE, Movement, arm_setting, movement_table
 from viapoint.training.planning.ompl_paths import points_on
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
@@ -271,7 +271,7 @@ def test_results_depend_on_neither_threads_nor_the_form_of_obstacles() -> None:
 def test_gradient_of_the_objective(kwargs) -> None:
     task, starts, goals, obstacles = drawn(5, **kwargs)
     aim = refine.SEED._replace(clearance=0.2)  # many residuals
-    setting, table = module._setting(task.arm, task.space.of_hand), movement_table(2)
+    setting, table = arm_setting(task.arm, task.space.of_hand, pack([[]]), near=np.inf), movement_table(2)
     dimension = task.space.dimension
     generator = np.random.default_rng(0)
     gradient, measured = np.empty((2, 2 * dimension))

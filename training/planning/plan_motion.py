@@ -37,10 +37,12 @@ from viapoint.envs.spaces import Space, space_of
 from viapoint.training.planning.motion_plan import Limits, MotionPlan, joint_motion
 from viapoint.training.planning.movements import (
     FINE_INSTANTS,
+    NEAR,
     OUTSIDE,
     Movement,
     MovementTable,
     Setting,
+    arm_setting,
     fine_table,
     movement_table,
     table_with,
@@ -101,8 +103,14 @@ class _Problem(NamedTuple):
 
     @property
     def setting(self) -> Setting:
-        """Arm and space for compiled functions."""
-        return _setting(self.arm, self.space.of_hand)
+        """Arm and space for compiled functions; rounding errors at the joint limits do not count."""
+        return self.setting_near(np.inf)
+
+    def setting_near(self, near: float) -> Setting:
+        """Return the same without spheres of an arm in the plane that are farther from all obstacles, [m]."""
+        return arm_setting(
+            self.arm, self.space.of_hand, self.obstacles, room=-RANGE_TOLERANCE, near=near
+        )
 
     @property
     def in_motion(self) -> bool:
@@ -386,13 +394,6 @@ def ompl_motion(
 
 
 @functools.lru_cache(maxsize=64)
-def _setting(arm: Arm, of_hand: bool) -> Setting:
-    """Return arm and space for compiled functions; rounding errors at the joint limits do not count."""
-    ranges = arm.joint_range + RANGE_TOLERANCE * np.array([-1.0, 1.0])
-    return Setting(arm.chain, arm.spheres, ranges, of_hand, arm.reach, hand_alone=False)
-
-
-@functools.lru_cache(maxsize=64)
 def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     """Make tables, and load or compile the machine code, so that no time limit is spent on them."""
     space = space_of(arm, "hand" if of_hand else "joints")
@@ -402,7 +403,8 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     straight = _straight(problem)
     is_free(problem.setting, straight, problem.obstacles, 0, 0.0)
     _known(problem, straight, "straight", 0.0, _fault(problem)[0])
-    _refined(problem, 0.0, movement_table(n_via), fine_table(n_via), np.zeros((0, n_via, len(start))), 1.0)
+    seeds = np.zeros((0, n_via, len(start)))
+    _refined(problem, problem.setting, 0.0, movement_table(n_via), fine_table(n_via), seeds, 1.0, np.inf)
 
 
 def _goals(problem: _Problem, goal: Any) -> Float:
@@ -423,7 +425,7 @@ def _goals(problem: _Problem, goal: Any) -> Float:
     if problem.arm.continuous and not problem.space.of_hand:
         # The equivalent position within the range that is nearest to the start.
         endless = np.isin(problem.arm.joint_names, problem.arm.continuous)
-        low, high = _setting(problem.arm, False).joint_range.T
+        low, high = problem.setting.joint_range.T
         turns = np.round((goals - problem.start) / TURN)
         turns = np.clip(turns, np.ceil((goals - high) / TURN), np.floor((goals - low) / TURN))
         goals = goals - TURN * np.where(endless, turns, 0.0)
@@ -571,6 +573,7 @@ def _search(
     unit = unit_of_jerk(way, problem.space.of_hand)
     near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
     table, fine = movement_table(n_via), fine_table(n_via)
+    setting = problem.setting_near(kept + NEAR)  # clearances below NEAR are right
     best, least = None, np.inf
     tight, widest = None, problem.margin  # the best of those that keep the margin and nothing more
     tried = free = since = 0
@@ -594,7 +597,9 @@ def _search(
                 spread = 0.0 if rank == 0 else near if rank < NARROW else far
                 seeds[k] = straight + spread * away
         wanted = max(enough - free, 1)
-        done, found = _refined(problem, kept, table, fine, seeds, duration, enough=wanted)
+        done, found = _refined(
+            problem, setting, kept, table, fine, seeds, duration, until, enough=wanted
+        )
         for k in range(done):
             clearance = float(found.clearance[k])
             movement = problem.movement(found.vias[k], fine, int(found.times[k]), duration)
@@ -627,11 +632,13 @@ def _more(cost: float) -> int:
 
 def _refined(
     problem: _Problem,
+    setting: Setting,
     kept: float,
     table: MovementTable,
     fine: MovementTable,
     seeds: Float,
     duration: float,
+    until: float,
     *,
     smooth: float = SMOOTH,
     enough: int = 1,
@@ -640,8 +647,8 @@ def _refined(
     fixed = problem.movement(seeds[:0, 0], table, 0, duration).offsets
     unit = unit_of_jerk(problem.goal - problem.start, problem.space.of_hand)
     return refine_seeds(
-        problem.setting, table, fine, problem.start, fixed, seeds, duration, problem.obstacles, 0, kept,
-        unit, smooth, enough,
+        setting, table, fine, problem.start, fixed, seeds, duration, problem.obstacles, 0, kept, unit, smooth,
+        enough, until - time.perf_counter(),
     )  # fmt: skip
 
 
@@ -664,7 +671,9 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
         table = table_with(durations)
         fine = table_with(durations, FINE_INSTANTS)
         vias = points[None, 1:-1] - problem.start
-        _, found = _refined(problem, kept, table, fine, vias, duration, smooth=0.0)
+        _, found = _refined(
+            problem, problem.setting, kept, table, fine, vias, duration, until, smooth=0.0
+        )
         clearance = float(found.clearance[0])
         if clearance >= kept:
             movement = problem.movement(found.vias[0], fine, 0, duration)
@@ -731,7 +740,7 @@ def _known(
     table, times, start, offsets, _ = movement
     vias = offsets[:-3]
     movement = problem.movement(vias, table, times, duration)
-    if clearance is None:
+    if clearance is None or clearance >= NEAR:
         clearance = exact_clearance(problem.setting, movement, problem.obstacles, 0, problem.margin)
     if problem.obstacles.velocity[0].any():
         clearance = min(clearance, _clearance_at_rest(problem, duration))

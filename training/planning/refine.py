@@ -27,7 +27,7 @@ from viapoint.envs.geometry.clearance import (
     nearest_spheres,
     place,
 )
-from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel
+from viapoint.envs.geometry.compiled import clock, compiled, inlined, inner, kernel
 from viapoint.envs.geometry.distance import point_distance, point_distance_and_normal
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.training.planning.movements import (
@@ -78,8 +78,8 @@ SEED = Aim(clearance=0.04, jerk=0.1, iterations=20, gain=1.0, stride=2)
 # paid for with contact on the other.
 NARROW = Aim(clearance=0.008, jerk=0.02, iterations=20, gain=1.0, stride=2)
 NEARLY = -0.03  # Least clearance of movements that are nearly free, [m]
-# Aim of the first attempt to polish a free movement. The weight of jerk is that at which the movement is smooth and
-# still free: it grows after an attempt whose movement is free and smoother, and falls after others.
+# Aim of the first attempt to polish a free movement. The weight of jerk falls until the movement stays free and becomes
+# smoother, and then grows until it does not.
 POLISH = Aim(clearance=0.02, jerk=1.0, iterations=20, gain=0.01, stride=2)
 ATTEMPTS, HEAVIER, LIGHTER = 8, 2.0, 0.3
 LITTLE = 0.97  # Least factor on the jerk cost by an attempt after which another one is worth its time
@@ -465,6 +465,7 @@ def refine_seeds(
     unit: float,
     smooth: float,
     enough: int,
+    patience: float,
 ) -> tuple[int, Found]:
     """Refine movements from seeds one after the other, and return how many were tried, and what was found.
 
@@ -482,7 +483,9 @@ def refine_seeds(
         unit: Unit of jerk costs in unit time.
         smooth: Jerk cost in this unit with which a movement that was polished once is smooth enough.
         enough: Number of free movements after which to stop.
+        patience: Time after which no further refinement begins, [s]; each takes less than a millisecond.
     """
+    end = clock() + patience
     number, vias, dimension = seeds.shape
     work = _work(setting, vias + 3, dimension, obstacles, scene)
     found = Found(seeds.copy(), np.zeros(number, np.int64), np.full(number, np.inf), np.full(number, -1.0))
@@ -494,6 +497,8 @@ def refine_seeds(
     trial = np.empty((vias + 3, dimension))
     free, tried = 0, 0
     for each in range(number):
+        if each and clock() > end:
+            break
         tried += 1
         _copy(seeds[each], offsets[0])
         for aim in (SEED, NARROW):
@@ -501,7 +506,7 @@ def refine_seeds(
             times[0] = _refine(setting, movement, obstacles, scene, aim, unit, work)
             movement = Movement(table, times[0], start, offsets[0], duration)
             apart = _clearance(setting, movement, obstacles, scene, margin, NEARLY)
-            if not NEARLY < apart < margin:
+            if not NEARLY < apart < margin or clock() > end:
                 break
         _copy(offsets[0, :vias], found.vias[each])
         found.times[each] = times[0]
@@ -514,6 +519,8 @@ def refine_seeds(
         stage, weight = 0, POLISH.jerk
         _, cost = best_times(table, offsets[0], work.gram)
         for _ in range(ATTEMPTS):
+            if clock() > end:
+                break
             _copy(offsets[stage], trial)
             movement = Movement(table, 0, start, trial, duration)
             aim = Aim(POLISH.clearance, weight, POLISH.iterations, POLISH.gain, POLISH.stride)
@@ -521,6 +528,8 @@ def refine_seeds(
             _, less = best_times(table, trial, work.gram)
             movement = Movement(table, other, start, trial, duration)
             if less >= cost or not is_free(setting, movement, obstacles, scene, margin):
+                if stage:
+                    break
                 weight *= LIGHTER
                 continue
             little = less > LITTLE * cost

@@ -251,7 +251,7 @@ def refined_actions(task: Task, problem: Problem, actions: Numbers) -> Numbers:
         fixed = moves.offsets[b, 0, number:].copy()
         _, better = refine_seeds(
             setting, table, fine, start, fixed, seeds, moves.duration[b, 0], problem.obstacles, b, CLEARANCE_MARGIN,
-            unit_of_jerk(line, setting.of_hand), SMOOTH, len(seeds),
+            unit_of_jerk(line, setting.of_hand), SMOOTH, len(seeds), np.inf,
         )  # fmt: skip
         waypoints = np.zeros((len(seeds), number + 2, len(start)))
         waypoints[:, 1:-1] = better.vias
