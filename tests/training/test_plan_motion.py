@@ -25,7 +25,7 @@ from viapoint.envs import (
     obstacles_to_json,
 )
 from viapoint.envs.arms.kinematics import torques
-from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.geometry.obstacles import pack, unpack
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training import UnsafePlanError, plan_motion, plan_motions, read_motion, write_motion
 from viapoint.training.cli.entry import main
@@ -35,7 +35,13 @@ from viapoint.training.planning import plan_motion as module
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems, read_problems
 from viapoint.training.planning.motion_plan import execute_plans
-from viapoint.training.planning.movements import OUTSIDE, Movement, arm_setting, movement_table
+from viapoint.training.planning.movements import (
+    OUTSIDE,
+    Movement,
+    arm_setting,
+    fine_table,
+    movement_table,
+)
 from viapoint.training.planning.ompl_paths import points_on
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
@@ -201,6 +207,33 @@ def objective(setting, table, row, start, offsets, scene, aim, gradient):
     return refine._assemble(setting, movement, scene, 0, aim, 360.0, np.inf, hessian, gradient, work)[0]
 
 
+def test_nothing_is_refined_further_after_the_time_limit() -> None:
+    line = GOAL - PANDA.home
+    fixed = np.concatenate((line[None], np.zeros((2, 7))))
+    seeds = np.tile(np.linspace(0.0, line, 4)[1:-1], (4, 1, 1))
+    given = (
+        arm_setting(PANDA, False, pack([[POST]])), movement_table(2), fine_table(2), PANDA.home, fixed, seeds, 2.0,
+        pack([[POST]]), 0, 0.001, refine.unit_of_jerk(line, False), 1.0, 4,
+    )  # fmt: skip
+    tried, found = refine.refine_seeds(*given, np.inf)
+    few, first = refine.refine_seeds(*given, 0.0)
+    assert (tried, few) == (4, 1)
+    assert found.cost[0] < first.cost[0] < np.inf  # it is free, and not polished
+
+
+def test_parts_of_the_arm_that_nothing_comes_near_change_no_plan(monkeypatch) -> None:
+    task, starts, goals, obstacles = drawn(8, arm="planar")
+    # A bar at the height of the links, which pass above the others
+    high = Box((0.03, 0.03, 0.02), position=(0.0, 0.15, 0.15))
+    scenes = [pack([[*unpack(each, 0), high]]) for each in obstacles[:4]] + obstacles[4:]
+    given = task.arm, starts, goals, scenes
+    plans = plan_motions(*given, ompl=False)
+    monkeypatch.setattr(module._Problem, "setting_near", lambda problem, near: problem.setting)
+    for plan, other in zip(plans, plan_motions(*given, ompl=False), strict=True):
+        assert np.allclose(plan.waypoints, other.waypoints, atol=1e-4)
+        assert plan.clearance == pytest.approx(other.clearance, abs=1e-5)
+
+
 def test_poses_and_several_goals() -> None:
     pose = Pose(position=(0.45, 0.35, 0.35), quaternion=(0.0, 1.0, 0.0, 0.0))
     plan = plan_motion(PANDA, PANDA.home, pose, [POST])
@@ -271,7 +304,7 @@ def test_results_depend_on_neither_threads_nor_the_form_of_obstacles() -> None:
 def test_gradient_of_the_objective(kwargs) -> None:
     task, starts, goals, obstacles = drawn(5, **kwargs)
     aim = refine.SEED._replace(clearance=0.2)  # many residuals
-    setting, table = arm_setting(task.arm, task.space.of_hand, pack([[]]), near=np.inf), movement_table(2)
+    setting, table = arm_setting(task.arm, task.space.of_hand, pack([[]])), movement_table(2)
     dimension = task.space.dimension
     generator = np.random.default_rng(0)
     gradient, measured = np.empty((2, 2 * dimension))

@@ -131,7 +131,7 @@ def memory_of(setting: Setting, table: MovementTable, dimension: int) -> Memory:
 
 
 def arm_setting(
-    arm: Arm, of_hand: bool, obstacles: Obstacles, *, room: float = 0.0, near: float = NEAR
+    arm: Arm, of_hand: bool, obstacles: Obstacles, *, room: float = 0.0, near: float = np.inf
 ) -> Setting:
     """Return arm and space for compiled functions.
 

@@ -104,7 +104,7 @@ class _Problem(NamedTuple):
     @property
     def setting(self) -> Setting:
         """Arm and space for compiled functions; rounding errors at the joint limits do not count."""
-        return self.setting_near(np.inf)
+        return arm_setting(self.arm, self.space.of_hand, self.obstacles, room=-RANGE_TOLERANCE)
 
     def setting_near(self, near: float) -> Setting:
         """Return the same without spheres of an arm in the plane that are farther from all obstacles, [m]."""

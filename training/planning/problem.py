@@ -22,6 +22,7 @@ from viapoint.training.planning.movements import (
     ELBOW_ROOM,
     FINE_INSTANTS,
     INSTANTS,
+    NEAR,
     Movement,
     MovementTable,
     Setting,
@@ -290,4 +291,5 @@ def setting_of(task: Task, obstacles: Obstacles, *, exact: bool = False) -> Sett
     With `exact`, movements of the hand keep ELBOW_ROOM from the joint ranges, which the executed movement needs.
     """
     of_hand = task.space.of_hand
-    return arm_setting(task.arm, of_hand, obstacles, room=ELBOW_ROOM if exact and of_hand else 0.0)
+    room = ELBOW_ROOM if exact and of_hand else 0.0
+    return arm_setting(task.arm, of_hand, obstacles, room=room, near=NEAR)
