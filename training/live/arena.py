@@ -567,7 +567,9 @@ def _execute_plan(env: ve.ReachVectorEnv, motion: MotionPlan) -> Decision:
     plan, number = motion.plan, env.task.n_via
     if env.task.replanning and len(plan.durations) == 1:
         times = plan.duration * np.linspace(0.0, 1.0, number + 2)
-        plan = plan._replace(waypoints=np.asarray(plan.trajectory()(times)), durations=np.diff(times))
+        points = np.array(plan.trajectory()(times))
+        points[[0, -1]] = plan.waypoints  # without rounding: another goal would be planned for anew
+        plan = plan._replace(waypoints=points, durations=np.diff(times))
     return env.execute_plan(plan.take(np.newaxis))
 
 
