@@ -30,7 +30,7 @@ from viapoint.envs.common.validation import (
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape
-from viapoint.envs.outcome import SETTLING
+from viapoint.envs.outcome import SETTLING, straight_jerk_cost
 from viapoint.envs.plans import Plan, SpaceName
 from viapoint.envs.scenes.options import Pose, as_pose
 from viapoint.envs.spaces import Space, space_of
@@ -50,7 +50,6 @@ from viapoint.training.planning.movements import (
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl, path_around, points_on
 from viapoint.training.planning.refine import (
     SMOOTH,
-    STRAIGHT_COST,
     Found,
     exact_clearance,
     is_free,
@@ -745,8 +744,7 @@ def _known(
     if problem.obstacles.velocity[0].any():
         clearance = min(clearance, _clearance_at_rest(problem, duration))
     cost = np.einsum("ij,id,jd->", table.cost[times], movement.offsets, movement.offsets)
-    line = problem.goal - problem.start
-    straight_cost = STRAIGHT_COST * float(line @ line)
+    straight_cost = float(straight_jerk_cost(np.linalg.norm(problem.goal - problem.start), 1.0))
     jerk = 1.0 if cost == 0.0 else max(float(cost) / straight_cost, 1.0) if straight_cost else np.nan
     reason = fault
     if not reason and clearance == OUTSIDE:

@@ -11,7 +11,7 @@ import numpy as np
 from viapoint.envs.common.arrays import Bool, Float, Single
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.env import ReachEnv
-from viapoint.envs.geometry.compiled import compiled, inner
+from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import Plan
 from viapoint.envs.registration import check_registered
@@ -26,7 +26,6 @@ from viapoint.training.planning.candidates import (
 )
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.movements import (
-    Memory,
     Setting,
     fine_table,
     least_clearance,
@@ -283,22 +282,6 @@ def plan_clearances(
     return np.asarray(_clearances(setting, moves, problem.obstacles, most, least, until))
 
 
-@inner
-def _clearance(
-    setting: Setting,
-    moves: Moves,
-    b: int,
-    h: int,
-    obstacles: Obstacles,
-    most: float,
-    least: float,
-    until: float,
-    memory: Memory,
-) -> float:
-    """Return the clearance of one plan, see :func:`~viapoint.training.planning.movements.least_clearance`."""
-    return least_clearance(setting, movement_of(moves, b, h), obstacles, b, most, least, until, memory)
-
-
 @compiled
 def _clearances(
     setting: Setting, moves: Moves, obstacles: Obstacles, most: float, least: float, until: float
@@ -309,7 +292,8 @@ def _clearances(
     memory = memory_of(setting, moves.table, moves.start.shape[1])
     for b in range(number):
         for h in range(plans):
-            found[b, h] = _clearance(setting, moves, b, h, obstacles, most, least, until, memory)
+            movement = movement_of(moves, b, h)
+            found[b, h] = least_clearance(setting, movement, obstacles, b, most, least, until, memory)
     return found
 
 
@@ -330,7 +314,9 @@ def _merits(
                 if worth[b, h] + gain * high - rank <= best:
                     break
                 floor = CLEARANCE_MARGIN if best > INFEASIBLE else min(deepest, CLEARANCE_MARGIN)
-                clearance = _clearance(setting, moves, b, h, obstacles, high, floor, horizons[rank], memory)
+                clearance = least_clearance(
+                    setting, movement_of(moves, b, h), obstacles, b, high, floor, horizons[rank], memory
+                )
                 if clearance >= CLEARANCE_MARGIN:
                     value = worth[b, h] + gain * clearance - rank
                     best = max(best, value)
