@@ -6,11 +6,9 @@ import time
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
-from llvmlite import ir
+import numpy as np
 from numba import njit, types
-from numba.core import cgutils
 from numba.core.caching import IndexDataCacheFile
-from numba.extending import intrinsic
 
 TINY = 1e-12  # Length below which a vector has no direction, [m]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -62,24 +60,25 @@ def inlined(function: Function) -> Function:
     return cast("Function", njit(inline="always", **KERNEL)(function))
 
 
-@intrinsic
-def clock(context: Any) -> Any:
-    """Return the time of a steady clock, [s], in compiled functions; always 0 on systems without `clock_gettime`."""
+def _no_clock(kind: int, moment: Any) -> int:
+    return 0
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        number, real = ir.IntType(64), ir.DoubleType()
-        if not hasattr(time, "clock_gettime"):
-            return ir.Constant(real, 0.0)
-        moment = cgutils.alloca_once(builder, number, size=2)  # seconds and nanoseconds
-        kind = ir.FunctionType(ir.IntType(32), [ir.IntType(32), number.as_pointer()])
-        read = cgutils.get_or_insert_function(builder.module, kind, "clock_gettime")
-        builder.call(read, [ir.Constant(ir.IntType(32), time.CLOCK_MONOTONIC), moment])
-        seconds = builder.load(moment)
-        nanoseconds = builder.load(builder.gep(moment, [ir.Constant(ir.IntType(32), 1)]))
-        fraction = builder.fmul(builder.sitofp(nanoseconds, real), ir.Constant(real, 1e-9))
-        return builder.fadd(builder.sitofp(seconds, real), fraction)
 
-    return types.float64(), generate
+# The clock of the operating system, where there is one that compiled functions can call: it fills in seconds and
+# nanoseconds.
+_read_clock: Any = njit(cache=True)(_no_clock)
+if hasattr(time, "clock_gettime"):
+    moment_type = types.CPointer(types.int64)  # type: ignore[no-untyped-call]
+    _read_clock = types.ExternalFunction("clock_gettime", types.int32(types.int32, moment_type))
+STEADY = getattr(time, "CLOCK_MONOTONIC", 0)  # Number of the clock that nobody sets
+
+
+@compiled
+def clock() -> float:
+    """Return the time of a steady clock, [s], for differences; always 0 on systems without `clock_gettime`."""
+    moment = np.zeros(2, np.int64)
+    _read_clock(STEADY, moment.ctypes)
+    return float(moment[0] + 1e-9 * moment[1])
 
 
 _read_index: Callable[[Any], Any] = IndexDataCacheFile._load_index

@@ -258,7 +258,9 @@ def test_the_motion_planner_plans_on_where_plans_are_revised(env_id, arenas, mon
         reached += movement.info["is_success"]
         last = found[-1]
         # The last plan in motion is what is followed, to its end.
-        followed += last.success and last.velocity.any() and np.allclose(movement.plan.duration, last.duration)
+        followed += (
+            last.success and last.velocity.any() and np.allclose(movement.plan.duration, last.duration)
+        )
     assert reached >= 7
     assert followed >= 2
 

@@ -118,8 +118,8 @@ class MotionPlan:
     jerk: float
     """Jerk cost relative to that of the straight movement of the same duration; NaN where that does not move."""
     source: str
-    """Origin of the via-points: `straight`, `straight, refined`, `given`, `random`, `ompl`, or another planner; `refused`
-    where there is no movement."""
+    """Origin of the via-points: `straight`, `straight, refined`, `given`, `random`, `ompl`, or another planner;
+    `refused` where there is no movement."""
     reason: str = ""
     """Reason why there is no better plan; empty for success."""
     seeds: int = 0

@@ -212,7 +212,8 @@ def _unit_movements(durations: Float, number_of_instants: int) -> tuple[Float, F
     """Return `basis`, `rate`, `bend` and `cost` of a table, see :class:`MovementTable`.
 
     It is the movement of :func:`viapoint.primitives.through` for each unit offset, unit velocity and unit acceleration.
-    That function needs a millisecond for one table; this one is 100 times as fast, which a single search notices.
+    That function needs 0.4 ms for one table; this one is 50 times as fast. Without it, decisions of a search take a
+    quarter longer in the plane, and twice as long where each candidate has passage times of its own.
     """
     number, segments = durations.shape
     columns = segments + 2

@@ -107,9 +107,7 @@ class _Problem(NamedTuple):
 
     def setting_near(self, near: float) -> Setting:
         """Return the same without spheres of an arm in the plane that are farther from all obstacles, [m]."""
-        return arm_setting(
-            self.arm, self.space.of_hand, self.obstacles, room=-RANGE_TOLERANCE, near=near
-        )
+        return arm_setting(self.arm, self.space.of_hand, self.obstacles, room=-RANGE_TOLERANCE, near=near)
 
     @property
     def in_motion(self) -> bool:
@@ -596,9 +594,7 @@ def _search(
                 spread = 0.0 if rank == 0 else near if rank < NARROW else far
                 seeds[k] = straight + spread * away
         wanted = max(enough - free, 1)
-        done, found = _refined(
-            problem, setting, kept, table, fine, seeds, duration, until, enough=wanted
-        )
+        done, found = _refined(problem, setting, kept, table, fine, seeds, duration, until, enough=wanted)
         for k in range(done):
             clearance = float(found.clearance[k])
             movement = problem.movement(found.vias[k], fine, int(found.times[k]), duration)
@@ -670,9 +666,7 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
         table = table_with(durations)
         fine = table_with(durations, FINE_INSTANTS)
         vias = points[None, 1:-1] - problem.start
-        _, found = _refined(
-            problem, problem.setting, kept, table, fine, vias, duration, until, smooth=0.0
-        )
+        _, found = _refined(problem, problem.setting, kept, table, fine, vias, duration, until, smooth=0.0)
         clearance = float(found.clearance[0])
         if clearance >= kept:
             movement = problem.movement(found.vias[0], fine, 0, duration)
@@ -744,7 +738,7 @@ def _known(
     if problem.obstacles.velocity[0].any():
         clearance = min(clearance, _clearance_at_rest(problem, duration))
     cost = np.einsum("ij,id,jd->", table.cost[times], movement.offsets, movement.offsets)
-    straight_cost = float(straight_jerk_cost(np.linalg.norm(problem.goal - problem.start), 1.0))
+    straight_cost = float(straight_jerk_cost(float(np.linalg.norm(problem.goal - problem.start)), 1.0))
     jerk = 1.0 if cost == 0.0 else max(float(cost) / straight_cost, 1.0) if straight_cost else np.nan
     reason = fault
     if not reason and clearance == OUTSIDE:

@@ -98,13 +98,9 @@ class Problem(NamedTuple):
 
     def take(self, rows: Any) -> Problem:
         """Return some of the problems, by indices, mask or slice."""
-        parts: list[Any] = []
-        for part in self:
-            if isinstance(part, Obstacles):
-                parts.append(part.take(rows))
-            else:
-                parts.append(None if part is None else part[rows])
-        return Problem(*parts)
+        given = {name: part for name, part in self._asdict().items() if part is not None}
+        obstacles = given.pop("obstacles").take(rows)
+        return self._replace(obstacles=obstacles, **{name: part[rows] for name, part in given.items()})
 
 
 class Moves(NamedTuple):

@@ -17,6 +17,7 @@ from viapoint.envs.plans import Plan
 from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.scenes.options import draw_given
+from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.planning.candidates import (
     MOST_CANDIDATES,
@@ -175,10 +176,15 @@ class GeometrySearch:
             ValueError: An argument is not allowed, an end is out of reach or touches an obstacle.
         """
         given = {"start": start, "goal": goal, "obstacles": obstacles}
-        scenes = draw_given(given, self.task.sampler(), [np.random.default_rng(0)])
-        problem = Problem.of_scenes(scenes, self.task)
-        plan = self.task.action.decode(self.solve(problem), problem.start, problem.goal).take(0)
-        return checked_motion(self.task.arm, self.task.space_name, plan, problem.obstacles, self.name)
+        return self.plan_scene(draw_given(given, self.task.sampler(), [np.random.default_rng(0)]))
+
+    def plan_scene(self, scene: Scenes, *, shortest: bool = False) -> MotionPlan:
+        """Return the best plan of one scene, with `shortest` in the shortest duration that the limits allow."""
+        task, problem = self.task, Problem.of_scenes(scene, self.task)
+        plan = task.action.decode(self.solve(problem), problem.start, problem.goal).take(0)
+        return checked_motion(
+            task.arm, task.space_name, plan, problem.obstacles, self.name, shortest=shortest
+        )
 
 
 def best_of(task: Task, problem: Problem, actions: Numbers, merit: Numbers) -> Numbers:
