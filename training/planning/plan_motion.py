@@ -100,13 +100,8 @@ class _Problem(NamedTuple):
     enough: int = 1  # Number of free movements
     generator: Any = None  # Random generator of the seeds
 
-    @property
-    def setting(self) -> Setting:
-        """Arm and space for compiled functions; rounding errors at the joint limits do not count."""
-        return arm_setting(self.arm, self.space.of_hand, self.obstacles, room=-RANGE_TOLERANCE)
-
-    def setting_near(self, near: float) -> Setting:
-        """Return the same without spheres of an arm in the plane that are farther from all obstacles, [m]."""
+    def setting(self, near: float = np.inf) -> Setting:
+        """Return arm and space; in the plane without spheres that are farther than `near` from all obstacles, [m]."""
         return arm_setting(self.arm, self.space.of_hand, self.obstacles, room=-RANGE_TOLERANCE, near=near)
 
     @property
@@ -398,10 +393,10 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     still = np.zeros_like(start)
     problem = _Problem(arm, space, start, still, still, start + 0.01, pack([[]]))
     straight = _straight(problem)
-    is_free(problem.setting, straight, problem.obstacles, 0, 0.0)
+    is_free(problem.setting(), straight, problem.obstacles, 0, 0.0)
     _known(problem, straight, "straight", 0.0, _fault(problem)[0])
     seeds = np.zeros((0, n_via, len(start)))
-    _refined(problem, problem.setting, 0.0, movement_table(n_via), fine_table(n_via), seeds, 1.0, np.inf)
+    _refined(problem, problem.setting(), 0.0, movement_table(n_via), fine_table(n_via), seeds, 1.0, np.inf)
 
 
 def _goals(problem: _Problem, goal: Any) -> Float:
@@ -422,7 +417,7 @@ def _goals(problem: _Problem, goal: Any) -> Float:
     if problem.arm.continuous and not problem.space.of_hand:
         # The equivalent position within the range that is nearest to the start.
         endless = np.isin(problem.arm.joint_names, problem.arm.continuous)
-        low, high = problem.setting.joint_range.T
+        low, high = problem.setting().joint_range.T
         turns = np.round((goals - problem.start) / TURN)
         turns = np.clip(turns, np.ceil((goals - high) / TURN), np.floor((goals - low) / TURN))
         goals = goals - TURN * np.where(endless, turns, 0.0)
@@ -516,7 +511,7 @@ def _plan(problem: _Problem, number: int, until: float, ompl: bool) -> MotionPla
     fault, kept = _fault(problem)
     straight = _straight(problem)
     coarse = straight._replace(table=movement_table(0))
-    if fault or is_free(problem.setting, coarse, problem.obstacles, 0, kept):
+    if fault or is_free(problem.setting(), coarse, problem.obstacles, 0, kept):
         plan = _known(problem, straight, "straight", problem.least, fault)
         if plan.success or fault or problem.duration is not None:
             return plan
@@ -570,7 +565,7 @@ def _search(
     unit = unit_of_jerk(way, problem.space.of_hand)
     near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
     table, fine = movement_table(n_via), fine_table(n_via)
-    setting = problem.setting_near(kept + NEAR)  # clearances below NEAR are right
+    setting = problem.setting(kept + NEAR)  # clearances below NEAR are right
     best, least = None, np.inf
     tight, widest = None, problem.margin  # the best of those that keep the margin and nothing more
     tried = free = since = 0
@@ -666,7 +661,7 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
         table = table_with(durations)
         fine = table_with(durations, FINE_INSTANTS)
         vias = points[None, 1:-1] - problem.start
-        _, found = _refined(problem, problem.setting, kept, table, fine, vias, duration, until, smooth=0.0)
+        _, found = _refined(problem, problem.setting(), kept, table, fine, vias, duration, until, smooth=0.0)
         clearance = float(found.clearance[0])
         if clearance >= kept:
             movement = problem.movement(found.vias[0], fine, 0, duration)
@@ -717,7 +712,7 @@ def _clearance_at_rest(problem: _Problem, end: float) -> float:
     obstacles = problem.obstacles
     later = obstacles._replace(centre=obstacles.centre + end * obstacles.velocity)
     rest = Movement(fine_table(0), 0, problem.goal, np.zeros((3, len(problem.goal))), SETTLING)
-    return exact_clearance(problem.setting, rest, later, 0, problem.margin)
+    return exact_clearance(problem.setting(), rest, later, 0, problem.margin)
 
 
 def _known(
@@ -734,7 +729,7 @@ def _known(
     vias = offsets[:-3]
     movement = problem.movement(vias, table, times, duration)
     if clearance is None or clearance >= NEAR:
-        clearance = exact_clearance(problem.setting, movement, problem.obstacles, 0, problem.margin)
+        clearance = exact_clearance(problem.setting(), movement, problem.obstacles, 0, problem.margin)
     if problem.obstacles.velocity[0].any():
         clearance = min(clearance, _clearance_at_rest(problem, duration))
     cost = np.einsum("ij,id,jd->", table.cost[times], movement.offsets, movement.offsets)
