@@ -53,10 +53,15 @@ class Decision(NamedTuple):
 
 
 class Episodes:
-    """Running episodes of n environments of a task."""
+    """Running episodes of n environments of a task.
 
-    def __init__(self, task: Task, number: int) -> None:
+    Plans that begin in motion are prolonged where the limits of the arm need it, or executed as they are if not
+    `prolong`.
+    """
+
+    def __init__(self, task: Task, number: int, *, prolong: bool = True) -> None:
         self.task = task
+        self._prolong = prolong
         meshes = [name for name in task.shapes if name not in KINDS]
         self.simulator = Simulator(
             task.arm, n_obstacles=task.observation.n_rows, num_envs=number, meshes=meshes
@@ -272,12 +277,12 @@ class Episodes:
         needed, inside = self._look_at(movements)
         stretch = np.maximum(needed, 1.0)
         moving = ((plan.velocity != 0.0) | (plan.acceleration != 0.0)).any(axis=-1)
-        stretch[moving] = np.minimum(stretch[moving], MOST_PROLONGED)
+        stretch[moving] = np.minimum(stretch[moving], MOST_PROLONGED if self._prolong else 1.0)
         scale = stretch[:, None]
         slower = plan._replace(durations=plan.durations * scale)
         shape, starts, rates, end = movements
         movements = Movements(shape, starts * scale, rates / scale, end * scale)
-        rows = changed = np.flatnonzero(moving & (needed > ENOUGH))
+        rows = changed = np.flatnonzero(moving & (needed > ENOUGH) & self._prolong)
         for _ in range(PROLONGED):
             if not rows.size:
                 break

@@ -146,9 +146,9 @@ class EpisodeState(NamedTuple):
         )
 
 
-def straight_jerk_cost(length: Float, duration: Float | float) -> Float:
+def straight_jerk_cost(length: Float | float, duration: Float | float) -> Float:
     """Return the jerk cost of straight minimum-jerk movements from rest to rest, [m^2/s^5] or [rad^2/s^5].
 
     Half the integral of the squared jerk is 360 A^2 / T^5 for length A and duration T.
     """
-    return 360.0 * length**2 / duration**5
+    return np.asarray(360.0 * length**2 / duration**5)

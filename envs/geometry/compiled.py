@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
-from numba import njit
+import numpy as np
+from numba import njit, types
 from numba.core.caching import IndexDataCacheFile
 
 TINY = 1e-12  # Length below which a vector has no direction, [m]
@@ -56,6 +58,27 @@ def inlined(function: Function) -> Function:
     A call with packed obstacles passes 150 numbers, which takes longer than a distance.
     """
     return cast("Function", njit(inline="always", **KERNEL)(function))
+
+
+def _no_clock(kind: int, moment: Any) -> int:
+    return 0
+
+
+# The clock of the operating system, where there is one that compiled functions can call: it fills in seconds and
+# nanoseconds.
+_read_clock: Any = njit(cache=True)(_no_clock)
+if hasattr(time, "clock_gettime"):
+    moment_type = types.CPointer(types.int64)  # type: ignore[no-untyped-call]
+    _read_clock = types.ExternalFunction("clock_gettime", types.int32(types.int32, moment_type))
+STEADY = getattr(time, "CLOCK_MONOTONIC", 0)  # Number of the clock that nobody sets
+
+
+@compiled
+def clock() -> float:
+    """Return the time of a steady clock, [s], for differences; always 0 on systems without `clock_gettime`."""
+    moment = np.zeros(2, np.int64)
+    _read_clock(STEADY, moment.ctypes)
+    return float(moment[0] + 1e-9 * moment[1])
 
 
 _read_index: Callable[[Any], Any] = IndexDataCacheFile._load_index

@@ -209,7 +209,7 @@ def as_pose(label: str, value: Any) -> Pose:
     """Return a pose from itself or a dictionary, of which an error tells the label."""
     if isinstance(value, Pose):
         return value
-    if "position" not in value or not set(value) <= set(Pose._fields):
+    if not isinstance(value, Mapping) or "position" not in value or not set(value) <= set(Pose._fields):
         raise ValueError(f"{label} must have a position, and may have a quaternion, got {value!r:.80}")
     return Pose(**value)
 

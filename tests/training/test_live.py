@@ -20,6 +20,7 @@ from viapoint.envs import ENV_IDS
 from viapoint.training import LivePage, ViaQ, ViaVecEnv
 from viapoint.training.agents.agent import SAC
 from viapoint.training.configs import LiveConfig
+from viapoint.training.live import arena as live_arena
 from viapoint.training.live import drawing, page
 from viapoint.training.live.arena import (
     AGENT,
@@ -38,6 +39,7 @@ from viapoint.training.live.arena import (
     profile,
     propose,
 )
+from viapoint.training.planning.plan_motion import plan_motion
 
 
 @pytest.fixture(scope="module")
@@ -236,6 +238,31 @@ def test_a_method_is_rewarded_as_in_the_environment(env_id):
             reward += float(rewards[0])
             ended = bool(terminated[0] or truncated[0])
         assert movement.reward == pytest.approx(reward, abs=1e-6)
+
+
+@pytest.mark.parametrize("env_id", [MOVING, JUMPS])
+def test_the_motion_planner_plans_on_where_plans_are_revised(env_id, arenas, monkeypatch):
+    found = []
+
+    def recorded(*args, **kwargs):
+        found.append(plan_motion(*args, **kwargs))
+        return found[-1]
+
+    monkeypatch.setattr(live_arena, "plan_motion", recorded)
+    arena = arenas(env_id)
+    reached, followed = 0, 0
+    for number in range(8):
+        scene = drawn(arena, number)
+        assert MOTION in arena.methods
+        *_, movement = execute(arena, decided(arena, scene, MOTION))
+        reached += movement.info["is_success"]
+        last = found[-1]
+        # The last plan in motion is what is followed, to its end.
+        followed += (
+            last.success and last.velocity.any() and np.allclose(movement.plan.duration, last.duration)
+        )
+    assert reached >= 7
+    assert followed >= 2
 
 
 def test_a_dragged_goal_jumps_no_more(arenas):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import sys
 
 import numpy as np
@@ -24,7 +25,7 @@ from viapoint.envs import (
     obstacles_to_json,
 )
 from viapoint.envs.arms.kinematics import torques
-from viapoint.envs.geometry.obstacles import pack
+from viapoint.envs.geometry.obstacles import pack, unpack
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training import UnsafePlanError, plan_motion, plan_motions, read_motion, write_motion
 from viapoint.training.cli.entry import main
@@ -34,7 +35,13 @@ from viapoint.training.planning import plan_motion as module
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems, read_problems
 from viapoint.training.planning.motion_plan import execute_plans
-from viapoint.training.planning.movements import OUTSIDE, Movement, movement_table
+from viapoint.training.planning.movements import (
+    OUTSIDE,
+    Movement,
+    arm_setting,
+    fine_table,
+    movement_table,
+)
 from viapoint.training.planning.ompl_paths import points_on
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
@@ -44,6 +51,8 @@ PANDA = arm_of("panda")
 GOAL = PANDA.home + np.array([0.8, 0.5, 0.0, 0.6, 0.0, 0.3, 0.0])
 POST = Box((0.05, 0.05, 0.4), position=(0.5, 0.15, 0.4))
 """Obstacle in the way from home to GOAL."""
+BAR = Box((0.01, 0.05, 0.04), position=(-0.05, 0.35, 0.0))
+"""Obstacle in the way of the hand of the arm in the plane."""
 WALL = [Box((0.02, 2.0, 2.0), position=(0.45, 0.2, 0.0), quaternion=(0.924, 0.0, 0.0, 0.383))]
 """Obstacle that nothing leads around; the goal is inside it."""
 
@@ -154,6 +163,35 @@ def test_movements_in_motion_begin_as_given_and_are_as_clear_as_they_say() -> No
     assert plan.clearance == pytest.approx(least, abs=1e-3)
 
 
+@pytest.mark.parametrize("name", ["panda", "planar"])
+def test_movements_that_begin_in_motion_are_executed_as_planned(name: str) -> None:
+    ends, bar = ((PANDA.home, GOAL), POST) if name == "panda" else (((-0.2, 0.3), (0.1, 0.4)), BAR)
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        velocity, acceleration = rng.uniform(-0.3, 0.3, (2, len(ends[0])))
+        given = {"velocity": velocity, "acceleration": acceleration, "ompl": False}
+        plan = plan_motion(name, *ends, [bar], **given)
+        done = plan.execute()
+        assert plan.success
+        assert done.is_success[0]
+        assert done.stretch[0] == 1.0
+        assert done.tracking_error[0] < 1e-3
+        assert done.planned_clearance[0] == pytest.approx(plan.clearance, abs=1e-3)
+        blocked = plan_motion(name, *ends, [bar], **given, time_limit=0.0)
+        assert blocked.success or blocked.execute(force=True).collision[0]
+
+
+def test_movements_in_motion_use_all_of_their_limits_and_nothing_more() -> None:
+    # From rest, limits are kept by slowing down; in motion, that would be another movement.
+    fast = 0.99 * PANDA.velocity_limit[0] * np.eye(7)[0]
+    goal = PANDA.home + 1.2 * np.eye(7)[0]
+    for share in (1.0, 1.05):
+        plan = plan_motion(PANDA, PANDA.home, goal, velocity=share * fast, duration=1.0)
+        done = plan.execute(force=True)
+        assert plan.success == done.is_success[0] == (share == 1.0)
+        assert done.duration[0] == pytest.approx(plan.duration)
+
+
 def test_a_plan_that_leaves_the_joint_limits_has_no_success() -> None:
     beyond = np.stack((PANDA.home, PANDA.joint_range[:, 1] + 0.1, GOAL))
     plan = Plan.at_rest(beyond, np.array([2.0, 2.0]))
@@ -167,6 +205,35 @@ def objective(setting, table, row, start, offsets, scene, aim, gradient):
     movement = Movement(table, row, np.ascontiguousarray(start), offsets, 1.0)
     hessian = np.empty((len(gradient), len(gradient)))
     return refine._assemble(setting, movement, scene, 0, aim, 360.0, np.inf, hessian, gradient, work)[0]
+
+
+def test_nothing_is_refined_further_after_the_time_limit() -> None:
+    line = GOAL - PANDA.home
+    fixed = np.concatenate((line[None], np.zeros((2, 7))))
+    seeds = np.tile(np.linspace(0.0, line, 4)[1:-1], (4, 1, 1))
+    bounds = np.full((2, 2, 7), [[[-np.inf]], [[np.inf]]])
+    given = (
+        arm_setting(PANDA, False, pack([[POST]])), movement_table(2), fine_table(2), PANDA.home, fixed, seeds, bounds,
+        2.0, pack([[POST]]), 0, 0.001, refine.unit_of_jerk(line, False), 1.0, 4,
+    )  # fmt: skip
+    tried, found = refine.refine_seeds(*given, np.inf)
+    few, first = refine.refine_seeds(*given, 0.0)
+    assert (tried, few) == (4, 1)
+    assert found.cost[0] < first.cost[0] < np.inf  # it is free, and not polished
+
+
+def test_parts_of_the_arm_that_nothing_comes_near_change_no_plan(monkeypatch) -> None:
+    task, starts, goals, obstacles = drawn(8, arm="planar")
+    # A bar at the height of the links, which pass above the others
+    high = Box((0.03, 0.03, 0.02), position=(0.0, 0.15, 0.15))
+    scenes = [pack([[*unpack(each, 0), high]]) for each in obstacles[:4]] + obstacles[4:]
+    given = task.arm, starts, goals, scenes
+    plans = plan_motions(*given, ompl=False)
+    whole = module._Problem.setting
+    monkeypatch.setattr(module._Problem, "setting", lambda problem, near=0.0: whole(problem))
+    for plan, other in zip(plans, plan_motions(*given, ompl=False), strict=True):
+        assert np.allclose(plan.waypoints, other.waypoints, atol=1e-4)
+        assert plan.clearance == pytest.approx(other.clearance, abs=1e-5)
 
 
 def test_poses_and_several_goals() -> None:
@@ -238,8 +305,8 @@ def test_results_depend_on_neither_threads_nor_the_form_of_obstacles() -> None:
 def test_within_bounds_no_allowed_direction_is_better() -> None:
     """Where refinement ends, the gradient vanishes, or points out of the bounds (Karush-Kuhn-Tucker)."""
     table, scene = movement_table(2), pack([[]])
-    setting = module._setting(PANDA, False)
-    aim = refine.Aim(clearance=0.0, jerk=1.0, iterations=60, gain=0.0, stride=2)
+    setting = arm_setting(PANDA, False, scene)
+    aim = refine.Aim(clearance=0.0, jerk=1.0, gain=0.0)
     generator = np.random.default_rng(0)
     line = GOAL - PANDA.home
     gradient = np.empty(14)
@@ -262,7 +329,7 @@ def test_within_bounds_no_allowed_direction_is_better() -> None:
 def test_gradient_of_the_objective(kwargs) -> None:
     task, starts, goals, obstacles = drawn(5, **kwargs)
     aim = refine.SEED._replace(clearance=0.2)  # many residuals
-    setting, table = module._setting(task.arm, task.space.of_hand), movement_table(2)
+    setting, table = arm_setting(task.arm, task.space.of_hand, pack([[]])), movement_table(2)
     dimension = task.space.dimension
     generator = np.random.default_rng(0)
     gradient, measured = np.empty((2, 2 * dimension))
@@ -284,14 +351,45 @@ def test_gradient_of_the_objective(kwargs) -> None:
         assert np.abs(computed - measured).max() < 0.03 * np.abs(measured).max()
 
 
-def test_a_batch_goes_on_after_problems_that_are_refused() -> None:
-    starts = [PANDA.home, PANDA.home[:6], PANDA.home * np.nan, PANDA.home, PANDA.home]
-    goals = [Pose((2.0, 0.0, 0.5)), *[GOAL] * 4]
-    plans = plan_motions(PANDA, starts, goals, [[], [], [], [{"shape": "blob"}], []])
-    assert [plan.success for plan in plans] == [False] * 4 + [True]
-    for number, word in enumerate(("reached", "shape (7,)", "finite", "blob")):
-        assert plans[number].reason.startswith(f"problem {number}: ")
-        assert word in plans[number].reason
+REFUSED = [
+    ({"goal": Pose((2.0, 0.0, 0.5))}, "cannot be reached"),
+    ({"start": PANDA.home[:6]}, r"shape \(7,\)"),
+    ({"start": PANDA.home * np.nan}, "finite"),
+    ({"start": None}, "real numbers"),
+    ({"goal": "home"}, "real numbers"),
+    ({"goal": {"place": (0.5, 0.2, 0.4)}}, "position"),
+    ({"goal": [Pose((0.5, 0.2, 0.4)), None]}, "position"),
+    ({"obstacles": [{"shape": "blob"}]}, "blob"),
+    ({"obstacles": 5}, "obstacles must be"),
+]
+UNSOLVED = [
+    ({"obstacles": [Sphere(0.1, position=PANDA.hand(GOAL))]}, "goal is in contact"),
+    ({"goal": GOAL + 9.0 * np.eye(7)[2]}, "outside the limits"),
+    ({"obstacles": WALL}, "in contact"),
+]
+
+
+def test_a_batch_goes_on_after_problems_that_are_refused(tmp_path) -> None:
+    problems = [changes for changes, _ in (*REFUSED, *UNSOLVED)] + [{}]
+    given = [{"start": PANDA.home, "goal": GOAL, "obstacles": [], **changes} for changes in problems]
+    parts = ([each[name] for each in given] for name in ("start", "goal", "obstacles"))
+    plans = plan_motions(PANDA, *parts)
+    assert [plan.success for plan in plans] == [False] * (len(plans) - 1) + [True]
+    for number, (_, reason) in enumerate((*REFUSED, *UNSOLVED)):
+        assert re.match(f"problem {number}: .*{reason}", plans[number].reason)
+        assert (plans[number].source == "refused") == (number < len(REFUSED))
+    refused = plans[0]
+    assert "cannot be reached" in repr(refused)
+    uses = (
+        lambda: refused.joints(force=True),
+        lambda: refused.execute(force=True),
+        lambda: write_motion(refused, tmp_path / "plan.csv", force=True),
+        lambda: execute_plans(plans),
+        refused.trajectory,
+    )
+    for use in uses:
+        with pytest.raises(UnsafePlanError, match="no movement"):
+            use()
     assert plan_motion(PANDA, PANDA.home, [Pose((2.0, 0.0, 0.5)), Pose((0.5, 0.2, 0.4))]).success
 
 

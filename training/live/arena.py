@@ -20,6 +20,7 @@ import numpy as np
 import viapoint.envs as ve
 from viapoint.envs.arms.kinematics import forward
 from viapoint.envs.common.arrays import Float, Observation, norm
+from viapoint.envs.episodes import Decision
 from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.envs.geometry.obstacles import pack, quaternions_of, unpack
 from viapoint.envs.geometry.shapes import KINDS, PLAIN_KINDS
@@ -33,7 +34,13 @@ from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.plan_motion import SEEDS, checked_motion, ompl_motion, plan_motion
 from viapoint.training.planning.problem import Problem
-from viapoint.training.planning.search import GeometrySearch, merits, registered_task
+from viapoint.training.planning.search import (
+    CLEARANCE_MARGIN,
+    GeometrySearch,
+    merits,
+    plan_clearances,
+    registered_task,
+)
 from viapoint.training.rollout import whole_task
 from viapoint.training.scene_sets import shipped_set
 
@@ -56,6 +63,7 @@ N_PROPOSALS = 5  # Proposals that are shown
 N_CANDIDATES = 256  # Best candidates among which distinct proposals are looked for
 APART = 0.03  # Distance by which the paths of two proposals differ somewhere, [m]
 N_CHECKS, REFINEMENTS = 512, 3  # Candidates of the geometry search, and rounds around the best
+SAME_GOAL = 1e-9  # Rounding error of a goal, in a coordinate
 NEXT_START = 0.02  # Least way to a goal that begins a new movement, in a coordinate
 
 Shapes = Iterable[ve.Shape]
@@ -185,10 +193,9 @@ class Arena:
         self.stepwise = self.env("own").task.stepwise  # True if the agent acts in every control step
         self.planar = self.task.arm.space == "hand"  # True if the arm moves in a horizontal plane
         self._sampler = self.task.sampler()
-        planner = () if revising else (MOTION,)
         own_agent = () if agent is None else (AGENT,)
+        first = (*own_agent, MOTION) if agent_first or revising else (MOTION, *own_agent)
         library = () if revising or importlib.util.find_spec("ompl") is None else (OMPL,)
-        first = (*own_agent, *planner) if agent_first else (*planner, *own_agent)
         self.methods = (*first, SEARCH, STRAIGHT, *library)  # the first one is the default
 
     def env(self, name: str) -> ve.ReachVectorEnv:
@@ -385,7 +392,7 @@ def decide(arena: Arena, state: State, time_limit: float = TIME_LIMIT) -> Propos
 
 def n_via(arena: Arena, state: State) -> int:
     """Return the number of via-points that the user wants, or that the method has by default."""
-    usual = 2 if state.method == MOTION else arena.task.n_via
+    usual = 2 if state.method == MOTION and not arena.task.replanning else arena.task.n_via
     return usual if state.n_via is None else state.n_via
 
 
@@ -510,7 +517,7 @@ def execute(arena: Arena, state: State) -> Iterator[Movement]:
         name, _, decide_ = _chooser(arena, state)
         env = arena.env(name)
         begin_episode(env, scene)
-        decision = env.execute_plan(state.plan.plan.take(np.newaxis))
+        decision = _execute_plan(env, state.plan)
     while True:
         rollout, scenes, plans = env.last_rollout[0], env.scenes, env.last_plan
         assert scenes is not None
@@ -518,17 +525,57 @@ def execute(arena: Arena, state: State) -> Iterator[Movement]:
         info = {name: value[0] for name, value in decision.info.items()}
         yield Movement(rollout, scenes, None if plans is None else plans.take(0), info, reward)
         moved = not np.array_equal(state.scene.goal, goal)
-        observation, goal = decision.observation, state.scene.goal
+        observation, goal, now = decision.observation, state.scene.goal, rollout.time[-1:]
         if decision.terminated[0] or decision.truncated[0]:
             here = env.task.space.coordinates(rollout.joints[-1])
             if not moved or not info["is_success"] or np.abs(here - goal).max() < NEXT_START:
                 return
-            now = scenes.obstacles_at(rollout.time[-1:])
-            scene = Scene(here, goal, tuple(unpack(now._replace(velocity=0.0 * now.velocity), 0)))
-            observation = begin_episode(env, scene)
+            left = scenes.obstacles_at(now)
+            scene = Scene(here, goal, tuple(unpack(left._replace(velocity=0.0 * left.velocity), 0)))
+            observation, now = begin_episode(env, scene), np.zeros(1)
         elif moved:
             observation = env.move_goals(goal[None])
-        decision = env.execute_actions(decide_(observation))
+        if state.method == MOTION:
+            decision = _plan_on(env, observation, now, decide_)
+        else:
+            decision = env.execute_actions(decide_(observation))
+
+
+def _plan_on(
+    env: ve.ReachVectorEnv, observation: Observation, time: Float, search: Callable[[Observation], Float]
+) -> Decision:
+    """Execute a decision of the motion planner at a time, shape (1,), [s].
+
+    The present plan stays while it is clear and its goal the present one. Where no other plan is found, the search
+    decides.
+    """
+    task, scenes = env.task, env.scenes
+    assert scenes is not None
+    problem = Problem.of_observation(observation, task)._replace(obstacles=scenes.obstacles_at(time))
+    goal = task.space.coordinates(scenes.goals(time))[0]
+    if task.replanning and env.last_plan is not None:
+        keep = np.zeros((1, task.action.size))
+        clear = plan_clearances(task, problem, keep[None], CLEARANCE_MARGIN, CLEARANCE_MARGIN)[0, 0]
+        same = np.abs(env.last_plan.waypoints[0, -1] - goal).max() < SAME_GOAL
+        if same and clear >= CLEARANCE_MARGIN:
+            return env.execute_actions(keep)
+    motion = plan_motion(
+        task.arm, problem.start[0], goal, problem.obstacles, n_via=int(np.clip(task.n_via, 1, 3)),
+        velocity=problem.velocity[0], acceleration=problem.acceleration[0], time_limit=TIME_LIMIT,
+        space=task.space_name, ompl=False,
+    )  # fmt: skip
+    return _execute_plan(env, motion) if motion.success else env.execute_actions(search(observation))
+
+
+def _execute_plan(env: ve.ReachVectorEnv, motion: MotionPlan) -> Decision:
+    """Execute a plan; a straight one passes the via-points that plans under revision have at even times."""
+    plan, number = motion.plan, env.task.n_via
+    if env.task.replanning and len(plan.durations) == 1:
+        times = plan.duration * np.linspace(0.0, 1.0, number + 2)
+        points = np.array(plan.trajectory()(times))
+        points[[0, -1]] = plan.waypoints  # without rounding: another goal would be planned for anew
+        plan = plan._replace(waypoints=points, durations=np.diff(times))
+    return env.execute_plan(plan.take(np.newaxis))
 
 
 def begin_episode(env: ve.ReachVectorEnv, scene: Scene) -> Observation:

@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 
 from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.common.arrays import Bool, Float, Single
-from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles, pack, quaternions_of
 from viapoint.envs.geometry.shapes import Box, PointCloud, Shape
 from viapoint.envs.scenes.scene import Scenes
@@ -165,8 +164,8 @@ def thick_points(task: Task, sight: Sight, depth: float | None = None) -> Obstac
         numbers = (cubes[:, 0] * CUBES + cubes[:, 1]) * CUBES + cubes[:, 2]
         _, first = np.unique(numbers, return_index=True)
         points = points[first]
-        outside = _outside(points, sight.free[b], sight.free_radius + POINT_RADIUS + END_CLEARANCE)
-        points = points[outside]
+        away = ((points[:, None] - sight.free[b]) ** 2).sum(axis=-1)
+        points = points[(away >= (sight.free_radius + POINT_RADIUS + END_CLEARANCE) ** 2).all(axis=-1)]
         scenes.append([PointCloud(points, radius=POINT_RADIUS)] if len(points) else [])
     return pack(scenes, rows=1)
 
@@ -213,18 +212,3 @@ def _box_around(points: Float, origin: Float, deepest: float) -> Box:
     axes = axes * sign
     place = middle + sign * axes @ (0.5 * (high + low))
     return Box(half, position=place, quaternion=quaternions_of(axes))
-
-
-@compiled
-def _outside(points: Float, centre: Float, radius: Float) -> Bool:
-    """Return True for points that are outside all spheres, shape (K,)."""
-    found = np.ones(len(points), np.bool_)
-    for k in range(len(points)):
-        for i in range(len(centre)):
-            x = points[k, 0] - centre[i, 0]
-            y = points[k, 1] - centre[i, 1]
-            z = points[k, 2] - centre[i, 2]
-            if x * x + y * y + z * z < radius[i] * radius[i]:
-                found[k] = False
-                break
-    return found

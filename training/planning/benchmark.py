@@ -32,8 +32,7 @@ from viapoint.training.checks import unknown_name
 from viapoint.training.planning.candidates import MOST_CANDIDATES
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
 from viapoint.training.planning.ompl_paths import import_ompl
-from viapoint.training.planning.plan_motion import checked_motion, ompl_motion, plan_motion
-from viapoint.training.planning.problem import Problem
+from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
 from viapoint.training.planning.search import GeometrySearch
 
 DATA = files("viapoint.training.planning") / "data"
@@ -257,10 +256,8 @@ def _searched(arm: Arm, problem: BenchmarkProblem, checks: int) -> MotionPlan:
     half = checks // 2
     task = Task.of(arm=arm, n_obstacles=(0, 32))
     search = GeometrySearch(task, checks - half, refinements=4, per_round=max(half // 4, 1))
-    obstacles = pack([problem.obstacles])
-    given = Problem.of_scenes(resting(problem.start[None], problem.goal[None], obstacles), task)
-    plan = task.action.decode(search.solve(given), given.start, given.goal).take(0)
-    return checked_motion(arm, "joints", plan, obstacles, "search", shortest=True)
+    scene = resting(problem.start[None], problem.goal[None], pack([problem.obstacles]))
+    return search.plan_scene(scene, shortest=True)
 
 
 def measure_planner(

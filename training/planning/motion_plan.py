@@ -98,7 +98,8 @@ class MotionPlan:
     space: SpaceName
     """Space of the coordinates."""
     waypoints: Float
-    """Start, via-points and goal, shape (K + 2, D), [rad] of joints or [m] of the hand."""
+    """Start, via-points and goal, shape (K + 2, D), [rad] of joints or [m] of the hand; (0, D) for a problem of a batch
+    that was refused, for which there is no movement."""
     durations: Float
     """Durations of the segments, shape (K + 1,), [s]."""
     velocity: Float
@@ -117,7 +118,8 @@ class MotionPlan:
     jerk: float
     """Jerk cost relative to that of the straight movement of the same duration; NaN where that does not move."""
     source: str
-    """Origin of the via-points: `straight`, `straight, refined`, `given`, `random`, `ompl`, or another planner."""
+    """Origin of the via-points: `straight`, `straight, refined`, `given`, `random`, `ompl`, or another planner;
+    `refused` where there is no movement."""
     reason: str = ""
     """Reason why there is no better plan; empty for success."""
     seeds: int = 0
@@ -127,6 +129,8 @@ class MotionPlan:
 
     def __repr__(self) -> str:
         """Return what matters."""
+        if not len(self.waypoints):
+            return f"MotionPlan({self.arm.name!r}, refused: {self.reason})"
         state = "success" if self.success else f"no success: {self.reason}"
         return (
             f"MotionPlan({self.arm.name!r}, {state}, n_via={len(self.durations) - 1}, duration={self.duration:.3f} s, "
@@ -141,7 +145,8 @@ class MotionPlan:
 
     @property
     def plan(self) -> Plan:
-        """The movement alone, as environments take it."""
+        """The movement alone, as environments take it; UnsafePlanError if there is none."""
+        self.refuse_unsafe(force=True)
         return Plan(self.waypoints, self.durations, self.velocity, self.acceleration)
 
     def trajectory(self) -> primitives.Trajectory:
@@ -156,7 +161,7 @@ class MotionPlan:
             force: True for plans without success, too.
 
         Raises:
-            UnsafePlanError: The plan has no success.
+            UnsafePlanError: The plan has no success, or there is no movement at all.
         """
         self.refuse_unsafe(force)
         number_of_at_least("rate", rate, 1e-3, HIGHEST_RATE)
@@ -172,17 +177,16 @@ class MotionPlan:
             force: True for plans without success, too.
 
         Raises:
-            UnsafePlanError: The plan has no success.
-            ValueError: The movement does not begin at rest.
+            UnsafePlanError: The plan has no success, or there is no movement at all.
         """
         self.refuse_unsafe(force)
-        if self.velocity.any() or self.acceleration.any():
-            raise ValueError("a movement that begins in motion cannot be executed from rest")
         outcome, _ = execute_plans([self])
         return outcome
 
     def refuse_unsafe(self, force: bool) -> None:
-        """Raise UnsafePlanError for a plan without success, unless `force` is True."""
+        """Raise UnsafePlanError where there is no movement, and for a plan without success unless `force` is True."""
+        if not len(self.waypoints):
+            raise UnsafePlanError(f"there is no movement: {self.reason}")
         if not self.success and not force:
             raise UnsafePlanError(f"the plan is not safe: {self.reason}; force=True takes it nevertheless")
 
@@ -196,23 +200,30 @@ def joint_motion(space: Space, position: Float, velocity: Float, acceleration: F
 def execute_plans(plans: Sequence[MotionPlan]) -> tuple[Outcome, Episodes]:
     """Execute plans of one arm in MuJoCo, each among its obstacles.
 
-    All plans must have equally many via-points; plans without success are executed, too. The results are the metrics,
-    shape (N,) each, and the simulations, which hold the records of the movements until the next ones.
+    All plans must have equally many via-points; plans without success are executed, too. Beyond a limit of the arm,
+    plans from rest are slowed down, and plans that begin in motion, which cannot be, have no success. The results are
+    the metrics, shape (N,) each, and the simulations, which hold the records of the movements until the next ones.
     """
+    parts = zip(*(each.plan for each in plans), strict=True)
+    plan = Plan(*map(np.stack, parts))
     first, number = plans[0], len(plans)
     solids = [_solids(plan.obstacles) for plan in plans]
     rows = max(each.kind.shape[1] for each in solids)
     meshes = sorted({name for each in solids for name in mesh_names(each.meshes)})
     episodes = _episodes(first.arm, first.space, len(first.durations) - 1, rows, number, tuple(meshes))
+    begin = Motion(plan.waypoints[:, 0], plan.velocity, plan.acceleration)
     space = episodes.task.space
-    waypoints = np.stack([plan.waypoints for plan in plans])
-    start, goal = (np.ascontiguousarray(space.joints(waypoints[:, end])) for end in (0, -1))
+    start, goal = (np.ascontiguousarray(space.joints(plan.waypoints[:, end])) for end in (0, -1))
     obstacles = no_obstacles(number, rows)
     for i, each in enumerate(solids):
         obstacles = obstacles.put([i], each.with_rows(rows))
     episodes.start(np.arange(number), resting(start, goal, obstacles))
-    decision = episodes.execute(Plan.at_rest(waypoints, np.stack([plan.durations for plan in plans])))
-    return Outcome(**{name: decision.info[name] for name in Outcome._fields}), episodes
+    episodes.simulator.batch.bind("qvel")[:] = space.joint_motion(begin).velocity
+    decision = episodes.execute(plan)
+    outcome = Outcome(**{name: decision.info[name] for name in Outcome._fields})
+    moving = plan.velocity.any(axis=-1) | plan.acceleration.any(axis=-1)
+    beyond = np.array([max(each.limits) > 1.0 for each in plans])
+    return outcome._replace(is_success=outcome.is_success & ~(moving & beyond)), episodes
 
 
 def _solids(obstacles: Obstacles) -> Obstacles:
@@ -248,4 +259,4 @@ def _episodes(
     """Return simulations of an arm among up to some obstacles, which may be some registered meshes."""
     shapes = (*PLAIN_KINDS, *meshes)
     task = Task.of(arm=arm, space=space, n_via=n_via, n_obstacles=(0, rows), shapes=shapes)
-    return Episodes(task, number)
+    return Episodes(task, number, prolong=False)

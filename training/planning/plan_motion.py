@@ -30,17 +30,19 @@ from viapoint.envs.common.validation import (
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape
-from viapoint.envs.outcome import SETTLING
+from viapoint.envs.outcome import SETTLING, straight_jerk_cost
 from viapoint.envs.plans import Plan, SpaceName
 from viapoint.envs.scenes.options import Pose, as_pose
 from viapoint.envs.spaces import Space, space_of
 from viapoint.training.planning.motion_plan import Limits, MotionPlan, joint_motion
 from viapoint.training.planning.movements import (
     FINE_INSTANTS,
+    NEAR,
     OUTSIDE,
     Movement,
     MovementTable,
     Setting,
+    arm_setting,
     fine_table,
     movement_table,
     table_with,
@@ -48,7 +50,6 @@ from viapoint.training.planning.movements import (
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl, path_around, points_on
 from viapoint.training.planning.refine import (
     SMOOTH,
-    STRAIGHT_COST,
     Found,
     exact_clearance,
     is_free,
@@ -99,10 +100,9 @@ class _Problem(NamedTuple):
     enough: int = 1  # Number of free movements
     generator: Any = None  # Random generator of the seeds
 
-    @property
-    def setting(self) -> Setting:
-        """Arm and space for compiled functions."""
-        return _setting(self.arm, self.space.of_hand)
+    def setting(self, near: float = np.inf) -> Setting:
+        """Return arm and space; in the plane without spheres that are farther than `near` from all obstacles, [m]."""
+        return arm_setting(self.arm, self.space.of_hand, self.obstacles, room=-RANGE_TOLERANCE, near=near)
 
     @property
     def in_motion(self) -> bool:
@@ -267,9 +267,10 @@ def plan_motions(
     """Plan N movements on threads; the other arguments are those of :func:`plan_motion`.
 
     Each movement is planned as :func:`plan_motion` plans it alone, whatever the number of threads is, except where the
-    time limit is reached, and where a path of OMPL is followed: all threads have its random generator in common. A
-    problem with an argument that is not allowed, or a pose out of reach, gives a plan without success that stays at
-    home; `reason` tells why.
+    time limit is reached, and where a path of OMPL is followed: all threads have its random generator in common. The
+    `reason` of each plan without success begins with the number of its problem, such as `problem 3: `, from 0. A
+    problem with an argument that is not allowed, or a pose out of reach, is refused: its plan has the source `refused`
+    and no waypoints, and raises UnsafePlanError when it is executed or exported, also with `force=True`.
 
     Args:
         arm: Arm, or name of one.
@@ -287,6 +288,8 @@ def plan_motions(
         >>> plans = plan_motions("planar", [(-0.2, 0.3), (-0.2, 0.4)], [(0.1, 0.4), (0.2, 0.3)], [[], []])
         >>> [plan.success for plan in plans]
         [True, True]
+        >>> plan_motions("planar", [(-0.2, 0.3, 0.0)], [(0.1, 0.4)], [[]])
+        [MotionPlan('planar', refused: problem 0: start must have shape (2,), got (3,))]
     """
     arm = arm_of(arm)
     if threads is not None:
@@ -304,15 +307,22 @@ def plan_motions(
     # What is a fault of all problems is raised here.
     number_of_at_least("time_limit", kwargs.get("time_limit", LONGEST_SEARCH), 0.0)
     seed = None if isinstance(rng, np.random.Generator) else rng
-    nothing = plan_motion(arm, home, home, **{**kwargs, "time_limit": 0.0, "rng": seed})
+    rest = plan_motion(arm, home, home, **{**kwargs, "time_limit": 0.0, "rng": seed})
+    refused = dataclasses.replace(
+        rest, waypoints=rest.waypoints[:0], durations=rest.durations[:0], success=False, clearance=np.nan,
+        limits=Limits(np.nan, np.nan), jerk=np.nan, source="refused", milliseconds=0.0,
+    )  # fmt: skip
 
     def plan(number: int) -> MotionPlan:
         try:
-            return plan_motion(
+            found = plan_motion(
                 arm, starts[number], goals[number], obstacles[number], rng=rngs[number], **kwargs
             )
-        except ValueError as error:
-            return dataclasses.replace(nothing, success=False, reason=f"problem {number}: {error}")
+        except (ValueError, TypeError) as error:
+            found = dataclasses.replace(refused, reason=str(error))
+        if found.success:
+            return found
+        return dataclasses.replace(found, reason=f"problem {number}: {found.reason}")
 
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(plan, range(len(starts))))
@@ -376,13 +386,6 @@ def ompl_motion(
 
 
 @functools.lru_cache(maxsize=64)
-def _setting(arm: Arm, of_hand: bool) -> Setting:
-    """Return arm and space for compiled functions; rounding errors at the joint limits do not count."""
-    ranges = arm.joint_range + RANGE_TOLERANCE * np.array([-1.0, 1.0])
-    return Setting(arm.chain, arm.spheres, ranges, of_hand, arm.reach, hand_alone=False)
-
-
-@functools.lru_cache(maxsize=64)
 def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     """Make tables, and load or compile the machine code, so that no time limit is spent on them."""
     space = space_of(arm, "hand" if of_hand else "joints")
@@ -390,9 +393,10 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     still = np.zeros_like(start)
     problem = _Problem(arm, space, start, still, still, start + 0.01, pack([[]]))
     straight = _straight(problem)
-    is_free(problem.setting, straight, problem.obstacles, 0, 0.0)
+    is_free(problem.setting(), straight, problem.obstacles, 0, 0.0)
     _known(problem, straight, "straight", 0.0, _fault(problem)[0])
-    _refined(problem, 0.0, movement_table(n_via), fine_table(n_via), np.zeros((0, n_via, len(start))), 1.0)
+    seeds = np.zeros((0, n_via, len(start)))
+    _refined(problem, problem.setting(), 0.0, movement_table(n_via), fine_table(n_via), seeds, 1.0, np.inf)
 
 
 def _goals(problem: _Problem, goal: Any) -> Float:
@@ -413,7 +417,7 @@ def _goals(problem: _Problem, goal: Any) -> Float:
     if problem.arm.continuous and not problem.space.of_hand:
         # The equivalent position within the range that is nearest to the start.
         endless = np.isin(problem.arm.joint_names, problem.arm.continuous)
-        low, high = _setting(problem.arm, False).joint_range.T
+        low, high = problem.setting().joint_range.T
         turns = np.round((goals - problem.start) / TURN)
         turns = np.clip(turns, np.ceil((goals - high) / TURN), np.floor((goals - low) / TURN))
         goals = goals - TURN * np.where(endless, turns, 0.0)
@@ -507,7 +511,7 @@ def _plan(problem: _Problem, number: int, until: float, ompl: bool) -> MotionPla
     fault, kept = _fault(problem)
     straight = _straight(problem)
     coarse = straight._replace(table=movement_table(0))
-    if fault or is_free(problem.setting, coarse, problem.obstacles, 0, kept):
+    if fault or is_free(problem.setting(), coarse, problem.obstacles, 0, kept):
         plan = _known(problem, straight, "straight", problem.least, fault)
         if plan.success or fault or problem.duration is not None:
             return plan
@@ -561,6 +565,7 @@ def _search(
     unit = unit_of_jerk(way, problem.space.of_hand)
     near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
     table, fine = movement_table(n_via), fine_table(n_via)
+    setting = problem.setting(kept + NEAR)  # clearances below NEAR are right
     best, least = None, np.inf
     tight, widest = None, problem.margin  # the best of those that keep the margin and nothing more
     tried = free = since = 0
@@ -584,7 +589,7 @@ def _search(
                 spread = 0.0 if rank == 0 else near if rank < NARROW else far
                 seeds[k] = straight + spread * away
         wanted = max(enough - free, 1)
-        done, found = _refined(problem, kept, table, fine, seeds, duration, enough=wanted)
+        done, found = _refined(problem, setting, kept, table, fine, seeds, duration, until, enough=wanted)
         for k in range(done):
             clearance = float(found.clearance[k])
             movement = problem.movement(found.vias[k], fine, int(found.times[k]), duration)
@@ -617,11 +622,13 @@ def _more(cost: float) -> int:
 
 def _refined(
     problem: _Problem,
+    setting: Setting,
     kept: float,
     table: MovementTable,
     fine: MovementTable,
     seeds: Float,
     duration: float,
+    until: float,
     *,
     smooth: float = SMOOTH,
     enough: int = 1,
@@ -631,8 +638,8 @@ def _refined(
     unit = unit_of_jerk(problem.goal - problem.start, problem.space.of_hand)
     endless = np.full(seeds.shape[1:], np.inf)
     return refine_seeds(
-        problem.setting, table, fine, problem.start, fixed, seeds, np.stack((-endless, endless)),
-        duration, problem.obstacles, 0, kept, unit, smooth, enough,
+        setting, table, fine, problem.start, fixed, seeds, np.stack((-endless, endless)), duration,
+        problem.obstacles, 0, kept, unit, smooth, enough, until - time.perf_counter(),
     )  # fmt: skip
 
 
@@ -655,7 +662,7 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
         table = table_with(durations)
         fine = table_with(durations, FINE_INSTANTS)
         vias = points[None, 1:-1] - problem.start
-        _, found = _refined(problem, kept, table, fine, vias, duration, smooth=0.0)
+        _, found = _refined(problem, problem.setting(), kept, table, fine, vias, duration, until, smooth=0.0)
         clearance = float(found.clearance[0])
         if clearance >= kept:
             movement = problem.movement(found.vias[0], fine, 0, duration)
@@ -706,7 +713,7 @@ def _clearance_at_rest(problem: _Problem, end: float) -> float:
     obstacles = problem.obstacles
     later = obstacles._replace(centre=obstacles.centre + end * obstacles.velocity)
     rest = Movement(fine_table(0), 0, problem.goal, np.zeros((3, len(problem.goal))), SETTLING)
-    return exact_clearance(problem.setting, rest, later, 0, problem.margin)
+    return exact_clearance(problem.setting(), rest, later, 0, problem.margin)
 
 
 def _known(
@@ -722,13 +729,12 @@ def _known(
     table, times, start, offsets, _ = movement
     vias = offsets[:-3]
     movement = problem.movement(vias, table, times, duration)
-    if clearance is None:
-        clearance = exact_clearance(problem.setting, movement, problem.obstacles, 0, problem.margin)
+    if clearance is None or clearance >= NEAR:
+        clearance = exact_clearance(problem.setting(), movement, problem.obstacles, 0, problem.margin)
     if problem.obstacles.velocity[0].any():
         clearance = min(clearance, _clearance_at_rest(problem, duration))
     cost = np.einsum("ij,id,jd->", table.cost[times], movement.offsets, movement.offsets)
-    line = problem.goal - problem.start
-    straight_cost = STRAIGHT_COST * float(line @ line)
+    straight_cost = float(straight_jerk_cost(float(np.linalg.norm(problem.goal - problem.start)), 1.0))
     jerk = 1.0 if cost == 0.0 else max(float(cost) / straight_cost, 1.0) if straight_cost else np.nan
     reason = fault
     if not reason and clearance == OUTSIDE:

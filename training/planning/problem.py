@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.spheres import grouped
 from viapoint.envs.common.arrays import Bool, Float, Int, norm
 from viapoint.envs.geometry.clearance import Placed, place
 from viapoint.envs.geometry.compiled import compiled, inlined, inner
-from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes, no_obstacles, obstacles_from_rows
+from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
 from viapoint.envs.plans import SHORTEST_DURATION, turned
 from viapoint.envs.replanning import NEARBY, least_remaining
@@ -22,11 +19,14 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.movements import (
+    ELBOW_ROOM,
     FINE_INSTANTS,
     INSTANTS,
+    NEAR,
     Movement,
     MovementTable,
     Setting,
+    arm_setting,
     best_times,
     jerk_cost,
     joints_at,
@@ -39,11 +39,6 @@ from viapoint.training.planning.movements import (
 
 Numbers = NDArray[np.floating[Any]]
 
-# Vertical distance from obstacles beyond which spheres of an arm in the plane never matter, [m]
-NEAR = 0.05
-
-# Angle that a straight elbow turns when the hand is 0.3 mm from its place, the usual error of tracking, [rad]
-ELBOW_ROOM = 0.04
 # Greatest factor by which a plan in motion is prolonged to keep the velocity limits of the joints
 PROLONGED = 1.5
 
@@ -103,13 +98,9 @@ class Problem(NamedTuple):
 
     def take(self, rows: Any) -> Problem:
         """Return some of the problems, by indices, mask or slice."""
-        parts: list[Any] = []
-        for part in self:
-            if isinstance(part, Obstacles):
-                parts.append(part.take(rows))
-            else:
-                parts.append(None if part is None else part[rows])
-        return Problem(*parts)
+        given = {name: part for name, part in self._asdict().items() if part is not None}
+        obstacles = given.pop("obstacles").take(rows)
+        return self._replace(obstacles=obstacles, **{name: part[rows] for name, part in given.items()})
 
 
 class Moves(NamedTuple):
@@ -295,41 +286,6 @@ def setting_of(task: Task, obstacles: Obstacles, *, exact: bool = False) -> Sett
 
     With `exact`, movements of the hand keep ELBOW_ROOM from the joint ranges, which the executed movement needs.
     """
-    arm = task.arm
-    if not task.space.of_hand:
-        return Setting(arm.chain, arm.spheres, arm.joint_range, False, arm.reach, False)
-    centre, half = bounding_boxes(obstacles)
-    tall = (np.abs(obstacles.rotation[..., 2, :]) * half).sum(axis=-1)
-    present = obstacles.present
-    low = (centre[..., 2] - tall).min(where=present, initial=1e9) - NEAR
-    high = (centre[..., 2] + tall).max(where=present, initial=-1e9) + NEAR
-    bottom, top = _heights(arm)
-    return _hand_setting(arm, tuple((top > low) & (bottom < high)), exact)
-
-
-@functools.lru_cache(maxsize=64)
-def _heights(arm: Arm) -> Float:
-    """Return the least and greatest heights of the groups of spheres of an arm in the plane, shape (2, G), [m]."""
-    spheres = arm.spheres
-    level = np.concatenate(([0.0], np.cumsum(arm.chain.origin[:, 2])))
-    found = np.empty((2, len(spheres.link)))
-    for group, link in enumerate(spheres.link):
-        some = slice(spheres.first[group], spheres.first[group + 1])
-        place = level[link] + spheres.centre[some, 2]
-        found[:, group] = (place - spheres.radius[some]).min(), (place + spheres.radius[some]).max()
-    return found
-
-
-@functools.lru_cache(maxsize=256)
-def _hand_setting(arm: Arm, wanted: tuple[bool, ...], exact: bool) -> Setting:
-    """Return an arm in the plane with some groups of spheres, the last one if none is wanted: no table is empty."""
-    spheres = arm.spheres
-    kept = np.flatnonzero(wanted) if any(wanted) else np.array([len(wanted) - 1])
-    some = [slice(spheres.first[group], spheres.first[group + 1]) for group in kept]
-    centres = [spheres.centre[rows] for rows in some]
-    spheres = grouped(centres, [spheres.radius[rows] for rows in some], spheres.link[kept].tolist(), ())
-    alone = len(spheres.radius) == 1 and bool(np.allclose(spheres.centre[0], arm.chain.tool_origin))
-    ranges = arm.joint_range
-    if exact:
-        ranges = ranges + ELBOW_ROOM * np.array([1.0, -1.0])
-    return Setting(arm.chain, spheres, ranges, True, arm.reach, alone)
+    of_hand = task.space.of_hand
+    room = ELBOW_ROOM if exact and of_hand else 0.0
+    return arm_setting(task.arm, of_hand, obstacles, room=room, near=NEAR)

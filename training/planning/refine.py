@@ -27,9 +27,10 @@ from viapoint.envs.geometry.clearance import (
     nearest_spheres,
     place,
 )
-from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel
+from viapoint.envs.geometry.compiled import clock, compiled, inlined, inner, kernel
 from viapoint.envs.geometry.distance import point_distance, point_distance_and_normal
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
+from viapoint.envs.outcome import straight_jerk_cost
 from viapoint.training.planning.movements import (
     OUTSIDE,
     Movement,
@@ -55,7 +56,6 @@ EASIER, HARDER = 0.3, 5.0
 FLAT = 0.02  # Share of CONTACT_WEIGHT that damps directions in which nothing is known
 # Longest step of a coordinate in joint space, [rad], and in hand space, [m]
 LONGEST_STEP = 0.6, 0.15
-STRAIGHT_COST = 360.0  # Jerk cost of a straight minimum-jerk movement of the way 1 in unit time
 # Way of a straight movement whose jerk cost is the unit for shorter ones, too, in joint space, [rad], and in hand
 # space, [m].
 SHORT = 2.0, 0.2
@@ -67,20 +67,20 @@ class Aim(NamedTuple):
 
     clearance: float  # Wanted clearance from obstacles, [m]
     jerk: float  # Weight of the jerk cost in units of `unit`
-    iterations: int  # Greatest number of iterations
     gain: float  # Relative gain of the objective below which a free movement is good enough
-    stride: int  # Step between the instants that are looked at
 
 
+ITERATIONS = 20  # Greatest number of iterations of a refinement
+STRIDE = 2  # Step between the instants that are looked at
 # Aim of the refinement of a seed: it has little weight of jerk, and ends as soon as the movement is free.
-SEED = Aim(clearance=0.04, jerk=0.1, iterations=20, gain=1.0, stride=2)
+SEED = Aim(clearance=0.04, jerk=0.1, gain=1.0)
 # Aim of a second refinement of movements that are nearly free: in a narrow passage, a wide clearance on one side is
 # paid for with contact on the other.
-NARROW = Aim(clearance=0.008, jerk=0.02, iterations=20, gain=1.0, stride=2)
+NARROW = Aim(clearance=0.008, jerk=0.02, gain=1.0)
 NEARLY = -0.03  # Least clearance of movements that are nearly free, [m]
-# Aim of the first attempt to polish a free movement. The weight of jerk is that at which the movement is smooth and
-# still free: it grows after an attempt whose movement is free and smoother, and falls after others.
-POLISH = Aim(clearance=0.02, jerk=1.0, iterations=20, gain=0.01, stride=2)
+# Aim of the first attempt to polish a free movement. The weight of jerk falls until the movement stays free and becomes
+# smoother, and then grows until it does not.
+POLISH = Aim(clearance=0.02, jerk=1.0, gain=0.01)
 ATTEMPTS, HEAVIER, LIGHTER = 8, 2.0, 0.3
 LITTLE = 0.97  # Least factor on the jerk cost by an attempt after which another one is worth its time
 # Clearance beyond the margin that is asked for: distances of point clouds that are cut off there are rounded, [m]
@@ -308,7 +308,7 @@ def _assemble(
     table, times, offsets = movement.table, movement.times, movement.offsets
     columns, dimension = offsets.shape
     vias = columns - 3
-    weight = aim.jerk * 2.0 / (aim.stride * unit)
+    weight = aim.jerk * 2.0 / (STRIDE * unit)
     hessian[:] = 0.0
     gradient[:] = 0.0
     objective = 0.0
@@ -325,9 +325,9 @@ def _assemble(
     resting = True
     for d in range(dimension):
         resting = resting and offsets[vias + 1, d] == 0.0 and offsets[vias + 2, d] == 0.0
-    begin = aim.stride // 2 + (SLOW if resting else 0)
+    begin = STRIDE // 2 + (SLOW if resting else 0)
     work.seen[:] = -1e9
-    for k in range(begin, last + 1 - SLOW, aim.stride):
+    for k in range(begin, last + 1 - SLOW, STRIDE):
         reached = joints_at(setting, movement, k, work.position, work.joints)
         place(setting.chain, setting.spheres, work.joints, work.placed)
         work.square[:] = 0.0
@@ -335,7 +335,7 @@ def _assemble(
         time = movement.duration * k / last
         from_obstacles, first = _add_obstacles(setting, obstacles, scene, time, aim.clearance, work)
         from_itself, second = 0.0, OWN_CLEARANCE
-        if (k - begin) % (4 * aim.stride) == 0:  # bodies of the arm are less often near one another
+        if (k - begin) % (4 * STRIDE) == 0:  # bodies of the arm are less often near one another
             from_itself, second = _add_own(setting, OWN_CLEARANCE, work)
         from_ranges, third = _add_ranges(setting, reached or not setting.of_hand, work)
         missing = from_obstacles + from_itself + from_ranges
@@ -410,7 +410,7 @@ def _refine(
         setting, movement, obstacles, scene, aim, unit, np.inf, hessian, gradient, work
     )
     damping = DAMPING
-    for _ in range(aim.iterations):
+    for _ in range(ITERATIONS):
         largest = 0.0
         for i in range(size):
             step[i] = -gradient[i]
@@ -462,7 +462,8 @@ def _refine(
 
 def unit_of_jerk(way: Float, of_hand: bool) -> float:
     """Return the unit of jerk costs in unit time: the cost of a straight movement, if it is not too short."""
-    return STRAIGHT_COST * max(float(np.linalg.norm(way)), SHORT[of_hand]) ** 2
+    length = max(float(np.linalg.norm(way)), SHORT[of_hand])
+    return float(straight_jerk_cost(length, 1.0))
 
 
 @compiled
@@ -481,6 +482,7 @@ def refine_seeds(
     unit: float,
     smooth: float,
     enough: int,
+    patience: float,
 ) -> tuple[int, Found]:
     """Refine movements from seeds one after the other, and return how many were tried, and what was found.
 
@@ -499,7 +501,9 @@ def refine_seeds(
         unit: Unit of jerk costs in unit time.
         smooth: Jerk cost in this unit with which a movement that was polished once is smooth enough.
         enough: Number of free movements after which to stop.
+        patience: Time after which no further refinement begins, [s]; each takes less than a millisecond.
     """
+    end = clock() + patience
     number, vias, dimension = seeds.shape
     work = _work(setting, vias + 3, dimension, obstacles, scene)
     found = Found(seeds.copy(), np.zeros(number, np.int64), np.full(number, np.inf), np.full(number, -1.0))
@@ -511,6 +515,8 @@ def refine_seeds(
     trial = np.empty((vias + 3, dimension))
     free, tried = 0, 0
     for each in range(number):
+        if each and clock() > end:
+            break
         tried += 1
         _copy(seeds[each], offsets[0])
         for aim in (SEED, NARROW):
@@ -518,7 +524,7 @@ def refine_seeds(
             times[0] = _refine(setting, movement, bounds, obstacles, scene, aim, unit, work)
             movement = Movement(table, times[0], start, offsets[0], duration)
             apart = _clearance(setting, movement, obstacles, scene, margin, NEARLY)
-            if not NEARLY < apart < margin:
+            if not NEARLY < apart < margin or clock() > end:
                 break
         _copy(offsets[0, :vias], found.vias[each])
         found.times[each] = times[0]
@@ -531,13 +537,17 @@ def refine_seeds(
         stage, weight = 0, POLISH.jerk
         _, cost = best_times(table, offsets[0], work.gram)
         for _ in range(ATTEMPTS):
+            if clock() > end:
+                break
             _copy(offsets[stage], trial)
             movement = Movement(table, 0, start, trial, duration)
-            aim = Aim(POLISH.clearance, weight, POLISH.iterations, POLISH.gain, POLISH.stride)
+            aim = Aim(POLISH.clearance, weight, POLISH.gain)
             other = _refine(setting, movement, bounds, obstacles, scene, aim, unit, work)
             _, less = best_times(table, trial, work.gram)
             movement = Movement(table, other, start, trial, duration)
             if less >= cost or not is_free(setting, movement, obstacles, scene, margin):
+                if stage:
+                    break
                 weight *= LIGHTER
                 continue
             little = less > LITTLE * cost

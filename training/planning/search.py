@@ -11,12 +11,13 @@ import numpy as np
 from viapoint.envs.common.arrays import Bool, Float, Single
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.env import ReachEnv
-from viapoint.envs.geometry.compiled import compiled, inner
+from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import Plan
 from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.scenes.options import draw_given
+from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.planning.candidates import (
     MOST_CANDIDATES,
@@ -26,7 +27,6 @@ from viapoint.training.planning.candidates import (
 )
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.movements import (
-    Memory,
     Setting,
     fine_table,
     least_clearance,
@@ -176,10 +176,15 @@ class GeometrySearch:
             ValueError: An argument is not allowed, an end is out of reach or touches an obstacle.
         """
         given = {"start": start, "goal": goal, "obstacles": obstacles}
-        scenes = draw_given(given, self.task.sampler(), [np.random.default_rng(0)])
-        problem = Problem.of_scenes(scenes, self.task)
-        plan = self.task.action.decode(self.solve(problem), problem.start, problem.goal).take(0)
-        return checked_motion(self.task.arm, self.task.space_name, plan, problem.obstacles, self.name)
+        return self.plan_scene(draw_given(given, self.task.sampler(), [np.random.default_rng(0)]))
+
+    def plan_scene(self, scene: Scenes, *, shortest: bool = False) -> MotionPlan:
+        """Return the best plan of one scene, with `shortest` in the shortest duration that the limits allow."""
+        task, problem = self.task, Problem.of_scenes(scene, self.task)
+        plan = task.action.decode(self.solve(problem), problem.start, problem.goal).take(0)
+        return checked_motion(
+            task.arm, task.space_name, plan, problem.obstacles, self.name, shortest=shortest
+        )
 
 
 def best_of(task: Task, problem: Problem, actions: Numbers, merit: Numbers) -> Numbers:
@@ -255,7 +260,7 @@ def refined_actions(task: Task, problem: Problem, actions: Numbers) -> Numbers:
             bounds = np.stack((middle - task.action.via_scale, middle + task.action.via_scale))
         _, better = refine_seeds(
             setting, table, fine, start, fixed, seeds, bounds, moves.duration[b, 0], problem.obstacles, b,
-            CLEARANCE_MARGIN, unit_of_jerk(line, setting.of_hand), SMOOTH, len(seeds),
+            CLEARANCE_MARGIN, unit_of_jerk(line, setting.of_hand), SMOOTH, len(seeds), np.inf,
         )  # fmt: skip
         waypoints = np.zeros((len(seeds), number + 2, len(start)))
         waypoints[:, 1:-1] = better.vias
@@ -287,22 +292,6 @@ def plan_clearances(
     return np.asarray(_clearances(setting, moves, problem.obstacles, most, least, until))
 
 
-@inner
-def _clearance(
-    setting: Setting,
-    moves: Moves,
-    b: int,
-    h: int,
-    obstacles: Obstacles,
-    most: float,
-    least: float,
-    until: float,
-    memory: Memory,
-) -> float:
-    """Return the clearance of one plan, see :func:`~viapoint.training.planning.movements.least_clearance`."""
-    return least_clearance(setting, movement_of(moves, b, h), obstacles, b, most, least, until, memory)
-
-
 @compiled
 def _clearances(
     setting: Setting, moves: Moves, obstacles: Obstacles, most: float, least: float, until: float
@@ -313,7 +302,8 @@ def _clearances(
     memory = memory_of(setting, moves.table, moves.start.shape[1])
     for b in range(number):
         for h in range(plans):
-            found[b, h] = _clearance(setting, moves, b, h, obstacles, most, least, until, memory)
+            movement = movement_of(moves, b, h)
+            found[b, h] = least_clearance(setting, movement, obstacles, b, most, least, until, memory)
     return found
 
 
@@ -334,7 +324,9 @@ def _merits(
                 if worth[b, h] + gain * high - rank <= best:
                     break
                 floor = CLEARANCE_MARGIN if best > INFEASIBLE else min(deepest, CLEARANCE_MARGIN)
-                clearance = _clearance(setting, moves, b, h, obstacles, high, floor, horizons[rank], memory)
+                clearance = least_clearance(
+                    setting, movement_of(moves, b, h), obstacles, b, high, floor, horizons[rank], memory
+                )
                 if clearance >= CLEARANCE_MARGIN:
                     value = worth[b, h] + gain * clearance - rank
                     best = max(best, value)
