@@ -49,7 +49,7 @@ SENSED_BASELINES = (
 LOOKING: dict[str, Any] = {
     "one look": "end",
     "a look each 0.3 s": ["horizon"],
-    "looks at what is new or near": ["sight", "clearance"],
+    "looks at what is new": ["sight"],
 }
 """Decisions of PlanarSensed with rays around the hand, in which points that were seen are remembered."""
 LOOKS = "PlanarSensed, hand_rays"
@@ -124,7 +124,8 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
     if config.only in ("everything", "looking") and task.sensor is not None and task.space.of_hand:
         for when, decide_at in LOOKING.items():
             settings = {**common, "env_kwargs": {"sensor": "hand_rays", "decide_at": decide_at}}
-            rows = evaluate(**settings, baselines=["thick:search512", "known:search512"]).rows
+            planner = ["thick:plan_motion"] if decide_at == "end" else []
+            rows = evaluate(**settings, baselines=["thick:search512", *planner, "known:search512"]).rows
             if decide_at != "end":
                 rows += seeds_of(config.looks, short, settings, untrained="horizon" in decide_at)
             for row in rows:

@@ -168,6 +168,10 @@ class Task:
             raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {timing!r}")
         if "sight" in task.decide_at and sensor is None:
             raise ValueError("decide_at with 'sight' needs a sensor")
+        if "clearance" in task.decide_at and sensor is not None:
+            raise ValueError(
+                "decide_at with 'clearance' tells of obstacles that a sensor may not have seen; use 'sight' or 'horizon'"
+            )
         if task.whole_movement and sensor is not None and sensor.looks > 1:
             raise ValueError(f"looks of the sensor must be 1 with one decision, got {sensor.looks}")
         if not task.whole_movement and timing != "optimal":
@@ -246,7 +250,8 @@ class Task:
             return self
         changes = self.moving_obstacles or self.n_jumps[1] > 0
         weights = dataclasses.replace(self.weights, progress=0.0)
-        every = TRIGGERS if self.sensor else tuple(each for each in TRIGGERS if each != "sight")
+        refused = "clearance" if self.sensor else "sight"
+        every = tuple(each for each in TRIGGERS if each != refused)
         return dataclasses.replace(self, decide_at=every if changes else END, weights=weights)
 
     @property

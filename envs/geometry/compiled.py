@@ -13,10 +13,10 @@ from numba.core.caching import IndexDataCacheFile
 TINY = 1e-12  # Length below which a vector has no direction, [m]
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Optimisations of arithmetic that are allowed; NaN and infinity keep their meaning
-FASTMATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
+# Arithmetic in another order would be 3 % faster. But the order would depend on which functions the compiler met first,
+# and results on whether machine code comes from the cache.
 # `_nrt` allows arrays to be made; left out, Numba takes it from the function that is compiled around this one.
-COMPILED: dict[str, Any] = {"nogil": True, "fastmath": FASTMATH, "_nrt": True, "no_cfunc_wrapper": True}
+COMPILED: dict[str, Any] = {"nogil": True, "_nrt": True, "no_cfunc_wrapper": True}
 KERNEL: dict[str, Any] = {**COMPILED, "error_model": "numpy", "_nrt": False}
 """Options of functions that make no arrays. Without `_nrt`, Numba does not count references to arrays, which takes 5 ns
 for each array and call. Divisions by zero give infinity instead of an exception."""

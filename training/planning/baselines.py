@@ -237,7 +237,7 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
         belief = DEFAULT_BELIEF
     planner = planner if belief else name
     made = _counted(planner, SEARCHES if belief else counted)
-    if planner in PLANNERS and (sensed or not task.replanning):
+    if planner in PLANNERS and not task.replanning:
         made = functools.partial(PlannerMethod, name=planner)
     if made is not None:
         if not belief:
