@@ -175,6 +175,15 @@ class Sensor:
         place, _ = forward(arm.chain, joints)
         return tool @ rotation, place + tool @ position
 
+    def sees(self, centre: Float, radius: float) -> bool:
+        """Return True if a ray comes within a ball, [m], or the sensor moves with the hand."""
+        if self.mount == "hand":
+            return True
+        rays = self.directions @ frame_matrices(np.array(self.quaternion)).T
+        away = centre - np.array(self.position)
+        way = np.clip(rays @ away, 0.0, self.range)
+        return bool((np.linalg.norm(way[:, None] * rays - away, axis=-1) <= radius).any())
+
     def ray_towards(self, local: Any) -> Any:
         """Return the number of the ray nearest to points, -1 outside the field of view, shape (...), int32.
 

@@ -34,7 +34,7 @@ from viapoint.envs.plans import (
 )
 from viapoint.envs.rewards import RewardWeights
 from viapoint.envs.scenes.families_registry import check_families, default_families
-from viapoint.envs.scenes.sampler import MOST_DRAWN, SceneSampler, is_planar, room_of
+from viapoint.envs.scenes.sampler import MOST_DRAWN, SceneSampler, farthest_reach, is_planar, room_of
 from viapoint.envs.scenes.scene import MOST_JUMPS
 from viapoint.envs.sensors import Sensor, named_sensor
 from viapoint.envs.spaces import Space, space_of
@@ -142,6 +142,8 @@ class Task:
         sensor = Sensor.of(sensor)
         if sensor is not None and not n_obstacles[1]:
             raise ValueError("sensor needs n_obstacles of 1 or more: there is nothing to see")
+        if sensor is not None and not sensor.sees(arm.chain.origin[0], farthest_reach(arm)):
+            raise ValueError(f"sensor sees nothing of what the arm {arm.name!r} reaches: {sensor}")
         task = cls(
             arm=arm,
             space_name=space,
@@ -170,7 +172,7 @@ class Task:
             raise ValueError("decide_at with 'sight' needs a sensor")
         if "clearance" in task.decide_at and sensor is not None:
             raise ValueError(
-                "decide_at with 'clearance' tells of obstacles that a sensor may not have seen; use 'sight' or 'horizon'"
+                "decide_at with 'clearance' tells of obstacles that a sensor may not have seen; use 'sight', 'horizon'"
             )
         if task.whole_movement and sensor is not None and sensor.looks > 1:
             raise ValueError(f"looks of the sensor must be 1 with one decision, got {sensor.looks}")

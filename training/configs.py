@@ -330,7 +330,7 @@ class AgentConfig(Config):
     env: Annotated[str | None, ENV] = None  # default: that of the agent
     arm: Annotated[str | None, ARM] = None  # in place of that of the agent, if any
     env_kwargs: NamedValues = field(default_factory=dict)
-    """Arguments of the environment, values in YAML: sensor=hand_rays decide_at=[sight,clearance]."""
+    """Arguments of the environment, values in YAML: sensor=hand_rays decide_at=[sight]."""
 
     def _check(self) -> None:
         check_env_kwargs(self.env_kwargs)
@@ -348,8 +348,10 @@ class EvaluateConfig(AgentConfig):
     """
 
     baselines: tuple[str, ...] = USUAL_BASELINES
-    """Some of straight, random, ompl, search512 or another number (the best of that many computed
-    plans), sobol512 (of fixed plans); with an agent, untrained (its network before training)."""
+    """Some of straight, random, plan_motion, ompl, search512 or another number (the best of that many computed plans),
+    sobol512 (of fixed plans); with an agent, untrained (its network before training); with a sensor, cautious512, and
+    points:, thick:, fitted:, seen: or known: before a planner; with moving obstacles, rest:, reach: or known: before
+    searchN."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
     refine: tuple[int, ...] = ()  # Numbers of proposals that the planner refines, one further row each.

@@ -7,6 +7,7 @@ import shlex
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from types import FrameType
@@ -96,6 +97,7 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
             run = Run(config.folder)
             with locked(run.folder):
                 _restore_settings(run, config)
+                print(f"going on with {run}", file=sys.stderr)
                 with _untrained_model(run.config) as model:
                     _continue_training(run, model, callbacks)
             return run
@@ -187,7 +189,9 @@ def _continue_training(run: Run, model: BaseAlgorithm, callbacks: list[BaseCallb
 def _learn(model: BaseAlgorithm, steps: int, monitor: RunCallback, *, fresh: bool) -> None:
     """Learn; a training that stalls, or that is stopped, ends like any other."""
     try:
-        model.learn(steps, monitor, None, reset_num_timesteps=fresh)  # type: ignore[arg-type]
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "the network is not updated")  # `_warn` has told it
+            model.learn(steps, monitor, None, reset_num_timesteps=fresh)  # type: ignore[arg-type]
     except _TrainingEnds:
         for each in monitor.callbacks:
             each.on_training_end()  # `learn` has not told them that it ends
@@ -321,8 +325,9 @@ class RunCallback(CallbackList):
         self.run.write_curve(self.curve)
         if self.config.progress and self._bar.disable:
             rate = 100.0 * record["success"]["rate"]
-            total = max(self.num_timesteps, self.config.total_timesteps)  # rounds are whole
-            told = f"{self.num_timesteps} of {total} decisions: success {rate:.1f} % in validation"
+            more = ", as rounds are whole" if self.num_timesteps > self.config.total_timesteps else ""
+            decisions = f"{self.num_timesteps} of {self.config.total_timesteps} decisions{more}"
+            told = f"{decisions}: success {rate:.1f} % in validation"
             print(told, file=sys.stderr)
         # A validation is better with more success, then with less jerk.
         best = max(self.curve, key=lambda each: (each["success"]["rate"], -(each["jerk_ratio"] or 0.0)))

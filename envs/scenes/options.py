@@ -61,7 +61,7 @@ def draw_given(
             in joint space joint positions, shape (J,) or (N, J), or a :class:`Pose` or its dictionary, or N of them.
             `obstacles`: a list of shapes or dictionaries, or their JSON, for all scenes, or N such lists. `jumps`: rows
             (time [s], target). `turns`: rows (time [s], velocity [m/s]), and `reaches`: rows (begin [s], duration [s],
-            way [m]), for each given obstacle, of zeros for none. Shape (n, .) for all scenes or (N, n, .).
+            x, y, z of the way [m]), for each given obstacle, of zeros for none. Shape (n, .) or (N, n, .).
         sampler: Sampler of the task's scenes.
         generators: N random generators.
 

@@ -252,16 +252,24 @@ def _setting_of(task: Task, plane: bool) -> Setting:
     )
 
 
+def farthest_reach(arm: Arm) -> float:
+    """Return the greatest distance of the hand from the first joint, in a plane from its axis, [m]."""
+    low, high = arm.joint_range.T
+    joints = np.random.default_rng(0).uniform(low, high, (REACH_SAMPLES, len(low)))
+    away = arm.hand(joints) - arm.chain.origin[0]
+    if is_planar(arm):
+        away[:, 2] = 0.0
+    return float(norm(away).max())
+
+
 def room_of(arm: Arm, kinds: tuple[str, ...], n_obstacles: tuple[int, int], tall: bool) -> Room:
     """Return the room for layouts around an arm."""
     plane = is_planar(arm)
     low, high = arm.joint_range.T
-    joints = np.random.default_rng(0).uniform(low, high, (REACH_SAMPLES, len(low)))
     foot = arm.chain.origin[0].copy()
     if plane:
         foot[2] = arm.hand(arm.home)[2]
-    reach = float(norm(arm.hand(joints) - foot).max())
-    scale = round(reach / (PLANE_REACH if plane else SPACE_REACH), 2)
+    scale = round(farthest_reach(arm) / (PLANE_REACH if plane else SPACE_REACH), 2)
     height = TALL_HALF_HEIGHT if tall else LOW_HALF_HEIGHT
     foot[2] -= 0.0 if plane else SHOULDER * scale
     turns = not arm.chain.sliding[0] and high[0] - low[0] < 2.0 * np.pi

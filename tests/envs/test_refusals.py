@@ -221,8 +221,12 @@ CALLS = [
         ({"dropped": 1.0},), ({"position": (0.0, np.nan, 0.0)},), ({"quaternion": (1.0, 1.0, 0.0, 0.0)},),
         ({"mount": "foot"},), ({"looks": 0},),
         ({"looks": 2},),  # an episode of one decision has one look
+        ({"position": (0.0, 0.0, 2.0), "quaternion": (0.5**0.5, 0.0, -(0.5**0.5), 0.0)},),  # it sees the sky alone
     ]),
-    (lambda change: ve.Task.of(**change), [({"sensor": "rays", "n_obstacles": 0},), ({"decide_at": ["sight"]},)]),
+    (lambda change: ve.Task.of(**change), [
+        ({"sensor": "rays", "n_obstacles": 0},), ({"decide_at": ["sight"]},),
+        ({"sensor": "hand_rays", "decide_at": ["sight", "clearance"]},),  # which knows what is not seen
+    ]),
     (ve.arm_of, [("large",)]),
     (ve.register_arm, [(ve.arm_of("panda"),)]),
     (family, [("",), ("shelf",)]),

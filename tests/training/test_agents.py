@@ -154,6 +154,16 @@ def test_the_least_and_the_most_of_each_setting_can_be_learned_with(made, env_id
     assert (np.abs(actions) <= 1.0).all()
 
 
+def test_a_training_that_would_change_nothing_is_told(made):
+    env = made()
+    with pytest.warns(UserWarning, match="8 decisions"):
+        assert model_on(env, learning_starts=16).learn(8)._n_updates == 0
+    with pytest.raises(ValueError, match="gradient_steps"):
+        model_on(env, gradient_steps=0)
+    with pytest.raises(ValueError, match="candidates"):
+        model_on(env, policy_kwargs={"candidate": 8})
+
+
 @pytest.fixture(scope="module")
 def learned():
     """A model after a few updates, and what it decides on."""

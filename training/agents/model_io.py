@@ -45,6 +45,7 @@ from viapoint.training.files import (
     write_json,
 )
 from viapoint.training.planning.candidates import MOST_CANDIDATES, MOST_ROUNDS
+from viapoint.training.planning.movements import INSTANTS
 from viapoint.training.vec_env import ViaVecEnv, check_spaces, env_arguments
 
 ACTIVATIONS = (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
@@ -71,14 +72,15 @@ LIMITS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("gamma", "gae_lambda", "tau", "explore_uniformly"), (0, 1)),
     **dict.fromkeys(("learning_starts", "target_policy_noise", "target_noise_clip"), (0, math.inf)),
     **dict.fromkeys(("ent_coef", "vf_coef", "top_quantiles_to_drop_per_net", "checks"), (0, math.inf)),
-    **dict.fromkeys(("buffer_size", "batch_size", "train_freq", "n_steps", "n_epochs"), (1, math.inf)),
+    **dict.fromkeys(("buffer_size", "train_freq", "n_steps", "n_epochs"), (1, math.inf)),
+    "batch_size": (1, 1 << 16),
     **dict.fromkeys(("policy_delay", "target_update_interval", "width"), (1, math.inf)),
     # Time and memory of a decision grow with these
     **dict.fromkeys(("candidates", "per_refinement", "next_candidates"), (1, MOST_CANDIDATES)),
     **dict.fromkeys(("explore_candidates", "labels"), (2, MOST_CANDIDATES)),
     "refine": (0, MOST_CANDIDATES),
     "refinements": (0, MOST_ROUNDS),
-    "instants": (2, 1024),
+    "instants": (2, INSTANTS),
     "nearest": (1, 1024),
 }
 
@@ -250,6 +252,8 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
             raise ValueError(f"{name} must be finite, got {value!r}")
         if name in POSITIVE and number <= 0:
             raise ValueError(f"{name} must be greater than 0, got {value!r}")
+        if name == "gradient_steps" and number == 0:
+            raise ValueError("gradient_steps must not be 0: the network would never be updated")
         least, most = LIMITS.get(name, (-math.inf, math.inf))
         if not least <= number <= most:
             raise ValueError(f"{name} must be from {least:g} to {most:g}, got {value!r}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, cast
@@ -11,7 +13,7 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.policies import BaseModel, BasePolicy
 from stable_baselines3.common.utils import is_vectorized_observation
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
@@ -20,8 +22,9 @@ from viapoint.envs.common.validation import whole_number
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
-from viapoint.training.agents.model_io import check_arguments, check_same_task
+from viapoint.training.agents.model_io import LIMITS, check_arguments, check_same_task
 from viapoint.training.agents.pairs import pairs_of
+from viapoint.training.checks import unknown_name
 from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
 from viapoint.training.planning.movements import FINE_INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
@@ -58,6 +61,9 @@ class PlanPolicy(BasePolicy):
         task: Mapping[str, Any],
         **kwargs: Any,
     ) -> None:
+        for name in kwargs:
+            if name not in inspect.signature(BaseModel).parameters:
+                raise ValueError(unknown_name("policy_kwargs", name, self.OWN))
         super().__init__(observation_space, action_space, **kwargs)
         self.task = Task.from_dict(task)
         self.replanning = self.task.replanning
@@ -250,7 +256,9 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         _init_setup_model: bool,
         **kwargs: Any,
     ) -> None:
-        check_arguments(type(self), {name: getattr(self, name) for name in own})
+        checked = {name: getattr(self, name) for name in own}
+        checked.update((name, value) for name, value in kwargs.items() if name in LIMITS)
+        check_arguments(type(self), checked)
         super().__init__(
             policy,
             env,
@@ -283,6 +291,15 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
             self._check_env(self.env)
         super()._setup_model()
         self.actor = self.policy
+
+    def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Any:
+        if total_timesteps <= self.learning_starts:
+            warnings.warn(
+                f"the network is not updated once in {total_timesteps} decisions, as learning starts after "
+                f"{self.learning_starts} (learning_starts)",
+                stacklevel=4,
+            )
+        return super()._setup_learn(total_timesteps, *args, **kwargs)
 
     def set_env(self, env: Any, force_reset: bool = True) -> None:
         """Set the training environment.

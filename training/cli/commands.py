@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
 import sys
 from pathlib import Path
@@ -40,8 +42,6 @@ MOST_FAULTS = 10  # Greatest number of problems that are named with what is wron
 
 def train(config: TrainConfig) -> None:
     """Train, and print the run."""
-    if config.resume:
-        print(f"going on with {Run(config.folder)}")
     print(training.train(config))
 
 
@@ -84,7 +84,12 @@ def evaluate(config: EvaluateConfig) -> None:
         run = Run(config.agent)
         record["weights_sha256"] = read_json(run.best / "model.json").get("weights_sha256")
         partial = ".partial" if result.partial else ""
-        name = f"{Path(config.scenes).stem}-{result.sha256[:8]}{partial}"  # the hash is that of the scenes
+        name = f"{Path(config.scenes).stem}-{result.sha256[:8]}"  # the hash is that of the scenes
+        if config.env_kwargs:
+            record["env_kwargs"] = config.env_kwargs
+            changed = json.dumps(config.env_kwargs, sort_keys=True).encode()
+            name += f"-{hashlib.sha256(changed).hexdigest()[:8]}"
+        name += partial
         kept = run.folder / "evaluations" / f"{name}.json"
         write_json(kept, _with_earlier(record, kept))
         print(f"kept as {kept}", file=_notes(config))

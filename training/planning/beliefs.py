@@ -158,7 +158,7 @@ def thick_points(task: Task, sight: Sight, depth: float | None = None) -> Obstac
     for b, hit in enumerate(sight.hit):
         seen = sight.points[b, hit]
         away = seen - sight.eyes[b, hit]
-        away /= np.linalg.norm(away, axis=-1, keepdims=True)
+        away /= np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), ROUNDING)  # a reading may be 0
         points = (seen[:, None] + steps[:, None] * away[:, None]).reshape(-1, 3)
         cubes = np.floor(points / SPACING).astype(np.int64) + CUBES // 2
         numbers = (cubes[:, 0] * CUBES + cubes[:, 1]) * CUBES + cubes[:, 2]
