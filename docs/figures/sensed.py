@@ -31,7 +31,7 @@ ENV_ID, SCENES = "viapoint/PlanarSensed-v0", (300, 420, 450)
 """Environment, and rows of its `validation` set."""
 LIMITS = (-0.5, 0.42), (-0.06, 0.7)
 RAY = "#e8c15a"
-DRAWN, N_DRAWN = 7, 1000
+DRAWN, N_DRAWN = 7, 3000
 """First part of the seeds of scenes in which success is counted, and their number."""
 BINS = 8
 """Numbers of equally many scenes in which success is counted."""
