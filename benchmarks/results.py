@@ -5,6 +5,7 @@ python benchmarks/results.py --env viapoint/PandaObstacles-v0 # others keep thei
 python benchmarks/results.py --only agents                    # only shipped agents, searches and planners
 python benchmarks/results.py --only runs                      # only the trainings of benchmarks/sb3.py
 python benchmarks/results.py --only looking                   # only searches and agents that look again on the way
+python benchmarks/results.py --only two                       # only sensed obstacles with two via-points
 python benchmarks/results.py --only reaches                   # only obstacles on reaches of their own
 """
 
@@ -46,14 +47,16 @@ SENSED_BASELINES = (
     "known:plan_motion",
 )
 """Baselines of tasks with a sensor: beliefs with more and more information. The last three need the truth."""
-LOOKING: dict[str, Any] = {
-    "one look": "end",
-    "a look each 0.3 s": ["horizon"],
-    "looks at what is new": ["sight"],
+LOOKING: dict[str, dict[str, Any]] = {
+    "one look": {"decide_at": "end"},
+    "a look each 0.3 s": {"decide_at": ["horizon"]},
+    "looks at what is new": {"decide_at": ["sight"]},
+    "two via-points, a look each 0.3 s": {"decide_at": ["horizon"], "n_via": 2},
 }
 """Decisions of PlanarSensed with rays around the hand, in which points that were seen are remembered."""
-LOOKS = "PlanarSensed, hand_rays"
-"""Name of this variant in the file and on the page."""
+LOOKS, TWO = "PlanarSensed, hand_rays", "PlanarSensed, two via-points"
+"""Names of this variant, and of one look with two via-points, in the file and on the page."""
+TWO_BASELINES = ("thick:search512", "thick:plan_motion", "cautious512", "seen:search512", "known:search512")
 PREDICTIONS = ("rest:search512", "search512", "reach:search512", "known:search512")
 """Searches with more and more that is known of the courses of obstacles."""
 INTERVALS = {"PlanarMovingObstacles": (0.3, 0.1), "PandaMovingObstacles": (0.5,)}
@@ -93,9 +96,9 @@ class Config:
     """Ids of environments with a shipped agent."""
     n_scenes: int | None = None
     """Number of scenes of each set; default: all of them."""
-    only: Literal["everything", "agents", "runs", "looking", "reaches"] = "everything"
-    """Part that is measured: shipped agents and their baselines, the trainings in `runs`, looking again on the way, or
-    obstacles on reaches of their own; other numbers stay."""
+    only: Literal["everything", "agents", "runs", "looking", "two", "reaches"] = "everything"
+    """Part that is measured: shipped agents and their baselines, the trainings in `runs`, looking again on the way, two
+    via-points, or obstacles on reaches of their own; other numbers stay."""
     runs: Path = Path("runs/sb3")
     """Folder of trainings, which get a row each: those of benchmarks/sb3.py, viaq with other seeds, viarank with other
     beliefs."""
@@ -103,6 +106,8 @@ class Config:
     """Folder of trainings among obstacles on reaches of their own, such as `PlanarMovingObstacles-0` for seed 0."""
     looks: Path = Path("runs/looks")
     """Folder of trainings that look again each 0.3 s, such as `PlanarSensed-0` for seed 0."""
+    two: Path = Path("runs/two")
+    """Folder of trainings with one look and two via-points, such as `PlanarSensed-0` for seed 0."""
 
 
 def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
@@ -122,14 +127,19 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
     if config.only in ("everything", "reaches"):
         yield from reaches_of(config, short, common)
     if config.only in ("everything", "looking") and task.sensor is not None and task.space.of_hand:
-        for when, decide_at in LOOKING.items():
-            settings = {**common, "env_kwargs": {"sensor": "hand_rays", "decide_at": decide_at}}
-            planner = ["thick:plan_motion"] if decide_at == "end" else []
+        for when, kwargs in LOOKING.items():
+            settings = {**common, "env_kwargs": {"sensor": "hand_rays", **kwargs}}
+            once = kwargs["decide_at"] == "end"
+            planner = ["thick:plan_motion"] if once else []
             rows = evaluate(**settings, baselines=["thick:search512", *planner, "known:search512"]).rows
-            if decide_at != "end":
-                rows += seeds_of(config.looks, short, settings, untrained="horizon" in decide_at)
+            if not once and "n_via" not in kwargs:
+                rows += seeds_of(config.looks, short, settings, untrained="horizon" in kwargs["decide_at"])
             for row in rows:
                 yield _numbers(LOOKS, name, f"{row['method']}, {when}", row)
+    if config.only in ("everything", "two") and task.sensor is not None and task.space.of_hand:
+        settings = {**common, "env_kwargs": {"n_via": 2}}
+        for row in evaluate(**settings, baselines=TWO_BASELINES).rows + seeds_of(config.two, short, settings):
+            yield _numbers(TWO, name, row["method"], row)
     if config.only not in ("everything", "runs"):
         return
     for folder in sorted(config.runs.glob(f"{short}-*")):
@@ -286,7 +296,7 @@ def draw_method(axes: Axes, name: str, row: dict[str, Any]) -> Any:
 
 def in_order(rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return rows by their tasks, and those of methods that were there before in the place that they had."""
-    tasks = [*SHIPPED_IDS, LOOKS, *REACHES]
+    tasks = [*SHIPPED_IDS, TWO, LOOKS, *REACHES]
     methods = list(dict.fromkeys((row["env"], row["method"]) for row in [*before, *rows]))
     return sorted(rows, key=lambda row: (tasks.index(row["env"]), methods.index((row["env"], row["method"]))))
 
