@@ -230,7 +230,8 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
             continue
         found[heading] = table([row for row in mine if not is_detail(row["method"])])
         for kind, part in {"beliefs": ":", "seeds": "agent, seed", "untrained": "untrained, "}.items():
-            some = [row for row in mine if part in row["method"]]
+            # Planners are in the table of the task.
+            some = [row for row in mine if part in row["method"] and ":plan" not in row["method"]]
             if some:
                 found[f"{heading}, {kind}"] = table(some)
     return found
