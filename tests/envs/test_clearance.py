@@ -175,7 +175,7 @@ def test_bounding_balls_are_hardly_larger_than_the_smallest_ones():
     corners = np.array(list(np.ndindex(2, 2, 2))) * (0.2, 0.4, 0.4) + 1.0
     spheres = grouped([corners], [np.full(8, 0.05)], [1], [])
     np.testing.assert_allclose(spheres.ball_centre[0], (1.1, 1.2, 1.2), atol=1e-3)
-    assert 0.35 <= spheres.ball_radius[0] < 0.351
+    assert 0.35 - 1e-12 < spheres.ball_radius[0] < 0.351
 
 
 def test_spheres_and_capsules_of_a_file_stay_as_they_are():

@@ -292,14 +292,15 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         super()._setup_model()
         self.actor = self.policy
 
-    def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Any:
-        if total_timesteps <= self.learning_starts:
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        total, callback = super()._setup_learn(*args, **kwargs)
+        if total <= self.learning_starts:
             warnings.warn(
-                f"the network is not updated once in {total_timesteps} decisions, as learning starts after "
+                f"the network is not updated once in {total} decisions, as learning starts after "
                 f"{self.learning_starts} (learning_starts)",
-                stacklevel=4,
+                stacklevel=3,
             )
-        return super()._setup_learn(total_timesteps, *args, **kwargs)
+        return total, callback
 
     def set_env(self, env: Any, force_reset: bool = True) -> None:
         """Set the training environment.
