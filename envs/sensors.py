@@ -176,7 +176,7 @@ class Sensor:
         return tool @ rotation, place + tool @ position
 
     def sees(self, centre: Float, radius: float) -> bool:
-        """Return True if a ray comes within a ball, [m], or the sensor moves with the hand."""
+        """Return True if a ray comes within a ball around a point, shape (3,), [m], or the sensor is on the hand."""
         if self.mount == "hand":
             return True
         rays = self.directions @ frame_matrices(np.array(self.quaternion)).T

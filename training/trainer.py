@@ -97,7 +97,8 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
             run = Run(config.folder)
             with locked(run.folder):
                 _restore_settings(run, config)
-                print(f"going on with {run}", file=sys.stderr)
+                if config.progress:
+                    print(f"going on with {run}", file=sys.stderr)
                 with _untrained_model(run.config) as model:
                     _continue_training(run, model, callbacks)
             return run

@@ -127,6 +127,16 @@ def test_beliefs_hold_what_is_seen_and_leave_the_ends_free(env_id, belief) -> No
             assert (free > 0.009).all()
 
 
+def test_a_reading_of_zero_is_a_point_at_the_sensor() -> None:
+    task = registered_task(SENSED)
+    sight = Sight.of_scenes(scenes_of(task, 2), task)
+    ray = int(sight.hit[0].argmax())
+    sight.points[0, ray] = sight.eyes[0, ray]
+    with np.errstate(invalid="raise"):
+        (cloud,) = unpack(thick_points(task, sight), 0)
+    assert np.isfinite(cloud.points).all()
+
+
 LOOKING = {"sensor": "hand_rays", "decide_at": ("sight",), "n_via": 1}
 
 

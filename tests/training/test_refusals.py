@@ -394,6 +394,10 @@ COMMANDS = [
     ("evaluate --problems . --scenes hard", "not both"),
     (f"evaluate --env {PLANE} --baselines straight --scenes nowhere.npz", "nowhere.npz"),
     (f"evaluate --env {SENSED} --baselines search16 --env-kwargs sensor=nose", "hand_rays"),
+    (
+        f"evaluate --env {SENSED} --baselines thick:plan_motion --env-kwargs sensor=hand_rays decide_at=[sight]",
+        "searchN",
+    ),
     (f"evaluate --env {PLANE} --json /proc/x", "--json /proc/x cannot be written"),
     (
         f"evaluate --env {PLANE} --json full/notes.txt",

@@ -73,7 +73,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("learning_starts", "target_policy_noise", "target_noise_clip"), (0, math.inf)),
     **dict.fromkeys(("ent_coef", "vf_coef", "top_quantiles_to_drop_per_net", "checks"), (0, math.inf)),
     **dict.fromkeys(("buffer_size", "train_freq", "n_steps", "n_epochs"), (1, math.inf)),
-    "batch_size": (1, 1 << 16),
+    "batch_size": (1, 1 << 16),  # rows are drawn with replacement: larger batches repeat them
     **dict.fromkeys(("policy_delay", "target_update_interval", "width"), (1, math.inf)),
     # Time and memory of a decision grow with these
     **dict.fromkeys(("candidates", "per_refinement", "next_candidates"), (1, MOST_CANDIDATES)),

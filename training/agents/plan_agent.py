@@ -155,7 +155,7 @@ class PlanPolicy(BasePolicy):
         return best
 
     def _within_reach(self, problem: Problem, actions: Numbers) -> NDArray[np.bool_]:
-        """Return True for actions whose movement stays within reach and joint ranges, and clear of the arm itself."""
+        """Return True, shape (B, H), for actions (B, H, m) with movements within reach and clear of the arm itself."""
         alone = problem._replace(obstacles=no_obstacles(len(actions)))
         moves = moves_of(self.task, alone, actions, exact=True)
         pairs = pairs_of(self.task, alone, moves, np.arange(FINE_INSTANTS), exact=True)
