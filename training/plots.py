@@ -1,4 +1,4 @@
-"""Figures of trainings, evaluations and studies, and of fits to measured movements."""
+"""Figures of success in trainings and studies, and of fits to measured movements."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.palette import PALETTE
 from viapoint.primitives import ViaPointFit
 from viapoint.training.files import write_figure
-from viapoint.training.scene_sets import BANDS
 
 BLUE = "#1f5fa8"
 AGENT = {"color": BLUE, "marker": "o"}
@@ -46,53 +45,13 @@ START: dict[str, Any] = {**POINT, "color": PALETTE.start, "marker": "s", "marker
 GOAL: dict[str, Any] = {**POINT, "color": PALETTE.goal, "marker": "D", "markersize": 5.0, "label": "goal"}
 
 
-def learning_curve(path: Path, curve: Sequence[Mapping[str, Any]]) -> Path:
-    """Draw success on the validation scenes against decisions, with its Wilson band and the time of training."""
-    if not curve:
-        raise ValueError("there is no learning curve to draw: the run was never evaluated")
-    rate, low, high = _percent([record["success"] for record in curve])
-    decisions = [record["decisions"] for record in curve]
-    figure = Figure(figsize=(6.0, 3.6), layout="constrained")
-    ax = figure.subplots()
-    ax.plot(decisions, rate, marker="o", markersize=3.5, color=BLUE)
-    ax.fill_between(decisions, low, high, alpha=0.2, linewidth=0.0, color=BLUE)
-    ax.set_xlabel(f"decisions ({curve[-1]['seconds'] / 60.0:.1f} minutes of training)")
-    ax.set_ylabel("success on validation scenes [%]\nband: 95 % Wilson interval")
-    ax.set_xlim(left=0.0)
-    ax.set_ylim(0.0, 102.0)
-    style_axes(ax)
-    return write_figure(path, figure, dpi=DOTS_PER_INCH)
-
-
-def success_by_band(path: Path, record: Mapping[str, Any]) -> Path:
-    """Draw the success of each method of an evaluation by the difficulty of the scenes, with Wilson intervals."""
-    summaries = record["methods"]
-    figure = Figure(figsize=(8.0, 3.8), layout="constrained")
-    ax = figure.subplots()
-    width = 0.8 / len(summaries)
-    for i, (name, summary) in enumerate(summaries.items()):
-        bands = summary["success_by_band"]
-        shown = [(j, bands[band]) for j, band in enumerate(BANDS) if band in bands]
-        x = np.array([j + (i - (len(summaries) - 1) / 2.0) * width for j, _ in shown])
-        rate, low, high = _percent([each for _, each in shown])
-        ax.bar(x, rate, width=0.9 * width, label=name, **_colour(name, list(summaries)))
-        ax.errorbar(x, rate, yerr=(rate - low, high - rate), fmt="none", ecolor="0.25", elinewidth=1.0)
-    ax.set_xticks(range(len(BANDS)), BANDS)
-    ax.set_xlabel("solution share: random actions whose plan is clear (easy to hard)")
-    ax.set_ylabel("success [%]")
-    ax.set_ylim(0.0, 102.0)
-    ax.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    style_axes(ax)
-    return write_figure(path, figure, dpi=DOTS_PER_INCH)
-
-
 def success_of_rows(
     path: Path, table: Any, curves: Mapping[str, Sequence[Sequence[Sequence[float]]]]
 ) -> Path:
-    """Draw success with intervals of each row of a study, and success during the trainings.
+    """Draw success with intervals of each method in each set of scenes, and success during trainings.
 
     `table` has lines of one environment with `method`, `set`, `success`, `low` and `high`; `curves` has pairs of
-    decisions and success in validation, for each run of each row.
+    decisions and success in validation, for each run of each method.
     """
     methods = list(dict.fromkeys(table["method"]))
     figure = Figure(figsize=(11.0, 1.6 + 0.32 * len(methods)), layout="constrained")
@@ -115,7 +74,7 @@ def success_of_rows(
         ax.set_ylabel("success in validation [%]")
         ax.set_ylim(-2.0, 102.0)
     for ax in (axes, *others):
-        ax.legend(frameon=False)
+        ax.legend(frameon=False, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
         style_axes(ax)
     return write_figure(path, figure, dpi=DOTS_PER_INCH)
 
@@ -173,9 +132,3 @@ def _colour(name: str, names: Sequence[str]) -> dict[str, Any]:
         return {"color": OTHER_COLOURS[others.index(name) % len(OTHER_COLOURS)]}
     variants = [each for each in names if each.startswith(kind)]
     return {"color": METHOD_STYLES[kind]["color"], "alpha": (1 + variants.index(name)) / len(variants)}
-
-
-def _percent(rates: Sequence[Mapping[str, float]]) -> tuple[Float, Float, Float]:
-    """Return rates and the ends of their intervals, [%]."""
-    rate, low, high = (100.0 * np.array([each[part] for each in rates]) for part in ("rate", "low", "high"))
-    return rate, low, high

@@ -274,13 +274,12 @@ def _environment(
         check_whole("n_scenes", n_scenes)
     places = []
     for each in scenes:
-        if each in SETS:
-            if each in SEEDS or shipped_set(each, task) is not None:  # the others cannot be drawn
-                places.append(each)
-        elif (folder / each).is_file():
+        if (folder / each).is_file():
             places.append(str((folder / each).absolute()))
-        else:
+        elif each not in SETS:
             raise ValueError(f"{unknown_name('scenes', each, SETS)}; or the path of a file of scenes")
+        elif each in SEEDS or shipped_set(each, task) is not None:  # the others cannot be drawn
+            places.append(each)
     if not places:
         raise ValueError(f"none of {', '.join(scenes)} is shipped for {env.env_id}")
     return dataclasses.replace(env, scenes=tuple(places))
@@ -306,8 +305,8 @@ def _agent(
         raise ValueError(f"refine is for tasks with one decision for a movement, {env.env_id} has several")
     if not seeds or len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must hold at least one number and none twice, got {seeds}")
-    agent = dataclasses.replace(env, row=row, training=training, untrained=untrained)
-    agent = dataclasses.replace(agent, checks=tuple(checks) or (0,), refine=tuple(refine))
+    decides: Values = {"checks": tuple(checks) or (0,), "refine": tuple(refine), "untrained": untrained}
+    agent = dataclasses.replace(env, row=row, training=training, **decides)
     trials = [dataclasses.replace(agent, seed=seed) for seed in seeds]
     for trial in trials:
         config = trial.config(Path())
@@ -355,9 +354,8 @@ def _ends(path: str, given: Any) -> list[Any]:
     low, high = ends.get("low"), ends.get("high")
     ordered = is_number(low) and is_number(high) and low < high and not (ends.get("log") and low <= 0)
     if not ordered or set(ends) - {"low", "high", "log"}:
-        raise ValueError(
-            f"{path} must be a list, or a range such as {{low: 1e-4, high: 1e-2, log: true}}, got {given!r}"
-        )
+        example = "{low: 1e-4, high: 1e-2, log: true}"
+        raise ValueError(f"{path} must be a list, or a range such as {example}, got {given!r}")
     return [low, high]
 
 
@@ -370,16 +368,12 @@ def run(config: StudyConfig) -> None:
     study = Study.from_yaml(config.file)
     table = run_study(study, out=config.out, workers=config.workers, told=print)
     if len(table):
-        print(markdown(table, study.name))
+        print(_page(table, study.name))
     print(f"tables and figures: {config.out or study.out}")
 
 
 def run_study(
-    study: Study,
-    *,
-    out: str | Path | None = None,
-    workers: int | None = None,
-    told: Told = lambda line: None,
+    study: Study, *, out: str | Path | None = None, workers: int | None = None, told: Told = lambda line: None
 ) -> pd.DataFrame:
     """Run what a study has not run yet, and write its tables.
 
@@ -417,21 +411,22 @@ def run_study(
             raise BadFileError(folder, "holds something else than a study; name another folder")
         write_json(mark, {"viapoint": "study", "name": study.name})
     missing = [trial for trial in study.trials if not _finished_record(trial, folder)]
-    searches = [search for search in study.searches if not _is_finished(search, folder)]
+    searches = []
+    for search in study.searches:
+        best = search.folder(folder) / "best.json"
+        if not best.is_file() or read_json(best).get("key") != search.key:
+            searches.append(search)
     failed = []
     if missing or searches:
-        told(
-            f"{len(missing)} trials and {len(searches)} searches to do; Ctrl-C stops, the same command goes on"
-        )
+        told(f"to do: {len(missing)} trials and {len(searches)} searches; the same command goes on after Ctrl-C")
         with _connected(workers):
             failed += _run_trials(missing, folder, told)
             for search in searches:
                 failed += _run_search(search, folder, workers, told)
     table = _write_results(study, folder)
     if failed:
-        raise StudyFailedError(
-            f"{len(failed)} trials failed; the same command tries them again: {'; '.join(failed)}"
-        )
+        reasons = "; ".join(failed)
+        raise StudyFailedError(f"{len(failed)} trials failed; the same command tries them again: {reasons}")
     return table
 
 
@@ -473,12 +468,6 @@ def _finished_record(trial: Trial, out: Path) -> Record:
     return record if record.get("asked") == _asked(trial) else {}
 
 
-def _is_finished(search: Trial, out: Path) -> bool:
-    """Return True if the best parameters of this very search are there."""
-    path = search.folder(out) / "best.json"
-    return path.is_file() and read_json(path).get("key") == search.key
-
-
 def _write_results(study: Study, folder: Path) -> pd.DataFrame:
     """Write `results.csv`, `results.md` and a figure for each environment from all records, and return the table."""
     lines = []
@@ -491,7 +480,7 @@ def _write_results(study: Study, folder: Path) -> pd.DataFrame:
             of_rows.setdefault(trial.row, []).append(record["curve"])
     table = _table(lines)
     write_bytes(folder / "results.csv", table.to_csv(index=False).encode())
-    write_bytes(folder / "results.md", markdown(table, study.name).encode())
+    write_bytes(folder / "results.md", _page(table, study.name).encode())
     for environment, part in table.groupby("environment", sort=False):
         figure = folder / f"{environment.rpartition('/')[2]}.png"
         success_of_rows(figure, part, curves.get(environment, {}))
@@ -513,7 +502,7 @@ def _table(lines: list[Record]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=COLUMNS).round(4)
 
 
-def markdown(table: pd.DataFrame, title: str) -> str:
+def _page(table: pd.DataFrame, title: str) -> str:
     """Return a page with one table for each environment: sets of scenes side by side, success in percent."""
     parts = [f"# {title}", NOTE]
     for environment, lines in table.groupby("environment", sort=False):
@@ -533,8 +522,7 @@ def _asked(trial: Trial) -> Record:
     """Return what identifies a trial as plain values."""
     plain: Record = as_plain(trial)
     plain["scenes"] = {name: frozen.sha256 for name, frozen in _sets(trial).items()}
-    for name in ("parameters", "trials", "first"):  # of searches
-        del plain[name]
+    del plain["parameters"], plain["trials"], plain["first"]  # of searches
     return plain
 
 
@@ -578,14 +566,8 @@ def _connected(workers: int | None) -> Any:
     ray = _import_ray()
     if ray.is_initialized():
         return nullcontext()
-    return ray.init(
-        address="local",
-        num_cpus=workers,
-        include_dashboard=False,
-        log_to_driver=False,
-        logging_level="ERROR",
-        _node_ip_address="127.0.0.1",
-    )
+    quiet: Values = {"include_dashboard": False, "log_to_driver": False, "logging_level": "ERROR"}
+    return ray.init(address="local", num_cpus=workers, _node_ip_address="127.0.0.1", **quiet)
 
 
 def _run_trials(trials: list[Trial], folder: Path, told: Told) -> list[str]:
@@ -679,8 +661,9 @@ def _distribution(given: Any) -> Any:
 
     if isinstance(given, list):
         return distributions.CategoricalDistribution(given)
-    whole = isinstance(given["low"], int) and isinstance(given["high"], int)
-    return (distributions.IntDistribution if whole else distributions.FloatDistribution)(**given)
+    if isinstance(given["low"], int) and isinstance(given["high"], int):
+        return distributions.IntDistribution(**given)
+    return distributions.FloatDistribution(**given)
 
 
 def _write_search(search: Trial, results: Any, folder: Path) -> str:

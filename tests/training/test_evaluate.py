@@ -11,11 +11,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from helpers import MOVING, PLANE, REACH, STEP, scenes_of
-from PIL import Image
 from stable_baselines3.common.vec_env import VecNormalize
 
 from viapoint.envs import scene_from_json, scene_to_json
-from viapoint.training import GeometrySearch, ViaVecEnv, evaluate, plots, report, statistics
+from viapoint.training import GeometrySearch, ViaVecEnv, evaluate, report, statistics
 from viapoint.training.agents.agent import PPO
 from viapoint.training.agents.model_io import build
 from viapoint.training.evaluation import SLOW_DECISION, MethodResult, evaluate_methods
@@ -247,15 +246,6 @@ def test_fewer_scenes_than_asked_for_are_told(small_scenes, capsys):
     result = evaluate(env=PLANE, scenes=small_scenes, n_scenes=50, baselines=baselines, time_decisions=False)
     assert len(result.results[0].success) == 40
     assert "40 scenes, not 50" in capsys.readouterr().err
-
-
-def test_pictures_are_drawn(record, tmp_path):
-    rates = ({"rate": r, "low": r - 0.1, "high": r + 0.1} for r in (0.2, 0.5, 0.9))
-    curve = [{"decisions": 10 * i, "seconds": float(i), "success": rate} for i, rate in enumerate(rates)]
-    line = plots.learning_curve(tmp_path / "a" / "curve.png", curve)
-    bars = plots.success_by_band(tmp_path / "bars.png", record)
-    for path in (line, bars):
-        assert np.asarray(Image.open(path).convert("L")).std() > 5.0
 
 
 def test_wilson_equals_published_values():

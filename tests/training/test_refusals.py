@@ -29,7 +29,6 @@ from viapoint.training import (
     load_agent,
     plan_motion,
     plan_motions,
-    plots,
     statistics,
     train,
 )
@@ -300,7 +299,6 @@ CALLS = [
       for name in (PANDA, *CHANGING)),
     *(lambda changes=changes: film(**changes)
       for changes in ({"path": "film.gif"}, {"mode": None}, {"number": 0})),
-    lambda: plots.learning_curve("none.png", []),
     *(lambda successes=successes: statistics.wilson(successes, 4) for successes in (5, -1)),
 ]  # fmt: skip
 

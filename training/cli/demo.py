@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 
 from viapoint.envs.gl import GLUnavailableError
-from viapoint.training import plots, report
+from viapoint.training import report
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.agents.model_io import untrained
 from viapoint.training.configs import DemoConfig, TrainConfig
@@ -19,6 +21,7 @@ from viapoint.training.evaluation import evaluate
 from viapoint.training.files import check_ours, read_json
 from viapoint.training.planning.baselines import agent_method
 from viapoint.training.planning.search import registered_task
+from viapoint.training.plots import success_of_rows
 from viapoint.training.progress import scene_progress
 from viapoint.training.runs import Run
 from viapoint.training.scene_sets import BANDS, FrozenScenes, scenes_for
@@ -31,8 +34,7 @@ BASELINES = ("search16", "search512", "straight", "random")
 FILES = {
     "table.md": "the table",
     "table.json": "the table with every outcome",
-    "learning_curve.png": "success during training",
-    "success_by_band.png": "success by difficulty",
+    "success.png": "success by difficulty, and during training",
     "gallery.png": "test scenes, planned and executed",
     "movements.mp4": "movements",
 }
@@ -57,8 +59,7 @@ def run(config: DemoConfig) -> None:
     if (record.get("sha256"), record.get("weights_sha256")) != (frozen.sha256, weights):
         record = {**_measured(agent, frozen), "weights_sha256": weights}
         report.write(record, folder)
-        plots.learning_curve(folder / "learning_curve.png", trained.curve)
-        plots.success_by_band(folder / "success_by_band.png", record)
+        _draw_success(folder / "success.png", record, trained)
         (folder / "movements.mp4").unlink(missing_ok=True)  # they are of another agent
     if not (folder / "movements.mp4").exists():
         try:
@@ -92,6 +93,16 @@ def _measured(agent: Agent, frozen: FrozenScenes) -> dict[str, Any]:
     if result.partial:
         raise KeyboardInterrupt
     return result.to_dict()
+
+
+def _draw_success(path: Path, record: Mapping[str, Any], trained: Run) -> None:
+    """Draw success by the difficulty of the scenes, and success during training."""
+    rows = []
+    for method, summary in record["methods"].items():
+        for band, found in summary["success_by_band"].items():
+            rows.append({"method": method, "set": f"share {band}", "success": found["rate"], **found})
+    curve = [[each["decisions"], each["success"]["rate"]] for each in trained.curve]
+    success_of_rows(path, pd.DataFrame(rows), {"agent": [curve]})
 
 
 def _show_movements(folder: Path, agent: Agent, frozen: FrozenScenes) -> None:
