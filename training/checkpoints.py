@@ -28,14 +28,8 @@ from viapoint.training.vec_env import ViaVecEnv
 
 FORMAT = 3
 # Counters of Stable-Baselines3's algorithms
-COUNTERS = (
-    "seed",
-    "num_timesteps",
-    "_total_timesteps",
-    "_episode_num",
-    "_n_updates",
-    "_current_progress_remaining",
-)
+COUNTERS: tuple[str, ...] = ("seed", "num_timesteps", "_total_timesteps", "_episode_num", "_n_updates")
+COUNTERS += ("_current_progress_remaining",)
 ARRAYS = ("_last_obs", "_last_episode_starts")
 DEQUES = ("ep_info_buffer", "ep_success_buffer")
 MAY_DIFFER = ("num_timesteps", "viapoint")  # Entries that do not tell models apart
@@ -49,7 +43,7 @@ def write_checkpoint(model: BaseAlgorithm, path: Path, seconds: float) -> None:
         "counters": {name: getattr(model, name) for name in COUNTERS},
         "recent": {name: list(getattr(model, name) or ()) for name in DEQUES},
         "last": {name: getattr(model, name) for name in ARRAYS},
-        "buffer": _buffer_state(model),
+        "buffer": {},
         "random": {
             "python": random.getstate(),
             "numpy": np.random.get_state(legacy=False),  # noqa: NPY002 - SB3 draws from it
@@ -57,6 +51,10 @@ def write_checkpoint(model: BaseAlgorithm, path: Path, seconds: float) -> None:
         },
         "env": env.state(),
     }
+    buffer: Any = getattr(model, "replay_buffer", None)  # a rollout buffer is empty between two collections
+    if buffer is not None:
+        filled = _mapped(_buffer_arrays(buffer), np.ndarray, lambda array: array[: buffer.size()])
+        arrays["buffer"] = {"pos": buffer.pos, "full": buffer.full, "arrays": filled}
     state = {
         "format": FORMAT,
         "model": describe(model),
@@ -153,15 +151,6 @@ def _variables(model: BaseAlgorithm) -> dict[str, Any]:
 def _buffer_arrays(buffer: Any) -> dict[str, Any]:
     """Return the arrays of a replay buffer, and the dictionaries that hold those of observations."""
     return {name: each for name, each in vars(buffer).items() if isinstance(each, np.ndarray | dict)}
-
-
-def _buffer_state(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return the filled part of the replay buffer; a rollout buffer is empty between two collections."""
-    buffer = getattr(model, "replay_buffer", None)
-    if buffer is None:
-        return {}
-    filled = _mapped(_buffer_arrays(buffer), np.ndarray, lambda array: array[: buffer.size()])
-    return {"pos": buffer.pos, "full": buffer.full, "arrays": filled}
 
 
 def _fill(arrays: Any, saved: Any) -> None:

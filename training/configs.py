@@ -22,17 +22,8 @@ from viapoint.envs.common.validation import is_number
 from viapoint.envs.registration import ENV_IDS
 from viapoint.envs.task import Task
 from viapoint.primitives.fitting import MOST_VIA_POINTS, USUAL_RANGE
-from viapoint.training.checks import (
-    DEFAULT_ENV,
-    RANGES,
-    SHIPPED_IDS,
-    check_env_kwargs,
-    check_file,
-    check_folder,
-    check_whole,
-    named_path,
-    unknown_name,
-)
+from viapoint.training import checks as valid
+from viapoint.training.checks import DEFAULT_ENV, SHIPPED_IDS, check_file, check_folder, named_path
 from viapoint.training.files import as_plain, parse_yaml
 from viapoint.training.planning.search import registered_task
 from viapoint.training.presets import STEP_PRESETS, Algorithm, Preset, preset_of, usual_algorithm
@@ -66,7 +57,7 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
 
 
 def from_words(words: list[str]) -> dict[str, Any]:
-    """Return NAME=VALUE words as a dictionary; values are YAML, so that lists and settings by name have a form."""
+    """Return NAME=VALUE words as a dictionary; values are YAML."""
     values: dict[str, Any] = {}
     for word in words:
         name, equals, text = word.partition("=")
@@ -104,9 +95,7 @@ def _listed(ids: Iterable[str]) -> str:
 
 
 ENV = tyro.conf.arg(metavar="ID", help=f"Id of a registered environment, such as {_listed(ENV_IDS)}.")
-AGENT = tyro.conf.arg(
-    metavar="AGENT", help="Run folder, model folder, or id of an environment with a shipped agent."
-)
+AGENT = tyro.conf.arg(metavar="AGENT", help="Run folder, model folder, or id of a shipped agent.")
 PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent: {_listed(SHIPPED_IDS)}.")
 ARM = tyro.conf.arg(metavar="ARM", help="Arm: panda, planar, or an MJCF or URDF file.")
 # Environments of the built-in arms; that of other arms is viapoint/Obstacles-v0
@@ -123,9 +112,7 @@ def _plain(name: str, values: Any) -> Any:
         raise ValueError(f"{name}: {error}") from None
     arm, given = plain.get("arm"), values.get("arm")
     if isinstance(given, Arm) and not given.file and arm_of(arm) is not given:
-        raise ValueError(
-            f"{name}: register_arm makes arm {arm!r} known by its name, which is that of another one"
-        )
+        raise ValueError(f"{name}: arm {arm!r} must be made known by register_arm; another one has its name")
     if isinstance(arm, str) and arm.endswith(ARM_FILES):
         plain["arm"] = str(Path(arm).expanduser().resolve())
     return plain
@@ -149,7 +136,7 @@ def task_with(env_id: str, env_kwargs: Mapping[str, Any]) -> Task:
         known = inspect.signature(Task.of).parameters
         for name in env_kwargs:
             if name not in (*known, "threads"):
-                raise ValueError(unknown_name("env_kwargs", name, known)) from error
+                raise ValueError(valid.unknown_name("env_kwargs", name, known)) from error
         raise ValueError(f"env_kwargs of {env_id}: {error}") from error
 
 
@@ -172,13 +159,13 @@ class Config:
                 value = named_path(name, value)
             elif str(each.type) == "NamedValues":
                 value = _plain(name, value)
-            elif name in RANGES and value is not each.default and not isinstance(value, tuple | list):
-                value = check_whole(name, value)
+            elif name in valid.RANGES and value is not each.default and not isinstance(value, tuple | list):
+                value = valid.check_whole(name, value)
             object.__setattr__(self, name, value)
         self._check()
 
     def _check(self) -> None:
-        """Check what is not a whole number."""
+        """Check what is not a whole number or a path."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,43 +184,33 @@ class TrainConfig(Config):
         ('runs/PandaObstacles-v0-viaq-1', 16000)
     """
 
-    env: Annotated[str, ENV] = DEFAULT_ENV
-    """Id of the environment."""
+    env: Annotated[str, ENV] = DEFAULT_ENV  #: Id of the environment.
     arm: Annotated[str | None, ARM] = None
     """Arm, which becomes one of the arguments of the environment; the usual environment is then one for any arm."""
     algo: Algorithm | None = None
     """Learning algorithm; default: viaq, or viarank where obstacles are seen with a sensor."""
-    seed: int = 0
-    """Seed of all random numbers."""
-    n_timesteps: int | None = None
-    """Decisions, in whole rounds of all environments; default: the preset's."""
-    stop_when_stalled: float | None = None
-    """Stop if success stalls for this share of decisions."""
-    n_envs: int | None = None
-    """Environments stepped together; default: the preset's."""
-    out: Path | str | None = None
-    """Run folder; default: runs/<environment>-<algorithm>-<seed>."""
+    seed: int = 0  #: Seed of all random numbers.
+    n_timesteps: int | None = None  #: Decisions, in whole rounds of all environments; default: the preset's.
+    stop_when_stalled: float | None = None  #: Stop if success stalls for this share of decisions.
+    n_envs: int | None = None  #: Environments stepped together; default: the preset's.
+    out: Path | str | None = None  #: Run folder; default: runs/<environment>-<algorithm>-<seed>.
     resume: bool = False
     """Continue the run from its last checkpoint; --n-timesteps may extend it, others must be as they were."""
-    eval_every: int | None = None
-    """Decisions between evaluations, 0 for none; default: the preset's."""
-    eval_scenes: int = 500
-    """Validation scenes in each evaluation."""
-    checkpoint_every: int | None = None
-    """Decisions between checkpoints; default: the preset's."""
+    eval_every: int | None = None  #: Decisions between evaluations, 0 for none; default: the preset's.
+    eval_scenes: int = 500  #: Validation scenes in each evaluation.
+    checkpoint_every: int | None = None  #: Decisions between checkpoints; default: the preset's.
     env_kwargs: NamedValues = field(default_factory=dict)
     """Arguments of the environment, values in YAML: n_via=2 timing=learned whole_arm=true n_obstacles=[1,8]."""
     hyperparameters: NamedValues = field(default_factory=dict)
     """Hyperparameters that replace those of the preset, in the same form: batch_size=256."""
-    progress: bool = True
-    """Show a progress bar."""
+    progress: bool = True  #: Show a progress bar.
 
     def _check(self) -> None:
         if not isinstance(self.env, str):
             raise ValueError(f"env must be the id of an environment, got {self.env!r}")
         if self.algo is not None and self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
-        check_env_kwargs(self.env_kwargs)
+        valid.check_env_kwargs(self.env_kwargs)
         if self.arm is not None:
             env, argument = env_of_arm(self.arm, None if self.env == DEFAULT_ENV else self.env)
             object.__setattr__(self, "env", env)
@@ -242,22 +219,17 @@ class TrainConfig(Config):
         if self.algo is None:
             object.__setattr__(self, "algo", usual_algorithm(self.task))
         if self.task.stepwise and self.algo not in STEP_PRESETS:
-            raise ValueError(
-                f"{self.algo} decides on whole movements; for {self.env} algo must be one of "
-                f"{', '.join(STEP_PRESETS)}"
-            )
-        share = self.stop_when_stalled
+            known = ", ".join(STEP_PRESETS)
+            raise ValueError(f"{self.algo} decides on whole movements; algo for {self.env} is one of {known}")
+        share, least = self.stop_when_stalled, self.preset.n_timesteps
         if share is None:
             return
         if not is_number(share) or not 0.0 < share < 1.0:
             raise ValueError(f"stop_when_stalled must be a number over 0 and below 1, got {share!r}")
         if not self.evaluation_interval:
             raise ValueError("stop_when_stalled needs validations: eval_every must be 1 or more, got 0")
-        if self.total_timesteps <= self.preset.n_timesteps:
-            raise ValueError(
-                f"n_timesteps must be over {self.preset.n_timesteps}, before which a training does not stall, "
-                f"got {self.total_timesteps}"
-            )
+        if self.total_timesteps <= least:  # before which a training does not stall
+            raise ValueError(f"stop_when_stalled needs n_timesteps over {least}, got {self.total_timesteps}")
 
     @functools.cached_property
     def task(self) -> Task:
@@ -333,7 +305,7 @@ class AgentConfig(Config):
     """Arguments of the environment, values in YAML: sensor=hand_rays decide_at=[sight]."""
 
     def _check(self) -> None:
-        check_env_kwargs(self.env_kwargs)
+        valid.check_env_kwargs(self.env_kwargs)
         if self.pretrained is not None:
             if self.agent not in (None, self.pretrained):
                 raise ValueError(f"the agent is named twice: {self.agent} and pretrained={self.pretrained}")
@@ -377,9 +349,7 @@ class EvaluateConfig(AgentConfig):
         if self.of_planners and self.arm is not None and self.problems is None:
             raise ValueError("the problems that are shipped are for one arm; --arm needs --problems")
         if self.problems is not None and self.scenes not in ("test", BENCHMARK):
-            raise ValueError(
-                f"name a set of scenes or a folder of problems, not both: got scenes={self.scenes!r}"
-            )
+            raise ValueError(f"name a scene set or a folder of problems, not both: got {self.scenes!r}")
         if self.of_planners and not self.baselines:
             raise ValueError("baselines must name at least one planner")
         if not self.checks:
@@ -485,8 +455,7 @@ class FitConfig(Config):
     """
 
     file: tyro.conf.Positional[Path]  # CSV file with one sample in each line, [s] and [m].
-    n_via: tuple[int, ...] = USUAL_RANGE
-    """Number of via-points, or the fewest and the most to choose among."""
+    n_via: tuple[int, ...] = USUAL_RANGE  # Number of via-points, or the fewest and the most to choose among.
     free_ends: bool = True
     """Fit onset and end, too; otherwise a movement begins with its first sample and ends with its last."""
     out: Path = Path("fit")  # Folder for the table fit.csv and the figure fit.png.
@@ -498,9 +467,8 @@ class FitConfig(Config):
 
     def _check(self) -> None:
         if len(self.n_via) not in (1, 2) or not 0 <= self.n_via[0] <= self.n_via[-1] <= MOST_VIA_POINTS:
-            raise ValueError(
-                f"n_via must be one number, or the fewest and the most, from 0 to {MOST_VIA_POINTS}, got {self.n_via}"
-            )
+            allowed = f"one number, or the fewest and the most, from 0 to {MOST_VIA_POINTS}"
+            raise ValueError(f"n_via must be {allowed}, got {self.n_via}")
         check_folder(f"out {self.out}", self.out)
 
 
@@ -548,7 +516,6 @@ class DemoConfig(Config):
         check_folder(f"out {self.out}", self.out)
 
 
-@dataclass(frozen=True, kw_only=True)
 class DoctorConfig(Config):
     """Check what works on this machine, and name what to install.
 

@@ -25,10 +25,8 @@ def dataset_folder(dataset_id: str) -> Path:
     from minari.storage import get_dataset_path
 
     if not DATASET_ID.fullmatch(dataset_id):
-        raise ValueError(
-            "dataset must be named like group/name-v0, of letters, digits, - and _, two or more in a group, got "
-            f"{dataset_id!r}"
-        )
+        allowed = "letters, digits, - and _, two or more in a group"
+        raise ValueError(f"dataset must be named like group/name-v0, of {allowed}, got {dataset_id!r}")
     return Path(get_dataset_path(dataset_id))
 
 
@@ -54,10 +52,7 @@ def record_dataset(
     import minari
 
     if isinstance(method, PlannerMethod):
-        raise ValueError(
-            f"movements of {method.name} are no actions, which a dataset holds; those of an agent, random or "
-            "search512 are"
-        )
+        raise ValueError(f"movements of {method.name} are no actions; those of an agent or search512 are")
     folder = dataset_folder(dataset_id)
     if folder.exists():
         raise ValueError(f"dataset {dataset_id} exists in {folder}; name another one, or a new version")
@@ -69,14 +64,9 @@ def record_dataset(
         with warnings.catch_warnings(), _whole_or_nothing(folder):
             # An author, a web address and an evaluation environment may be missing.
             warnings.simplefilter("ignore", UserWarning)
-            return minari.create_dataset_from_buffers(
-                dataset_id,
-                buffers,
-                env=env,
-                algorithm_name=method.name,
-                description=f"{episodes} episodes of {method.name} in {env_id}, "
-                f"seeds {seed} to {seed + episodes - 1}",
-            )
+            told = f"{episodes} episodes of {method.name} in {env_id}, seeds {seed} to {seed + episodes - 1}"
+            about: Any = {"algorithm_name": method.name, "description": told}
+            return minari.create_dataset_from_buffers(dataset_id, buffers, env=env, **about)
 
 
 @contextmanager
@@ -104,29 +94,23 @@ def _episode(env: gym.Env[Any, Any], method: Method, number: int, seed: int) -> 
     unwrapped: Any = env.unwrapped
     observation, _ = env.reset(seed=seed)
     seen = [observation]
-    steps: list[tuple[Any, ...]] = []
+    infos: list[dict[str, Any]] = []
+    played: dict[str, list[Any]] = {
+        name: [] for name in ("actions", "rewards", "terminations", "truncations")
+    }
     over = False
     while not over:
         batch = {name: part[None] for name, part in observation.items()}
         decided = method.decide(batch, unwrapped.batch.scenes)[0]
         action = np.clip(decided, -1.0, 1.0).astype(np.float32)
-        observation, reward, terminated, truncated, info = env.step(action)
+        observation, *result, info = env.step(action)
         seen.append(observation)
-        steps.append((action, reward, terminated, truncated, info))
-        over = terminated or truncated
-    actions, rewards, terminations, truncations, infos = zip(*steps, strict=True)
-    observations, reports = {}, {}
-    for name in seen[0]:
-        observations[name] = np.stack([each[name] for each in seen])
-    for name in infos[0]:
-        reports[name] = np.array([info[name] for info in infos])
-    return EpisodeBuffer(
-        id=number,
-        seed=seed,
-        observations=observations,
-        actions=np.stack(actions),
-        rewards=list(rewards),
-        terminations=list(terminations),
-        truncations=list(truncations),
-        infos=reports,
-    )
+        infos.append(info)
+        for values, value in zip(played.values(), (action, *result), strict=True):
+            values.append(value)
+        over = any(result[1:])
+    observations = {name: np.stack([each[name] for each in seen]) for name in observation}
+    reports = {name: np.array([each[name] for each in infos]) for name in infos[0]}
+    actions = np.stack(played.pop("actions"))
+    told = {"id": number, "seed": seed, "observations": observations, "actions": actions, "infos": reports}
+    return EpisodeBuffer(**told, **played)

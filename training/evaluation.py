@@ -97,14 +97,10 @@ class EvaluationResult:
         # viapoint/PlanarReach-v0, scenes test (20, sha256 ...)
     """
 
-    env_id: str
-    """Id of the environment."""
-    scenes: str
-    """Name of the scene set."""
-    sha256: str
-    """Hash of the scene set."""
-    results: tuple[MethodResult, ...]
-    """Outcomes of each method, the agent first."""
+    env_id: str  #: Id of the environment.
+    scenes: str  #: Name of the scene set.
+    sha256: str  #: Hash of the scene set.
+    results: tuple[MethodResult, ...]  #: Outcomes of each method, the agent first.
 
     @property
     def partial(self) -> bool:
@@ -115,12 +111,6 @@ class EvaluationResult:
     def success_rate(self) -> float:
         """Share of the scenes in which the first method succeeded."""
         return float(self.results[0].success.mean())
-
-    @property
-    def success_interval(self) -> tuple[float, float]:
-        """Wilson interval of that share at 95 %."""
-        rate = _rate(self.results[0].success)
-        return rate["low"], rate["high"]
 
     @property
     def rows(self) -> list[dict[str, Any]]:
@@ -143,9 +133,12 @@ class EvaluationResult:
             number = min(len(first.success), len(each.success))  # of an evaluation that was interrupted
             pairs = each.success[:number], first.success[:number]
             compared[each.name] = mcnemar(*pairs) if number else None
-        outcomes = {}
+        outcomes: dict[str, dict[str, list[Any]]] = {result.name: {} for result in self.results}
         for result in self.results:
-            outcomes[result.name] = {name: _rounded(values) for name, values in result.outcomes.items()}
+            for name, values in result.outcomes.items():
+                # A millionth of their unit is finer than their accuracy.
+                rounded = np.round(values, 6) if values.dtype.kind == "f" else values
+                outcomes[result.name][name] = rounded.tolist()
         return {
             "viapoint": versions()["viapoint"],
             "env": self.env_id,
@@ -200,7 +193,6 @@ def evaluate(
         >>> result = evaluate("viapoint/PlanarObstacles-v0", baselines=["straight"], n_scenes=50)
         >>> result.success_rate > 0.5
         True
-        >>> low, high = result.success_interval
         >>> [row["method"] for row in result.rows]
         ['agent', 'straight']
     """
@@ -209,9 +201,7 @@ def evaluate(
     if isinstance(baselines, str) or not isinstance(baselines, Sequence):
         raise ValueError(f"baselines must be a list, such as ['straight'], got {baselines!r}")
     if not isinstance(scenes, str | Path | FrozenScenes):
-        raise ValueError(
-            f"scenes must be one of {', '.join(SETS)}, the path of a file or a set, got {scenes!r}"
-        )
+        raise ValueError(f"scenes must be one of {', '.join(SETS)}, a file or a set, got {scenes!r}")
     settings: list[dict[str, int]] = []
     for number in [checks] if checks is None or isinstance(checks, int) else checks:
         settings.append({} if number is None else {"checks": check_whole("checks", number)})
@@ -221,25 +211,27 @@ def evaluate(
         agent = load_agent(agent)
     env_id, kwargs = _environment_of(agent, env, env_kwargs)
     task = registered_task(env_id, **kwargs)
-    methods = _rows_of(agent, settings)
+    methods: list[Method] = []
+    if isinstance(agent, BaseAlgorithm):
+        methods += [agent_method("agent", agent, **each) for each in settings]
+    elif agent is not None:
+        methods.append(agent)
     for each in baselines:
         if not isinstance(each, str):
             methods.append(each)
         elif each == "untrained" and isinstance(agent, BaseAlgorithm):
-            methods += _rows_of(untrained(agent), settings, each)
+            before = untrained(agent)
+            methods += [agent_method(each, before, **setting) for setting in settings]
         else:
             methods.append(make_method(each, env_id, **kwargs))
     chosen = scenes_for(scenes, task, n_scenes)
     if n_scenes is not None and n_scenes > len(chosen.share):
         print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
-    return evaluate_methods(
-        methods, chosen, env_id, env_kwargs=kwargs, time_decisions=time_decisions, progress=progress
-    )
+    options: dict[str, Any] = {"time_decisions": time_decisions, "progress": progress}
+    return evaluate_methods(methods, chosen, env_id, env_kwargs=kwargs, **options)
 
 
-def _environment_of(
-    agent: BaseAlgorithm | Method | None, env: str | None, env_kwargs: Mapping[str, Any] | None
-) -> tuple[str, dict[str, Any]]:
+def _environment_of(agent: Any, env: str | None, env_kwargs: Any) -> tuple[str, dict[str, Any]]:
     """Return id and arguments of the environment of an evaluation, in which an action is a whole movement."""
     if not isinstance(agent, BaseAlgorithm):
         if env is None:
@@ -252,15 +244,6 @@ def _environment_of(
         trained = agent.get_env().get_attr("task", [0])[0]  # type: ignore[union-attr]
         check_same_task(trained, registered_task(mine, **env_kwargs))
     return mine, whole_task(mine, kwargs if env_kwargs is None else env_kwargs)
-
-
-def _rows_of(
-    agent: BaseAlgorithm | Method | None, settings: Sequence[Mapping[str, int]], name: str = "agent"
-) -> list[Method]:
-    """Return one method for each number of checks, and of refined proposals."""
-    if isinstance(agent, BaseAlgorithm):
-        return [agent_method(name, agent, **each) for each in settings]
-    return [] if agent is None else [agent]
 
 
 def evaluate_methods(
@@ -286,9 +269,8 @@ def evaluate_methods(
     opened = SceneSimulation(env_id, min(batch, len(frozen.share)), **(env_kwargs or {}))
     with one_thread(), closing(opened) as simulation:
         for method in methods:
-            result = _evaluate_one(method, frozen, simulation, batch, time_decisions, progress)
-            results.append(result)
-            if result.partial:
+            results.append(_evaluate_one(method, frozen, simulation, batch, time_decisions, progress))
+            if results[-1].partial:
                 break
     return EvaluationResult(env_id=env_id, scenes=frozen.name, sha256=frozen.sha256, results=tuple(results))
 
@@ -389,9 +371,3 @@ def _rate(values: NDArray[np.bool_]) -> dict[str, Any]:
 
 def _quantile(values: NDArray[Any], share: float = 0.5) -> float | None:
     return float(np.quantile(values, share)) if len(values) else None
-
-
-def _rounded(values: NDArray[Any]) -> list[Any]:
-    """Return values rounded to a millionth of their unit, which is finer than their accuracy."""
-    listed: list[Any] = (np.round(values, 6) if values.dtype.kind == "f" else values).tolist()
-    return listed

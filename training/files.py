@@ -26,8 +26,6 @@ from safetensors.numpy import save as save_arrays
 
 from viapoint.envs.arms.arm import Arm
 
-Arrays = dict[str, NDArray[Any]]
-
 LARGEST_JSON = 64 << 20  # Greatest size of a JSON or YAML file, [bytes]
 # Numbers such as 1e-3, which YAML 1.1 reads as words because they lack a point or a sign
 _NUMBER = re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+")
@@ -41,10 +39,8 @@ PACKAGES = ("viapoint", "gymnasium", "mujoco", "numpy", "sb3-contrib", "stable-b
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that results depend on."""
-    return {
-        "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in PACKAGES},
-    }
+    packages = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {"python": platform.python_version(), **packages}
 
 
 class BadFileError(ValueError):
@@ -143,9 +139,8 @@ def _move_aside(path: Path) -> None:
 def write_figure(path: Path, figure: Any, **options: Any) -> Path:
     """Write a figure of Matplotlib in the format of the suffix; options are those of `savefig`."""
     content = io.BytesIO()
-    metadata: dict[str, Any] = {"Creator": MARK.decode(), "Date": None}
-    if path.suffix != ".svg":
-        metadata = {"Software": MARK.decode()}
+    mark = MARK.decode()
+    metadata = {"Creator": mark, "Date": None} if path.suffix == ".svg" else {"Software": mark}
     figure.savefig(content, format=path.suffix[1:], metadata=metadata, **options)
     write_bytes(path, content.getvalue())
     return path
@@ -168,9 +163,7 @@ def _as_json(value: Any) -> Any:
         return str(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return dataclasses.asdict(value)
-    raise ValueError(
-        f"values must be numbers, texts, lists and dictionaries, as files hold them, got {value!r:.80}"
-    )
+    raise ValueError(f"values must be numbers, texts, lists and dictionaries, got {value!r:.80}")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -228,21 +221,12 @@ def parse_yaml(text: str | bytes) -> Any:
         raise ValueError(f"cannot be read as YAML ({' '.join(str(error).split())})") from None
 
 
-def read_yaml(path: Path) -> Any:
-    """Return the plain values of a YAML file; what is missing, too large or something else raises BadFileError."""
-    content = read_bytes(path, LARGEST_JSON)
-    try:
-        return parse_yaml(content)
-    except ValueError as error:
-        raise BadFileError(path, str(error)) from None
-
-
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write named arrays as safetensors, which hold no code."""
     write_bytes(path, save_arrays({name: np.asarray(array, order="C") for name, array in arrays.items()}))
 
 
-def read_arrays(path: Path, largest: int | None = None) -> Arrays:
+def read_arrays(path: Path, largest: int | None = None) -> dict[str, NDArray[Any]]:
     """Read named arrays; a file that is missing, too large [bytes] or torn raises BadFileError."""
     content = read_bytes(path, largest)
     try:

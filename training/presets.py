@@ -84,17 +84,12 @@ PRESETS: dict[str, Preset] = {
 
 # Presets of tasks in which an action lasts one control step, which counts as a decision
 _STEP_WISE = {"learning_starts": 4096, "gamma": 0.98}
+_STEPS: dict[str, Any] = {"n_timesteps": 200_000, **_SELDOM}
+_PPO_STEP_WISE = {"n_steps": 64, "batch_size": 512, "n_epochs": 5, "gamma": 0.98, "ent_coef": 0.0}
+_PPO_STEPS: dict[str, Any] = {"n_timesteps": 2_000_000, "eval_every": 50_000, "checkpoint_every": 200_000}
 STEP_PRESETS: dict[str, Preset] = {
-    "sac": _changed(PRESETS["sac"], _STEP_WISE, n_timesteps=200_000, **_SELDOM),
-    "td3": _changed(PRESETS["td3"], _STEP_WISE, n_timesteps=200_000, **_SELDOM),
-    "tqc": _changed(PRESETS["tqc"], _STEP_WISE, n_timesteps=200_000, **_SELDOM),
-    "ppo": _changed(
-        PRESETS["ppo"],
-        {"n_steps": 64, "batch_size": 512, "n_epochs": 5, "gamma": 0.98, "ent_coef": 0.0},
-        n_timesteps=2_000_000,
-        eval_every=50_000,
-        checkpoint_every=200_000,
-    ),
+    **{name: _changed(PRESETS[name], _STEP_WISE, **_STEPS) for name in ("sac", "td3", "tqc")},
+    "ppo": _changed(PRESETS["ppo"], _PPO_STEP_WISE, **_PPO_STEPS),
 }
 
 # Presets of tasks without obstacles, which need fewer decisions
@@ -132,13 +127,9 @@ def preset_of(task: Task, algo: Algorithm) -> Preset:
         preset = REPLANNING_PRESETS.get(algo, preset)
     elif not task.n_obstacles[1]:
         preset = REACH_PRESETS.get(algo, preset)
-    if task.space.of_hand:
+    if task.space.of_hand or algo not in ("viaq", "viarank"):
         return preset
-    if algo == "viaq":
-        return dataclasses.replace(preset, n_timesteps=min(preset.n_timesteps, JOINT_DECISIONS))
-    if algo == "viarank":
-        settings = dict(JOINT_SIGHT)
-        if task.replanning:  # movements under way are not refined
-            settings["policy_kwargs"] = {**JOINT_SIGHT["policy_kwargs"], "refine": 0}
-        return _changed(preset, settings, n_timesteps=JOINT_DECISIONS)
-    return preset
+    settings = dict(JOINT_SIGHT) if algo == "viarank" else {}
+    if settings and task.replanning:  # movements under way are not refined
+        settings["policy_kwargs"] = {**JOINT_SIGHT["policy_kwargs"], "refine": 0}
+    return _changed(preset, settings, n_timesteps=min(preset.n_timesteps, JOINT_DECISIONS))

@@ -19,18 +19,12 @@ if TYPE_CHECKING:
 
 # Function of observations and scenes that returns actions, shape (N, m)
 Decide = Callable[[Observation, Scenes], Float]
-
-
 # Metrics of N simulated actions or episodes by name, `reward` among them, shape (N,) each
 Outcomes = dict[str, NDArray[Any]]
 
 
 class SceneSimulation:
-    """Simulation of episodes in given scenes, `num_envs` at a time; `kwargs` are arguments of the environment.
-
-    Raises:
-        ValueError: There is no such environment, or an argument is not allowed.
-    """
+    """Simulation of episodes in given scenes, `num_envs` at a time; `kwargs` are arguments of the environment."""
 
     def __init__(self, env_id: str, num_envs: int = 512, **kwargs: Any) -> None:
         self.env_id, self.kwargs = env_id, kwargs

@@ -15,6 +15,7 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,25 +23,13 @@ from filelock import FileLock, Timeout
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from viapoint.envs.arms.stored import COPY, keep_arm, with_kept_arm
+from viapoint.training import files
 from viapoint.training.agents.agent import best_model
 from viapoint.training.agents.model_io import save_model
 from viapoint.training.checkpoints import read_checkpoint, write_checkpoint
 from viapoint.training.checks import check_folder
 from viapoint.training.configs import TrainConfig
-from viapoint.training.files import (
-    LARGEST_JSON,
-    UNFINISHED,
-    BadFileError,
-    as_plain,
-    check_ours,
-    read_bytes,
-    read_json,
-    tidy,
-    versions,
-    write_bytes,
-    write_folder,
-    write_json,
-)
+from viapoint.training.files import BadFileError, as_plain, read_json, write_json
 
 KEPT_CHECKPOINTS = 2
 PATIENCE = 10.0  # [s]; workers of a study that was killed end within seconds
@@ -78,9 +67,9 @@ class Run:
         self.folder = folder
         record = read_json(folder / "config.json")
         try:
-            for name in ("env", "algo", "seed", "n_timesteps"):
-                if name not in record:
-                    raise ValueError(f"{name} is missing")
+            missing = {"env", "algo", "seed", "n_timesteps"} - record.keys()
+            if missing:
+                raise ValueError(f"without {', '.join(sorted(missing))}")
             if isinstance(record.get("env_kwargs"), dict):
                 record["env_kwargs"] = with_kept_arm(record["env_kwargs"], folder)
             self.config: TrainConfig = TrainConfig(**record)
@@ -106,7 +95,7 @@ class Run:
         folder.mkdir(parents=True, exist_ok=True)
         with locked(folder):
             check_free(folder)  # another process may have been faster
-            write_json(folder / "versions.json", versions())
+            write_json(folder / "versions.json", files.versions())
             keep_arm(folder, config.task.arm)
             # The file that makes a folder a run comes last; it does not hold the arguments of one call.
             write_json(folder / "config.json", {**as_plain(config), "out": None, "resume": False})
@@ -124,7 +113,7 @@ class Run:
     def curve(self) -> list[dict[str, Any]]:
         """Learning curve: one record for each evaluation; a damaged one raises BadFileError."""
         path = self.folder / "learning_curve.jsonl"
-        lines = read_bytes(path, LARGEST_JSON).splitlines() if path.exists() else []
+        lines = files.read_bytes(path, files.LARGEST_JSON).splitlines() if path.exists() else []
         try:
             records: list[dict[str, Any]] = [json.loads(line) for line in lines]
             for record in records:
@@ -136,7 +125,7 @@ class Run:
     def write_curve(self, records: list[dict[str, Any]]) -> None:
         """Replace the learning curve."""
         content = "".join(json.dumps(record, allow_nan=False) + "\n" for record in records)
-        write_bytes(self.folder / "learning_curve.jsonl", content.encode())
+        files.write_bytes(self.folder / "learning_curve.jsonl", content.encode())
 
     @property
     def decisions(self) -> int:
@@ -156,7 +145,7 @@ class Run:
 
     def save(self, name: str, model: BaseAlgorithm) -> None:
         """Write a model as `best` or `final`; a folder with other files is kept as `best.1`, as training must go on."""
-        write_folder(self.folder / name, lambda temporary: save_model(model, temporary), move_foreign=True)
+        files.write_folder(self.folder / name, partial(save_model, model), move_foreign=True)
 
     def checkpoint(self, model: BaseAlgorithm, seconds: float) -> None:
         """Write a checkpoint of a training that has taken a time, [s], and remove outdated ones."""
@@ -210,7 +199,7 @@ class Run:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock a run folder for this process, and tidy up what a crash left in it; in use, it raises BadFileError.
+    """Lock a run folder for this process, and files.tidy up what a crash left in it; in use, it raises BadFileError.
 
     The operating system unlocks it when the process ends.
     """
@@ -220,7 +209,7 @@ def locked(folder: Path) -> Iterator[None]:
         raise BadFileError(folder, "is in use by another process") from None
     with held:
         for name in (".", "checkpoints", "evaluations"):
-            tidy(folder / name)
+            files.tidy(folder / name)
         yield
 
 
@@ -230,9 +219,9 @@ def check_free(folder: Path) -> None:
         raise BadFileError(folder, "holds a run already; continue it with --resume or name another folder")
     check_folder(f"run folder {folder}", folder)
     for path in folder.glob("*"):
-        if path.name not in ("versions.json", COPY, "lock") and not UNFINISHED.fullmatch(path.name):
+        if path.name not in ("versions.json", COPY, "lock") and not files.UNFINISHED.fullmatch(path.name):
             raise BadFileError(folder, f"holds {path.name} and is no run folder; name an empty or a new one")
-    check_ours(folder / "versions.json")
+    files.check_ours(folder / "versions.json")
 
 
 def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = None) -> None:
@@ -248,11 +237,8 @@ def check_unchanged(run: Run, config: TrainConfig, usual: TrainConfig | None = N
     others = sorted(name for name in names if asked.get(name, UNSET) != begun.get(name, UNSET))
     if others:
         had = ", ".join(f"{name} {begun.get(name, 'as usual')}" for name in others)
-        raise BadFileError(
-            run.folder,
-            f"holds a run with {had}; --resume goes on with what it began with: leave these flags out, or name "
-            "another folder for other settings",
-        )
+        advice = "--resume goes on with it: leave these flags out, or name another folder for other settings"
+        raise BadFileError(run.folder, f"holds a run with {had}; {advice}")
 
 
 def _settings(config: TrainConfig) -> dict[str, Any]:

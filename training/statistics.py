@@ -41,12 +41,9 @@ def mcnemar(first: ArrayLike, second: ArrayLike) -> dict[str, float]:
     only_first = int((a > b).sum())
     only_second = int((b > a).sum())
     differing = only_first + only_second
-    return {
-        "difference": float(a.mean() - b.mean()),
-        "only_first": only_first,
-        "only_second": only_second,
-        "p_value": float(stats.binomtest(only_first, differing).pvalue) if differing else 1.0,
-    }
+    p_value = float(stats.binomtest(only_first, differing).pvalue) if differing else 1.0
+    result = {"difference": float(a.mean() - b.mean()), "only_first": only_first, "only_second": only_second}
+    return {**result, "p_value": p_value}
 
 
 def across_seeds(
@@ -86,16 +83,9 @@ def across_seeds(
 
 
 def success_weighted_path_length(success: ArrayLike, shortest: ArrayLike, taken: ArrayLike) -> float:
-    """Return SPL: the success rate with each success weighted by how short its path was.
-
-        SPL = mean(S l / max(p, l))
+    """Return SPL = mean(S l / max(p, l)), of success S, shortest path l > 0 and path taken p, shape (N,), [m].
 
     Source: Anderson et al. 2018, On Evaluation of Embodied Navigation Agents, arXiv 1807.06757.
-
-    Args:
-        success: S, shape (N,), N > 0.
-        shortest: l, shape (N,), more than 0 and finite, [m].
-        taken: p, shape (N,), [m].
     """
     weight = np.asarray(shortest) / np.maximum(taken, shortest)
     return float((np.asarray(success) * weight).mean())

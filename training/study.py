@@ -27,13 +27,13 @@ from stable_baselines3.common.callbacks import ConvertCallback
 
 from viapoint.envs.common.validation import is_number
 from viapoint.envs.task import Task
+from viapoint.training import files
 from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
 from viapoint.training.agents.model_io import check_arguments, check_hyperparameters, load_model, untrained
 from viapoint.training.checks import check_env_kwargs, check_folder, check_whole, named_path, unknown_name
 from viapoint.training.configs import StudyConfig, TrainConfig
 from viapoint.training.evaluation import evaluate_methods
 from viapoint.training.extras import explain_import_error
-from viapoint.training.files import BadFileError, as_plain, read_json, read_yaml, write_bytes, write_json
 from viapoint.training.planning.baselines import Method, agent_method, factory, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plots import success_of_rows
@@ -151,9 +151,9 @@ class Study:
             ValueError: The file cannot be read, or something in it is not allowed; the message says what is.
         """
         path = Path(path).expanduser()
-        given = read_yaml(path)
+        content = files.read_bytes(path, files.LARGEST_JSON)
         try:
-            return cls.from_dict(given, name=path.stem, folder=path.parent)
+            return cls.from_dict(files.parse_yaml(content), name=path.stem, folder=path.parent)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 
@@ -406,19 +406,21 @@ def run_study(
     folder = named_path("out", study.out if out is None else out).absolute()
     check_folder(f"out {folder}", folder)
     mark = folder / "study.json"
-    if not mark.is_file() or read_json(mark).get("viapoint") != "study":
+    if not mark.is_file() or files.read_json(mark).get("viapoint") != "study":
         if folder.exists() and any(folder.iterdir()):
-            raise BadFileError(folder, "holds something else than a study; name another folder")
-        write_json(mark, {"viapoint": "study", "name": study.name})
+            raise files.BadFileError(folder, "holds something else than a study; name another folder")
+        files.write_json(mark, {"viapoint": "study", "name": study.name})
     missing = [trial for trial in study.trials if not _finished_record(trial, folder)]
     searches = []
     for search in study.searches:
         best = search.folder(folder) / "best.json"
-        if not best.is_file() or read_json(best).get("key") != search.key:
+        if not best.is_file() or files.read_json(best).get("key") != search.key:
             searches.append(search)
     failed = []
     if missing or searches:
-        told(f"to do: {len(missing)} trials and {len(searches)} searches; the same command goes on after Ctrl-C")
+        told(
+            f"to do: {len(missing)} trials and {len(searches)} searches; the same command goes on after Ctrl-C"
+        )
         with _connected(workers):
             failed += _run_trials(missing, folder, told)
             for search in searches:
@@ -457,14 +459,14 @@ def _run_trial(trial: Trial, out: Path) -> Record:
             if not trial.method:
                 line["decisions"] = 0 if "/untrained" in row else run.decisions
             record["rows"].append(line)
-    write_json(trial.folder(out) / "result.json", record)
+    files.write_json(trial.folder(out) / "result.json", record)
     return record
 
 
 def _finished_record(trial: Trial, out: Path) -> Record:
     """Return the record of a trial that is complete, otherwise an empty one; that of other settings is obsolete."""
     path = trial.folder(out) / "result.json"
-    record = read_json(path) if path.is_file() else {}
+    record = files.read_json(path) if path.is_file() else {}
     return record if record.get("asked") == _asked(trial) else {}
 
 
@@ -479,8 +481,8 @@ def _write_results(study: Study, folder: Path) -> pd.DataFrame:
             of_rows = curves.setdefault(trial.environment, {})
             of_rows.setdefault(trial.row, []).append(record["curve"])
     table = _table(lines)
-    write_bytes(folder / "results.csv", table.to_csv(index=False).encode())
-    write_bytes(folder / "results.md", _page(table, study.name).encode())
+    files.write_bytes(folder / "results.csv", table.to_csv(index=False).encode())
+    files.write_bytes(folder / "results.md", _page(table, study.name).encode())
     for environment, part in table.groupby("environment", sort=False):
         figure = folder / f"{environment.rpartition('/')[2]}.png"
         success_of_rows(figure, part, curves.get(environment, {}))
@@ -520,7 +522,7 @@ def _page(table: pd.DataFrame, title: str) -> str:
 
 def _asked(trial: Trial) -> Record:
     """Return what identifies a trial as plain values."""
-    plain: Record = as_plain(trial)
+    plain: Record = files.as_plain(trial)
     plain["scenes"] = {name: frozen.sha256 for name, frozen in _sets(trial).items()}
     del plain["parameters"], plain["trials"], plain["first"]  # of searches
     return plain
@@ -672,12 +674,12 @@ def _write_search(search: Trial, results: Any, folder: Path) -> str:
     table = pd.DataFrame(lines)[[*search.parameters, "success", "decisions"]]
     # A training that was stopped early had less success than others with as many decisions.
     table = table.sort_values(["decisions", "success"], ascending=False)
-    write_bytes(search.folder(folder) / "trials.csv", table.to_csv(index=False).encode())
+    files.write_bytes(search.folder(folder) / "trials.csv", table.to_csv(index=False).encode())
     best = table.to_dict("records")[0]
     chosen = search.config(folder, {path: best[path] for path in search.parameters})
     config = dataclasses.replace(chosen, out=None)
     record = {"viapoint": "search", "key": search.key, "success": best["success"], "command": config.command}
-    write_json(search.folder(folder) / "best.json", {**record, "training": as_plain(config)})
+    files.write_json(search.folder(folder) / "best.json", {**record, "training": files.as_plain(config)})
     return f"best of {search.row}, {100.0 * best['success']:.1f} %: {config.command}"
 
 

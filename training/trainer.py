@@ -59,10 +59,9 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
     (`stop_when_stalled`) stays as it is: the decision to end depends on the learning curve alone.
 
     Args:
-        config: Environment, algorithm, seed, run folder and everything else that a training depends on.
+        config: Everything that a training depends on.
         callback: Callback of Stable-Baselines3, or a list of them. One that stops the training does so at the end of
-            the round of experience and updates, from which the run can go on. The checkpoints of a run do not contain
-            the state of callbacks.
+            the round of experience and updates, from which the run can go on; checkpoints do not contain its state.
 
     Returns:
         The run. `run.best` and `run.final` are model folders, which :func:`evaluate` and :func:`load_agent` accept.
@@ -77,12 +76,7 @@ def train(config: TrainConfig, callback: Callbacks = None) -> Run:
         >>> import tempfile
         >>> from viapoint.training import TrainConfig, train
         >>> config = TrainConfig(
-        ...     env="viapoint/PlanarReach-v0",
-        ...     n_timesteps=64,
-        ...     n_envs=32,
-        ...     eval_scenes=8,
-        ...     out=tempfile.mkdtemp(),
-        ...     progress=False,
+        ...     env="viapoint/PlanarReach-v0", n_timesteps=64, eval_scenes=8, out=tempfile.mkdtemp(), progress=False
         ... )
         >>> run = train(config)
         >>> run.best.name, run.final.name
@@ -132,11 +126,9 @@ def _warn(config: TrainConfig) -> None:
     """Print what a training of a resolved configuration can hardly learn."""
     starts = config.hyperparameters.get("learning_starts", 0)
     if config.total_timesteps <= starts:
-        print(
-            f"n_timesteps={config.total_timesteps}: the network is not updated once, as learning starts after "
-            f"{starts} decisions (learning_starts)",
-            file=sys.stderr,
-        )
+        reason = f"learning starts after {starts} decisions (learning_starts)"
+        told = f"n_timesteps={config.total_timesteps}: the network is not updated once, as {reason}"
+        print(told, file=sys.stderr)
     if not config.task.n_via and config.task.n_obstacles[1] and not config.task.stepwise:
         print("n_via=0: all movements are straight, and none can pass around an obstacle", file=sys.stderr)
 
@@ -147,15 +139,12 @@ def _untrained_model(config: TrainConfig) -> Iterator[BaseAlgorithm]:
     env = ViaVecEnv(config.env, config.n_envs or config.preset.n_envs, **config.env_kwargs)
     with closing(env):
         try:
-            model = build(
-                config.algorithm, config.preset.policy, env, config.hyperparameters, seed=config.seed
-            )
+            policy = config.preset.policy
+            model = build(config.algorithm, policy, env, config.hyperparameters, seed=config.seed)
         except Exception as error:  # of a library, for networks or buffers that cannot be built
             usual = config.preset.hyperparameters
             others = {name: each for name, each in config.hyperparameters.items() if usual.get(name) != each}
-            raise ValueError(
-                f"{config.algo} cannot be made for {config.env} with {others}: {error}"
-            ) from error
+            raise ValueError(f"no {config.algo} for {config.env} with {others}: {error}") from error
         yield model
 
 
@@ -177,14 +166,11 @@ def _continue_training(run: Run, model: BaseAlgorithm, callbacks: list[BaseCallb
                 _learn(model, remaining, monitor, fresh=seconds is None)
             run.save("final", model)
             if monitor.interrupted:  # also after the last decision
-                raise TrainingStoppedError(
-                    f"stopped after {run.decisions} decisions, and all is saved; go on with: {_resume_command(run)}"
-                )
+                told = f"stopped after {run.decisions} decisions, and all is saved"
+                raise TrainingStoppedError(f"{told}; go on with: {_resume_command(run)}")
     except OSError as error:
-        raise TrainingFailedError(
-            f"training cannot go on: {error}; all up to decision {run.decisions} is saved; go on with: "
-            f"{_resume_command(run)}"
-        ) from error
+        told = f"{error}; all up to decision {run.decisions} is saved; go on with: {_resume_command(run)}"
+        raise TrainingFailedError(f"training cannot go on: {told}") from error
 
 
 def _learn(model: BaseAlgorithm, steps: int, monitor: RunCallback, *, fresh: bool) -> None:
@@ -205,17 +191,15 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
     check_unchanged(run, config, TrainConfig())
     begun = run.config.total_timesteps
     number = config.n_timesteps or begun
-    if number < begun:
-        raise BadFileError(
-            run.folder,
-            f"holds a run of {begun} decisions, whose settings change in its course; n_timesteps must be as many or "
-            f"more, got {number}",
-        )
+    if number < begun:  # settings change in the course of a run
+        reason = f"holds a run of {begun} decisions; n_timesteps must be as many or more, got {number}"
+        raise BadFileError(run.folder, reason)
     run.config = dataclasses.replace(run.config, n_timesteps=number, progress=config.progress)
-    began = run.versions
-    others = [
-        f"{name} {began[name]} (now {now})" for name, now in versions().items() if began.get(name, now) != now
-    ]
+    others = []
+    for name, now in versions().items():
+        began = run.versions.get(name, now)
+        if began != now:
+            others.append(f"{name} {began} (now {now})")
     if others:
         print(f"the run began with {', '.join(others)}: it may end otherwise", file=sys.stderr)
 
@@ -236,10 +220,8 @@ class RunCallback(CallbackList):
     Stable-Baselines3 drops the step that it has just made, and no run could go on from there to the same result.
     """
 
-    def __init__(
-        self, run: Run, callbacks: list[BaseCallback], seconds: float | None, decisions: int
-    ) -> None:
-        super().__init__(callbacks)
+    def __init__(self, run: Run, callbacks: Sequence[Any], seconds: float | None, decisions: int) -> None:
+        super().__init__(list(callbacks))
         self.run, self.config = run, run.config
         earlier = [] if seconds is None else run.curve
         self.curve = [record for record in earlier if record["decisions"] <= decisions]
@@ -257,11 +239,8 @@ class RunCallback(CallbackList):
         return time.monotonic() - self._began
 
     def __enter__(self) -> RunCallback:
-        self._bar = progress_bar(
-            total=self.config.total_timesteps,
-            bar_format=PROGRESS,
-            disable=None if self.config.progress else True,
-        )
+        total, hidden = self.config.total_timesteps, None if self.config.progress else True
+        self._bar = progress_bar(total=total, bar_format=PROGRESS, disable=hidden)
         self._handler: Any = None
         with suppress(ValueError):  # other threads than the main one get no signals
             self._handler = signal.signal(signal.SIGINT, self._on_interrupt)
@@ -295,9 +274,8 @@ class RunCallback(CallbackList):
 
     def _run_due_actions(self, *, final: bool) -> None:
         config = self.config
-        validates = self._validation is not None and (
-            final or not self.curve or self._is_due(config.evaluation_interval)
-        )
+        due = final or not self.curve or self._is_due(config.evaluation_interval or 1)
+        validates = self._validation is not None and due
         if validates:
             self._validate()
         if validates or final or self._is_due(LOG_EVERY):
@@ -328,8 +306,7 @@ class RunCallback(CallbackList):
             rate = 100.0 * record["success"]["rate"]
             more = ", as rounds are whole" if self.num_timesteps > self.config.total_timesteps else ""
             decisions = f"{self.num_timesteps} of {self.config.total_timesteps} decisions{more}"
-            told = f"{decisions}: success {rate:.1f} % in validation"
-            print(told, file=sys.stderr)
+            print(f"{decisions}: success {rate:.1f} % in validation", file=sys.stderr)
         # A validation is better with more success, then with less jerk.
         best = max(self.curve, key=lambda each: (each["success"]["rate"], -(each["jerk_ratio"] or 0.0)))
         if record is best:
@@ -342,12 +319,8 @@ class RunCallback(CallbackList):
         summary = result.summary()
         env = self.training_env
         assert isinstance(env, ViaVecEnv)
-        record = {
-            "decisions": self.num_timesteps,
-            "physics_steps": env.physics_steps,
-            "seconds": round(seconds, 3),
-            "success_by_band": summary["success_by_band"],
-        }
+        record: dict[str, Any] = {"decisions": self.num_timesteps, "physics_steps": env.physics_steps}
+        record |= {"seconds": round(seconds, 3), "success_by_band": summary["success_by_band"]}
         for name in VALIDATED:
             value = record[name] = summary[name]
             if isinstance(value, dict):

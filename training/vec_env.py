@@ -45,37 +45,37 @@ def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
         return inner.env_id, dict(inner.env_kwargs)
     spec: Any = inner.get_attr("spec", [0])[0]
     if spec is None or not hasattr(inner.get_attr("unwrapped", [0])[0], "task"):
-        raise ValueError(
-            f"the environment must be one of this package, made by its id, got {inner if spec is None else spec.id}"
-        )
+        given = inner if spec is None else spec.id
+        raise ValueError(f"the environment must be one of this package, made by its id, got {given}")
     registered = gym.spec(spec.id)
-    given = {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
+    arguments = {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
     usual = {**registered.kwargs, "max_episode_steps": registered.max_episode_steps}
-    others = [name for name in given if name not in usual or as_plain(given[name]) != as_plain(usual[name])]
-    return spec.id, {name: given[name] for name in others if name not in ("render_mode", "threads")}
+    for name in ("render_mode", "threads"):
+        arguments.pop(name, None)
+    for name in usual.keys() & arguments.keys():
+        if as_plain(arguments[name]) == as_plain(usual[name]):
+            del arguments[name]
+    return spec.id, arguments
 
 
 def check_unwrapped(env: VecEnv) -> None:
     """Check that no wrapper changes observations, or actions of single environments; ValueError otherwise."""
+    reason = "models know an environment by its id alone"
     if env.observation_space != env.unwrapped.observation_space:
-        raise ValueError(
-            f"{type(env).__name__} changes observations: models know an environment by its id alone"
-        )
-    for wrapper in (gym.ObservationWrapper, gym.ActionWrapper):
+        raise ValueError(f"{type(env).__name__} changes observations: {reason}")
+    for wrapper, example in (
+        (gym.ObservationWrapper, "FlattenObservation"),
+        (gym.ActionWrapper, "RescaleAction"),
+    ):
         if not isinstance(env.unwrapped, ViaVecEnv) and any(env.env_is_wrapped(wrapper, [0])):
-            raise ValueError(
-                f"the environment must have no {wrapper.__name__}, such as FlattenObservation or RescaleAction: models "
-                "know it by its id alone"
-            )
+            raise ValueError(f"env must have no {wrapper.__name__}, such as {example}: {reason}")
 
 
 def check_spaces(own: VecEnv, env: VecEnv) -> None:
     """Check that an environment has the observations and actions of an agent's own one; ValueError otherwise."""
     if (env.observation_space, env.action_space) != (own.observation_space, own.action_space):
         trained, given = (" ".join(map(str, filter(None, env_arguments(each)))) for each in (own, env))
-        raise ValueError(
-            f"the agent decides in {trained}, whose observations or actions are others than in {given}"
-        )
+        raise ValueError(f"the agent decides in {trained}, observations or actions are others in {given}")
 
 
 def predicted_actions(model: BaseAlgorithm, observation: Any) -> NDArray[Any]:
@@ -202,8 +202,8 @@ class ViaVecEnv(VecEnv):
 
     def state(self) -> dict[str, Any]:
         """Return random generators, running episodes and counters as values and arrays for :meth:`restore`."""
-        counters = {"returns": self._returns.copy(), "lengths": self._lengths.copy()}
-        return {**self.venv.unwrapped.state(), **counters}
+        own = self.venv.unwrapped.state()
+        return {**own, "returns": self._returns.copy(), "lengths": self._lengths.copy()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state of this environment, or of one of the same kind and number of copies."""
@@ -222,16 +222,12 @@ class ViaVecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of the vector environment, which all copies share."""
         if len(self._rows(indices)) != self.num_envs:
-            raise ValueError(
-                f"the copies share {attr_name}: it can be set for all of them only, not for {indices}"
-            )
+            raise ValueError(f"the copies share {attr_name}: it is set for all of them, not for {indices}")
         setattr(self.venv.unwrapped, attr_name, value)
 
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
-    ) -> list[Any]:
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
         """Call a method of the vector environment once, and return its result for each copy asked for."""
-        answer = getattr(self.venv.unwrapped, method_name)(*method_args, **method_kwargs)
+        answer = getattr(self.venv.unwrapped, method_name)(*args, **kwargs)
         return [answer] * len(self._rows(indices))
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:

@@ -34,7 +34,9 @@ PLAN_SIZE, PLAN_FPS = (640, 480), 50  # Pictures of a plan, [pixels], [1/s]
 PAUSE = 0.8  # Time for which each result stays, [s]
 TILE = 2.6  # Width of one picture, [inch]
 RESOLUTION = 110  # Resolution, [dots per inch]
-COLUMNS = 4  # Greatest number of pictures in a row
+COLUMNS = 4  # Number of pictures in a row
+# Colours of the palette by their names in the legend
+MARKS = {"planned": "plan", "executed": "executed", "via-point": "via", "goal": "goal", "contact": "contact"}
 LINE = 28  # Greatest number of characters of the heading above one picture
 
 
@@ -61,21 +63,20 @@ def record_video(
         raise ValueError(f"env must be made with render_mode='rgb_array_list', got {env.render_mode!r}")
     if not len(scenes.start):
         raise ValueError("scenes must hold at least one scene")
-    fps = float(env.metadata["render_fps"])
-    return _write_mp4(path, _scenes(env, scenes, decide, name, fps), fps)
+    fps, number = float(env.metadata["render_fps"]), len(scenes.start)
+    told = "only the hand must clear" if env.get_wrapper_attr("task").hand_alone else ""
+
+    def frames() -> Iterator[Frame]:
+        for i in range(number):
+            info = play(env, scenes.take([i]), decide)
+            left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
+            yield from _with_captions(env.unwrapped.render(), left, info, fps, told)
+
+    return _write_mp4(path, frames(), fps)
 
 
 def record_plan(path: str | Path, plan: MotionPlan) -> int:
-    """Record the execution of a plan as an MP4, and return the number of frames.
-
-    Args:
-        path: MP4 file; its folder is created.
-        plan: Plan.
-
-    Raises:
-        ValueError: The path has another suffix or is a file of something else.
-        GLUnavailableError: There is no OpenGL library.
-    """
+    """Record the execution of a plan as an MP4, and return the number of frames; see :func:`record_video`."""
     path = Path(path).expanduser()
     check_file("path", path, ".mp4")
     outcome, episodes = execute_plans([plan])
@@ -86,16 +87,6 @@ def record_plan(path: str | Path, plan: MotionPlan) -> int:
         return _write_mp4(path, _with_captions(film.render(), left, info, PLAN_FPS), PLAN_FPS)
     finally:
         film.close()
-
-
-def _scenes(env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, name: str, fps: float) -> Iterator[Frame]:
-    """Yield the frames of a movement in each scene and of a pause after it."""
-    number = len(scenes.start)
-    for i in range(number):
-        info = play(env, scenes.take([i]), decide)
-        left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
-        told = "only the hand must clear" if env.get_wrapper_attr("task").hand_alone else ""
-        yield from _with_captions(env.unwrapped.render(), left, info, fps, told)
 
 
 def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
@@ -153,12 +144,10 @@ def play(env: gym.Env[Any, Any], scene: Scenes, decide: Decide) -> dict[str, Any
             return {name: value[0] for name, value in decision.info.items()}
 
 
-def _with_captions(
-    frames: Any, left: str, info: dict[str, Any], fps: float, told: str = ""
-) -> Iterator[Frame]:
+def _with_captions(given: Any, left: str, info: Any, fps: float, told: str = "") -> Iterator[Frame]:
     """Yield frames with a caption that tells something, and the last one for a pause with the outcome in its place."""
     outcome, colour = describe_outcome(info)
-    frames = list(frames)
+    frames = list(given)
     plain = _caption(frames[0].shape[1], left, told, PALETTE.start)
     final = _caption(frames[0].shape[1], left, outcome, colour)
     for frame in frames:
@@ -187,34 +176,19 @@ def _stacked(frame: Frame, caption: Frame) -> Frame:
 
 
 def gallery(
-    path: Path,
-    env: gym.Env[Any, Any],
-    scenes: Scenes,
-    decide: Decide,
-    titles: Sequence[str],
-    *,
-    heading: str = "",
+    path: Path, env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, titles: Sequence[str], heading: str
 ) -> None:
     """Play an episode in each scene, and save a page of their last pictures as a PNG file.
 
-    Args:
-        path: PNG file.
-        env: Environment made with `render_mode="rgb_array"`.
-        scenes: Scenes, at least one, with as many rows for obstacles as the environment has.
-        decide: Function from observation and scene, of one row each, to actions, shape (1, m).
-        titles: Text below each picture, such as the difficulty of the scene.
-        heading: Heading of the page.
-
-    Raises:
-        GLUnavailableError: There is no OpenGL library.
+    `titles` are the texts below the pictures. The environment is made with `render_mode="rgb_array"`; the rest is as
+    for :func:`record_video`.
     """
-    columns = min(COLUMNS, len(titles))
-    rows = -(-len(titles) // columns)
-    lines = textwrap.wrap(heading, LINE * columns)
-    margin = 0.45 + 0.3 * bool(lines) + 0.2 * len(lines[1:]) + 0.3 * (columns == 1)
-    figure = Figure(figsize=(TILE * columns, (TILE + 0.5) * rows + margin), dpi=RESOLUTION)
+    rows = -(-len(titles) // COLUMNS)
+    lines = textwrap.wrap(heading, LINE * COLUMNS)
+    height = (TILE + 0.5) * rows + 0.55 + 0.2 * len(lines)
+    figure = Figure(figsize=(TILE * COLUMNS, height), dpi=RESOLUTION)
     figure.set_layout_engine("constrained", w_pad=0.03, h_pad=0.03)
-    grid = figure.subplots(rows, columns, squeeze=False)
+    grid = figure.subplots(rows, COLUMNS, squeeze=False)
     for axes in grid.flat:
         axes.set(xticks=[], yticks=[], frame_on=False)
     for row, (axes, title) in enumerate(zip(grid.flat, titles, strict=False)):
@@ -222,16 +196,7 @@ def gallery(
         axes.imshow(env.unwrapped.render())
         axes.set_title(outcome, fontsize=8.5, color=colour, fontweight="bold", pad=3)
         axes.set_xlabel(title, fontsize=8, color=PALETTE.joint)
-    marks = {
-        "planned": "plan",
-        "executed": "executed",
-        "via-point": "via",
-        "goal": "goal",
-        "contact": "contact",
-    }
-    handles = [Line2D([], [], color=getattr(PALETTE, name), linewidth=4) for name in marks.values()]
-    places: Any = {"loc": "outside lower center", "ncols": 5 if columns > 1 else 2}
-    figure.legend(handles, list(marks), **places, fontsize=8, frameon=False)
-    if lines:
-        figure.suptitle("\n".join(lines), fontsize=11, color=PALETTE.executed)
+    handles = [Line2D([], [], color=getattr(PALETTE, name), linewidth=4) for name in MARKS.values()]
+    figure.legend(handles, list(MARKS), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    figure.suptitle("\n".join(lines), fontsize=11, color=PALETTE.executed)
     write_figure(path, figure)

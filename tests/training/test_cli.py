@@ -452,7 +452,7 @@ def test_a_gallery_is_a_page_of_movements(tmp_path):
     env = gym.make(PLANE, render_mode="rgb_array", width=96, height=96)
     titles = [f"scene {seed}" for seed in range(5)]
     path = tmp_path / "gallery.png"
-    gallery(path, env, scenes_of(env.unwrapped.task, 5), search(env), titles, heading="test scenes")
+    gallery(path, env, scenes_of(env.unwrapped.task, 5), search(env), titles, "test scenes")
     assert np.asarray(Image.open(path).convert("RGB")).std() > 5.0
 
 

@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -13,20 +14,11 @@ import gymnasium as gym
 import pandas as pd
 
 from viapoint.envs.arms.registry import arm_of
-from viapoint.training import report
+from viapoint.training import configs, report
 from viapoint.training import trainer as training
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.checks import SHIPPED_IDS
-from viapoint.training.configs import (
-    USUAL_BASELINES,
-    AgentConfig,
-    EvaluateConfig,
-    PlayConfig,
-    RecordConfig,
-    TrainConfig,
-    env_of_arm,
-    task_with,
-)
+from viapoint.training.configs import AgentConfig, EvaluateConfig, PlayConfig, RecordConfig, TrainConfig
 from viapoint.training.datasets import dataset_folder, record_dataset
 from viapoint.training.evaluation import evaluate as measure
 from viapoint.training.files import BadFileError, read_json, versions, write_json
@@ -50,13 +42,11 @@ def _named(config: AgentConfig, name: str | None) -> tuple[Agent | None, str, di
     agent = None if name is None else load_agent(name)
     if agent is not None and config.env not in (None, agent.env_id):
         raise ValueError(f"env must be {agent.env_id}, on which the agent was trained, got {config.env!r}")
-    env_id, argument = env_of_arm(config.arm, config.env if agent is None else agent.env_id)
+    env_id, argument = configs.env_of_arm(config.arm, config.env if agent is None else agent.env_id)
     if env_id is None:
-        raise ValueError(
-            "name an agent (run folder, model folder or id), an environment with --env, or an arm with --arm"
-        )
+        raise ValueError("name an agent (run folder, model folder or id), or an environment: --env or --arm")
     env_kwargs = {**({} if agent is None else agent.env_kwargs), **argument, **config.env_kwargs}
-    task_with(env_id, env_kwargs)  # says what is wrong with an argument
+    configs.task_with(env_id, env_kwargs)  # says what is wrong with an argument
     return agent, env_id, env_kwargs
 
 
@@ -66,31 +56,21 @@ def evaluate(config: EvaluateConfig) -> None:
         _measure_planners(config)
         return
     agent, env, env_kwargs = _named(config, config.agent)
+    names = ("scenes", "n_scenes", "checks", "refine", "baselines")
+    settings = {name: getattr(config, name) for name in names}
     with scene_progress() as progress:
-        result = measure(
-            agent,
-            env=env,
-            env_kwargs=env_kwargs,
-            scenes=config.scenes,
-            n_scenes=config.n_scenes,
-            checks=config.checks,
-            refine=config.refine,
-            baselines=config.baselines,
-            progress=progress,
-        )
+        result = measure(agent, env=env, env_kwargs=env_kwargs, progress=progress, **settings)
     record = result.to_dict()
     print(report.formatted(record, config.format))
     if config.agent is not None and (Path(config.agent).expanduser() / "config.json").is_file():
         run = Run(config.agent)
         record["weights_sha256"] = read_json(run.best / "model.json").get("weights_sha256")
-        partial = ".partial" if result.partial else ""
         name = f"{Path(config.scenes).stem}-{result.sha256[:8]}"  # the hash is that of the scenes
         if config.env_kwargs:
             record["env_kwargs"] = config.env_kwargs
             changed = json.dumps(config.env_kwargs, sort_keys=True).encode()
             name += f"-{hashlib.sha256(changed).hexdigest()[:8]}"
-        name += partial
-        kept = run.folder / "evaluations" / f"{name}.json"
+        kept = run.folder / "evaluations" / f"{name}{'.partial' * result.partial}.json"
         write_json(kept, _with_earlier(record, kept))
         print(f"kept as {kept}", file=_notes(config))
     if config.json is not None:
@@ -121,14 +101,12 @@ def _notes(config: EvaluateConfig) -> TextIO:
 def _measure_planners(config: EvaluateConfig) -> None:
     """Measure planners on the problems of MotionBenchMaker, print the table, and write one line for each problem."""
     arm = benchmark.benchmark_panda() if config.arm is None else arm_of(config.arm)
-    faults = list[str]()
-    if config.problems is None:
-        problems = benchmark.benchmark_problems()
-    else:
+    problems, faults = benchmark.benchmark_problems(), list[str]()
+    if config.problems is not None:
         joints = benchmark.JOINTS if config.arm is None else arm.joint_names
         problems, faults = benchmark.read_problems(config.problems, joints)
     problems = [problems[row] for row in evenly_spread(len(problems), config.n_scenes)]
-    names = ("plan_motion",) if config.baselines == USUAL_BASELINES else config.baselines
+    names = ("plan_motion",) if config.baselines == configs.USUAL_BASELINES else config.baselines
     for name in names:
         benchmark.benchmark_planner(name)  # an unknown name is told before anything is measured
     with scene_progress() as progress:
@@ -155,13 +133,12 @@ def play(config: PlayConfig) -> None:
 
     agent, env_id, env_kwargs = _named(config, config.agent)
     scenes = scenes_for(config.scenes, registered_task(env_id, **env_kwargs), config.n_scenes).scenes
-    env = gym.make(env_id, render_mode="rgb_array_list", **env_kwargs)
     if agent is None:
         method = make_method("search512", env_id, **env_kwargs)
     else:
         method = agent_method("agent", agent, config.checks)
-    record_video(config.video, env, scenes, method.decide, name=method.name)
-    env.close()
+    with closing(gym.make(env_id, render_mode="rgb_array_list", **env_kwargs)) as env:
+        record_video(config.video, env, scenes, method.decide, name=method.name)
     print(f"{len(scenes.start)} movements: {config.video}")
 
 
@@ -175,14 +152,10 @@ def record(config: RecordConfig) -> None:
         method = agent_method("agent", agent)
     else:
         if config.env is config.arm is None:
-            raise ValueError(
-                f"there is no agent {name!r}; for a baseline, name an environment: --env or --arm"
-            )
+            raise ValueError(f"there is no agent {name!r}; a baseline needs an environment: --env or --arm")
         _, env_id, env_kwargs = _named(config, None)
         if registered_task(env_id, **env_kwargs).stepwise and name != "random":
-            raise ValueError(
-                f"baselines of {env_id}, which decides in every control step, are random, got {name!r}"
-            )
+            raise ValueError(f"{env_id} decides in every control step: its baseline is random, got {name!r}")
         method = make_method(name, env_id, **env_kwargs)
     usual = re.sub(r"[^-\w/]+", "-", f"{env_id.rpartition('-v')[0]}/{method.name}")  # a name of Minari
     dataset = f"{usual}-v0" if config.dataset is None else config.dataset

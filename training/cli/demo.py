@@ -114,7 +114,7 @@ def _show_movements(folder: Path, agent: Agent, frozen: FrozenScenes) -> None:
     if registered_task(agent.env_id, **agent.env_kwargs).hand_alone:
         heading += "; only the hand must clear the obstacles, links may cross them"
     env = gym.make(agent.env_id, render_mode="rgb_array", **agent.env_kwargs)
-    gallery(folder / "gallery.png", env, chosen.scenes, decide, titles, heading=heading)
+    gallery(folder / "gallery.png", env, chosen.scenes, decide, titles, heading)
     env.close()
     env = gym.make(agent.env_id, render_mode="rgb_array_list", **agent.env_kwargs)
     record_video(folder / "movements.mp4", env, frozen.spread(MOVEMENTS).scenes, decide)

@@ -106,13 +106,13 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
     kind = kinds[command]
     if issubclass(kind, configs.AgentConfig):
         options = _agent_first(options)
-    default = {} if usual is None else {"default": usual}
+    settings: dict[str, Any] = {"prog": f"viapoint {command}", "registry": configs.REGISTRY}
+    if usual is not None:
+        settings["default"] = usual
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(
-                kind, prog=f"viapoint {command}", args=options, registry=configs.REGISTRY, **default
-            )
+            return tyro.cli(kind, args=options, **settings)
     except SystemExit as end:
         if not end.code:
             raise
@@ -147,9 +147,8 @@ def _complaint(text: str, command: str, kind: type[Any]) -> str:
     """Return what tyro says below a title, in a frame or in ASCII, as one line with the flags of fields."""
     _, _, body = re.sub(r"\x1b\[[0-9;]*m", "", text).strip().partition("\n")  # without colours
     said = " ".join(re.sub("[│╰╯─]|-{3,}", " ", body).split())
-    said = re.sub(
-        rf"^Error parsing ({kind.__name__}: )?|( Argument helptext: .*)? For full helptext, .*", "", said
-    )
+    title, end = rf"^Error parsing ({kind.__name__}: )?", "( Argument helptext: .*)? For full helptext, .*"
+    said = re.sub(f"{title}|{end}", "", said)
     for each in dataclasses.fields(kind):
         said = re.sub(rf"^{each.name}\b", f"--{each.name.replace('_', '-')}", said)
     return f"{said} (viapoint {command} --help)"
@@ -158,11 +157,11 @@ def _complaint(text: str, command: str, kind: type[Any]) -> str:
 def _one_line(error: Exception) -> str:
     if isinstance(error, ImportError):
         return explain_import_error(error)
-    known = isinstance(error, ValueError | OSError) or type(error).__module__.startswith(
-        ("viapoint", "gymnasium")
-    )
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if known else f"{type(error).__name__}: {text} (--debug shows where)"
+    kind = type(error)
+    text = " ".join(str(error).split()) or kind.__name__
+    if isinstance(error, ValueError | OSError) or kind.__module__.startswith(("viapoint", "gymnasium")):
+        return text
+    return f"{kind.__name__}: {text} (--debug shows where)"
 
 
 def _was_interrupted(error: BaseException | None) -> bool:

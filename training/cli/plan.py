@@ -32,17 +32,9 @@ def run(config: PlanConfig) -> None:
     start = config.start or scene.get("start")
     if start is None:
         start = arm.hand(arm.home)[:2] if arm.space == "hand" else arm.home
-    plan = plan_motion(
-        arm,
-        start,
-        _goal(config, scene),
-        scene.get("obstacles", ()),
-        n_via=config.n_via,
-        margin=config.margin,
-        duration=config.duration,
-        time_limit=config.time_limit,
-        rng=config.seed,
-    )
+    goal, obstacles = _goal(config, scene), scene.get("obstacles", ())
+    settings = {name: getattr(config, name) for name in ("n_via", "margin", "duration", "time_limit")}
+    plan = plan_motion(arm, start, goal, obstacles, rng=config.seed, **settings)
     print(plan)
     if not plan.success and not config.force:
         raise ValueError(f"no plan is safe: {plan.reason}; --force writes it nevertheless")
@@ -57,14 +49,11 @@ def run(config: PlanConfig) -> None:
 
 def _check_replaceable(path: Path) -> None:
     """Check that there is no file yet, or a movement, which was written by an earlier call."""
-    if not path.exists():
-        return
     try:
-        read_motion(path)
+        if path.exists():
+            read_motion(path)
     except (OSError, ValueError):
-        raise BadFileError(
-            path, "exists and was not written by viapoint; name another file, or move it away"
-        ) from None
+        raise BadFileError(path, "exists and holds no movement; name another file, or move it away") from None
 
 
 def _arm_for(config: PlanConfig) -> Arm:
@@ -112,10 +101,8 @@ def _scene(path: Path | None, arm: Arm) -> dict[str, Any]:
 
 def _goal(config: PlanConfig, scene: dict[str, Any]) -> Any:
     """Return the goal: coordinates, or a pose."""
-    if config.goal:
-        return config.goal
     if config.position:
         return Pose(np.array(config.position), config.quaternion or None)
-    if "goal" in scene:
-        return scene["goal"]
-    raise ValueError("name a goal: --goal JOINTS, or --position X Y Z, or a scene file that has one")
+    if not config.goal and "goal" not in scene:
+        raise ValueError("name a goal: --goal JOINTS, or --position X Y Z, or a scene file that has one")
+    return config.goal or scene["goal"]

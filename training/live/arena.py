@@ -29,18 +29,13 @@ from viapoint.envs.scenes.options import OPTIONS, options_to_json, scene_options
 from viapoint.primitives import passage_durations
 from viapoint.training.agents.agent import Agent
 from viapoint.training.paper.movements import TARGETS, rows_of_lights
+from viapoint.training.planning import search as searching
 from viapoint.training.planning.baselines import AgentMethod
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.plan_motion import SEEDS, checked_motion, ompl_motion, plan_motion
 from viapoint.training.planning.problem import Problem
-from viapoint.training.planning.search import (
-    CLEARANCE_MARGIN,
-    GeometrySearch,
-    merits,
-    plan_clearances,
-    registered_task,
-)
+from viapoint.training.planning.search import CLEARANCE_MARGIN, GeometrySearch, registered_task
 from viapoint.training.rollout import whole_task
 from viapoint.training.scene_sets import shipped_set
 
@@ -168,16 +163,10 @@ class Arena:
     """Arm, task, agent (or None) and environments of one tab."""
 
     def __init__(
-        self,
-        env_id: str,
-        agent: Agent | None,
-        seed: int | None,
-        env_kwargs: Mapping[str, Any],
-        agent_first: bool = False,
+        self, env_id: str, agent: Agent | None, seed: int | None, own: Mapping[str, Any], named: bool = False
     ) -> None:
         self.env_id, self.agent, self._seed = env_id, agent, seed
         self.policy: Any = getattr(agent, "policy", None)
-        own = dict(env_kwargs)
         planned = whole_task(env_id, own)  # the page plans whole movements, or revises them
         self.task = registered_task(env_id, **planned)
         any_shape = tuple(dict.fromkeys((*PLAIN_KINDS, *self.task.shapes)))
@@ -185,7 +174,7 @@ class Arena:
         revising = self.task.replanning
         never = {"decide_at": (), "horizon": 1e3} if revising else {}
         self.arguments = {
-            "own": own,  # as the id says, with obstacles as the agent knows them
+            "own": dict(own),  # as the id says, with obstacles as the agent knows them
             "any": {**planned, **more},  # with obstacles of any number and shape
             "whole": {**planned, **more, **never},  # the same, with a plan that is never revised
         }
@@ -194,9 +183,9 @@ class Arena:
         self.planar = self.task.arm.space == "hand"  # True if the arm moves in a horizontal plane
         self._sampler = self.task.sampler()
         own_agent = () if agent is None else (AGENT,)
-        first = (*own_agent, MOTION) if agent_first or revising else (MOTION, *own_agent)
+        decides = (*own_agent, MOTION) if named or revising else (MOTION, *own_agent)
         library = () if revising or importlib.util.find_spec("ompl") is None else (OMPL,)
-        self.methods = (*first, SEARCH, STRAIGHT, *library)  # the first one is the default
+        self.methods = (*decides, SEARCH, STRAIGHT, *library)  # the first one is the default
 
     def env(self, name: str) -> ve.ReachVectorEnv:
         """Return a batch of one environment, `own`, `any` or `whole`, which is made once."""
@@ -214,12 +203,6 @@ class Arena:
         """Return the action that the agent chooses, shape (1, m)."""
         with _agent_lock:
             return AgentMethod(AGENT, self.agent, checks).decide(observation)
-
-    def propose(self, problem: Any) -> tuple[Float, Float]:
-        """Return the candidates of the agent in one problem, shape (N, m), and its values of them, shape (N,)."""
-        with _agent_lock:
-            actions, values = self.policy.propose(problem)
-        return actions[0], values[0]
 
     # Scenes
 
@@ -360,9 +343,8 @@ class Arena:
     def resized(self, shape: ve.Shape, name: str, value: float) -> ve.Shape:
         """Return an obstacle with another size, see :meth:`sizes_of`."""
         parameter, index, *_ = SIZES[name]
-        sizes = np.array(getattr(shape, parameter))
-        sizes[index] = value
-        changed: dict[str, Any] = {parameter: sizes}
+        changed: dict[str, Any] = {parameter: np.array(getattr(shape, parameter))}
+        changed[parameter][index] = value
         return dataclasses.replace(shape, **changed)
 
 
@@ -428,10 +410,8 @@ def _planned(arena: Arena, state: State, time_limit: float) -> Proposal:
         seeds: Any = SEEDS
         if last is not None and len(last.waypoints) == number + 2 and time_limit == TIME_LIMIT:
             seeds = last.waypoints[None, 1:-1]
-        motion = plan_motion(
-            *problem, n_via=number, seeds=seeds, time_limit=time_limit, duration=state.duration,
-            space=task.space_name, ompl=False,
-        )  # fmt: skip
+        limits: Any = {"time_limit": time_limit, "duration": state.duration, "ompl": False}
+        motion = plan_motion(*problem, n_via=number, seeds=seeds, space=task.space_name, **limits)
     seconds = time.perf_counter() - begin
     if state.duration is not None:  # or the shortest that the limits allow; as it is if that fails
         plan = ve.Plan(motion.waypoints, motion.durations * (state.duration / motion.duration))
@@ -477,14 +457,15 @@ def _distinct(arena: Arena, state: State) -> list[Proposal]:
         return [first]
     if by_agent:
         observation = begin_episode(arena.env(name), scene)
-        actions, values = arena.propose(Problem.of_observation(observation, task))
+        with _agent_lock:
+            (actions,), (values,) = arena.policy.propose(Problem.of_observation(observation, task))
     else:
         actions = candidate_actions(task, N_CHECKS, replanning=False).astype(np.float64)
         # Merits of several actions in one problem are bounds for all but the best.
         rest, start, goal = np.zeros_like(scene.start)[None], scene.start[None], scene.goal[None]
         problem = Problem(start, rest, rest, goal, pack([scene.obstacles]))
         each_alone = problem.take(np.zeros(len(actions), np.int64))
-        values = merits(task, each_alone, actions[:, None])[:, 0]
+        values = searching.merits(task, each_alone, actions[:, None])[:, 0]
     order = np.argsort(-values, kind="stable")[:N_CANDIDATES]
     known = values[order] if by_agent else np.full(len(order), np.nan)
     ends = (np.tile(end, (len(order), 1)) for end in (scene.start, scene.goal))
@@ -555,14 +536,14 @@ def _plan_on(
     goal = task.space.coordinates(scenes.goals(time))[0]
     if task.replanning and env.last_plan is not None:
         keep = np.zeros((1, task.action.size))
-        clear = plan_clearances(task, problem, keep[None], CLEARANCE_MARGIN, CLEARANCE_MARGIN)[0, 0]
+        clear = searching.plan_clearances(task, problem, keep[None], CLEARANCE_MARGIN, CLEARANCE_MARGIN)[0, 0]
         same = np.abs(env.last_plan.waypoints[0, -1] - goal).max() < SAME_GOAL
         if same and clear >= CLEARANCE_MARGIN:
             return env.execute_actions(keep)
+    number = int(np.clip(task.n_via, 1, 3))
     motion = plan_motion(
-        task.arm, problem.start[0], goal, problem.obstacles, n_via=int(np.clip(task.n_via, 1, 3)),
-        velocity=problem.velocity[0], acceleration=problem.acceleration[0], time_limit=TIME_LIMIT,
-        space=task.space_name, ompl=False,
+        task.arm, problem.start[0], goal, problem.obstacles, n_via=number, velocity=problem.velocity[0],
+        acceleration=problem.acceleration[0], time_limit=TIME_LIMIT, space=task.space_name, ompl=False,
     )  # fmt: skip
     return _execute_plan(env, motion) if motion.success else env.execute_actions(search(observation))
 

@@ -35,6 +35,7 @@ HANDLES = {name: trimesh.creation.icosphere(3, radius) for name, radius in RADII
 # First views: position of the camera, point that it looks at, [m], direction up, and field of view, [rad]
 PLANE = (-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), math.radians(33.0)
 SPACE = (2.6, -2.0, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), math.radians(38.0)
+ORIGIN = (0.0, 0.0, 0.0)  # Place of what is drawn where it is, [m]
 NARROW = 0.75  # Width of a window relative to its height, below which the view is wider
 OPACITY, GHOST = 0.45, 0.16  # Of what hides others, and of the arm at the goal
 POINT = 0.005  # Size of the points that a sensor sees, [m]
@@ -158,13 +159,11 @@ class View:
                 self._meshes[f"/arm/{i}"] = mesh
                 self._nodes[f"/arm/{i}"] = self._scene.add_mesh_trimesh(f"/arm/{i}", mesh)
         axes = (True, True, not self._planar)
-        self._rings = self._scene.add_transform_controls(
-            "/turn", 0.2, disable_axes=True, disable_sliders=True, visible=False, active_axes=axes
-        )
+        rings: Any = {"disable_axes": True, "disable_sliders": True, "visible": False, "active_axes": axes}
+        self._rings = self._scene.add_transform_controls("/turn", 0.2, **rings)
         self._rings.on_update(lambda _: act("turn", np.array(self._rings.wxyz)))
-        self._seen = self._scene.add_point_cloud(
-            "/seen", np.zeros((0, 3)), _rgb(PALETTE.seen), point_size=POINT, point_shape="circle"
-        )
+        points: Any = {"point_size": POINT, "point_shape": "circle"}
+        self._seen = self._scene.add_point_cloud("/seen", np.zeros((0, 3)), _rgb(PALETTE.seen), **points)
 
     def draw(self, state: State) -> None:
         """Draw the scene, the plans and the movement."""
@@ -185,10 +184,9 @@ class View:
         for i, (shape, place) in enumerate(zip(scene.obstacles, places, strict=False)):
             strength = PALE if i == state.selected else 1.0
             key = f"/obstacle/{i}"
+            mesh = self._meshes.get(key)
             if self._shapes.get(key) is not shape:  # most stay as they are
                 self._shapes[key], mesh = shape, obstacle_mesh(shape, self._levels)
-            else:
-                mesh = self._meshes[key]
             node = self._show(key, mesh, PALETTE.obstacle, strength, place)
             node.flat_shading = not isinstance(shape, Sphere | Capsule)
             large = isinstance(shape, HalfSpace) or float(shape.packed_size.max()) > LARGE
@@ -256,9 +254,7 @@ class View:
         drop = np.array([place, (*place[:2], min(self._floor, place[2] - 1e-3))])
         self._show(f"/drop-{name}/{number}", tube(drop, DROP), colour, PALE)
 
-    def _show(
-        self, key: str, mesh: Any, colour: Colour, strength: float = 1.0, place: Any = (0.0, 0.0, 0.0)
-    ) -> Any:
+    def _show(self, key: str, mesh: Any, colour: Colour, strength: float = 1.0, place: Any = ORIGIN) -> Any:
         """Show a mesh in a colour at a place, [m], and return its node."""
         self._shown.add(key)
         node = self._nodes.get(key)

@@ -150,13 +150,12 @@ class Tab:
 
     def go_to(self, kind: str) -> None:
         """Go to another scene of a kind, or undo all changes."""
-        self._take(self.state.drawn if kind == RESET else next(self._scenes[kind]))
+        scene = self.state.drawn if kind == RESET else next(self._scenes[kind])
+        self.change(scene=scene, drawn=scene, by_hand=None, duration=None, selected=None)
 
     def load(self, content: bytes) -> None:
         """Go to the scene of a JSON file; an impossible one is refused."""
-        self._take(self.arena.read(content))
-
-    def _take(self, scene: live.Scene) -> None:
+        scene = self.arena.read(content)
         self.change(scene=scene, drawn=scene, by_hand=None, duration=None, selected=None)
 
     def drag(self, kind: str, number: int, place: Float) -> None:
@@ -174,26 +173,22 @@ class Tab:
             else:
                 raise ValueError("the goal would be out of the arm's reach")
         elif kind == "obstacle" and number < len(scene.obstacles):
-            self._alter(number, position=place)
+            shape = dataclasses.replace(scene.obstacles[number], position=place)
+            self.change(scene=scene.with_obstacle(number, shape), selected=number)
         elif kind == "via" and state.plan is not None and number < len(state.plan.durations) - 1:
             vias = state.plan.waypoints[1:-1].copy()
             vias[number] = arena.moved(vias[number], place)
             self.change(by_hand=vias)
 
-    def _alter(self, row: int, **changes: Any) -> None:
-        """Change an obstacle, and select it."""
-        scene = self.state.scene
-        shape = dataclasses.replace(scene.obstacles[row], **changes)
-        self.change(scene=scene.with_obstacle(row, shape), selected=row)
-
     def turn(self, quaternion: Float) -> None:
         """Turn the selected obstacle, or the tool at the goal."""
-        scene, arena = self.state.scene, self.arena
-        if self.state.selected is None:
+        scene, arena, row = self.state.scene, self.arena, self.state.selected
+        if row is None:
             goal = arena.moved(scene.goal, arena.tool(scene.goal), scene.obstacles, quaternion)
             self.change(scene=scene._replace(goal=goal, jumps=()), by_hand=None)
         else:
-            self._alter(self.state.selected, quaternion=quaternion)
+            shape = dataclasses.replace(scene.obstacles[row], quaternion=quaternion)
+            self.change(scene=scene.with_obstacle(row, shape))
 
     def show(self, name: str, value: Any) -> None:
         """Select an obstacle, unless it has been removed meanwhile, or show the rings that turn it or the goal."""
@@ -290,12 +285,11 @@ class LivePage(contextlib.AbstractContextManager["LivePage", None]):
     """Page in the browser on which scenes are changed by hand and the movement is planned anew.
 
     Args:
-        agent: Agent, run folder, model folder, or id of an environment with a shipped agent; it decides at first. None
-            for the agent that is shipped for `env`, if there is one; then the motion planner decides at first.
+        agent: Agent, run folder, model folder, or id of a shipped agent; it decides at first. None for the agent that
+            is shipped for `env`, if there is one; then the motion planner decides at first.
         env: Id of the environment; by default that of the agent.
         port: Port to listen on; 0 for a free one.
-        arm: Arm of the environment: the name of one, an MJCF or URDF file, or an arm. Without `env`, it moves among
-            obstacles.
+        arm: Name, file or record of the arm of the environment; without `env`, it moves among obstacles.
         model_file: File whose visible geoms, such as meshes, are drawn; by default the one that `arm` names.
         seed: Seed of the random scenes.
         **env_kwargs: Arguments of the environment; by default those of the agent.
