@@ -174,9 +174,6 @@ class TrainConfig(Config):
 
     Example: viapoint train --env viapoint/PlanarObstacles-v0 --n-timesteps 10000 --out runs/first
 
-    Raises:
-        ValueError: A value is not allowed; the message lists the allowed values.
-
     Example:
         >>> from viapoint.training import TrainConfig
         >>> config = TrainConfig(env="viapoint/PandaObstacles-v0", seed=1, hyperparameters={"batch_size": 128})

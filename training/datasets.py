@@ -41,9 +41,8 @@ def record_dataset(
 ) -> Any:
     """Record episodes of a method as a Minari dataset, such as group/name-v0, and return it.
 
-    Episode i is reset with `seed + i`. Its actions are those of the method in single precision, as the action space has
-    them, so that a replay gives the same observations and rewards. `progress` is called with the method's name and the
-    numbers of recorded and of all episodes.
+    Episode i is reset with `seed + i`. Actions are in single precision, as the action space has them, so that a replay
+    gives the same. `progress` is called with the method's name and the numbers of recorded and of all episodes.
 
     Raises:
         ValueError: The dataset exists, its name is not allowed, or decisions of the method are no actions.

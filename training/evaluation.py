@@ -169,21 +169,20 @@ def evaluate(
     Ctrl-C ends the evaluation; the result then holds the finished scenes and is marked as partial.
 
     Args:
-        agent: Id of an environment, for its shipped agent; run folder or model folder; an agent; any object with
-            `name` and `decide`, such as a :class:`GeometrySearch`; None to evaluate baselines alone.
+        agent: Id of a shipped agent, run folder, model folder, an agent, or any object with `name` and `decide`, such
+            as a :class:`GeometrySearch`; None to evaluate baselines alone.
         env: Id of the environment; that of the agent if not given.
         env_kwargs: Keyword arguments of the environment; those of the agent if not given.
         scenes: `validation`, `test`, `hard`, `uniform`, the path of a scene file, or a scene set.
         n_scenes: Number of scenes, evenly spread over the set; all if not given.
-        checks: Number of proposals that the agent checks with exact geometry, or several numbers, one row each; the
-            agent's own setting if not given.
-        refine: Number of proposals that the planner refines, or several numbers, one further row each.
-        baselines: Names, or objects with `name` and `decide`. Names are `untrained` (the agent's network before
-            training), `straight`, `random`, `plan_motion`, `ompl`, `searchN` and `sobolN` (N checked plans), in
-            tasks with a sensor also `cautiousN` and BELIEF:METHOD, such as `thick:search512`, and where obstacles move
-            PREDICTION:searchN, such as `reach:search512`.
+        checks: Numbers of proposals that the agent checks with exact geometry, one row each; its own if not given.
+        refine: Numbers of proposals that the planner refines, one further row each.
+        baselines: Objects with `name` and `decide`, or names: `untrained` (the agent's network before training),
+            `straight`, `random`, `plan_motion`, `ompl`, `searchN` and `sobolN` (N checked plans); with a sensor also
+            `cautiousN` and BELIEF:METHOD, such as `thick:search512`; where obstacles move also PREDICTION:searchN, such
+            as `reach:search512`.
         time_decisions: Measure the wall time of single decisions.
-        progress: Function of the method's name, the number of finished scenes and the number of all scenes.
+        progress: Function of the method's name and the numbers of finished and of all scenes.
 
     Raises:
         ValueError: There is no such agent, baseline, scene set or environment, or they do not fit together.
@@ -191,10 +190,8 @@ def evaluate(
     Example:
         >>> from viapoint.training import evaluate
         >>> result = evaluate("viapoint/PlanarObstacles-v0", baselines=["straight"], n_scenes=50)
-        >>> result.success_rate > 0.5
-        True
-        >>> [row["method"] for row in result.rows]
-        ['agent', 'straight']
+        >>> result.success_rate > 0.5, [row["method"] for row in result.rows]
+        (True, ['agent', 'straight'])
     """
     if n_scenes is not None:
         check_whole("n_scenes", n_scenes)

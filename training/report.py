@@ -1,14 +1,17 @@
-"""Tables of evaluations for terminals, documents and programs."""
+"""Output of commands: tables of evaluations, and progress bars, which are shown on terminals alone."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from tqdm.auto import tqdm  # a bar of its own kind in a notebook
 
 from viapoint.training.configs import Format
 from viapoint.training.files import MARK, write_bytes, write_json
@@ -110,3 +113,25 @@ def write(record: Record, folder: Path) -> None:
     """Write the table as Markdown, and with the outcomes of every scene as JSON."""
     write_bytes(folder / "table.md", f"{markdown(record)}\n<!-- {MARK.decode()} -->\n".encode())
     write_json(folder / "table.json", dict(record))
+
+
+def progress_bar(**settings: Any) -> Any:
+    """Return a bar of tqdm on the standard error output, which shows nothing if that is no terminal."""
+    return tqdm(**{"disable": None, "file": sys.stderr, "dynamic_ncols": True, **settings})
+
+
+@contextmanager
+def scene_progress() -> Iterator[Callable[[str, int, int], None]]:
+    """Show a bar over the scenes of each method; the context is a function of name, finished and all scenes."""
+    with progress_bar(unit=" scenes", delay=0.01) as bar:
+        shown = ""
+
+        def progress(name: str, done: int, total: int) -> None:
+            nonlocal shown
+            if name != shown:
+                shown = name
+                bar.reset(total)
+                bar.set_description(name)
+            bar.update(done - bar.n)
+
+        yield progress

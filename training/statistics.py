@@ -15,11 +15,7 @@ Interval = tuple[float, float, float]  # Estimate, and both ends of its confiden
 def wilson(successes: int, trials: int) -> Interval:
     """Return Wilson's score interval of a success rate; without trials it is (nan, 0, 1).
 
-    Recommended by Brown, Cai and DasGupta 2001, Stat. Sci. 16; computed by `scipy.stats.binomtest`.
-
-    Raises:
-        ValueError: Not 0 <= successes <= trials.
-        TypeError: A count is not an integer.
+    Recommended by Brown, Cai and DasGupta 2001, Stat. Sci. 16. Impossible counts raise ValueError or TypeError.
     """
     if successes == trials == 0:
         return math.nan, 0.0, 1.0
@@ -32,10 +28,8 @@ def mcnemar(first: ArrayLike, second: ArrayLike) -> dict[str, float]:
     """Compare the successes of two methods on the same N > 0 scenes, shape (N,), by the exact McNemar test.
 
     The result holds `difference`, the success rate of the first minus that of the second; `only_first` and
-    `only_second`, numbers of scenes in which one alone succeeded; and the two-sided `p_value`.
-
-    Only the b scenes where the first alone succeeded and the c where the second alone did distinguish them. If
-    both are equally likely, b is binomial(b + c, 1/2). Source: McNemar 1947, Psychometrika 12, 153-157.
+    `only_second`, numbers b and c of scenes in which one alone succeeded; and the two-sided `p_value`: if both are
+    equally good, b is binomial(b + c, 1/2). Source: McNemar 1947, Psychometrika 12, 153-157.
     """
     a, b = np.asarray(first), np.asarray(second)
     only_first = int((a > b).sum())
@@ -57,8 +51,7 @@ def across_seeds(
     stratum show no spread to a bootstrap; then the interval is Wilson's over the scenes.
 
     Sources: Owen 2007, The Pigeonhole Bootstrap, Ann. Appl. Stat. 1, 386-411; Agarwal et al. 2021, arXiv 2108.13264.
-        Intervals of a few seeds may be a little too narrow: those of five simulated agents covered the truth in 88 to
-        99 % of trials, least where agents differed most.
+    Intervals of a few seeds may be too narrow: those of five simulated agents cover the truth in 88 to 99 % of trials.
 
     Args:
         scores: Scores, shape (seeds, scenes).

@@ -378,8 +378,7 @@ def run_study(
     """Run what a study has not run yet, and write its tables.
 
     Ray places the trials: the one that the process is connected to, or one of this machine. The same call continues a
-    study that was stopped or killed: complete trials are kept, and interrupted trainings go on from their last
-    checkpoints.
+    study that was stopped or killed.
 
     Args:
         study: Environments, agents, baselines and searches.
@@ -388,7 +387,7 @@ def run_study(
         told: Function of one line for each trial that ends.
 
     Returns:
-        Table with one line for each environment, set of scenes and row, as `results.csv` holds it.
+        Table with one line for each environment, set of scenes and row, as in `results.csv`.
 
     Raises:
         ImportError: Ray, or for a search Optuna, is not installed.

@@ -22,7 +22,7 @@ from viapoint.training.agents.model_io import build
 from viapoint.training.configs import TrainConfig
 from viapoint.training.evaluation import MethodResult, evaluate, one_thread
 from viapoint.training.files import BadFileError, read_json, versions, write_json
-from viapoint.training.progress import progress_bar
+from viapoint.training.report import progress_bar
 from viapoint.training.runs import Run, check_unchanged, locked
 from viapoint.training.scene_sets import FrozenScenes, scenes_for
 from viapoint.training.vec_env import LOGGED, ViaVecEnv

@@ -92,10 +92,8 @@ def predicted_actions(model: BaseAlgorithm, observation: Any) -> NDArray[Any]:
 class ViaVecEnv(VecEnv):
     """Vector environment for Stable-Baselines3 that simulates all copies of an environment in one batch.
 
-    It replaces `make_vec_env` of Stable-Baselines3, which makes one Python environment per copy; `benchmarks/speed.py`
-    measures how much faster it is. Episodes may have one step or many, and may end at different times.
-    `HerReplayBuffer` of Stable-Baselines3 does not apply: the reward of another goal depends on contact and jerk of a
-    movement that was not made, so observations have no `achieved_goal`.
+    It replaces `make_vec_env` of Stable-Baselines3, which makes one Python environment per copy. `HerReplayBuffer` does
+    not apply: the reward of another goal depends on contact and jerk of a movement that was not made.
 
     Args:
         env_id: Id of a registered environment.
@@ -169,10 +167,9 @@ class ViaVecEnv(VecEnv):
         """Step all copies; if an episode ended, the observation is the first one of the next episode.
 
         Returns:
-            Observation, reward (N,), done (N,) and N info dictionaries. The dictionaries hold what the environment
-            reports of the decision and `TimeLimit.truncated`, as those of Stable-Baselines3's `make_vec_env`. At the
-            end of an episode they also hold `terminal_observation` and `episode` (return r, length l, wall time t [s]
-            since the start, and those metrics of `LOGGED` that the environment reports).
+            Observation, reward (N,), done (N,) and N info dictionaries, as from Stable-Baselines3's `make_vec_env`. At
+            the end of an episode, `episode` in them holds return r, length l, wall time t [s] since the start, and
+            those metrics of `LOGGED` that the environment reports.
         """
         observation, reward, terminated, truncated, info = self.venv.step(self._actions)
         done = terminated | truncated

@@ -53,8 +53,7 @@ def record_video(
         name: Name of the method, for the caption.
 
     Raises:
-        ValueError: The path has another suffix or is a file of something else, the environment has another render
-            mode, or there is no scene.
+        ValueError: An argument is not allowed, or the file is one of something else.
         GLUnavailableError: There is no OpenGL library.
     """
     path = Path(path).expanduser()

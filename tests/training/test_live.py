@@ -24,7 +24,6 @@ from viapoint.training.live import arena as live_arena
 from viapoint.training.live import drawing, page
 from viapoint.training.live.arena import (
     AGENT,
-    APART,
     HAND,
     MOTION,
     OMPL,
@@ -36,7 +35,6 @@ from viapoint.training.live.arena import (
     decide,
     describe_plan,
     execute,
-    profile,
     propose,
 )
 from viapoint.training.planning.plan_motion import plan_motion
@@ -98,13 +96,13 @@ def test_every_environment_has_scenes_decisions_movements_and_a_drawing(env_id, 
     scene = drawn(arena)
     state = with_proposals(arena, decided(arena, scene))
     np.testing.assert_allclose(state.plan.waypoints[[0, -1]], (scene.start, scene.goal), atol=1e-6)
-    lines = profile(arena, scene, state.plan.plan)
+    lines = live_arena.profile(arena, scene, state.plan.plan)
     assert lines["speed"][[0, -1]].max() < 0.02 * lines["speed"].max()
     if not np.any([shape.velocity for shape in scene.obstacles]):
         assert min(lines["clearance"].min(), 1.0) >= state.plan.clearance - 1e-6
     paths = np.array([arena.path(each.motion.plan) for each in state.proposals])
     for i, j in np.argwhere(~np.eye(len(paths), dtype=bool)):
-        assert np.linalg.norm(paths[i] - paths[j], axis=-1).max() > 0.9 * APART
+        assert np.linalg.norm(paths[i] - paths[j], axis=-1).max() > 0.9 * live_arena.APART
     movements = list(execute(arena, state))
     np.testing.assert_allclose(movements[0].rollout.hand[0], arena.tool(scene.start), atol=1e-6)
     if arena.task.whole_movement and state.plan.success:
@@ -252,15 +250,12 @@ def test_the_motion_planner_plans_on_where_plans_are_revised(env_id, arenas, mon
     arena = arenas(env_id)
     reached, followed = 0, 0
     for number in range(8):
-        scene = drawn(arena, number)
-        assert MOTION in arena.methods
-        *_, movement = execute(arena, decided(arena, scene, MOTION))
+        *_, movement = execute(arena, decided(arena, drawn(arena, number), MOTION))
         reached += movement.info["is_success"]
         last = found[-1]
         # The last plan in motion is what is followed, to its end.
-        followed += (
-            last.success and last.velocity.any() and np.allclose(movement.plan.duration, last.duration)
-        )
+        in_motion = last.success and last.velocity.any()
+        followed += in_motion and np.allclose(movement.plan.duration, last.duration)
     assert reached >= 7
     assert followed >= 2
 
@@ -426,20 +421,18 @@ def test_scenes_that_exceed_the_environment_of_the_agent_are_searched():
         assert decided(arena, other, AGENT).proposals[0].maker == SEARCH
 
 
-def test_the_page_is_private():
-    with LivePage(env=PLANE, port=0) as page:
-        assert page.url.startswith("http://127.0.0.1:")
-        assert page._server.request_share_url() is None
+@pytest.mark.parametrize(
+    ("named", "first", "n_via"),
+    [({"agent": PLANE}, AGENT, 1), ({"env": PLANE, "env_kwargs": {"n_via": 2}}, MOTION, 2)],
+)
+def test_the_page_is_private_and_serves_what_was_asked_for(named, first, n_via, monkeypatch):
+    """An agent that is named decides at first."""
 
+    def check(served):
+        assert served.url.startswith("http://127.0.0.1:")
+        assert served._server.request_share_url() is None
+        arena, _ = served._make()
+        assert (arena.methods[0], arena.task.n_via) == (first, n_via)
 
-def test_the_command_passes_arguments_of_the_environment_on(monkeypatch):
-    seen = []
-    monkeypatch.setattr(page.LivePage, "wait", lambda served: seen.append(served._make()[0].task.n_via))
-    page.run(LiveConfig(env=PLANE, env_kwargs={"n_via": 2}, port=0))
-    assert seen == [2]
-
-
-@pytest.mark.parametrize(("named", "first"), [({"agent": PLANE}, AGENT), ({"env": PLANE}, MOTION)])
-def test_an_agent_decides_at_first_where_it_is_named(named, first):
-    with LivePage(**named, port=0) as served:
-        assert served._make()[0].methods[0] == first
+    monkeypatch.setattr(page.LivePage, "wait", check)
+    page.run(LiveConfig(**named, port=0))

@@ -25,7 +25,7 @@ from viapoint.training.files import BadFileError, read_json, versions, write_jso
 from viapoint.training.planning import benchmark
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.progress import scene_progress
+from viapoint.training.report import scene_progress
 from viapoint.training.runs import Run
 from viapoint.training.scene_sets import evenly_spread, scenes_for
 

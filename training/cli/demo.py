@@ -22,7 +22,7 @@ from viapoint.training.files import check_ours, read_json
 from viapoint.training.planning.baselines import agent_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plots import success_of_rows
-from viapoint.training.progress import scene_progress
+from viapoint.training.report import scene_progress
 from viapoint.training.runs import Run
 from viapoint.training.scene_sets import BANDS, FrozenScenes, scenes_for
 from viapoint.training.trainer import train_or_resume

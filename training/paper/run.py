@@ -21,7 +21,7 @@ from viapoint.training.paper import double_step, figures, obstacles, one_via, po
 from viapoint.training.paper.claim import Claim, Number
 from viapoint.training.paper.one_via import ENDS, FAST, SLOW, THREE_POINTS
 from viapoint.training.plots import STYLE
-from viapoint.training.progress import progress_bar
+from viapoint.training.report import progress_bar
 
 # Titles and functions of the rows: twelve of Flash & Hogan 1985, one of Flash & Henis 1991
 ROWS: dict[int, tuple[str, Callable[..., list[Claim]]]] = {
