@@ -218,14 +218,15 @@ class TrainConfig(Config):
         if self.task.stepwise and self.algo not in STEP_PRESETS:
             known = ", ".join(STEP_PRESETS)
             raise ValueError(f"{self.algo} decides on whole movements; algo for {self.env} is one of {known}")
-        share, least = self.stop_when_stalled, self.preset.n_timesteps
+        share = self.stop_when_stalled
         if share is None:
             return
+        least = self.preset.n_timesteps  # before which a training does not stall
         if not is_number(share) or not 0.0 < share < 1.0:
             raise ValueError(f"stop_when_stalled must be a number over 0 and below 1, got {share!r}")
         if not self.evaluation_interval:
             raise ValueError("stop_when_stalled needs validations: eval_every must be 1 or more, got 0")
-        if self.total_timesteps <= least:  # before which a training does not stall
+        if self.total_timesteps <= least:
             raise ValueError(f"stop_when_stalled needs n_timesteps over {least}, got {self.total_timesteps}")
 
     @functools.cached_property

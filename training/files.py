@@ -97,16 +97,20 @@ def write_folder(path: Path, fill: Callable[[Path], None], *, move_foreign: bool
     try:
         fill(temporary)
         _sync_folder(temporary)
-        outdated = path.with_name(f".{path.name}.{uuid.uuid4().hex}.old")
+        aside = path.with_name(f".{path.name}.{uuid.uuid4().hex}.old")
         foreign = _foreign(path, temporary)
         if foreign and not move_foreign:
             raise BadFileError(path, foreign)
         if foreign:
-            _move_aside(path)
-        elif path.exists():
-            path.rename(outdated)
+            number = 1
+            while os.path.lexists(aside := path.with_name(f"{path.name}.{number}")):
+                number += 1
+            print(f"{path} holds what viapoint did not write: it is kept as {aside}", file=sys.stderr)
+        if path.exists():
+            path.rename(aside)
         temporary.rename(path)
-        shutil.rmtree(outdated, ignore_errors=True)  # there is none of a new folder
+        if not foreign:
+            shutil.rmtree(aside, ignore_errors=True)  # there is none of a new folder
         _sync_folder(path.parent)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -125,15 +129,6 @@ def _foreign(path: Path, newer: Path) -> str:
         if there and not _is_ours(path / record.name):
             return f"holds no {record.name} that viapoint wrote; name a new folder"
     return ""
-
-
-def _move_aside(path: Path) -> None:
-    """Rename a file or folder, so that another one can be written in its place."""
-    number = 1
-    while os.path.lexists(f"{path}.{number}"):
-        number += 1
-    aside = path.rename(f"{path}.{number}")
-    print(f"{path} holds what was not written by viapoint: it is kept as {aside}", file=sys.stderr)
 
 
 def write_figure(path: Path, figure: Any, **options: Any) -> Path:

@@ -45,6 +45,8 @@ def across_seeds(
 ) -> Interval:
     """Return the interquartile mean over seeds of each seed's mean over scenes, with a two-way bootstrap interval.
 
+    `scores` has shape (seeds, scenes), and `strata` holds the stratum of each scene, such as its band, shape (scenes,).
+
     The interquartile mean leaves out the lowest and the highest floor(n / 4) of the seeds. A draw takes seeds as whole
     rows and scenes as whole columns, scenes within their strata, as all agents meet the same scenes; drawn one by one,
     the entries of an agent that fails in many scenes would pass for many agents. Scores of 0 and 1 that differ in no
@@ -52,12 +54,6 @@ def across_seeds(
 
     Sources: Owen 2007, The Pigeonhole Bootstrap, Ann. Appl. Stat. 1, 386-411; Agarwal et al. 2021, arXiv 2108.13264.
     Intervals of a few seeds may be too narrow: those of five simulated agents cover the truth in 88 to 99 % of trials.
-
-    Args:
-        scores: Scores, shape (seeds, scenes).
-        strata: Stratum of each scene, such as its band, shape (scenes,).
-        generator: Random generator of the draws.
-        samples: Number of draws.
     """
     table = np.asarray(scores, dtype=np.float64)
     seeds, scenes = table.shape

@@ -239,8 +239,8 @@ class RunCallback(CallbackList):
         return time.monotonic() - self._began
 
     def __enter__(self) -> RunCallback:
-        total, hidden = self.config.total_timesteps, None if self.config.progress else True
-        self._bar = progress_bar(total=total, bar_format=PROGRESS, disable=hidden)
+        shown = {} if self.config.progress else {"disable": True}
+        self._bar = progress_bar(total=self.config.total_timesteps, bar_format=PROGRESS, **shown)
         self._handler: Any = None
         with suppress(ValueError):  # other threads than the main one get no signals
             self._handler = signal.signal(signal.SIGINT, self._on_interrupt)

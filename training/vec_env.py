@@ -31,11 +31,7 @@ LOGGED = ("collision", "reachable", "min_clearance", "jerk_ratio", "duration")
 def env_arguments(env: VecEnv | None) -> tuple[str, dict[str, Any]]:
     """Return the id of a vector environment and the keyword arguments that its id does not imply.
 
-    Args:
-        env: A :class:`ViaVecEnv`, or environments of this package in a vector environment of Stable-Baselines3.
-
-    Raises:
-        ValueError: The environment is another one.
+    It is a :class:`ViaVecEnv`, or has environments of this package; another one raises ValueError.
     """
     if env is None:
         raise ValueError("the environment must be one of this package, made by its id, got none")

@@ -45,12 +45,8 @@ def record_video(
 ) -> int:
     """Record one episode in each scene as an MP4, and return the number of frames.
 
-    Args:
-        path: MP4 file; its folder is created.
-        env: Environment made with `render_mode="rgb_array_list"`.
-        scenes: Scenes with as many rows for obstacles as the environment has.
-        decide: Function from observation and scene, of one row each, to actions, shape (1, m).
-        name: Name of the method, for the caption.
+    The environment is made with `render_mode="rgb_array_list"`, and has as many rows for obstacles as the scenes.
+    `decide` takes observation and scene, of one row each, and returns actions, shape (1, m). `name` is for the caption.
 
     Raises:
         ValueError: An argument is not allowed, or the file is one of something else.
@@ -62,7 +58,8 @@ def record_video(
         raise ValueError(f"env must be made with render_mode='rgb_array_list', got {env.render_mode!r}")
     if not len(scenes.start):
         raise ValueError("scenes must hold at least one scene")
-    fps, number = float(env.metadata["render_fps"]), len(scenes.start)
+    fps = float(env.metadata["render_fps"])
+    number = len(scenes.start)
     told = "only the hand must clear" if env.get_wrapper_attr("task").hand_alone else ""
 
     def frames() -> Iterator[Frame]:

@@ -101,7 +101,8 @@ def _notes(config: EvaluateConfig) -> TextIO:
 def _measure_planners(config: EvaluateConfig) -> None:
     """Measure planners on the problems of MotionBenchMaker, print the table, and write one line for each problem."""
     arm = benchmark.benchmark_panda() if config.arm is None else arm_of(config.arm)
-    problems, faults = benchmark.benchmark_problems(), list[str]()
+    problems = benchmark.benchmark_problems()
+    faults = list[str]()
     if config.problems is not None:
         joints = benchmark.JOINTS if config.arm is None else arm.joint_names
         problems, faults = benchmark.read_problems(config.problems, joints)

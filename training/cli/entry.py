@@ -147,8 +147,8 @@ def _complaint(text: str, command: str, kind: type[Any]) -> str:
     """Return what tyro says below a title, in a frame or in ASCII, as one line with the flags of fields."""
     _, _, body = re.sub(r"\x1b\[[0-9;]*m", "", text).strip().partition("\n")  # without colours
     said = " ".join(re.sub("[│╰╯─]|-{3,}", " ", body).split())
-    title, end = rf"^Error parsing ({kind.__name__}: )?", "( Argument helptext: .*)? For full helptext, .*"
-    said = re.sub(f"{title}|{end}", "", said)
+    said = re.sub(rf"^Error parsing ({kind.__name__}: )?", "", said)
+    said = re.sub("( Argument helptext: .*)? For full helptext, .*", "", said)
     for each in dataclasses.fields(kind):
         said = re.sub(rf"^{each.name}\b", f"--{each.name.replace('_', '-')}", said)
     return f"{said} (viapoint {command} --help)"

@@ -32,9 +32,9 @@ def run(config: PlanConfig) -> None:
     start = config.start or scene.get("start")
     if start is None:
         start = arm.hand(arm.home)[:2] if arm.space == "hand" else arm.home
-    goal, obstacles = _goal(config, scene), scene.get("obstacles", ())
+    problem = arm, start, _goal(config, scene), scene.get("obstacles", ())
     settings = {name: getattr(config, name) for name in ("n_via", "margin", "duration", "time_limit")}
-    plan = plan_motion(arm, start, goal, obstacles, rng=config.seed, **settings)
+    plan = plan_motion(*problem, rng=config.seed, **settings)
     print(plan)
     if not plan.success and not config.force:
         raise ValueError(f"no plan is safe: {plan.reason}; --force writes it nevertheless")

@@ -83,20 +83,11 @@ LEAST_APART = 0.3  # Least distance of the targets of a movement, [m]
 
 
 def rows_of_lights(
-    length: float = 0.25,
-    radius: float = 0.008,
-    shift: tuple[float, float] = (0.0, 0.0),
-    half_height: float = 0.04,
+    length: float = 0.25, radius: float = 0.008, shift: Any = (0.0, 0.0), half_height: float = 0.04
 ) -> list[tuple[str, str, Box]]:
     """Return the obstacle paradigm of Flash & Hogan 1985: pairs of targets far apart, and a row of lights between.
 
     `radius` is half the width of the row, and `shift` the offset of its middle along and across the line, [m].
-
-    Example:
-        >>> from viapoint.training.paper.movements import rows_of_lights
-        >>> rows = rows_of_lights()
-        >>> len(rows), rows[0][:2]
-        (14, ('T1', 'T3'))
     """
     found = []
     for (first, start), (last, goal) in itertools.permutations(TARGETS.items(), 2):

@@ -53,9 +53,7 @@ def light_scenes(n_rows: int) -> Scenes:
 def light_movements(agent: Path | None) -> ObstacleMovements:
     """Simulate the movements of an agent, or without one of a search, around the rows of lights.
 
-    Raises:
-        ValueError: The agent's task is not of the hand in the plane, has no boxes, or needs several decisions for a
-            movement; or no movement gets around a row.
+    An agent of another task, or one that gets around no row, raises ValueError.
     """
     if agent is None:
         simulation = SceneSimulation(DEFAULT_ENV, 256)
@@ -67,10 +65,8 @@ def light_movements(agent: Path | None) -> ObstacleMovements:
     task = simulation.task
     fits = task.whole_movement and task.space_name == "hand" and task.arm.name == "planar"
     if not fits or not task.n_obstacles[1] or "box" not in task.shapes:
-        raise ValueError(
-            f"agent must be of a task of the plane with boxes in which one decision is a whole movement, such as "
-            f"{DEFAULT_ENV}; that of {agent} is of {simulation.env_id}"
-        )
+        needed = f"a task of the plane with boxes and whole movements, such as {DEFAULT_ENV}"
+        raise ValueError(f"agent must be of {needed}; that of {agent} is of {simulation.env_id}")
     scenes = light_scenes(task.observation.n_rows)
     check_scenes(scenes, task.arm)
     action = method.decide(simulation.observe(scenes), scenes)
