@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -94,9 +95,8 @@ def _episode(env: gym.Env[Any, Any], method: Method, number: int, seed: int) -> 
     observation, _ = env.reset(seed=seed)
     seen = [observation]
     infos: list[dict[str, Any]] = []
-    played: dict[str, list[Any]] = {
-        name: [] for name in ("actions", "rewards", "terminations", "truncations")
-    }
+    names = ("actions", "rewards", "terminations", "truncations")
+    played: dict[str, list[Any]] = defaultdict(list)
     over = False
     while not over:
         batch = {name: part[None] for name, part in observation.items()}
@@ -105,8 +105,8 @@ def _episode(env: gym.Env[Any, Any], method: Method, number: int, seed: int) -> 
         observation, *result, info = env.step(action)
         seen.append(observation)
         infos.append(info)
-        for values, value in zip(played.values(), (action, *result), strict=True):
-            values.append(value)
+        for name, value in zip(names, (action, *result), strict=True):
+            played[name].append(value)
         over = any(result[1:])
     observations = {name: np.stack([each[name] for each in seen]) for name in observation}
     reports = {name: np.array([each[name] for each in infos]) for name in infos[0]}

@@ -28,7 +28,7 @@ from viapoint.training.planning.baselines import Method, agent_method, make_meth
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import Outcomes, SceneSimulation, joined, whole_task
 from viapoint.training.scene_sets import BANDS, DRAWN, SETS, FrozenScenes, scenes_for
-from viapoint.training.statistics import mcnemar, success_weighted_path_length, wilson
+from viapoint.training.statistics import mcnemar, wilson
 from viapoint.training.vec_env import env_arguments
 
 Progress = Callable[[str, int, int], None]  # Method's name, scenes done, all scenes
@@ -60,7 +60,7 @@ class MethodResult:
 
     def summary(self) -> dict[str, Any]:
         """Return the metrics by name; those of successes are None without successes."""
-        success, outcomes, times = self.success, self.outcomes, self.decision_times
+        success = self.success
         summary: dict[str, Any] = {"scenes": len(success), "partial": self.partial, "success": _rate(success)}
         by_band = summary["success_by_band"] = {}
         for i, name in enumerate(BANDS):
@@ -70,17 +70,20 @@ class MethodResult:
         for name in dict.fromkeys(self.family.tolist()):
             if name != DRAWN:
                 by_family[name] = _rate(success[self.family == name])
-        summary["collision"] = _rate(np.asarray(outcomes["collision"], dtype=bool))
-        summary["unreachable"] = _rate(~np.asarray(outcomes["reachable"], dtype=bool))
+        summary["collision"] = _rate(np.asarray(self.outcomes["collision"], dtype=bool))
+        summary["unreachable"] = _rate(~np.asarray(self.outcomes["reachable"], dtype=bool))
         for name in ("min_clearance", "goal_error", "tracking_error"):
-            summary[name] = _quantile(outcomes[name])
+            summary[name] = _quantile(self.outcomes[name])
         for name in ("jerk_ratio", "duration", "path_length"):
-            summary[name] = _quantile(outcomes[name][success])
+            summary[name] = _quantile(self.outcomes[name][success])
         summary["spl"] = None
         if len(success) and np.isfinite(self.distance).all():
-            summary["spl"] = success_weighted_path_length(success, self.distance, outcomes["path_length"])
-        summary["decision_time"] = _quantile(times)
-        summary["decision_time_98"] = None if len(times) < 2 else _quantile(times, 0.98)
+            # SPL = mean(S l / max(p, l)): Anderson et al. 2018, arXiv 1807.06757
+            weight = self.distance / np.maximum(self.outcomes["path_length"], self.distance)
+            summary["spl"] = float((success * weight).mean())
+        summary["decision_time"] = _quantile(self.decision_times)
+        several = len(self.decision_times) > 1
+        summary["decision_time_98"] = _quantile(self.decision_times, 0.98) if several else None
         return summary
 
 
@@ -305,9 +308,9 @@ def _evaluate_one(
     nothing = {name: np.zeros(0) for name in (*Outcome._fields, "action")}
     outcomes = joined(pieces) if pieces else nothing
     done = len(outcomes["is_success"])
-    arm, scenes = simulation.task.arm, frozen.scenes
-    away = np.linalg.norm(arm.hand(scenes.goal) - arm.hand(scenes.start), axis=-1)
-    away[(scenes.jump_times < NEVER).any(axis=-1)] = np.nan  # the shortest path is unknown
+    hand = simulation.task.arm.hand
+    away = np.linalg.norm(hand(frozen.scenes.goal) - hand(frozen.scenes.start), axis=-1)
+    away[(frozen.scenes.jump_times < NEVER).any(axis=-1)] = np.nan  # the shortest path is unknown
     return MethodResult(
         name=method.name,
         outcomes=outcomes,
@@ -361,9 +364,15 @@ def one_thread() -> Iterator[None]:
 
 def _rate(values: NDArray[np.bool_]) -> dict[str, Any]:
     """Return a rate with its 95 % Wilson interval."""
-    count, number = int(values.sum()), len(values)
-    rate, low, high = wilson(count, number)
-    return {"rate": rate if number else None, "low": low, "high": high, "count": count, "of": number}
+    count = int(values.sum())
+    rate, low, high = wilson(count, len(values))
+    return {
+        "rate": rate if len(values) else None,
+        "low": low,
+        "high": high,
+        "count": count,
+        "of": len(values),
+    }
 
 
 def _quantile(values: NDArray[Any], share: float = 0.5) -> float | None:

@@ -93,10 +93,10 @@ def joined(pieces: Sequence[Mapping[str, NDArray[Any]]]) -> Outcomes:
 
 def _episodes(env: ReachVectorEnv, scenes: Scenes, first: Float, decide: Decide | None) -> Outcomes:
     """Play one episode in each scene; environments beyond them do not take part."""
-    number, size = len(first), env.num_envs
-    actions = np.zeros((size, first.shape[1]))
+    number = len(first)
+    actions = np.zeros((env.num_envs, first.shape[1]))
     actions[:number] = first
-    running = np.arange(size) < number
+    running = np.arange(env.num_envs) < number
     reward, decisions = np.zeros(number), np.zeros(number)
     last: Outcomes = {}
     while running.any():

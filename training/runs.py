@@ -79,8 +79,9 @@ class Run:
             raise BadFileError(folder / "config.json", reason) from None
 
     def __repr__(self) -> str:
-        config, curve = self.config, self.curve
+        config = self.config
         stalled = " until it stalled" if self.stalled else ""
+        curve = self.curve
         rate = f", success {100.0 * curve[-1]['success']['rate']:.1f} % on validation scenes" if curve else ""
         return (
             f"Run({str(self.folder)!r}: {config.algo} on {config.env}, seed {config.seed}, "

@@ -69,12 +69,3 @@ def across_seeds(
     draws = stats.trim_mean(np.take_along_axis(means, chosen, axis=0), 0.25, axis=0)
     low, high = np.quantile(draws, (0.5 - CONFIDENCE / 2.0, 0.5 + CONFIDENCE / 2.0))
     return float(stats.trim_mean(table.mean(axis=1), 0.25)), float(low), float(high)
-
-
-def success_weighted_path_length(success: ArrayLike, shortest: ArrayLike, taken: ArrayLike) -> float:
-    """Return SPL = mean(S l / max(p, l)), of success S, shortest path l > 0 and path taken p, shape (N,), [m].
-
-    Source: Anderson et al. 2018, On Evaluation of Embodied Navigation Agents, arXiv 1807.06757.
-    """
-    weight = np.asarray(shortest) / np.maximum(taken, shortest)
-    return float((np.asarray(success) * weight).mean())

@@ -550,9 +550,9 @@ def _plan_on(
 
 def _execute_plan(env: ve.ReachVectorEnv, motion: MotionPlan) -> Decision:
     """Execute a plan; a straight one passes the via-points that plans under revision have at even times."""
-    plan, number = motion.plan, env.task.n_via
+    plan = motion.plan
     if env.task.replanning and len(plan.durations) == 1:
-        times = plan.duration * np.linspace(0.0, 1.0, number + 2)
+        times = plan.duration * np.linspace(0.0, 1.0, env.task.n_via + 2)
         points = np.array(plan.trajectory()(times))
         points[[0, -1]] = plan.waypoints  # without rounding: another goal would be planned for anew
         plan = plan._replace(waypoints=points, durations=np.diff(times))

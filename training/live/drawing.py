@@ -238,10 +238,10 @@ class View:
 
     def _draw_seen(self, state: State) -> None:
         """Draw the points that the sensor of the task sees from the start."""
-        task, scene = self._arena.task, state.scene
+        task = self._arena.task
         if task.sensor is not None:
-            joints = task.space.joints(scene.start)[None]
-            found = task.sensor.read(task.arm, joints, pack([scene.obstacles]))
+            joints = task.space.joints(state.scene.start)[None]
+            found = task.sensor.read(task.arm, joints, pack([state.scene.obstacles]))
             points = found.points[found.seen >= 0]
             if self._planar:
                 points[:, 2] = LOW + 0.002  # on top of the obstacles

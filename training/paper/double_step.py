@@ -108,9 +108,9 @@ def excess_cost(movement: DoubleStep) -> float:
 
     It is the cost of the rest of the first movement, less that of a movement from its state in all the time there is.
     """
-    first, target = movement.first, TARGETS[NAMES[1]]
-    rest = retarget(first, movement.moment, target, first.duration)
-    slow = retarget(first, movement.moment, target, movement.arrival)
+    target = TARGETS[NAMES[1]]
+    rest = retarget(movement.first, movement.moment, target, movement.first.duration)
+    slow = retarget(movement.first, movement.moment, target, movement.arrival)
     return float(rest.cost() - slow.cost())
 
 

@@ -283,7 +283,6 @@ def isochrony(avoidance: ObstacleMovements) -> Figure:
     """Draw Fig. 10: passage times and their residuals on the simulated arm."""
     figure, axes = sheet(2, 2, 8.4)
     (over_place, place_residual), (over_height, height_residual) = axes
-    shares, lengths = one_via.SHARES, one_via.LENGTHS
     alongs = np.linspace(0.001, 0.999, 400)
     heights = np.linspace(0.02, 1.0, 200)
     for height, colour in ((1.0, SECOND), (-one_via.HEIGHT, PALETTE.plan), (0.1, THIRD)):
@@ -292,16 +291,17 @@ def isochrony(avoidance: ObstacleMovements) -> Figure:
     found = features(avoidance.profiles, avoidance.plan)
     over_place.plot(found.along, found.bend, **FAINT)
     place_residual.plot(found.along, found.residual, label="around lights", **FAINT)
-    arm, _ = one_via.arm_shares(shares, one_via.HEIGHT)
-    over_place.plot(shares, arm, **DOTS)
-    residual = arm - passage_share(curved(*ENDS, shares, one_via.HEIGHT))
-    place_residual.plot(shares, residual, label="arm, via-points", **DOTS)
+    arm, _ = one_via.arm_shares(one_via.SHARES, one_via.HEIGHT)
+    over_place.plot(one_via.SHARES, arm, **DOTS)
+    residual = arm - passage_share(curved(*ENDS, one_via.SHARES, one_via.HEIGHT))
+    place_residual.plot(one_via.SHARES, residual, label="arm, via-points", **DOTS)
     for along, colour in ((0.5, SECOND), (one_via.TYPICAL, PALETTE.plan), (0.2, THIRD)):
         share = passage_share(curved(*ENDS, along, heights))
         over_height.plot(heights, share, color=colour, label=f"{along:g}")
-        arm, _ = one_via.arm_shares(along, -lengths)
-        over_height.plot(lengths, arm, **DOTS)
-        height_residual.plot(lengths, arm - passage_share(curved(*ENDS, along, -lengths)), **DOTS)
+        arm, _ = one_via.arm_shares(along, -one_via.LENGTHS)
+        over_height.plot(one_via.LENGTHS, arm, **DOTS)
+        model = passage_share(curved(*ENDS, along, -one_via.LENGTHS))
+        height_residual.plot(one_via.LENGTHS, arm - model, **DOTS)
     texts = ("$d_1/(d_1+d_2)$", "$d_3/(d_1+d_2)$")
     for row, text, (mean, deviation) in zip(axes, texts, SUBJECTS, strict=True):
         row[0].set(xlabel=text, ylabel="$t_1/(t_1+t_2)$", xlim=(0, 1))

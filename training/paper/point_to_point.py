@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -137,7 +138,7 @@ def joint_claims() -> list[Claim]:
 
 def same_movement_elsewhere() -> tuple[Trajectory, SimulatedMovements]:
     """Simulate a reach of 20 cm to the right in 0.6 s from six places."""
-    starts = np.array([[x, y] for x in (-0.3, -0.15, 0.0) for y in (0.3, 0.45)])
+    starts = np.array(list(itertools.product((-0.3, -0.15, 0.0), (0.3, 0.45))))
     movement = point_to_point(starts, starts + np.array([0.2, 0.0]), 0.6)
     return movement, simulate(movement)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import itertools
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -170,9 +171,10 @@ class ClaimsFailedError(Exception):
 
 def run(config: PaperConfig) -> None:
     """Compute the claims, draw and write them, and raise an error if a claim does not hold."""
-    files_of_figures = [f"{name}{suffix}" for name in DRAWINGS for suffix in (".png", ".svg")]
-    for name in (*PAGES, *files_of_figures):
+    for name in PAGES:
         check_ours(config.out / name)
+    for name, suffix in itertools.product(DRAWINGS, (".png", ".svg")):
+        check_ours(config.out / f"{name}{suffix}")
     with one_thread():
         claims, pictures = reproduce(config.out, config.agent)
     summary = write(claims, pictures, config.out)
