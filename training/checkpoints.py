@@ -28,8 +28,14 @@ from viapoint.training.vec_env import ViaVecEnv
 
 FORMAT = 3
 # Counters of Stable-Baselines3's algorithms
-COUNTERS: tuple[str, ...] = ("seed", "num_timesteps", "_total_timesteps", "_episode_num", "_n_updates")
-COUNTERS += ("_current_progress_remaining",)
+COUNTERS = (
+    "seed",
+    "num_timesteps",
+    "_total_timesteps",
+    "_episode_num",
+    "_n_updates",
+    "_current_progress_remaining",
+)
 ARRAYS = ("_last_obs", "_last_episode_starts")
 DEQUES = ("ep_info_buffer", "ep_success_buffer")
 MAY_DIFFER = ("num_timesteps", "viapoint")  # Entries that do not tell models apart

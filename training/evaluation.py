@@ -365,14 +365,9 @@ def one_thread() -> Iterator[None]:
 def _rate(values: NDArray[np.bool_]) -> dict[str, Any]:
     """Return a rate with its 95 % Wilson interval."""
     count = int(values.sum())
-    rate, low, high = wilson(count, len(values))
-    return {
-        "rate": rate if len(values) else None,
-        "low": low,
-        "high": high,
-        "count": count,
-        "of": len(values),
-    }
+    number = len(values)
+    rate, low, high = wilson(count, number)
+    return {"rate": rate if number else None, "low": low, "high": high, "count": count, "of": number}
 
 
 def _quantile(values: NDArray[Any], share: float = 0.5) -> float | None:

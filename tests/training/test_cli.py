@@ -1,6 +1,5 @@
 """The commands, from configurations and words to files: training, evaluation, films, demo, doctor and fit."""
 
-import errno
 import io
 import json
 import os
@@ -430,15 +429,9 @@ def recorded(*columns):
     return pd.concat(parts) if "movement" in columns else parts[0]
 
 
-@pytest.fixture
-def file(tmp_path):
-    path = tmp_path / "movements.csv"
-    recorded("movement", "time", "x", "y", "z").to_csv(path, index=False)
-    return path
-
-
-def test_a_file_gives_a_table_and_a_figure(file, tmp_path, capsys):
-    folder = tmp_path / "new" / "fit"
+def test_a_file_gives_a_table_and_a_figure(tmp_path, capsys):
+    file, folder = tmp_path / "movements.csv", tmp_path / "new" / "fit"
+    recorded("movement", "time", "x", "y", "z").to_csv(file, index=False)
     run("fit", file, "--out", folder)
     printed = capsys.readouterr().out
     table = pd.read_csv(folder / "fit.csv")
@@ -508,6 +501,7 @@ TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
         (["time,x,y", "s,m,m", *TABLE[1:]], "leave out lines of units"),
         (["# arm 1", *TABLE], "first line must name the columns"),
         (TABLE[:1], "holds no samples"),
+        ([], "is empty"),
         (["", *TABLE[:3], "0.1,,0.2"], "line 5, column x: nothing"),
         (["time,x,y,x", "0.0,0.1,0.2,0.1"], "several columns x"),
         (["time,x,y,movement", "0.0,0.1,0.2,a", "", "0.1,0.1,0.2,"], "names no movement in line 4"),
@@ -519,20 +513,3 @@ def test_lines_at_fault_are_told_by_their_number_in_the_file(lines, told, tmp_pa
     path.write_text("\n".join(lines))
     assert told in failed("fit", path, "--out", tmp_path / "fit")
     assert not (tmp_path / "fit").exists()
-
-
-def test_foreign_files_stay(file, tmp_path, failed):
-    (tmp_path / "fit.csv").write_text("mine")
-    assert "not written by viapoint" in failed("fit", file, "--out", tmp_path)
-    assert (tmp_path / "fit.csv").read_text() == "mine"
-    (tmp_path / "empty.csv").touch()
-    assert "is empty" in failed("fit", tmp_path / "empty.csv", "--out", tmp_path / "fit")
-
-
-def test_a_full_disk_leaves_no_half_of_a_figure(file, tmp_path, failed, monkeypatch):
-    def full(handle):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    assert "fit.png" in failed("fit", file, "--out", tmp_path / "fit")
-    assert not list((tmp_path / "fit").iterdir())

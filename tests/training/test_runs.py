@@ -179,8 +179,9 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
             tmp_path / "folder", lambda folder: files.write_bytes(folder / "a", b"new")
         ),
     ):
-        with pytest.raises(OSError):
+        with pytest.raises(OSError) as error:
             write()
+        assert error.value.filename  # a full disk does not say what it has no room for
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
     assert path.read_bytes() == b"old"
 
@@ -269,11 +270,16 @@ def begin_paper(path):
     paper.run(PaperConfig(out=path.parent))
 
 
+def begin_fit(path):
+    cli.main(["fit", str(Path(__file__).parents[2] / "docs" / "reach.csv"), "--out", str(path.parent)])
+
+
 OVER = [
     *((evaluate, "foreign.json", content) for content in (NOTES, b"", FOREIGN_JSON)),
     (film, "wedding.mp4", NOTES),
     *((begin_demo, name, NOTES) for name in ("table.md", "movements.mp4")),
     *((begin_paper, name, NOTES) for name in ("index.html", "limits.png")),
+    *((begin_fit, name, NOTES) for name in ("fit.csv", "fit.png")),
 ]
 
 
