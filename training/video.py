@@ -22,7 +22,6 @@ from viapoint.envs.common.arrays import Frame
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.renderer import EpisodeRenderer
 from viapoint.envs.scenes.scene import Scenes
-from viapoint.training.checks import check_file
 from viapoint.training.files import MARK, write_figure
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
 from viapoint.training.rollout import Decide
@@ -41,23 +40,14 @@ LINE = 28  # Greatest number of characters of the heading above one picture
 
 
 def record_video(
-    path: str | Path, env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, *, name: str = "agent"
+    path: Path, env: gym.Env[Any, Any], scenes: Scenes, decide: Decide, *, name: str = "agent"
 ) -> int:
     """Record one episode in each scene as an MP4, and return the number of frames.
 
     The environment is made with `render_mode="rgb_array_list"`, and has as many rows for obstacles as the scenes.
     `decide` takes observation and scene, of one row each, and returns actions, shape (1, m). `name` is for the caption.
-
-    Raises:
-        ValueError: An argument is not allowed, or the file is one of something else.
-        GLUnavailableError: There is no OpenGL library.
+    Without an OpenGL library, GLUnavailableError is raised.
     """
-    path = Path(path).expanduser()
-    check_file("path", path, ".mp4")
-    if env.render_mode != "rgb_array_list":
-        raise ValueError(f"env must be made with render_mode='rgb_array_list', got {env.render_mode!r}")
-    if not len(scenes.start):
-        raise ValueError("scenes must hold at least one scene")
     fps = float(env.metadata["render_fps"])
     number = len(scenes.start)
     told = "only the hand must clear" if env.get_wrapper_attr("task").hand_alone else ""
@@ -71,10 +61,8 @@ def record_video(
     return _write_mp4(path, frames(), fps)
 
 
-def record_plan(path: str | Path, plan: MotionPlan) -> int:
+def record_plan(path: Path, plan: MotionPlan) -> int:
     """Record the execution of a plan as an MP4, and return the number of frames; see :func:`record_video`."""
-    path = Path(path).expanduser()
-    check_file("path", path, ".mp4")
     outcome, episodes = execute_plans([plan])
     info = {name: value[0] for name, value in outcome._asdict().items()}
     film = EpisodeRenderer(episodes, 0, "rgb_array_list", *PLAN_SIZE, PLAN_FPS)

@@ -50,7 +50,6 @@ from viapoint.training.planning.benchmark import benchmark_planner
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import load, scenes_for, shipped_path
-from viapoint.training.video import record_video
 
 CHANGING = MOVING, JUMPS
 STALLING = {"stop_when_stalled": 0.3}
@@ -188,14 +187,6 @@ def many_points():
     return PointCloud(points, 0.01, position=(0.0, -0.8, 0.2))
 
 
-def scenes(number):
-    return SceneSimulation(PLANE, 1).task.sampler()([np.random.default_rng(0)] * number)
-
-
-def film(path="film.mp4", number=1, mode="rgb_array_list"):
-    record_video(path, gym.make(PLANE, render_mode=mode), scenes(number), lambda *_: np.zeros((1, 3)))
-
-
 class Decides:
     """Method that always decides the same."""
 
@@ -297,8 +288,6 @@ CALLS = [
     *(lambda env_id=env_id: scenes_for(load(shipped_path(env_id), "validation"), Task.of()) for env_id in CHANGING),
     *(lambda name=name: evaluate(env=PLANE, baselines=["straight"], scenes=load(shipped_path(name), "test"))
       for name in (PANDA, *CHANGING)),
-    *(lambda changes=changes: film(**changes)
-      for changes in ({"path": "film.gif"}, {"mode": None}, {"number": 0})),
     *(lambda successes=successes: statistics.wilson(successes, 4) for successes in (5, -1)),
 ]  # fmt: skip
 
@@ -378,8 +367,8 @@ COMMANDS = [
     ("live --env nothing", "nothing"),
     ("evaluate nowhere", "nowhere"),
     ("evaluate --pretrained nobody", "nobody"),
-    ("plan --position 0.4 0.3", "--position needs 3 numbers for panda, x y z, got 2"),
-    ("plan --goal 0.4 0.3", "--goal needs 7 numbers"),
+    ("plan --position 0.4 0.3", "position must have shape (3,), got (2,)"),
+    ("plan --goal 0.4 0.3", "goal must have shape (n, 7)"),
     ("evaluate --baselines straight --agent", "--agent needs a name"),
     ("plan --arm panda --velocity-limit 0.3 --position 0.4 0.3 0.3", "--velocity-limit"),
     ("plan --arm nowhere.xml --position 0.4 0.3 0.3", "nowhere.xml"),

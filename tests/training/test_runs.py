@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import PLANE, REACH
@@ -24,7 +23,6 @@ from viapoint.training.configs import DemoConfig, PaperConfig
 from viapoint.training.files import BadFileError
 from viapoint.training.paper import run as paper
 from viapoint.training.presets import PRESETS
-from viapoint.training.video import record_video
 
 
 def new(algo, env, **hyperparameters):
@@ -217,10 +215,7 @@ def evaluate(path):
 
 
 def film(path):
-    env = gym.make(REACH, render_mode="rgb_array_list", width=64, height=64)
-    scenes = env.unwrapped.task.sampler()([np.random.default_rng(0)])
-    record_video(path, env, scenes, lambda *_: np.zeros((1, 3)))
-    env.close()
+    cli.main(["play", "--env", REACH, "--n-scenes", "1", "--video", str(path)])
 
 
 SAVES = [

@@ -12,7 +12,7 @@ import pandas as pd
 
 from viapoint.envs import Plan, Scenes
 from viapoint.envs.geometry.obstacles import pack
-from viapoint.envs.scenes.scene import check_scenes, resting
+from viapoint.envs.scenes.scene import resting
 from viapoint.primitives import speed_valleys
 from viapoint.training import GeometrySearch, load_agent
 from viapoint.training.checks import DEFAULT_ENV
@@ -68,7 +68,6 @@ def light_movements(agent: Path | None) -> ObstacleMovements:
         needed = f"a task of the plane with boxes and whole movements, such as {DEFAULT_ENV}"
         raise ValueError(f"agent must be of {needed}; that of {agent} is of {simulation.env_id}")
     scenes = light_scenes(task.observation.n_rows)
-    check_scenes(scenes, task.arm)
     action = method.decide(simulation.observe(scenes), scenes)
     success = simulation(scenes, action)["is_success"]
     simulation.close()
