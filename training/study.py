@@ -549,8 +549,11 @@ def _measured(method: Method, frozen: FrozenScenes, env_id: str, env_kwargs: Rec
     }
 
 
-def _import_ray() -> Any:
-    """Import Ray with Ray Tune, which take seconds, and Optuna only when a study runs."""
+def _connected(workers: int | None) -> Any:
+    """Return a context with a Ray of this machine that listens on 127.0.0.1 alone; nothing where there is a Ray.
+
+    Ray Tune and Optuna take seconds to import, which is done only when a study runs.
+    """
     for name, value in SETTINGS.items():
         os.environ.setdefault(name, value)
     try:
@@ -559,12 +562,6 @@ def _import_ray() -> Any:
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(explain_import_error(error, "a study"), name=error.name) from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    return ray
-
-
-def _connected(workers: int | None) -> Any:
-    """Return a context with a Ray of this machine that listens on 127.0.0.1 alone; nothing where there is a Ray."""
-    ray = _import_ray()
     if ray.is_initialized():
         return nullcontext()
     quiet: Values = {"include_dashboard": False, "log_to_driver": False, "logging_level": "ERROR"}
@@ -573,7 +570,8 @@ def _connected(workers: int | None) -> Any:
 
 def _run_trials(trials: list[Trial], folder: Path, told: Told) -> list[str]:
     """Run trials as tasks of Ray, and return a line for each that failed."""
-    ray = _import_ray()
+    import ray
+
     task = ray.remote(num_cpus=1, max_retries=RETRIES)(_run_trial)  # each trial computes on one core
     running: dict[Any, Trial] = {task.remote(trial, folder): trial for trial in trials}
     failed = []
@@ -595,7 +593,7 @@ def _run_search(search: Trial, folder: Path, workers: int | None, told: Told) ->
 
     Optuna chooses the parameters, and successive halving (ASHA) stops trainings that are behind in validation.
     """
-    tune = _import_ray().tune
+    from ray import tune
     from ray.tune.schedulers import ASHAScheduler
     from ray.tune.search.optuna import OptunaSearch
 
@@ -625,25 +623,16 @@ def _run_search(search: Trial, folder: Path, workers: int | None, told: Told) ->
         space = {name: _distribution(given) for name, given in search.parameters.items()}
         first = [dict(each) for each in search.first] or None
         goal: dict[str, Any] = {"metric": "success", "mode": "max"}
-        tuner = tune.Tuner(
-            work,
-            tune_config=tune.TuneConfig(
-                **goal,
-                num_samples=search.trials,
-                max_concurrent_trials=workers,
-                search_alg=OptunaSearch(space, points_to_evaluate=first, seed=0, **goal),
-                # Trainings end by themselves, before max_t.
-                scheduler=ASHAScheduler("decisions", max_t=2 * total, grace_period=max(total // 4, 1)),
-            ),
-            run_config=tune.RunConfig(
-                name=path.name,
-                storage_path=str(path.parent),
-                failure_config=tune.FailureConfig(max_failures=RETRIES),
-                verbose=0,
-            ),
-        )
+        chooses = OptunaSearch(space, points_to_evaluate=first, seed=0, **goal)
+        # Trainings end by themselves, before max_t.
+        stops = ASHAScheduler("decisions", max_t=2 * total, grace_period=max(total // 4, 1))
+        numbers: Any = {"num_samples": search.trials, "max_concurrent_trials": workers}
+        how = tune.TuneConfig(**goal, **numbers, search_alg=chooses, scheduler=stops)
+        again = tune.FailureConfig(max_failures=RETRIES)
+        where = tune.RunConfig(name=path.name, storage_path=str(path.parent), failure_config=again, verbose=0)
+        tuner = tune.Tuner(work, tune_config=how, run_config=where)
     handler = signal.getsignal(signal.SIGINT)
-    results = tuner.fit()
+    results: Any = tuner.fit()
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, handler)  # Ray Tune leaves its own
     if sum(each.error is not None or each.metrics.get("done", False) for each in results) < search.trials:

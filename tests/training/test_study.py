@@ -17,7 +17,7 @@ import yaml
 from helpers import PLANE
 
 from viapoint.training import Study, run_study
-from viapoint.training.study import COLUMNS, StudyFailedError, _connected, _import_ray
+from viapoint.training.study import COLUMNS, StudyFailedError, _connected
 
 FEW = {"learning_starts": 64, "gradient_steps": 1}
 TRAINING = {
@@ -58,7 +58,7 @@ def of_viaq(results):
 def ray():
     """One Ray for all studies of this process, as each start takes seconds."""
     with _connected(2):
-        yield _import_ray()
+        yield
 
 
 @pytest.fixture(scope="module")
