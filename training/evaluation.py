@@ -276,12 +276,7 @@ def evaluate_methods(
 
 
 def _evaluate_one(
-    method: Method,
-    frozen: FrozenScenes,
-    simulation: SceneSimulation,
-    batch: int,
-    time_decisions: bool,
-    progress: Progress | None,
+    method: Method, frozen: FrozenScenes, simulation: SceneSimulation, batch: int, timed: bool, progress: Any
 ) -> MethodResult:
     number = len(frozen.share)
     pieces: list[Outcomes] = []
@@ -301,7 +296,7 @@ def _evaluate_one(
             pieces.append(outcome)
             if progress is not None:
                 progress(method.name, min(first + batch, number), number)
-        if time_decisions:
+        if timed:
             times = _decision_times(method, frozen.scenes, simulation, seconds / number)
     except KeyboardInterrupt:
         interrupted = True

@@ -274,12 +274,13 @@ def _environment(
         check_whole("n_scenes", n_scenes)
     places = []
     for each in scenes:
-        if (folder / each).is_file():
+        if each in SETS:
+            if each in SEEDS or shipped_set(each, task) is not None:  # the others cannot be drawn
+                places.append(each)
+        elif (folder / each).is_file():
             places.append(str((folder / each).absolute()))
-        elif each not in SETS:
+        else:
             raise ValueError(f"{unknown_name('scenes', each, SETS)}; or the path of a file of scenes")
-        elif each in SEEDS or shipped_set(each, task) is not None:  # the others cannot be drawn
-            places.append(each)
     if not places:
         raise ValueError(f"none of {', '.join(scenes)} is shipped for {env.env_id}")
     return dataclasses.replace(env, scenes=tuple(places))
