@@ -70,8 +70,7 @@ class Episodes:
         home = np.tile(task.arm.home, (number, 1))
         self.scenes = resting(home, home.copy(), no_obstacles(number, task.observation.n_rows))
         """Scenes of the running episodes."""
-        self.history: list[History] = [[] for _ in range(number)]
-        """Plans of the running episodes."""
+        self.history: list[History] = [[] for _ in range(number)]  # Plans of the running episodes
         self._finished: tuple[Int, Scenes, list[tuple[History, list[Piece]]]] | None = None
         """Rows, scenes and records of the episodes before the running ones; None if they are not kept."""
         self._moving = False
@@ -84,8 +83,7 @@ class Episodes:
         )
         """Plans under way."""
         self._movements = Movements.of(self.plan)
-        self.begun = np.zeros(number, bool)
-        """True where a plan is under way, shape (n,)."""
+        self.begun = np.zeros(number, bool)  # True where a plan is under way, shape (n,)
         self._began = np.zeros(number, np.int64)
         self._motion = Motion.at_rest(self._start)
         self.last_plan: Plan | None = None

@@ -53,8 +53,7 @@ class EventPredictor:
         self.task = task
         self.timestep = task.arm.timestep
         self.triggers = frozenset(() if isinstance(task.decide_at, str) else task.decide_at)
-        self.limit = int(self.steps(task.time_limit))
-        """Greatest number of physics steps of an episode."""
+        self.limit = int(self.steps(task.time_limit))  # Greatest number of physics steps of an episode
 
     def steps(self, time: Any) -> Any:
         """Return the first physics step at or after a time [s], NEVER for a time that is very late."""

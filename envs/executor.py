@@ -47,10 +47,8 @@ class Executor:
         self._resumes = not task.whole_movement
         arm, number = simulator.arm, len(simulator.batch.state)
         home, far = np.tile(arm.home, (number, 1)), np.full(number, FAR)
-        self.state = EpisodeState.at_rest(home, arm.hand(home), far, far)
-        """Metrics of the running episodes."""
-        self.past: list[list[Piece]] = [[] for _ in range(number)]
-        """Records of the running episodes."""
+        self.state = EpisodeState.at_rest(home, arm.hand(home), far, far)  # Metrics of the running episodes
+        self.past: list[list[Piece]] = [[] for _ in range(number)]  # Records of the running episodes
         self._placed = memory(arm.chain, arm.spheres)
 
     def begin(self, rows: Int, joints: Float, obstacles: Obstacles) -> None:

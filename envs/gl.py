@@ -124,8 +124,7 @@ class Window:
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         # A thread may have the context of one platform alone, GLFW or EGL.
         self._glfw.make_context_current(None)
-        self.scene = mujoco.MjvScene(model, MAX_GEOMS)
-        """Scene that is shown."""
+        self.scene = mujoco.MjvScene(model, MAX_GEOMS)  # Scene that is shown
 
     def draw(self) -> bool:
         """Show the scene; return False after the window has been closed."""

@@ -35,10 +35,8 @@ class ObservationLayout:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.n_rows = task.n_obstacles[1]
-        """Greatest number of obstacles."""
-        self.row_size = len(task.shapes) + POSE_SIZE
-        """Number of values of one obstacle."""
+        self.n_rows = task.n_obstacles[1]  # Greatest number of obstacles
+        self.row_size = len(task.shapes) + POSE_SIZE  # Number of values of one obstacle
 
     @functools.cached_property
     def bounds(self) -> dict[str, tuple[Float, Float]]:

@@ -186,8 +186,7 @@ class ActionLayout:
         in_hand = space == "hand"
         self.names_of_axes = ("along", "across") if in_hand else arm.joint_names
         """Names of the D components of an offset."""
-        self.dimension = len(self.names_of_axes)
-        """Dimension D of the space."""
+        self.dimension = len(self.names_of_axes)  # Dimension D of the space
         width = arm.joint_range[:, 1] - arm.joint_range[:, 0]
         offsets = np.minimum(RANGE_SHARE * width, LARGEST_OFFSET)
         self.via_scale = np.array(HAND_OFFSETS) if in_hand else offsets
@@ -201,10 +200,8 @@ class ActionLayout:
         """Logarithm of the factor on the duration for an action of 1."""
         vias = [f"via_{k}_{axis}" for k in range(1, n_via + 1) for axis in self.names_of_axes]
         splits = [f"split_{k}" for k in range(1, n_via + 1)] if timing == "learned" else []
-        self.names = (*vias, "duration", *splits)
-        """Names of the components, in order."""
-        self.size = len(self.names)
-        """Number of components m."""
+        self.names = (*vias, "duration", *splits)  # Names of the components, in order
+        self.size = len(self.names)  # Number of components m
         straight = np.linspace(0.0, 1.0, n_via + 2)[:, None]
         self._straight_split = np.diff(np.log(primitives.passage_durations(straight, np.asarray(1.0))))
         """Log ratios of neighbouring segments' durations on the straight movement with evenly spaced vias."""

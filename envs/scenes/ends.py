@@ -27,8 +27,7 @@ INSTANTS = 32  # Parts of the straight movement between which it is looked at
 ROLL = 0.3  # Greatest deviation of the tool's roll about its axis from quarter turns, [rad]
 # Spread around home of the seeds of inverse kinematics, as a share of the ranges of the joints
 SEED_SPREAD = 0.3
-BLOCKED, FREE, OUT_OF_REACH = 1, 0, -1
-"""Outcome of a straight movement."""
+BLOCKED, FREE, OUT_OF_REACH = 1, 0, -1  # Outcome of a straight movement
 
 
 class Setting(NamedTuple):

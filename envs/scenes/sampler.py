@@ -71,8 +71,7 @@ class SceneSampler:
         self.task = task
         self.plane = is_planar(task.arm)
         fewest, most = task.n_obstacles
-        self.rows = most
-        """Number of rows for obstacles."""
+        self.rows = most  # Number of rows for obstacles
         most = min(most, max(fewest, MOST_DRAWN))
         self.room = room_of(task.arm, task.shapes, (fewest, most), task.whole_arm)
         self.viewpoint = None if task.sensor is None else task.sensor.viewpoint
