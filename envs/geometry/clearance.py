@@ -43,8 +43,8 @@ class Bounds(NamedTuple):
     It is not a part of :class:`Placed`: compiled functions that pass a record on take longer the more arrays it has.
     """
 
-    apart: Float  # Lower bounds of the clearance of groups from obstacles, shape (G,), [m]
-    pair_apart: Float  # Lower bounds of the clearance of pairs of groups, shape (P,), [m]
+    # Lower bounds of the clearance of groups from obstacles, and then of pairs of groups, shape (G + P,), [m]
+    apart: Float
     way: Float  # Bounds of the way of the spheres of links 0 to J since another configuration, shape (J + 1,), [m]
     bend: Float  # Bounds of how much longer than its chord this way is, shape (J + 1,), [m]
     group_way: Float  # Bounds of the way of the spheres of groups, shape (G,), [m]
@@ -74,8 +74,7 @@ def bounds_memory(chain: Chain, spheres: Spheres, between: bool) -> Bounds:
     joints = len(chain.mass)
     groups = len(spheres.link)
     return Bounds(
-        np.empty(groups),
-        np.empty(len(spheres.pairs)),
+        np.empty(groups + len(spheres.pairs)),
         np.empty(joints + 1),
         np.empty(joints + 1),
         np.empty(groups),
@@ -365,12 +364,13 @@ def movement_clearance(
     drift = step * fastest(obstacles, scene)  # the way of obstacles in one step
     # A coarse look comes first: with a small clearance from the start, the second one skips most configurations.
     for stride in (COARSE, 1):
-        _forget(bounds)
+        bounds.apart[:] = -FAR  # so low that they tell nothing
         last = -1  # the configuration whose places are kept
         for k in range(0, len(path), stride):
             _set_ways(reach, path[max(k - stride, 0)], path[k], spheres, bounds)
             is_placed = False
-            if len(between) > 0 and stride == 1 and k > 0 and _matters(spheres, bounds, drift, least):
+            looks_between = len(between) > 0 and stride == 1 and k > 0
+            if looks_between and _matters(spheres, bounds, drift, least):
                 if last != k - 1:
                     place(chain, spheres, path[k - 1], placed)
                     _keep_places(placed, bounds)
@@ -378,56 +378,53 @@ def movement_clearance(
                 _shorten_ways(spheres, placed, bounds)
                 _keep_places(placed, bounds)
                 is_placed, last = True, k
-            _move(stride * drift, spheres, bounds)
-            for group in range(len(spheres.link)):
-                if spheres.link[group] == 0 or bounds.apart[group] >= least:
+            for check in range(len(bounds.apart)):
+                bounds.apart[check] -= _way(spheres, bounds, check, stride * drift)
+            for check in range(len(bounds.apart)):
+                of_pair = check >= len(spheres.link)
+                bound = bounds.apart[check]
+                if bound >= (least_self if of_pair else least) or not (of_pair or spheres.link[check]):
                     continue
                 if not is_placed:
                     place(chain, spheres, path[k], placed)
                     is_placed = True
-                time, most = begin + k * step, least + WINDOW
-                bound = bounds.apart[group]
-                apart = nearest_obstacle(spheres, placed, group, obstacles, scene, time, most, -FAR)
-                bounds.apart[group] = apart
-                least = min(least, apart)
-                if len(between) == 0 or stride > 1 or k == 0:
-                    continue
-                way = bounds.group_way[group] + drift
-                low = min(least, least_self)
-                if way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
-                    continue
-                share = _until_next(bound + way, way, low, floor)
-                while share < 1.0:
-                    _place_between(chain, spheres, path, k, share, between, placed)
-                    time, most = begin + (k - 1 + share) * step, least + WINDOW
-                    apart = nearest_obstacle(spheres, placed, group, obstacles, scene, time, most, -FAR)
-                    least = min(least, apart)
-                    share += _until_next(apart, way, min(least, least_self), floor)
-                is_placed = False
-            for pair in range(len(spheres.pairs)):
-                if bounds.pair_apart[pair] >= least_self:
-                    continue
-                if not is_placed:
-                    place(chain, spheres, path[k], placed)
-                    is_placed = True
-                bound = bounds.pair_apart[pair]
-                apart, _, _ = nearest_spheres(spheres, placed, pair, least_self + WINDOW, -FAR)
-                bounds.pair_apart[pair] = apart
-                least_self = min(least_self, apart)
-                if len(between) == 0 or stride > 1 or k == 0:
-                    continue
-                way = _way_of_pair(spheres, bounds, pair)
-                low = min(least, least_self)
-                if way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
-                    continue
-                share = _until_next(bound + way, way, low, floor)
-                while share < 1.0:
-                    _place_between(chain, spheres, path, k, share, between, placed)
-                    apart, _, _ = nearest_spheres(spheres, placed, pair, least_self + WINDOW, -FAR)
+                most = (least_self if of_pair else least) + WINDOW
+                apart = _nearest(spheres, placed, check, obstacles, scene, begin + k * step, most)
+                bounds.apart[check] = apart
+                if of_pair:
                     least_self = min(least_self, apart)
+                else:
+                    least = min(least, apart)
+                if not looks_between:
+                    continue
+                way = _way(spheres, bounds, check, drift)
+                low = min(least, least_self)
+                if way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
+                    continue
+                share = _until_next(bound + way, way, low, floor)
+                while share < 1.0:
+                    _place_between(chain, spheres, path, k, share, between, placed)
+                    time = begin + (k - 1 + share) * step
+                    most = (least_self if of_pair else least) + WINDOW
+                    apart = _nearest(spheres, placed, check, obstacles, scene, time, most)
+                    if of_pair:
+                        least_self = min(least_self, apart)
+                    else:
+                        least = min(least, apart)
                     share += _until_next(apart, way, min(least, least_self), floor)
                 is_placed = False
     return least, least_self
+
+
+@inlined
+def _nearest(
+    spheres: Spheres, placed: Placed, check: int, obstacles: Obstacles, scene: int, time: float, most: float
+) -> float:
+    """Return the clearance of a group from all obstacles, or that of a pair of groups, at most `most`, [m]."""
+    groups = len(spheres.link)
+    if check < groups:
+        return nearest_obstacle(spheres, placed, check, obstacles, scene, time, most, -FAR)
+    return nearest_spheres(spheres, placed, check - groups, most, -FAR)[0]
 
 
 @inlined
@@ -457,24 +454,18 @@ def _place_between(
 
 
 @inlined
-def _way_of_pair(spheres: Spheres, bounds: Bounds, pair: int) -> float:
-    """Return how much a pair of groups may have moved, seen from one another, [m].
+def _way(spheres: Spheres, bounds: Bounds, check: int, drift: float) -> float:
+    """Return how much a group and the obstacles, or a pair of groups, may have come nearer to one another, [m].
 
-    That is by the joints between both alone, and not by more than both have moved.
+    Obstacles move by `drift`. A pair moves by the joints between both alone, and not by more than both have moved.
     """
-    one = spheres.pairs[pair, 0]
-    other = spheres.pairs[pair, 1]
+    groups = len(spheres.link)
+    if check < groups:
+        return float(bounds.group_way[check] + drift)
+    one = spheres.pairs[check - groups, 0]
+    other = spheres.pairs[check - groups, 1]
     between = abs(bounds.way[spheres.link[other]] - bounds.way[spheres.link[one]])
     return float(min(between, bounds.group_way[one] + bounds.group_way[other]))
-
-
-@inlined
-def _forget(bounds: Bounds) -> None:
-    """Set all lower bounds of clearance so low that they tell nothing."""
-    for group in range(len(bounds.apart)):
-        bounds.apart[group] = -FAR
-    for pair in range(len(bounds.pair_apart)):
-        bounds.pair_apart[pair] = -FAR
 
 
 @inlined
@@ -497,7 +488,7 @@ def _set_ways(reach: Float, first: Float, second: Float, spheres: Spheres, bound
 @inlined
 def _matters(spheres: Spheres, bounds: Bounds, drift: float, least: float) -> bool:
     """Return True if the ways of the groups must be known better, because one may now be nearer than the least."""
-    for group in range(len(bounds.apart)):
+    for group in range(len(spheres.link)):
         if spheres.link[group] > 0 and bounds.apart[group] - bounds.group_way[group] - drift < least:
             return True
     return False
@@ -510,7 +501,7 @@ def _keep_places(placed: Placed, bounds: Bounds) -> None:
         for row in range(3):
             for column in range(3):
                 bounds.rotation[link, row, column] = placed.rotation[link, row, column]
-    for group in range(len(bounds.apart)):
+    for group in range(len(bounds.ball)):
         for axis in range(3):
             bounds.ball[group, axis] = placed.ball[group, axis]
 
@@ -522,7 +513,7 @@ def _shorten_ways(spheres: Spheres, placed: Placed, bounds: Bounds) -> None:
     No sphere of a group has a longer chord than that of the group's ball and of a point at its edge. The chord is the
     mean of the velocity, from which the velocity differs by half of its greatest derivative at most.
     """
-    for group in range(len(bounds.apart)):
+    for group in range(len(bounds.ball)):
         link = spheres.link[group]
         turn = 0.0
         for row in range(3):
@@ -532,15 +523,6 @@ def _shorten_ways(spheres: Spheres, placed: Placed, bounds: Bounds) -> None:
         chord = math.sqrt(_square(placed.ball, group, bounds.ball, group))
         bound = chord + spheres.ball_radius[group] * math.sqrt(turn) + bounds.bend[link]
         bounds.group_way[group] = min(bounds.group_way[group], bound)
-
-
-@inlined
-def _move(drift: float, spheres: Spheres, bounds: Bounds) -> None:
-    """Lower the bounds of clearance by the ways of the spheres, and the one of the obstacles, `drift`, [m]."""
-    for group in range(len(bounds.apart)):
-        bounds.apart[group] -= bounds.group_way[group] + drift
-    for pair in range(len(bounds.pair_apart)):
-        bounds.pair_apart[pair] -= _way_of_pair(spheres, bounds, pair)
 
 
 @inner
