@@ -30,6 +30,7 @@ from viapoint.envs.plans import (
     SHORTEST_DURATION,
     ActionLayout,
     SpaceName,
+    Steering,
     Timing,
 )
 from viapoint.envs.rewards import RewardWeights
@@ -38,7 +39,6 @@ from viapoint.envs.scenes.sampler import MOST_DRAWN, SceneSampler, farthest_reac
 from viapoint.envs.scenes.scene import MOST_JUMPS
 from viapoint.envs.sensors import Sensor, named_sensor
 from viapoint.envs.spaces import Space, space_of
-from viapoint.envs.steering import Steering
 
 Trigger = Literal["horizon", "target", "course", "clearance", "sight"]
 TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)  # Events that may end a decision before the goal

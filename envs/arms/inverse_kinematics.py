@@ -256,20 +256,8 @@ def planar_motion(
     return joints.reshape(shape), rates.reshape(shape), changes.reshape(shape)
 
 
-def _least_distance(arm: Arm, position: Float, begin: Float) -> float:
-    """Return the least distance between tool and a place that is found from some configurations, (N, J), [m]."""
-    from scipy.optimize import least_squares  # here, because it is needed where nothing was found only
-
-    low, high = arm.joint_range.T
-    nearest = begin[np.linalg.norm(arm.hand(begin) - position, axis=-1).argmin()]
-    descend(arm.chain, arm.joint_range, position, np.eye(3), False, nearest)
-    inside = np.clip(nearest, low + INSIDE, high - INSIDE)
-    found = least_squares(lambda joints: arm.hand(joints) - position, inside, bounds=(low, high))
-    return float(np.linalg.norm(found.fun))
-
-
-def _different_solutions(arm: Arm, position: Float, axes: Float | None, begin: Float) -> list[Float]:
-    """Return the different configurations that put the tool at a target from those to begin with, (N, J)."""
+def _solutions(arm: Arm, position: Float, axes: Float | None, begin: Float) -> list[Float]:
+    """Return different configurations with the tool at a target, found from those to begin with, (N, J)."""
     found: list[Float] = []
     target = np.eye(3) if axes is None else axes
     for joints in begin.copy():
@@ -290,7 +278,6 @@ def inverse_kinematics(
     *,
     seed: Any = None,
     n_seeds: int = 64,
-    rng: np.random.Generator | None = None,
 ) -> Float:
     """Return different joint positions that put the tool at a pose, the nearest to the first seed first, (S, J).
 
@@ -300,7 +287,6 @@ def inverse_kinematics(
         quaternion: Orientation (w, x, y, z) of the tool, shape (4,); None for any.
         seed: Joint positions to begin with, shape (J,); home by default.
         n_seeds: Number of seeds; as many again, four times, where these find nothing.
-        rng: Random generator of further seeds; one with a fixed seed by default.
 
     Raises:
         UnreachableError: No solution was found; the message tells the nearest distance.
@@ -318,15 +304,21 @@ def inverse_kinematics(
     axes = None if quaternion is None else frame_matrices(unit_quaternion("quaternion", quaternion))
     number = whole_number("n_seeds", n_seeds, 1)
     first = arm.home if seed is None else finite_array("seed", seed, arm.home.shape)
-    rng = np.random.default_rng(0) if rng is None else rng
+    rng = np.random.default_rng(0)
     low, high = arm.joint_range.T
     begin = np.concatenate((first[None], rng.uniform(low, high, (number - 1, len(low)))))
-    found = _different_solutions(arm, position, axes, begin)
+    found = _solutions(arm, position, axes, begin)
     if not found:  # some poses near the joint limits are reached from few places
         begin = rng.uniform(low, high, (PATIENCE * number, len(low)))
-        found = _different_solutions(arm, position, axes, begin)
+        found = _solutions(arm, position, axes, begin)
     if not found:
-        away = _least_distance(arm, position, begin)
+        from scipy.optimize import least_squares  # here, because it is rarely needed
+
+        nearest = begin[np.linalg.norm(arm.hand(begin) - position, axis=-1).argmin()]
+        descend(arm.chain, arm.joint_range, position, np.eye(3), False, nearest)
+        inside = np.clip(nearest, low + INSIDE, high - INSIDE)
+        place = least_squares(lambda joints: arm.hand(joints) - position, inside, bounds=(low, high))
+        away = float(np.linalg.norm(place.fun))
         pose = "position" if quaternion is None else "pose"
         nearest = f"the nearest place found is {1e3 * away:.1f} mm away"
         if quaternion is not None and away < PLACE_TOLERANCE:

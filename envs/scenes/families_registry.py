@@ -49,14 +49,7 @@ FAMILIES: dict[tuple[bool, str], SceneFamily] = {
 
 
 def scene_families(plane: bool) -> Mapping[str, SceneFamily]:
-    """Return the families of scenes in the plane or in space, by name.
-
-    Example:
-        >>> from viapoint.envs.scenes.families_registry import scene_families
-        >>> families = scene_families(plane=False)
-        >>> families["shelf"].trained, families["cage"].trained
-        (True, False)
-    """
+    """Return the families of scenes in the plane or in space, by name."""
     return {name: each for (there, name), each in FAMILIES.items() if there == plane}
 
 
