@@ -403,23 +403,18 @@ class Episodes:
             ends = self._began * timestep + self.plan.duration
             duration = np.where(self.begun, np.minimum(time, ends), 0.0)
         straight = straight_jerk_cost(self._straight_length(time), np.maximum(duration, timestep))
+        same: dict[str, Any] = {}
+        for name in set(Outcome._fields).intersection(state._fields):
+            same[name] = getattr(state, name).copy()
         return Outcome(
             is_success=arrived & ~touched & state.within & state.reachable & ~state.unstable,
             collision=touched,
             first_contact_time=np.where(touched, state.first_contact * timestep, -1.0),
-            min_clearance=state.min_clearance.copy(),
-            self_clearance=state.self_clearance.copy(),
-            planned_clearance=state.planned_clearance.copy(),
             goal_error=error,
             duration=duration,
-            path_length=state.path_length.copy(),
-            jerk_cost=state.jerk_cost.copy(),
             jerk_ratio=np.maximum(state.jerk_cost / straight, 1.0),
-            peak_speed=state.peak_speed.copy(),
             tracking_error=np.sqrt(state.deviation / np.maximum(state.steps, 1)),
-            reachable=state.reachable.copy(),
-            unstable=state.unstable.copy(),
-            stretch=state.stretch.copy(),
+            **same,
         )
 
     def _straight_length(self, time: Float) -> Float:

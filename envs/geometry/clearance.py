@@ -158,30 +158,6 @@ def group_clearance(
     return least, nearest
 
 
-@inlined
-def nearest_obstacle(
-    spheres: Spheres,
-    placed: Placed,
-    group: int,
-    obstacles: Obstacles,
-    scene: int,
-    time: float,
-    least: float,
-    floor: float,
-) -> float:
-    """Return the clearance of a group of spheres from all obstacles, at most `least`, [m].
-
-    The arguments are those of :func:`obstacle_clearance`.
-    """
-    for row in range(obstacles.kind.shape[1]):
-        if obstacles.kind[scene, row] == ABSENT:
-            continue
-        least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
-        if least < floor:
-            break
-    return least
-
-
 @inner
 def obstacle_clearance(
     spheres: Spheres,
@@ -191,15 +167,23 @@ def obstacle_clearance(
     time: float,
     least: float,
     floor: float,
+    only: int = -1,
+    link: int = 1,
 ) -> float:
     """Return the clearance of a placed arm from the obstacles of a scene at a time, at most `least`, [m].
 
-    The base does not count, as it may stand on an obstacle. The search stops at the first clearance below `floor`: the
-    exact value below it does not matter.
+    The search stops at the first clearance below `floor`: the exact value below it does not matter. Of the obstacles,
+    one may be the `only` one that counts, and links from `link` on: the base does not, as it may stand on an obstacle.
     """
+    first = max(only, 0)
+    last = obstacles.kind.shape[1] if only < 0 else only + 1
     for group in range(len(spheres.link)):
-        if spheres.link[group] > 0:  # the base may stand on an obstacle
-            least = nearest_obstacle(spheres, placed, group, obstacles, scene, time, least, floor)
+        if spheres.link[group] < link:
+            continue
+        for row in range(first, last):
+            if obstacles.kind[scene, row] == ABSENT:
+                continue
+            least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
             if least < floor:
                 return least
     return least
@@ -422,9 +406,14 @@ def _nearest(
 ) -> float:
     """Return the clearance of a group from all obstacles, or that of a pair of groups, at most `most`, [m]."""
     groups = len(spheres.link)
-    if check < groups:
-        return nearest_obstacle(spheres, placed, check, obstacles, scene, time, most, -FAR)
-    return nearest_spheres(spheres, placed, check - groups, most, -FAR)[0]
+    if check >= groups:
+        return nearest_spheres(spheres, placed, check - groups, most, -FAR)[0]
+    for row in range(obstacles.kind.shape[1]):
+        if obstacles.kind[scene, row] != ABSENT:
+            most, _ = group_clearance(spheres, placed, check, obstacles, scene, row, time, most, -FAR)
+            if most < -FAR:
+                break
+    return most
 
 
 @inlined
@@ -525,33 +514,6 @@ def _shorten_ways(spheres: Spheres, placed: Placed, bounds: Bounds) -> None:
         bounds.group_way[group] = min(bounds.group_way[group], bound)
 
 
-@inner
-def row_clearance(
-    spheres: Spheres,
-    placed: Placed,
-    obstacles: Obstacles,
-    scene: int,
-    row: int,
-    time: float,
-    least: float,
-    floor: float,
-    link: int,
-) -> float:
-    """Return the clearance of links from `link` on of a placed arm from one obstacle, at most `least`, [m].
-
-    The search stops at the first clearance below `floor`; the exact value below it does not matter.
-    """
-    if obstacles.kind[scene, row] == ABSENT:
-        return least
-    for group in range(len(spheres.link)):
-        if spheres.link[group] < link:  # the base, or links that are not asked for
-            continue
-        least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
-        if least < floor:
-            return least
-    return least
-
-
 @compiled
 def row_clearances(
     chain: Chain, spheres: Spheres, joints: Float, obstacles: Obstacles, most: float
@@ -567,5 +529,5 @@ def row_clearances(
         place(chain, spheres, joints[scene], placed)
         own[scene] = self_clearance(spheres, placed, most, -FAR)
         for row in range(rows):
-            found[scene, row] = row_clearance(spheres, placed, obstacles, scene, row, 0.0, most, -FAR, 1)
+            found[scene, row] = obstacle_clearance(spheres, placed, obstacles, scene, 0.0, most, -FAR, row)
     return found, own

@@ -9,7 +9,7 @@ import numpy as np
 from viapoint.envs.arms.inverse_kinematics import descend, solve_planar
 from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position, transform
 from viapoint.envs.common.arrays import Bool, Float, Int
-from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, row_clearance, self_clearance
+from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, self_clearance
 from viapoint.envs.geometry.compiled import inlined, inner, kernel
 from viapoint.envs.geometry.obstacles import ABSENT
 from viapoint.envs.scenes.scene import NEVER, Scenes, way_since_start
@@ -204,7 +204,8 @@ def is_row_clear(
     for axis in range(3):
         change = scenes.turn_velocity[scene, row, axis] - obstacles.velocity[scene, row, axis]
         obstacles.centre[scene, row, axis] += after * change + moved * scenes.reach[scene, row, 2 + axis]
-    least = row_clearance(draft.setting.spheres, placed, obstacles, scene, row, time, margin, margin, link)
+    spheres = draft.setting.spheres
+    least = obstacle_clearance(spheres, placed, obstacles, scene, time, margin, margin, row, link)
     obstacles.centre[scene, row, 0] = x
     obstacles.centre[scene, row, 1] = y
     obstacles.centre[scene, row, 2] = z
