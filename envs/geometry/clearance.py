@@ -206,51 +206,23 @@ def nearest_spheres(
 def _nearest_spheres(
     spheres: Spheres, placed: Placed, first: int, second: int, least: float, floor: float
 ) -> tuple[float, int, int]:
-    """Return the same for two groups whose bounding balls are near."""
-    nearest, partner = -1, -1
-    place_group(spheres, first, placed)
-    place_group(spheres, second, placed)
-    # Groups that are divided leave out most pairs of parts.
-    if spheres.part[first] < spheres.part[first + 1] or spheres.part[second] < spheres.part[second + 1]:
-        return _nearest_by_parts(spheres, placed, first, second, least, floor)
-    for one in range(spheres.first[first], spheres.first[first + 1]):
-        # The ball of the second group excludes most spheres of the first.
-        size = spheres.radius[one]
-        if _are_apart(placed.centre, one, placed.ball, second, size + spheres.ball_radius[second] + least):
-            continue
-        for other in range(spheres.first[second], spheres.first[second + 1]):
-            sizes = size + spheres.radius[other]
-            if not _are_apart(placed.centre, one, placed.centre, other, sizes + least):
-                least = math.sqrt(_square(placed.centre, one, placed.centre, other)) - sizes
-                nearest, partner = one, other
-                if least < floor:
-                    return least, nearest, partner
-    return least, nearest, partner
-
-
-@inner
-def _nearest_by_parts(
-    spheres: Spheres, placed: Placed, first: int, second: int, least: float, floor: float
-) -> tuple[float, int, int]:
-    """Return the same for two placed groups, one of many spheres, of which most parts are apart.
-
-    The loop over spheres stands twice: with this one alone, checks of the Panda, whose links are mostly covered by few
-    spheres, took 10 % longer.
-    """
+    """Return the same for two groups whose bounding balls are near; most pairs of their parts are apart."""
     nearest, partner = -1, -1
     balls = spheres.ball_radius
+    place_group(spheres, first, placed)
+    place_group(spheres, second, placed)
     for start in range(spheres.first[first], spheres.first[first + 1], PART):
         part = _part(spheres, first, start)
         if _are_apart(placed.ball, part, placed.ball, second, balls[part] + balls[second] + least):
             continue
         for other_start in range(spheres.first[second], spheres.first[second + 1], PART):
             other_part = _part(spheres, second, other_start)
-            if _are_apart(
-                placed.ball, part, placed.ball, other_part, balls[part] + balls[other_part] + least
-            ):
+            sizes = balls[part] + balls[other_part]
+            if other_part != second and _are_apart(placed.ball, part, placed.ball, other_part, sizes + least):
                 continue
             for one in range(start, min(start + PART, spheres.first[first + 1])):
                 size = spheres.radius[one]
+                # The ball of the second part excludes most spheres of the first.
                 if _are_apart(placed.centre, one, placed.ball, other_part, size + balls[other_part] + least):
                     continue
                 for other in range(other_start, min(other_start + PART, spheres.first[second + 1])):
