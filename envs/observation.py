@@ -100,12 +100,7 @@ class ObservationLayout:
         times since the starts of the episodes, (N,), [s], are needed where decisions are made during a movement, and
         plans of a zero action in tasks with replanning. Without the looks of a sensor so far, a first look is made.
         """
-        parts: dict[str, Any] = {
-            "joints": joints,
-            "hand": hand,
-            "goal": goal[1],
-            "goal_joints": goal[0],
-        }
+        parts: dict[str, Any] = {"joints": joints, "hand": hand, "goal": goal[1], "goal_joints": goal[0]}
         task = self.task
         if task.sensor is not None:
             if looks is None:

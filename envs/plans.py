@@ -75,10 +75,7 @@ class Plan(NamedTuple):
     def trajectory(self) -> primitives.Trajectory:
         """Return the minimum-jerk movement through the waypoints."""
         return primitives.through(
-            self.waypoints,
-            self.durations,
-            start_velocity=self.velocity,
-            start_acceleration=self.acceleration,
+            self.waypoints, self.durations, start_velocity=self.velocity, start_acceleration=self.acceleration
         )
 
 

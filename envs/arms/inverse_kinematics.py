@@ -198,11 +198,7 @@ def planar_solutions(chain: Chain, joint_range: Float, places: Float) -> tuple[F
 
 @compiled
 def _planar_motion(
-    chain: Chain,
-    joint_range: Float,
-    position: Float,
-    velocity: Float,
-    acceleration: Float,
+    chain: Chain, joint_range: Float, position: Float, velocity: Float, acceleration: Float
 ) -> tuple[Float, Float, Float]:
     """Return joints, rates and accelerations for N states of the hand.
 
@@ -272,12 +268,7 @@ class UnreachableError(ValueError):
 
 
 def inverse_kinematics(
-    arm: Arm,
-    position: Any,
-    quaternion: Any = None,
-    *,
-    seed: Any = None,
-    n_seeds: int = 64,
+    arm: Arm, position: Any, quaternion: Any = None, *, seed: Any = None, n_seeds: int = 64
 ) -> Float:
     """Return different joint positions that put the tool at a pose, the nearest to the first seed first, (S, J).
 

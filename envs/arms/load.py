@@ -171,12 +171,7 @@ def load_arm(
 
 
 def _load(
-    whole: mujoco.MjModel,
-    name: str,
-    known_as: str,
-    urdf: Urdf,
-    notes: list[str],
-    given: Mapping[str, Any],
+    whole: mujoco.MjModel, name: str, known_as: str, urdf: Urdf, notes: list[str], given: Mapping[str, Any]
 ) -> Arm:
     """Return the arm of a model and the given arguments; see :func:`load_arm`."""
     chosen = choose_tool(whole, given["tool"], given["base"], notes)
@@ -263,11 +258,7 @@ def _load(
         torque = np.where(weak, WEIGHTS * weight, torque)
     endless = itertools.compress(names, (whole.jnt_limited[numbers] == 0) & ~arm.chain.sliding)
     return replace(
-        arm,
-        excess=arm.excess + excess,
-        notes=tuple(notes),
-        continuous=tuple(endless),
-        torque_limit=torque,
+        arm, excess=arm.excess + excess, notes=tuple(notes), continuous=tuple(endless), torque_limit=torque
     )
 
 

@@ -242,11 +242,7 @@ class Furniture:
         """Return a point of the frame in the world, [m]."""
         x, y = self._turned(point[0], point[1])
         scale, foot = self.room.scale, self.room.foot
-        return (
-            foot[0] + scale * (self._x + x),
-            foot[1] + scale * (self._y + y),
-            foot[2] + scale * point[2],
-        )
+        return (foot[0] + scale * (self._x + x), foot[1] + scale * (self._y + y), foot[2] + scale * point[2])
 
 
 def mix(limits: tuple[float, float], share: float) -> float:
