@@ -135,19 +135,12 @@ def local_distance(
 
 
 @kernel
-def _distances(
-    kind: int, size: Float, rotation: Float, position: Float, meshes: Meshes, clouds: Clouds,
-    points: Float, found: Float,
-) -> None:  # fmt: skip
-    """Fill in the signed distances of points, shape (M, 3), from one shape."""
+def _distances(kind: int, size: Float, meshes: Meshes, clouds: Clouds, points: Float, found: Float) -> None:
+    """Fill in the signed distances of points, shape (M, 3), in the frame of a shape."""
+    a, b, c = size
     for i in range(len(points)):
-        dx = points[i, 0] - position[0]
-        dy = points[i, 1] - position[1]
-        dz = points[i, 2] - position[2]
-        x = rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz
-        y = rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz
-        z = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
-        found[i] = local_distance(kind, size[0], size[1], size[2], meshes, clouds, x, y, z, FAR)[0]
+        x, y, z = points[i]
+        found[i] = local_distance(kind, a, b, c, meshes, clouds, x, y, z, FAR)[0]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -237,11 +230,10 @@ class Shape:
         radius = finite_array("radius", radius)
         if (radius < 0.0).any():
             raise ValueError(f"radius must be 0 or greater, got {radius.min()}")
-        flat = np.array(points.reshape(-1, 3))
-        found = np.empty(len(flat))
-        pose = self.rotation, np.array(self.position)
+        local = (points.reshape(-1, 3) - self.position) @ self.rotation
         tables = self.mesh or join_meshes([]), self.cloud or join_clouds([])
-        _distances(self.number, self.packed_size, *pose, *tables, flat, found)
+        found = np.empty(len(local))
+        _distances(self.number, self.packed_size, *tables, local, found)
         return found.reshape(points.shape[:-1]) - radius
 
     @property
