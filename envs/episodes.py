@@ -204,9 +204,7 @@ class Episodes:
         if self.task.whole_movement:
             return Plan.at_rest(waypoints, durations)
         if waypoints.shape != self.plan.waypoints.shape:
-            raise ValueError(
-                f"plan must have waypoints of shape {self.plan.waypoints.shape}, got {waypoints.shape}"
-            )
+            raise ValueError(f"waypoints must have shape {self.plan.waypoints.shape}, got {waypoints.shape}")
         waypoints = np.concatenate((state.position[:, None], waypoints[:, 1:]), axis=1)
         return Plan(waypoints, durations, state.velocity, state.acceleration)
 

@@ -286,10 +286,8 @@ def _measure(
         )
         state.min_clearance[row] = min(state.min_clearance[row], done[0])
         state.self_clearance[row] = min(state.self_clearance[row], done[1])
-        planned_path = path[scene, : steps[scene] + 1]
-        command = movement_clearance(
-            *body, planned_path, obstacles, scene, 0.0, timestep, placed, bounds, 0.0
-        )
+        wanted = path[scene, : steps[scene] + 1]
+        command = movement_clearance(*body, wanted, obstacles, scene, 0.0, timestep, placed, bounds, 0.0)
         state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
         found[scene] = end
     return found

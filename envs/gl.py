@@ -112,9 +112,7 @@ class Window:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if not glfw.init():
-                raise GLUnavailableError(
-                    "render_mode='human' cannot open a window: the display does not answer"
-                )
+                raise GLUnavailableError("render_mode='human' opens no window: the display does not answer")
             glfw.window_hint(glfw.VISIBLE, 1)
             glfw.window_hint(glfw.SAMPLES, 4)
             self._window = glfw.create_window(width, height, title, None, None)

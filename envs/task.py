@@ -179,9 +179,7 @@ class Task:
         if not task.whole_movement and timing != "optimal":
             raise ValueError(f"timing must be optimal where plans are revised or steered, got {timing!r}")
         if task.whole_movement and (task.moving_obstacles or task.n_jumps[1]):
-            raise ValueError(
-                "obstacles that move and targets that jump need decide_at with events of a movement"
-            )
+            raise ValueError("obstacles that move and targets that jump need decide_at with events")
         if task.stepwise:
             task.steering  # noqa: B018 - making it checks the control step
         return task
@@ -223,9 +221,7 @@ class Task:
         timestep = self.arm.timestep
         number = round(self.control_step / timestep)
         if abs(number * timestep - self.control_step) > 1e-6 * self.control_step or number > 500:
-            raise ValueError(
-                f"control_step must be 1 to 500 physics steps of {timestep} s, got {self.control_step!r}"
-            )
+            raise ValueError(f"control_step must be 1 to 500 times {timestep} s, got {self.control_step!r}")
         speeds = JOINT_SPEED_SHARE * np.minimum(self.arm.velocity_limit, 10.0)
         return Steering(
             space=self.space_name,

@@ -304,9 +304,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """
         self._check_running()
         if self.task.stepwise:
-            raise TypeError(
-                "here an action steers the arm for one control step; plans need another decide_at"
-            )
+            raise TypeError("an action steers the arm for one control step; plans need another decide_at")
         number, dimension = self.num_envs, self.task.space.dimension
         waypoints = finite_array("waypoints of the plan", plan.waypoints, (number, None, dimension))
         durations = finite_array("durations of the plan", plan.durations, (number, waypoints.shape[1] - 1))

@@ -341,9 +341,7 @@ def _capsules(
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:
             half = 0.0
         elif model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_CAPSULE:
-            raise ValueError(
-                f"collision geoms must be capsules or spheres, geom {model.geom(geom).name!r} is none"
-            )
+            raise ValueError(f"collision geoms must be capsules or spheres, not {model.geom(geom).name!r}")
         axis = half * data.geom_xmat[geom].reshape(3, 3)[:, 2]
         turn, place = frames[links[name]]
         centre = data.geom_xpos[geom] - place

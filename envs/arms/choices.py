@@ -81,9 +81,7 @@ def choose_tool(model: mujoco.MjModel, given: Any, base: str | None, notes: list
         try:
             name, point = given
         except (TypeError, ValueError):
-            raise ValueError(
-                f"tool must be a site, a body, or a pair of body and point, got {given!r:.60}"
-            ) from None
+            raise ValueError(f"tool must be a site, a body, or (body, point), got {given!r:.60}") from None
         tool = _named(name, bodies)
         tool = tool._replace(position=finite_array("tool", point, (3,)), name=f"a point of {name!r}")
     else:
@@ -150,7 +148,7 @@ def _usual_tool(
         raise ValueError(f"there are several tools: {listed}; name one with tool=, or a side with base=")
     if inner:
         notes.append(
-            f"{WARNING}the tool is {tool.name!r}, but could be {', '.join(inner)}: name one with tool="
+            f"{WARNING}the tool is {tool.name!r}, but could be {', '.join(inner)}: name it with tool="
         )
     return tool
 

@@ -198,9 +198,7 @@ def _load(
     stuck = whole.dof_damping[dofs].reshape(len(names), -1)[:, 0] * velocity > STUCK * torque
     if stuck.any():
         some = ", ".join(itertools.compress(names, stuck))
-        notes.append(
-            f"{WARNING}damping of {some} is left out: it needs {STUCK:g} times the torque limit at full speed"
-        )
+        notes.append(f"{WARNING}damping of {some} is left out: it takes {STUCK:g} times the torque limit")
         whole.dof_damping[dofs[stuck]] = 0.0
     parsed = _parse(whole, names, chosen, notes)
     # Pairs that cannot touch are not compared: those of the file, and those that are always near and always apart.
@@ -249,7 +247,7 @@ def _load(
         some = ", ".join(itertools.compress(names, weak))
         if given["torque_limit"] is not None:
             raise ValueError(
-                f"the torque limits of {some} do not hold the arm's own weight at home; raise torque_limit"
+                f"torque limits of {some} do not hold the arm's weight at home; raise torque_limit"
             )
         notes.append(
             f"{WARNING}torque limits of {some}: {WEIGHTS:g} times the weight at home, which those of the file do not "
@@ -389,9 +387,7 @@ def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: l
     endless = model.jnt_limited[numbers] == 0
     some = ", ".join(itertools.compress(joints, endless))
     if (endless & (kinds == MOVES[1])).any():
-        raise ValueError(
-            f"slides need limits, but {some} has none; give it a range in the file, or joint_range"
-        )
+        raise ValueError(f"slides need limits, but {some} has none; give a range in the file, or joint_range")
     if some:
         notes.append(f"range of {some}, continuous: +-pi")
     return np.where(endless[:, None], (-np.pi, np.pi), model.jnt_range[numbers])
@@ -595,7 +591,7 @@ def _note_rest(
     followers = ", ".join(itertools.compress(joints, np.isin(numbers, coupled)))
     if followers:
         notes.append(
-            f"{WARNING}{followers} follows another joint in the file, but not in plans; joints= without it fixes it"
+            f"{WARNING}{followers} follows another joint in the file, not in plans; leave it out of joints="
         )
 
 

@@ -270,8 +270,6 @@ def _srdf(path: Path, urdf: ET.Element, notes: list[str]) -> tuple[tuple[str, st
         links = {link.get("name") for link in urdf.findall("link")}
         unknown = dict.fromkeys(name for name in itertools.chain(*pairs) if name not in links)
         if unknown:
-            notes.append(
-                f"{WARNING}{place.name} names links that the URDF does not have: {', '.join(unknown)}"
-            )
+            notes.append(f"{WARNING}{place.name} names links that the URDF lacks: {', '.join(unknown)}")
         return tuple(pairs)
     return ()

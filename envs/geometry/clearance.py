@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.kinematics import PART, Chain, Spheres, link_frames
+from viapoint.envs.arms.kinematics import PART, Chain, Spheres, link_frames, transform
 from viapoint.envs.common.arrays import Bool, Float
 from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel
 from viapoint.envs.geometry.distance import point_distance
@@ -96,13 +96,8 @@ def place(chain: Chain, spheres: Spheres, joints: Float, placed: Placed) -> None
 @inlined
 def _place_point(placed: Placed, link: int, points: Float, row: int, places: Float) -> None:
     """Place one of the points of a table that are fixed to links."""
-    for axis in range(3):
-        places[row, axis] = (
-            placed.origin[link, axis]
-            + placed.rotation[link, axis, 0] * points[row, 0]
-            + placed.rotation[link, axis, 1] * points[row, 1]
-            + placed.rotation[link, axis, 2] * points[row, 2]
-        )
+    here = transform(placed.rotation, placed.origin, link, points[row])
+    places[row, 0], places[row, 1], places[row, 2] = here
 
 
 @inlined

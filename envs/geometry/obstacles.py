@@ -351,9 +351,7 @@ def geom_meshes(obstacles: Obstacles, among: Iterable[str] | None = None) -> Any
     """
     kind = obstacles.kind
     if (kind == POINT_CLOUD).any():
-        raise ValueError(
-            "a point cloud is no single geom; use a sphere for each point of PointCloud.covering"
-        )
+        raise ValueError("a point cloud is no single geom; use a sphere for each of PointCloud.covering")
     meshes = kind == MESH
     names = np.array([*mesh_names(obstacles.meshes, among), ""])
     found = names[np.where(meshes, obstacles.size[..., 0], -1).astype(np.int64)]

@@ -312,9 +312,7 @@ class Capsule(Shape):
         half = 0.5 * (second - first)
         length = float(np.linalg.norm(half))
         if not 0.0 < length < np.inf:
-            raise ValueError(
-                f"ends of a capsule must be different, got {first.tolist()} and {second.tolist()}"
-            )
+            raise ValueError(f"ends of a capsule must differ, got {first.tolist()} and {second.tolist()}")
         return cls(radius, length, position=first + half, quaternion=quaternion_to(half / length), **others)
 
 
@@ -608,9 +606,7 @@ def check_kinds(names: Iterable[Any]) -> tuple[str, ...]:
     for name in names:
         if not isinstance(name, str) or (name not in KINDS and name not in REGISTERED_MESHES):
             known = ", ".join((*KINDS, *REGISTERED_MESHES))
-            raise ValueError(
-                f"shape must be one of {known}, got {name!r}; register_mesh names a convex mesh of your own"
-            )
+            raise ValueError(f"shape must be one of {known}, got {name!r}; register_mesh adds a convex mesh")
     if len(set(names)) < len(names):
         raise ValueError(f"shapes must not be repeated, got {', '.join(names)}")
     return names

@@ -151,9 +151,7 @@ def _check_shape(row: int, shape: Shape, sampler: SceneSampler) -> None:
                 f"environment, {', '.join(allowed)}"
             )
     if kind not in allowed:
-        raise ValueError(
-            f"obstacle {row} must be one of the shapes of the task, {', '.join(allowed)}, got {kind}"
-        )
+        raise ValueError(f"obstacle {row} must be one of the task's shapes, {', '.join(allowed)}, got {kind}")
     arm = sampler.task.arm
     base = np.repeat(arm.spheres.link, np.diff(arm.spheres.first)) == 0
     centres = sphere_centres(arm.chain, arm.spheres, arm.home)[base]
@@ -186,9 +184,7 @@ def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles) -> 
     array = finite_array(label, value, (2,), (3,), (number, 2), (number, 3))
     height = sampler.room.foot[2]
     if array.shape[-1] == 3 and (np.abs(array[..., 2] - height) > REACHED).any():
-        raise ValueError(
-            f"{label} must have z = {height:g} m, which is the plane of the hand, got {array.tolist()}"
-        )
+        raise ValueError(f"{label} must have z = {height:g} m, as the hand has, got {array.tolist()}")
     return _planar(label, sampler.task.arm, np.broadcast_to(array[..., :2], (number, 2)))
 
 
