@@ -127,11 +127,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         n_threads = max(min(n_threads, self.num_envs // LEAST_SHARE), 1)
         self._shares = np.array_split(np.arange(self.num_envs), n_threads)
         self._episodes = [Episodes(self.task, len(share)) for share in self._shares]
-        self._renderers = [
-            EpisodeRenderer(episodes, row, render_mode, width, height, SINGLE_METADATA["render_fps"])
-            for episodes in self._episodes
-            for row in range(len(episodes.begun))
-        ]
+        # Running episodes of each environment, and their row
+        self._rows = [(each, row) for each in self._episodes for row in range(len(each.begun))]
+        look = render_mode, width, height, SINGLE_METADATA["render_fps"]
+        self._renderers = [EpisodeRenderer(each, row, *look) for each, row in self._rows]
         self._pool: ThreadPoolExecutor | None = None
         self._process = os.getpid()  # of the pool, whose threads do not survive a fork
         self.generators: list[np.random.Generator] = []
@@ -178,7 +177,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """Last movements at every physics step, one for each environment; empty before the first reset."""
         if not self._running:
             return ()
-        return tuple(each.recorded(row).rollout for each in self._episodes for row in range(len(each.begun)))
+        return tuple(each.recorded(row).rollout for each, row in self._rows)
 
     @property
     def last_plan(self) -> Plan | None:
@@ -191,7 +190,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     @property
     def last_plans(self) -> tuple[History, ...]:
         """All plans of the running episodes with the times at which they began, [s]."""
-        return tuple(list(history) for each in self._episodes for history in each.history)
+        return tuple(list(each.history[row]) for each, row in self._rows)
 
     # Episodes
 
