@@ -432,16 +432,14 @@ class Episodes:
     # Copies
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the running episodes as arrays, for :meth:`restore`; films of the past are not part."""
+        """Return the state of the running episodes for :meth:`restore`; scenes and films of the past are not part."""
         return {
-            "scenes": as_dict(self.scenes),
             "metrics": as_dict(self.executor.state),
             "plan": as_dict(self.plan),
             "motion": as_dict(self._motion),
             "began": self._began.copy(),
             "begun": self.begun.copy(),
             "physics": self.simulator.batch.state.copy(),
-            "physics_steps": self.simulator.physics_steps,
             "looks": [part.copy() for part in self.looks or ()],
         }
 

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.common.arrays import Bool, Float, Int, Observation, from_dict
+from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict
 from viapoint.envs.common.validation import finite_array, masked_rows, seeds_of, whole_number
 from viapoint.envs.episodes import Decision, Episodes, History
 from viapoint.envs.geometry.obstacles import geom_meshes
@@ -362,7 +362,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self._check_running()
         return {
             "generators": [generator.bit_generator.state for generator in self.generators],
-            "episodes": [each.state() for each in self._episodes],
+            "scenes": as_dict(self.scenes),
+            "episodes": _together([each.state() for each in self._episodes]),
+            "physics_steps": self.physics_steps,
             "over": self._over.copy(),
             "decisions": self._decisions.copy(),
             "ended": np.stack((self.terminated, self.truncated)),
@@ -375,15 +377,11 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             self._np_random = self.generators[0]
         for generator, place in zip(self.generators, state["generators"], strict=True):
             generator.bit_generator.state = place
-        parts = [dict(part) for part in state["episodes"]]
-        like = self._episodes[0].scenes
-        scenes = Scenes.together([from_dict(like, part.pop("scenes")) for part in parts])
-        steps = [int(part.pop("physics_steps")) for part in parts]
-        every = _together(parts)
+        scenes = from_dict(self._episodes[0].scenes, state["scenes"])
         for each, share in zip(self._episodes, self._shares, strict=True):
-            each.restore(_taken(every, share), scenes.take(share))
+            each.restore(_taken(state["episodes"], share), scenes.take(share))
             each.simulator.physics_steps = 0
-        self._episodes[0].simulator.physics_steps = sum(steps)
+        self._episodes[0].simulator.physics_steps = int(state["physics_steps"])
         self._over[:] = state["over"]
         self._decisions[:] = state["decisions"]
         self.terminated, self.truncated = np.array(state["ended"])

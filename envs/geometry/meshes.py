@@ -131,7 +131,9 @@ def build_mesh(vertices: Float, faces: Int | None) -> Meshes:
     for vertex in np.setdiff1d(np.arange(len(vertices)), hull.simplices):
         depth = ((corners[:, 0] - vertices[vertex]) * normals).sum(axis=1).min()
         if depth > DENT * size:
-            raise ValueError(f"vertices must be convex: vertex {vertex} lies {depth:.3g} m inside; {HULL_HINT}")
+            raise ValueError(
+                f"vertices must be convex: vertex {vertex} lies {depth:.3g} m inside; {HULL_HINT}"
+            )
     if faces is not None:
         _check_faces(vertices, faces, hull.volume, DENT * size**3)
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
