@@ -24,8 +24,7 @@ from viapoint.envs.simulator import Simulator
 from viapoint.envs.task import Task
 
 LIMIT_INSTANTS = 64  # Instants at which the limits of a plan are checked
-# Greatest number of times that a plan in motion is prolonged, and the greatest remaining factor
-PROLONGED, ENOUGH = 6, 1.0
+PROLONGED, ENOUGH = 6, 1.0  # Greatest number of prolongations of a plan in motion, and remaining factor
 MOST_PROLONGED = 1.5
 """Greatest factor each time. Longer plans in motion swing out and need more: the factors would grow without bound."""
 

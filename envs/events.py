@@ -119,8 +119,7 @@ class EventPredictor:
         every = max(round(LOOK / self.timestep), 1)
         ahead = round(FORESIGHT / LOOK)
         turns = self.steps(scenes.course_times())
-        # Pieces of the episodes in which the obstacles keep their velocity
-        pieces = []
+        pieces = []  # Pieces of the episodes in which the obstacles keep their velocity
         for row in range(len(now)):
             inside = (turns[row] > now[row]) & (turns[row] < latest[row])
             cuts = [now[row], *np.unique(turns[row][inside]), latest[row]]

@@ -15,8 +15,7 @@ LIMIT_TOLERANCE = 1e-3  # Tolerance of MuJoCo's soft joint limits, [rad]
 class Tolerance(NamedTuple):
     """Bounds of success at the end of a movement."""
 
-    goal: float
-    """Greatest distance from the goal, [m] of the hand, or [rad] of the joint that is farthest from it."""
+    goal: float  # Greatest distance from the goal, [m] of the hand, or [rad] of the farthest joint
     speed: float  # Greatest speed that counts as rest, [m/s] or [rad/s]
     unit: float  # Distance from the goal at which the reward's goal error saturates, [m] or [rad]
 

@@ -19,14 +19,12 @@ if TYPE_CHECKING:
 Timing = Literal["optimal", "learned"]
 SpaceName = Literal["hand", "joints"]
 
-# Log ratio of neighbouring segments' durations for an action of 1: a factor of four
-LOG_SPLIT = float(np.log(4.0))
+LOG_SPLIT = float(np.log(4.0))  # Log ratio of neighbouring durations for an action of 1: a factor of four
 MOST_VIAS = 16  # Greatest number of via-points of an action; more add no new movements in practice
 # Bounds of the duration range, [s] in hand space, factors in joint space
 SHORTEST_DURATION, LONGEST_DURATION = 0.05, 60.0
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)  # Nodes and weights of Gauss-Legendre quadrature
-# Largest offsets of via-points along and across the straight line of the hand, [m]
-HAND_OFFSETS = (0.15, 0.25)
+HAND_OFFSETS = (0.15, 0.25)  # Largest offsets of via-points along and across the line of the hand, [m]
 # Largest offset of a joint at a via-point: a share of its range, and a bound, [rad]
 RANGE_SHARE, LARGEST_OFFSET = 0.35, 1.0
 UNLIMITED_SPEED = 4.0  # Speed that counts as the limit of joints without one in durations of actions, [rad/s]
@@ -185,20 +183,16 @@ class ActionLayout:
         self.duration_range = low, high = duration_range
         """Shortest and longest total duration, [s] or relative; an action of 0 is their geometric mean."""
         in_hand = space == "hand"
-        self.names_of_axes = ("along", "across") if in_hand else arm.joint_names
-        """Names of the D components of an offset."""
+        self.names_of_axes = ("along", "across") if in_hand else arm.joint_names  # Names of the D components
         self.dimension = len(self.names_of_axes)  # Dimension D of the space
         width = arm.joint_range[:, 1] - arm.joint_range[:, 0]
         offsets = np.minimum(RANGE_SHARE * width, LARGEST_OFFSET)
         self.via_scale = np.array(HAND_OFFSETS) if in_hand else offsets
         """Largest offset of each component, shape (D,), [m] or [rad]."""
         limited = np.isfinite(arm.velocity_limit)
-        self.rate_limit = np.where(limited, arm.velocity_limit, UNLIMITED_SPEED)
-        """Velocity limits of the joints, [rad/s]."""
-        self.centre = float((low * high) ** 0.5)
-        """Duration of the zero action, [s] in hand space, relative in joint space."""
-        self.log_half_range = float(0.5 * np.log(high / low))
-        """Logarithm of the factor on the duration for an action of 1."""
+        self.rate_limit = np.where(limited, arm.velocity_limit, UNLIMITED_SPEED)  # Velocity limits, [rad/s]
+        self.centre = float((low * high) ** 0.5)  # Duration of the zero action, [s], in joint space relative
+        self.log_half_range = float(0.5 * np.log(high / low))  # Log factor on the duration for an action of 1
         vias = [f"via_{k}_{axis}" for k in range(1, n_via + 1) for axis in self.names_of_axes]
         splits = [f"split_{k}" for k in range(1, n_via + 1)] if timing == "learned" else []
         self.names = (*vias, "duration", *splits)  # Names of the components, in order

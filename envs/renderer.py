@@ -234,8 +234,7 @@ class SceneView:
         mujoco.mj_camlight(model, data)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self.scene)
-        # The floor of arms in space fades into the background.
-        self.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True  # the floor in space fades away
         table = model.geom("table").id
         for geom in self._shown({table}):
             geom.castshadow = False  # there is nothing below it, and its own surface would be speckled

@@ -43,8 +43,7 @@ from viapoint.envs.spaces import Space, space_of
 Trigger = Literal["horizon", "target", "course", "clearance", "sight"]
 TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)  # Events that may end a decision before the goal
 COURSES = ("turns", "reaches")  # Courses of obstacles that move; the first is the default
-# Values of `decide_at` with one decision for a movement, and with one in every control step
-END, STEPS = "end", "steps"
+END, STEPS = "end", "steps"  # `decide_at` with one decision, and with one in every control step
 MOST_OBSTACLES = 256  # Greatest number of obstacles in a scene that is given
 PLANE_SHAPES = ("cylinder", "box")  # Default shapes of obstacles in the plane
 SPACE_SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")  # Default shapes of obstacles in space

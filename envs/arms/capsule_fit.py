@@ -28,8 +28,7 @@ ROUNDING = 1e-6  # Added to the radius, so that rounding leaves nothing outside,
 SHORTEST = 1e-3  # Length of the axis below which a capsule becomes a sphere, [m]
 # Corners of each ring of the polytope around an ellipsoid, and half of those of the prism around a cylinder
 RIM_POINTS = 24
-# Places of the planes that cut a body, as shares of its length along a principal axis
-CUTS = (0.35, 0.5, 0.65)
+CUTS = (0.35, 0.5, 0.65)  # Planes that cut a body, as shares of its length along a principal axis
 LEAST_SHARE = 0.3  # Least length along an axis across which a body is cut, as a share of the greatest
 # First and last step of the search for the ends, and last one where cuts are compared, as shares of the size
 FIRST_STEP, LAST_STEP, COARSE_STEP = 0.25, 5e-4, 0.05

@@ -15,10 +15,8 @@ from viapoint.envs.arms.urdf import WARNING
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.validation import finite_array
 
-# Types of joints that an arm may have
-MOVES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-# Types of geoms that are left out
-GROUNDS = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+MOVES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))  # Joints that an arm may have
+GROUNDS = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))  # Geoms that are left out
 # Usual names of tools, the most telling first; prefixes that end in `_`, `/` or `:` may precede them
 TOOL_NAMES = (
     r"attachment(_site)?", r"tcp", r"tool\d*(_?center)?(_?(point|frame|link))?", r"ee(f|_?site|_?link|_?frame)?",

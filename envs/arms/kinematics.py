@@ -30,16 +30,14 @@ class Chain(NamedTuple):
     its z axis is the axis of the joint.
     """
 
-    # Origin of the frame of each joint at 0, in the frame of the link before, shape (J, 3), [m]
-    origin: Float
+    origin: Float  # Origin of each joint's frame at 0, in the frame of the link before, shape (J, 3), [m]
     rotation: Float  # Axes of this frame as columns, in the frame of the link before, shape (J, 3, 3)
     sliding: Bool  # True for joints that slide along their z axis, False for hinges about it, shape (J,)
     tool_origin: Float  # Origin of the tool's frame in that of the last link, shape (3,), [m]
     tool_rotation: Float  # Axes of the tool's frame as columns, shape (3, 3)
     mass: Float  # Mass of each moving link with all that is fixed to it, shape (J,), [kg]
     centre: Float  # Centre of mass in the link's frame, shape (J, 3), [m]
-    # Rotational inertia about the centre of mass, in the link's frame, shape (J, 3, 3), [kg m^2]
-    inertia: Float
+    inertia: Float  # Inertia about the centre of mass, in the link's frame, shape (J, 3, 3), [kg m^2]
     armature: Float  # Inertia of the motors seen at the joints, shape (J,), [kg m^2] or [kg]
     damping: Float  # Viscous friction of the joints, shape (J,), [N m s/rad] or [N s/m]
     gravity: Float  # Gravitational acceleration, shape (3,), [m/s^2]

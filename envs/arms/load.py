@@ -50,8 +50,7 @@ LOOKED_AT, NEAR_LOOKED_AT = 16, 1000
 # Distance within which bodies are near in at least half of the configurations, and tolerance for these, which is the
 # least one, [m]
 NEAR, FINE = 0.03, 0.005
-# Damping beyond which a joint hardly moves: its torque at full speed, relative to the torque limit
-STUCK = 100.0
+STUCK = 100.0  # Damping beyond which a joint hardly moves: torque at full speed over the limit
 # Names of files that do not tell the arm; it gets the name of the model
 GENERIC_NAMES = ("arm", "model", "robot", "scene")
 MIN_JOINTS = 2  # Least number of joints

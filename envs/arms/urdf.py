@@ -42,8 +42,7 @@ class Urdf(NamedTuple):
     name: str  # Name of the robot
     assets: dict[str, bytes]  # Meshes that MuJoCo cannot read as they are, by the names in the text
     velocity_limits: dict[str, float]  # Velocity limits of joints by name, [rad/s] or [m/s]
-    # Pairs of links that are not compared, from an SRDF file beside it
-    never_touch: tuple[tuple[str, str], ...]
+    never_touch: tuple[tuple[str, str], ...]  # Pairs of links that an SRDF file beside it does not compare
     notes: tuple[str, ...]  # Parts that were left out
 
 

@@ -50,8 +50,7 @@ class Bounds(NamedTuple):
     group_way: Float  # Bounds of the way of the spheres of groups, shape (G,), [m]
     rotation: Float  # Axes of the links' frames in the configuration before, shape (J + 1, 3, 3)
     ball: Float  # Centres of the bounding balls in the configuration before, shape (G, 3), [m]
-    # Joints between two configurations, shape (J,); empty if nothing counts between them
-    between: Float
+    between: Float  # Joints between two configurations, shape (J,); empty if nothing counts there
 
 
 @compiled

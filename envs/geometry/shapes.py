@@ -489,8 +489,7 @@ class PointCloud(Shape):
 
 SHAPES: tuple[type[Shape], ...] = (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
 """Classes of the kinds, in the order of KINDS."""
-# Meshes that have a name of their own, see :func:`register_mesh`
-REGISTERED_MESHES: dict[str, ConvexMesh] = {}
+REGISTERED_MESHES: dict[str, ConvexMesh] = {}  # Meshes with a name of their own, see :func:`register_mesh`
 
 
 def register_mesh(name: str, vertices: Any, faces: Any = None) -> None:

@@ -18,15 +18,13 @@ PAIRS, TRIES = 3, 6  # Pairs of start and goal for a layout, and attempts at eac
 # Share of starts at home or near it, and of these and starts in places of goals; others are free ones
 HOME, REACHING = 0.4, 0.8
 FREE_GOALS = 0.1  # Share of goals that are free configurations, where the layout has places
-# Share of pairs whose start and goal are exchanged, where the layout has no places of starts
-EXCHANGED = 0.25
+EXCHANGED = 0.25  # Share of pairs whose ends are exchanged, where the layout has no places of starts
 JITTER = 0.3  # Greatest deviation from home of half of the starts there, [rad]
 # Least clearance of the arm from itself at ends, [m], and the share of that at home that it is at most
 SELF_MARGIN, HOME_SHARE = 0.005, 0.5
 INSTANTS = 32  # Parts of the straight movement between which it is looked at
 ROLL = 0.3  # Greatest deviation of the tool's roll about its axis from quarter turns, [rad]
-# Spread around home of the seeds of inverse kinematics, as a share of the ranges of the joints
-SEED_SPREAD = 0.3
+SEED_SPREAD = 0.3  # Spread of seeds of inverse kinematics around home, as a share of the ranges
 BLOCKED, FREE, OUT_OF_REACH = 1, 0, -1  # Outcome of a straight movement
 
 

@@ -91,8 +91,7 @@ class Layout(NamedTuple):
     goals: list[float]  # PLACE numbers for each place of goals; without any, goals are free configurations
     # PLACE numbers for each place of starts; without any, starts are home, in a place of goals, or free
     starts: list[float]
-    # Number of obstacles that are kept, the first ones that leave both ends free; 0 if they belong together
-    keep: int = 0
+    keep: int = 0  # Number of obstacles that are kept, the first with free ends; 0 if they belong together
 
 
 class Place(NamedTuple):

@@ -28,8 +28,7 @@ from viapoint.envs.scenes.sampler import VIEW_MARGIN, SceneSampler
 from viapoint.envs.scenes.scene import ENDS, MOST_JUMPS, NEVER, Scenes, check_scenes, resting
 from viapoint.envs.spaces import space_of
 
-# Options of `reset` that give a scene, or a part of one
-OPTIONS = (*ENDS, "obstacles", "jumps", "turns", "reaches")
+OPTIONS = (*ENDS, "obstacles", "jumps", "turns", "reaches")  # Options of `reset` that give a part of a scene
 FORMAT = "viapoint-scene"  # Value of the key `format` of a scene file
 REACHED = 1e-6  # Greatest distance of the hand from a given place, [m]
 
