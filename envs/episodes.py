@@ -153,22 +153,13 @@ class Episodes:
         """Return the present observations."""
         state, task, time = self.executor.state, self.task, self.time
         goal = self.scenes.goals(time)
+        goals = goal, task.arm.hand(goal)
         nominal = self.nominal if task.replanning else None
-        command = None
-        if task.stepwise:
-            command = self._motion
-        elif nominal is not None:
+        command = self._motion if task.stepwise else None
+        if nominal is not None:
             command = nominal.state
-        return task.observation.observe(
-            state.joints,
-            state.hand,
-            (goal, task.arm.hand(goal)),
-            self.scenes.obstacles_at(time),
-            command,
-            time,
-            nominal,
-            self.looks,
-        )
+        now = state.joints, state.hand, goals, self.scenes.obstacles_at(time)
+        return task.observation.observe(*now, command, time, nominal, self.looks)
 
     def decide(self, actions: Float, active: Bool) -> Decision:
         """Make one decision for actions (n, m) in [-1, 1] and execute it until it ends.

@@ -99,17 +99,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         for name, value in task.items():
             if isinstance(value, Mapping | list):  # the caller may change it later
                 task[name] = copy.copy(value)
-        EzPickle.__init__(
-            self,
-            num_envs,
-            autoreset_mode=autoreset_mode,
-            render_mode=render_mode,
-            width=width,
-            height=height,
-            threads=threads,
-            max_episode_steps=max_episode_steps,
-            **task,
-        )
+        pictures = {"render_mode": render_mode, "width": width, "height": height}
+        ends = {"autoreset_mode": autoreset_mode, "max_episode_steps": max_episode_steps}
+        EzPickle.__init__(self, num_envs, threads=threads, **pictures, **ends, **task)
         self.task = Task.of(**task)
         """Task of an episode: what an agent may compute with before it moves."""
         self.num_envs = whole_number("num_envs", num_envs, 1)

@@ -90,17 +90,10 @@ def read_arm(path: Path) -> Arm | None:
     data = mark.attrib["data"]
     choices: dict[str, Any] = json.loads(data)
     left_out = tuple(LeftOut(*each) for each in choices["left_out"])
-    arm = arm_from_xml(
-        choices["name"],
-        text.replace(_element(data), ""),
-        joints=choices["joints"],
-        tool="hand",
-        home=choices["home"],
-        velocity_limit=choices["velocity_limit"],
-        torque_limit=choices["torque_limit"],
-        space=choices["space"],
-        exclude={frozenset((pair.first, pair.second)): pair.reason for pair in left_out},
-    )
+    exclude = {frozenset((pair.first, pair.second)): pair.reason for pair in left_out}
+    kept = {each: choices[each] for each in ("joints", "home", "velocity_limit", "torque_limit", "space")}
+    xml = text.replace(_element(data), "")
+    arm = arm_from_xml(choices["name"], xml, tool="hand", exclude=exclude, **kept)
     return replace(
         arm,
         left_out=left_out,
