@@ -28,6 +28,7 @@ LOOK = 0.032  # Time from one prediction to the next, [s]
 GLANCE = 0.064  # Time from one glance of the sensor to the next, [s]
 # Something new is seen where this number of points is farther than this from all that are remembered, [m]
 NEW_POINTS, NEW_DISTANCE = 4, 0.04
+Goals = Callable[[Float], Float]  # Function of times, shape (N,), that returns the goals, shape (N, D)
 NEVER = np.iinfo(np.int64).max // 4  # Physics step of an event that does not happen
 
 
@@ -62,13 +63,7 @@ class EventPredictor:
         return np.where(time < 1e8, number, NEVER)
 
     def __call__(
-        self,
-        plan: Plan,
-        began: Int,
-        now: Int,
-        scenes: Scenes,
-        goal: Callable[[Float], Float],
-        looks: Looks | None,
+        self, plan: Plan, began: Int, now: Int, scenes: Scenes, goal: Goals, looks: Looks | None
     ) -> tuple[Int, Int, Bool]:
         """Return the ends of decisions that begin at physics step `now` under plans that began at step `began`.
 

@@ -269,12 +269,7 @@ def _product(matrix: Float, vector: Vector) -> Vector:
 
 @compiled
 def slowdowns(
-    chain: Chain,
-    velocity_limit: Float,
-    torque_limit: Float,
-    position: Float,
-    velocity: Float,
-    acceleration: Float,
+    chain: Chain, velocity_limit: Float, torque_limit: Float, q: Float, v: Float, a: Float
 ) -> Float:
     """Return factors by which N movements must be slower to keep the limits; less than 1 for those that may be faster.
 
@@ -283,10 +278,10 @@ def slowdowns(
 
         |v| / s <= share limit_v,    |m| / s^2 + |f| / s <= share limit_t - g,
 
-    with the torques m of inertia, f of friction, and g of gravity in the direction of the motion's torque. Positions,
-    velocities and accelerations have the shape (N, T, J); limits are infinite for none.
+    with the torques m of inertia, f of friction, and g of gravity in the direction of the motion's torque. Positions q,
+    velocities v and accelerations a have the shape (N, T, J); limits are infinite for none.
     """
-    number, length, joints = position.shape
+    number, length, joints = q.shape
     found = np.empty(number)
     rest = np.zeros(joints)
     heavy = np.empty(joints)
@@ -295,13 +290,13 @@ def slowdowns(
         least = 0.0
         for k in range(length):
             for j in range(joints):
-                least = max(least, abs(velocity[n, k, j]) / (LIMIT_SHARE * velocity_limit[j]))
+                least = max(least, abs(v[n, k, j]) / (LIMIT_SHARE * velocity_limit[j]))
             if k % TORQUE_STRIDE and k < length - 1:  # torques change slowly
                 continue
-            inverse_dynamics(chain, position[n, k], rest, rest, heavy)
-            inverse_dynamics(chain, position[n, k], velocity[n, k], acceleration[n, k], whole)
+            inverse_dynamics(chain, q[n, k], rest, rest, heavy)
+            inverse_dynamics(chain, q[n, k], v[n, k], a[n, k], whole)
             for j in range(joints):
-                friction = chain.damping[j] * velocity[n, k, j]
+                friction = chain.damping[j] * v[n, k, j]
                 motion = whole[j] - heavy[j] - friction
                 against = heavy[j] if motion + friction >= 0.0 else -heavy[j]
                 room = max(LIMIT_SHARE * torque_limit[j] - against, LEAST_TORQUE_SHARE * torque_limit[j])

@@ -65,6 +65,7 @@ INERTIA_MARGIN = 2e-5  # Relative margin of the triangle inequality of principal
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 RESERVED = ("", "world", "meshes")  # Names that bodies of the arm cannot have, beside those of obstacles
 
+Names = tuple[str, ...]  # Names of joints, from the base to the tool
 Pair = tuple[int, int]  # Numbers of two bodies, that of the lower link first
 
 
@@ -75,7 +76,7 @@ class Parsed(NamedTuple):
     # Places with the arm's joints at 0, and all others as in the first keyframe or at their reference
     rest: mujoco.MjData
     moved: mujoco.MjData  # Places in any configuration
-    joints: tuple[str, ...]
+    joints: Names
     carriers: list[int]  # Body of each joint
     tool: Tool
     links: dict[int, int]  # Link of each body of the arm, 0 for the base, in the order of the file
@@ -354,7 +355,7 @@ def _leave_out(spec: mujoco.MjSpec, fault: str) -> str:
     raise ValueError(f"MuJoCo cannot read the file: {fault}")
 
 
-def _joint_names(joints: Any) -> tuple[str, ...]:
+def _joint_names(joints: Any) -> Names:
     """Return different names of joints."""
     names = tuple(joints) if isinstance(joints, Iterable) and not isinstance(joints, str) else ()
     are_strings = all(isinstance(each, str) for each in names)
@@ -365,13 +366,13 @@ def _joint_names(joints: Any) -> tuple[str, ...]:
     return names
 
 
-def _per_joint(name: str, values: Any, joints: tuple[str, ...]) -> Float:
+def _per_joint(name: str, values: Any, joints: Names) -> Float:
     """Return one number for each joint, shape (J,); a single number applies to all."""
     numbers = finite_array(name, values, (len(joints),), (1,), ())
     return np.array(np.broadcast_to(numbers, (len(joints),)))
 
 
-def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: list[str]) -> Float:
+def _ranges(model: mujoco.MjModel, joints: Names, given: Any, notes: list[str]) -> Float:
     """Return the range of each joint, as MuJoCo read it from the file or as given, shape (J, 2)."""
     numbers = [model.joint(name).id for name in joints]
     kinds = model.jnt_type[numbers]
@@ -392,7 +393,7 @@ def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: l
     return np.where(endless[:, None], (-np.pi, np.pi), model.jnt_range[numbers])
 
 
-def _torques(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, arm: str, notes: list[str]) -> Float:
+def _torques(model: mujoco.MjModel, joints: Names, given: Any, arm: str, notes: list[str]) -> Float:
     """Return the torque limit of each joint, its own, or the greatest of the actuators that drive it."""
     if given is not None:
         return _per_joint("torque_limit", given, joints)
@@ -414,13 +415,7 @@ def _torques(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, arm: st
 
 
 def _completed(
-    what: str,
-    joints: tuple[str, ...],
-    limits: Float,
-    known: Float | None,
-    default: Any,
-    how: str,
-    notes: list[str],
+    what: str, joints: Names, limits: Float, known: Float | None, default: Any, how: str, notes: list[str]
 ) -> Float:
     """Return limits of which missing ones, which are 0, are those of a known arm or a default; a note tells it."""
     missing = limits <= 0.0
@@ -432,7 +427,7 @@ def _completed(
     return np.where(missing, default if known is None else known, limits)
 
 
-def _greatest_weight(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
+def _greatest_weight(model: mujoco.MjModel, joints: Names) -> Float:
     """Return the greatest torques that gravity needs in random configurations, shape (J,)."""
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     dofs = [int(model.joint(name).dofadr[0]) for name in joints]
@@ -462,12 +457,7 @@ def _symmetric_limit(limits: Float) -> float:
 
 
 def _velocities(
-    model: mujoco.MjModel,
-    joints: tuple[str, ...],
-    given: Any,
-    in_urdf: dict[str, float],
-    arm: str,
-    notes: list[str],
+    model: mujoco.MjModel, joints: Names, given: Any, in_urdf: dict[str, float], arm: str, notes: list[str]
 ) -> Float:
     """Return the velocity limit of each joint, shape (J,)."""
     if given is None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
@@ -513,7 +503,7 @@ def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[Pair], notes: l
     return max(drawn, key=apart)
 
 
-def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: list[str]) -> Parsed:
+def _parse(model: mujoco.MjModel, joints: Names, tool: Tool, notes: list[str]) -> Parsed:
     """Return the arm of a model: the bodies that its joints move, and what they stand on."""
     carriers = [int(model.joint(name).bodyid[0]) for name in joints]
     for i in range(1, len(joints)):
@@ -556,9 +546,7 @@ def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: li
     return Parsed(model, rest, copy.copy(rest), joints, carriers, tool, links, names, geoms, pairs)
 
 
-def _note_rest(
-    model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, bodies: list[int], notes: list[str]
-) -> None:
+def _note_rest(model: mujoco.MjModel, joints: Names, tool: Tool, bodies: list[int], notes: list[str]) -> None:
     """Note what the arm does not take from its file: other bodies and joints, planes, and forces such as of springs."""
     collides = (model.geom_contype | model.geom_conaffinity) > 0
     ground = np.isin(model.geom_type, GROUNDS)

@@ -37,18 +37,14 @@ def point_distance_and_normal(
     dy = y - centre[scene, row, 1] - time * velocity[scene, row, 1]
     dz = z - centre[scene, row, 2] - time * velocity[scene, row, 2]
     axes = obstacles.rotation
-    distance, nx, ny, nz = local_distance(
-        obstacles.kind[scene, row],
-        size[scene, row, 0],
-        size[scene, row, 1],
-        size[scene, row, 2],
-        obstacles.meshes,
-        obstacles.clouds,
+    here = (
         axes[scene, row, 0, 0] * dx + axes[scene, row, 1, 0] * dy + axes[scene, row, 2, 0] * dz,
         axes[scene, row, 0, 1] * dx + axes[scene, row, 1, 1] * dy + axes[scene, row, 2, 1] * dz,
         axes[scene, row, 0, 2] * dx + axes[scene, row, 1, 2] * dy + axes[scene, row, 2, 2] * dz,
-        limit,
     )
+    sizes = size[scene, row, 0], size[scene, row, 1], size[scene, row, 2]
+    kind, meshes, clouds = obstacles.kind[scene, row], obstacles.meshes, obstacles.clouds
+    distance, nx, ny, nz = local_distance(kind, sizes, meshes, clouds, here, limit)
     return (
         distance,
         axes[scene, row, 0, 0] * nx + axes[scene, row, 0, 1] * ny + axes[scene, row, 0, 2] * nz,

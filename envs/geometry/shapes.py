@@ -33,6 +33,7 @@ PLAIN_KINDS = tuple(kind for number, kind in enumerate(KINDS) if number not in I
 LEAST_SPACING = 1e-6  # Least edge of the cubes of :meth:`PointCloud.covering`, [m]
 
 Matrix = tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]
+Vector = tuple[float, float, float]  # Three components
 Distance = tuple[float, float, float, float]  # Signed distance, [m], and the components of its gradient
 
 
@@ -99,22 +100,14 @@ def box_distance(a: float, b: float, c: float, x: float, y: float, z: float) -> 
 
 @inlined
 def local_distance(
-    kind: int,
-    a: float,
-    b: float,
-    c: float,
-    meshes: Meshes,
-    clouds: Clouds,
-    x: float,
-    y: float,
-    z: float,
-    limit: float,
+    kind: int, size: Vector, meshes: Meshes, clouds: Clouds, point: Vector, limit: float
 ) -> Distance:
     """Return the signed distance of a point in the frame of a shape, and its gradient.
 
-    The sizes a, b and c are those of :attr:`Shape.packed_size`. Beyond `limit`, any number between it and the distance
-    may be returned, [m].
+    The size is :attr:`Shape.packed_size`. Beyond `limit`, any number between it and the distance may be returned, [m].
     """
+    a, b, c = size
+    x, y, z = point
     if kind == SPHERE:
         found = sphere_distance(a, x, y, z)
     elif kind == CAPSULE:
@@ -137,10 +130,10 @@ def local_distance(
 @kernel
 def _distances(kind: int, size: Float, meshes: Meshes, clouds: Clouds, points: Float, found: Float) -> None:
     """Fill in the signed distances of points, shape (M, 3), in the frame of a shape."""
-    a, b, c = size
+    sizes = size[0], size[1], size[2]
     for i in range(len(points)):
-        x, y, z = points[i]
-        found[i] = local_distance(kind, a, b, c, meshes, clouds, x, y, z, FAR)[0]
+        point = points[i, 0], points[i, 1], points[i, 2]
+        found[i] = local_distance(kind, sizes, meshes, clouds, point, FAR)[0]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
