@@ -11,7 +11,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.kinematics import Chain, link_frames, tool_jacobian, transform
 from viapoint.envs.common.arrays import Bool, Float, frame_matrices
 from viapoint.envs.common.validation import finite_array, unit_quaternion, whole_number
-from viapoint.envs.geometry.compiled import compiled, kernel
+from viapoint.envs.geometry.compiled import compiled, kernel, rotated
 
 ITERATIONS = 80  # Greatest number of iterations from one seed
 # Greatest distance from the target, [m], and greatest angle, [rad], of a solution
@@ -61,25 +61,20 @@ def descend(
     rotation, origin = np.empty((last + 1, 3, 3)), np.empty((last + 1, 3))
     jacobian = np.empty((6, last))
     error = np.zeros(6)
-    tool = np.empty(3)
     square = np.empty((6, 6))
     away = 1e9
     for _ in range(ITERATIONS):
         link_frames(chain, joints, rotation, origin)
         here = transform(rotation, origin, last, chain.tool_origin)
-        tool[0], tool[1], tool[2] = here
         for a in range(3):
             error[a] = position[a] - here[a]
             error[3 + a] = 0.0
         trace = -1.0
         if oriented:
             for column in range(3):
-                x, y, z = 0.0, 0.0, 0.0
-                for k in range(3):
-                    turn = chain.tool_rotation[k, column]
-                    x += rotation[last, 0, k] * turn
-                    y += rotation[last, 1, k] * turn
-                    z += rotation[last, 2, k] * turn
+                turn = chain.tool_rotation
+                axis = turn[0, column], turn[1, column], turn[2, column]
+                x, y, z = rotated(rotation[last], axis)
                 u = axes[0, column]
                 v = axes[1, column]
                 w = axes[2, column]
@@ -99,7 +94,7 @@ def descend(
         elif oriented and angle > 1.0:
             error[3] = 0.5  # half a turn: any axis will do
         scale = min(LONGEST_STEP / away, 1.0)  # the Jacobian holds for small steps
-        tool_jacobian(chain, rotation, origin, tool, jacobian)
+        tool_jacobian(chain, rotation, origin, here, jacobian)
         damping = (DAMPING * min(away, 1.0)) ** 2 + 1e-12
         for i in range(rows):
             error[i] *= scale

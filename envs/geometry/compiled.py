@@ -1,4 +1,4 @@
-"""Decorators of compiled functions."""
+"""Decorators of compiled functions, and rotations of vectors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ import numpy as np
 from numba import njit, types
 from numba.core.caching import IndexDataCacheFile
 
+from viapoint.envs.common.arrays import Float
+
 TINY = 1e-12  # Length below which a vector has no direction, [m]
+Vector = tuple[float, float, float]  # Three components
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 # Arithmetic in another order would be 3 % faster. But the order would depend on which functions the compiler met first,
@@ -51,6 +54,28 @@ def inlined(function: Function) -> Function:
     A call with packed obstacles passes 150 numbers, which takes longer than a distance.
     """
     return cast("Function", njit(inline="always", **KERNEL)(function))
+
+
+@inlined
+def rotated(axes: Float, vector: Vector) -> Vector:
+    """Return a vector of a frame in the world, for the axes of the frame as columns, shape (3, 3)."""
+    x, y, z = vector
+    return (
+        axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z,
+        axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z,
+        axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z,
+    )
+
+
+@inlined
+def rotated_back(axes: Float, vector: Vector) -> Vector:
+    """Return a vector of the world in a frame, for the axes of the frame as columns, shape (3, 3)."""
+    x, y, z = vector
+    return (
+        axes[0, 0] * x + axes[1, 0] * y + axes[2, 0] * z,
+        axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z,
+        axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z,
+    )
 
 
 def _no_clock(kind: int, moment: Any) -> int:

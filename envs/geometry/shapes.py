@@ -19,7 +19,7 @@ from viapoint.envs.common.arrays import Float, frame_matrices, frozen, quaternio
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, unit_quaternion
 from viapoint.envs.geometry.clouds import Clouds, build_cloud, cloud_distance, join_clouds
-from viapoint.envs.geometry.compiled import TINY, inlined, kernel
+from viapoint.envs.geometry.compiled import TINY, Vector, inlined, kernel
 from viapoint.envs.geometry.meshes import FAR, Meshes, build_mesh, convex_hull, join_meshes, mesh_distance
 
 # Kinds of obstacles; the number of a kind is its place in this table
@@ -33,7 +33,6 @@ PLAIN_KINDS = tuple(kind for number, kind in enumerate(KINDS) if number not in I
 LEAST_SPACING = 1e-6  # Least edge of the cubes of :meth:`PointCloud.covering`, [m]
 
 Matrix = tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]
-Vector = tuple[float, float, float]  # Three components
 Distance = tuple[float, float, float, float]  # Signed distance, [m], and the components of its gradient
 
 
