@@ -264,11 +264,9 @@ class ActionLayout:
                 offset = turned(offset, line * np.array([1.0, -1.0]))
             parts.append(offset / self.via_scale)
         total = durations.sum(axis=-1)
-        unit = (
-            self.centre
-            if self.space == "hand"
-            else self.centre * self.shortest(waypoints, durations / total[..., None])
-        )
+        unit: Any = self.centre
+        if self.space != "hand":
+            unit = self.centre * self.shortest(waypoints, durations / total[..., None])
         parts.append((np.log(total / unit) / self.log_half_range)[..., None])
         if self.timing == "learned":
             ratios = np.log(durations[..., 1:] / durations[..., :-1])

@@ -10,7 +10,7 @@ from viapoint.envs.arms.inverse_kinematics import descend, solve_planar
 from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position, transform
 from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, self_clearance
-from viapoint.envs.geometry.compiled import inlined, inner, kernel
+from viapoint.envs.geometry.compiled import inlined, inner, kernel, rotated
 from viapoint.envs.geometry.obstacles import ABSENT
 from viapoint.envs.scenes.scene import NEVER, Scenes, way_since_start
 
@@ -362,9 +362,7 @@ def _tool_axes(approach: Float, cone: float, numbers: Float, axes: Float) -> Non
     angle = 2.0 * np.pi * numbers[1]
     u = sine * np.cos(angle)
     v = sine * np.sin(angle)
-    x = u * axes[0, 0] + v * axes[0, 1] + cosine * axes[0, 2]
-    y = u * axes[1, 0] + v * axes[1, 1] + cosine * axes[1, 2]
-    z = u * axes[2, 0] + v * axes[2, 1] + cosine * axes[2, 2]
+    x, y, z = rotated(axes, (u, v, cosine))
     _fill_frame(x, y, z, axes)
     roll = 0.5 * np.pi * np.floor(4.0 * numbers[2]) + ROLL * (2.0 * numbers[3] - 1.0)
     c, s = np.cos(roll), np.sin(roll)
