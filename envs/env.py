@@ -34,8 +34,8 @@ class ReachEnv(gym.Env[Any, Any]):
 
     metadata = SINGLE_METADATA
 
-    def __init__(self, *, threads: int = 1, **kwargs: Any) -> None:
-        self.batch = ReachVectorEnv(1, threads=threads, **kwargs)
+    def __init__(self, **kwargs: Any) -> None:
+        self.batch = ReachVectorEnv(1, **kwargs)
         """Vector environment with one environment."""
         self.observation_space = self.batch.single_observation_space
         self.action_space = self.batch.single_action_space

@@ -24,8 +24,7 @@ from viapoint.envs.simulator import Simulator
 from viapoint.envs.task import Task
 
 LIMIT_INSTANTS = 64  # Instants at which the limits of a plan are checked
-# Greatest number of times that a plan in motion is prolonged, and the greatest remaining factor
-PROLONGED, ENOUGH = 6, 1.0
+PROLONGED, ENOUGH = 6, 1.0  # Greatest number of prolongations of a plan in motion, and remaining factor
 MOST_PROLONGED = 1.5
 """Greatest factor each time. Longer plans in motion swing out and need more: the factors would grow without bound."""
 
@@ -70,8 +69,7 @@ class Episodes:
         home = np.tile(task.arm.home, (number, 1))
         self.scenes = resting(home, home.copy(), no_obstacles(number, task.observation.n_rows))
         """Scenes of the running episodes."""
-        self.history: list[History] = [[] for _ in range(number)]
-        """Plans of the running episodes."""
+        self.history: list[History] = [[] for _ in range(number)]  # Plans of the running episodes
         self._finished: tuple[Int, Scenes, list[tuple[History, list[Piece]]]] | None = None
         """Rows, scenes and records of the episodes before the running ones; None if they are not kept."""
         self._moving = False
@@ -84,8 +82,7 @@ class Episodes:
         )
         """Plans under way."""
         self._movements = Movements.of(self.plan)
-        self.begun = np.zeros(number, bool)
-        """True where a plan is under way, shape (n,)."""
+        self.begun = np.zeros(number, bool)  # True where a plan is under way, shape (n,)
         self._began = np.zeros(number, np.int64)
         self._motion = Motion.at_rest(self._start)
         self.last_plan: Plan | None = None
@@ -156,22 +153,13 @@ class Episodes:
         """Return the present observations."""
         state, task, time = self.executor.state, self.task, self.time
         goal = self.scenes.goals(time)
+        goals = goal, task.arm.hand(goal)
         nominal = self.nominal if task.replanning else None
-        command = None
-        if task.stepwise:
-            command = self._motion
-        elif nominal is not None:
+        command = self._motion if task.stepwise else None
+        if nominal is not None:
             command = nominal.state
-        return task.observation.observe(
-            state.joints,
-            state.hand,
-            (goal, task.arm.hand(goal)),
-            self.scenes.obstacles_at(time),
-            command,
-            time,
-            nominal,
-            self.looks,
-        )
+        now = state.joints, state.hand, goals, self.scenes.obstacles_at(time)
+        return task.observation.observe(*now, command, time, nominal, self.looks)
 
     def decide(self, actions: Float, active: Bool) -> Decision:
         """Make one decision for actions (n, m) in [-1, 1] and execute it until it ends.
@@ -206,9 +194,7 @@ class Episodes:
         if self.task.whole_movement:
             return Plan.at_rest(waypoints, durations)
         if waypoints.shape != self.plan.waypoints.shape:
-            raise ValueError(
-                f"plan must have waypoints of shape {self.plan.waypoints.shape}, got {waypoints.shape}"
-            )
+            raise ValueError(f"waypoints must have shape {self.plan.waypoints.shape}, got {waypoints.shape}")
         waypoints = np.concatenate((state.position[:, None], waypoints[:, 1:]), axis=1)
         return Plan(waypoints, durations, state.velocity, state.acceleration)
 
@@ -405,23 +391,18 @@ class Episodes:
             ends = self._began * timestep + self.plan.duration
             duration = np.where(self.begun, np.minimum(time, ends), 0.0)
         straight = straight_jerk_cost(self._straight_length(time), np.maximum(duration, timestep))
+        same: dict[str, Any] = {}
+        for name in set(Outcome._fields).intersection(state._fields):
+            same[name] = getattr(state, name).copy()
         return Outcome(
             is_success=arrived & ~touched & state.within & state.reachable & ~state.unstable,
             collision=touched,
             first_contact_time=np.where(touched, state.first_contact * timestep, -1.0),
-            min_clearance=state.min_clearance.copy(),
-            self_clearance=state.self_clearance.copy(),
-            planned_clearance=state.planned_clearance.copy(),
             goal_error=error,
             duration=duration,
-            path_length=state.path_length.copy(),
-            jerk_cost=state.jerk_cost.copy(),
             jerk_ratio=np.maximum(state.jerk_cost / straight, 1.0),
-            peak_speed=state.peak_speed.copy(),
             tracking_error=np.sqrt(state.deviation / np.maximum(state.steps, 1)),
-            reachable=state.reachable.copy(),
-            unstable=state.unstable.copy(),
-            stretch=state.stretch.copy(),
+            **same,
         )
 
     def _straight_length(self, time: Float) -> Float:
@@ -441,16 +422,14 @@ class Episodes:
     # Copies
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the running episodes as arrays, for :meth:`restore`; films of the past are not part."""
+        """Return the state of the running episodes for :meth:`restore`; scenes and films of the past are not part."""
         return {
-            "scenes": as_dict(self.scenes),
             "metrics": as_dict(self.executor.state),
             "plan": as_dict(self.plan),
             "motion": as_dict(self._motion),
             "began": self._began.copy(),
             "begun": self.begun.copy(),
             "physics": self.simulator.batch.state.copy(),
-            "physics_steps": self.simulator.physics_steps,
             "looks": [part.copy() for part in self.looks or ()],
         }
 

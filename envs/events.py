@@ -28,6 +28,7 @@ LOOK = 0.032  # Time from one prediction to the next, [s]
 GLANCE = 0.064  # Time from one glance of the sensor to the next, [s]
 # Something new is seen where this number of points is farther than this from all that are remembered, [m]
 NEW_POINTS, NEW_DISTANCE = 4, 0.04
+Goals = Callable[[Float], Float]  # Function of times, shape (N,), that returns the goals, shape (N, D)
 NEVER = np.iinfo(np.int64).max // 4  # Physics step of an event that does not happen
 
 
@@ -53,8 +54,7 @@ class EventPredictor:
         self.task = task
         self.timestep = task.arm.timestep
         self.triggers = frozenset(() if isinstance(task.decide_at, str) else task.decide_at)
-        self.limit = int(self.steps(task.time_limit))
-        """Greatest number of physics steps of an episode."""
+        self.limit = int(self.steps(task.time_limit))  # Greatest number of physics steps of an episode
 
     def steps(self, time: Any) -> Any:
         """Return the first physics step at or after a time [s], NEVER for a time that is very late."""
@@ -63,13 +63,7 @@ class EventPredictor:
         return np.where(time < 1e8, number, NEVER)
 
     def __call__(
-        self,
-        plan: Plan,
-        began: Int,
-        now: Int,
-        scenes: Scenes,
-        goal: Callable[[Float], Float],
-        looks: Looks | None,
+        self, plan: Plan, began: Int, now: Int, scenes: Scenes, goal: Goals, looks: Looks | None
     ) -> tuple[Int, Int, Bool]:
         """Return the ends of decisions that begin at physics step `now` under plans that began at step `began`.
 
@@ -120,8 +114,7 @@ class EventPredictor:
         every = max(round(LOOK / self.timestep), 1)
         ahead = round(FORESIGHT / LOOK)
         turns = self.steps(scenes.course_times())
-        # Pieces of the episodes in which the obstacles keep their velocity
-        pieces = []
+        pieces = []  # Pieces of the episodes in which the obstacles keep their velocity
         for row in range(len(now)):
             inside = (turns[row] > now[row]) & (turns[row] < latest[row])
             cuts = [now[row], *np.unique(turns[row][inside]), latest[row]]

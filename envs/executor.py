@@ -23,7 +23,7 @@ from viapoint.envs.geometry.clearance import (
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import ABSENT, BOX, CYLINDER, HALF_SPACE, Obstacles
 from viapoint.envs.geometry.shapes import IN_TABLES
-from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Rollout
+from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Rollout, Tolerance
 from viapoint.envs.plans import Motion
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.simulator import MOST_BETWEEN, Simulator
@@ -47,10 +47,8 @@ class Executor:
         self._resumes = not task.whole_movement
         arm, number = simulator.arm, len(simulator.batch.state)
         home, far = np.tile(arm.home, (number, 1)), np.full(number, FAR)
-        self.state = EpisodeState.at_rest(home, arm.hand(home), far, far)
-        """Metrics of the running episodes."""
-        self.past: list[list[Piece]] = [[] for _ in range(number)]
-        """Records of the running episodes."""
+        self.state = EpisodeState.at_rest(home, arm.hand(home), far, far)  # Metrics of the running episodes
+        self.past: list[list[Piece]] = [[] for _ in range(number)]  # Records of the running episodes
         self._placed = memory(arm.chain, arm.spheres)
 
     def begin(self, rows: Int, joints: Float, obstacles: Obstacles) -> None:
@@ -101,35 +99,17 @@ class Executor:
             time = timestep * np.arange(number)[:, None, None]
             centres = obstacles.centre[:, None] + time * obstacles.velocity[:, None]
         joints, contact, unstable = simulator.rollout(rows, controls, steps, centres, resume=self._resumes)
-        body = arm.chain, arm.spheres, arm.reach
+        executed = arm.chain, arm.spheres, arm.reach, joints, contact, steps, obstacles, timestep, placed
         # Contacts between two physics steps
-        for i, k, states in _risky_steps(
-            *body, joints, contact, steps, obstacles, timestep, simulator.thinnest, placed
-        ):
+        for i, k, states in _risky_steps(*executed, simulator.thinnest):
             if not contact[i, : k + 1].any():
                 times = timestep * np.arange(k + 1, k + 3)[:, None, None]
                 places = obstacles.centre[i] + times * obstacles.velocity[i]
                 ends = joints[i, k : k + 2]
                 contact[i, k + 1] = simulator.touches_between(int(rows[i]), ends, places, states)
         begin = self.state.steps[rows]
-        done = _measure(
-            *body,
-            arm.joint_range,
-            self.space.of_hand,
-            joints,
-            contact,
-            motion.position,
-            path,
-            steps,
-            obstacles,
-            timestep,
-            goal,
-            self.tolerance.goal,
-            self.tolerance.speed,
-            self.state,
-            rows,
-            placed,
-        )
+        wanted = motion.position, path, goal, self.tolerance, self.space.of_hand
+        done = _measure(*executed, *wanted, arm.joint_range, self.state, rows)
         for i, row in enumerate(rows):
             end = done[i]
             steps_done = begin[i] + np.arange(1, end + 1)
@@ -177,8 +157,8 @@ def _risky_steps(
     steps: Int,
     obstacles: Obstacles,
     timestep: float,
-    thinnest: float,
     placed: Placed,
+    thinnest: float,
 ) -> list[tuple[int, int, int]]:
     """Return steps in which the arm may have passed through something thin: scene, step, and states to look at.
 
@@ -212,28 +192,27 @@ def _measure(
     chain: Chain,
     spheres: Spheres,
     reach: Float,
-    joint_range: Float,
-    of_hand: bool,
     joints: Float,
     contact: Bool,
-    planned: Float,
-    path: Float,
     steps: Int,
     obstacles: Obstacles,
     timestep: float,
+    placed: Placed,
+    planned: Float,
+    path: Float,
     goal: Float,
-    goal_tolerance: float,
-    rest_speed: float,
+    tolerance: Tolerance,
+    of_hand: bool,
+    joint_range: Float,
     state: EpisodeState,
     rows: Int,
-    placed: Placed,
 ) -> Int:
     """Add executed segments to the metrics of n episodes, and return how many of their steps count, shape (n,).
 
     Joint positions after each step, (n, T, J), and contacts before it, (n, T), are those of the simulation. The
     references, (n, T + 1 or more, D), and the joint positions that belong to them begin before the first step. Each
-    episode has its own number of steps. At rest, the arm is within the tolerance of its goal, shape (n, D), and slower
-    than `rest_speed`; the metrics in `state` are changed at `rows`.
+    episode has its own number of steps. At rest, the arm is slow and near its goal, shape (n, D), as the tolerance
+    tells; the metrics in `state` are changed at `rows`.
     """
     found = np.empty_like(steps)
     bounds = bounds_memory(chain, spheres, False)
@@ -277,7 +256,7 @@ def _measure(
             state.deviation[row] += away
             error = np.sqrt(square) if of_hand else greatest
             speed = moved / timestep if of_hand else rate
-            resting = speed < rest_speed and error < goal_tolerance
+            resting = speed < tolerance.speed and error < tolerance.goal
             state.rest[row] = state.rest[row] + 1 if resting else 0
         state.last_speed[row] = speed
         state.steps[row] = begin + end
@@ -288,10 +267,8 @@ def _measure(
         )
         state.min_clearance[row] = min(state.min_clearance[row], done[0])
         state.self_clearance[row] = min(state.self_clearance[row], done[1])
-        planned_path = path[scene, : steps[scene] + 1]
-        command = movement_clearance(
-            *body, planned_path, obstacles, scene, 0.0, timestep, placed, bounds, 0.0
-        )
+        wanted = path[scene, : steps[scene] + 1]
+        command = movement_clearance(*body, wanted, obstacles, scene, 0.0, timestep, placed, bounds, 0.0)
         state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
         found[scene] = end
     return found

@@ -112,9 +112,7 @@ class Window:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if not glfw.init():
-                raise GLUnavailableError(
-                    "render_mode='human' cannot open a window: the display does not answer"
-                )
+                raise GLUnavailableError("render_mode='human' opens no window: the display does not answer")
             glfw.window_hint(glfw.VISIBLE, 1)
             glfw.window_hint(glfw.SAMPLES, 4)
             self._window = glfw.create_window(width, height, title, None, None)
@@ -124,8 +122,7 @@ class Window:
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         # A thread may have the context of one platform alone, GLFW or EGL.
         self._glfw.make_context_current(None)
-        self.scene = mujoco.MjvScene(model, MAX_GEOMS)
-        """Scene that is shown."""
+        self.scene = mujoco.MjvScene(model, MAX_GEOMS)  # Scene that is shown
 
     def draw(self) -> bool:
         """Show the scene; return False after the window has been closed."""

@@ -35,10 +35,8 @@ class ObservationLayout:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.n_rows = task.n_obstacles[1]
-        """Greatest number of obstacles."""
-        self.row_size = len(task.shapes) + POSE_SIZE
-        """Number of values of one obstacle."""
+        self.n_rows = task.n_obstacles[1]  # Greatest number of obstacles
+        self.row_size = len(task.shapes) + POSE_SIZE  # Number of values of one obstacle
 
     @functools.cached_property
     def bounds(self) -> dict[str, tuple[Float, Float]]:
@@ -102,12 +100,7 @@ class ObservationLayout:
         times since the starts of the episodes, (N,), [s], are needed where decisions are made during a movement, and
         plans of a zero action in tasks with replanning. Without the looks of a sensor so far, a first look is made.
         """
-        parts: dict[str, Any] = {
-            "joints": joints,
-            "hand": hand,
-            "goal": goal[1],
-            "goal_joints": goal[0],
-        }
+        parts: dict[str, Any] = {"joints": joints, "hand": hand, "goal": goal[1], "goal_joints": goal[0]}
         task = self.task
         if task.sensor is not None:
             if looks is None:

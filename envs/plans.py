@@ -1,7 +1,9 @@
-"""Plans: movements as via-points and durations, and the actions that stand for them."""
+"""Plans: movements as via-points and durations, and actions that stand for them or steer the arm."""
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -17,17 +19,17 @@ if TYPE_CHECKING:
 Timing = Literal["optimal", "learned"]
 SpaceName = Literal["hand", "joints"]
 
-# Log ratio of neighbouring segments' durations for an action of 1: a factor of four
-LOG_SPLIT = float(np.log(4.0))
+LOG_SPLIT = float(np.log(4.0))  # Log ratio of neighbouring durations for an action of 1: a factor of four
 MOST_VIAS = 16  # Greatest number of via-points of an action; more add no new movements in practice
 # Bounds of the duration range, [s] in hand space, factors in joint space
 SHORTEST_DURATION, LONGEST_DURATION = 0.05, 60.0
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)  # Nodes and weights of Gauss-Legendre quadrature
-# Largest offsets of via-points along and across the straight line of the hand, [m]
-HAND_OFFSETS = (0.15, 0.25)
+HAND_OFFSETS = (0.15, 0.25)  # Largest offsets of via-points along and across the line of the hand, [m]
 # Largest offset of a joint at a via-point: a share of its range, and a bound, [rad]
 RANGE_SHARE, LARGEST_OFFSET = 0.35, 1.0
 UNLIMITED_SPEED = 4.0  # Speed that counts as the limit of joints without one in durations of actions, [rad/s]
+MAX_START_OFFSET = 1e-3  # Greatest distance of a plan's beginning from the present reference, [m] or [rad]
+QUADRATURE = 12  # Gauss-Legendre nodes for the jerk cost of a control step
 PEAK_INSTANTS = 64  # Instants at which the joint rates of a movement are looked at
 
 
@@ -71,10 +73,7 @@ class Plan(NamedTuple):
     def trajectory(self) -> primitives.Trajectory:
         """Return the minimum-jerk movement through the waypoints."""
         return primitives.through(
-            self.waypoints,
-            self.durations,
-            start_velocity=self.velocity,
-            start_acceleration=self.acceleration,
+            self.waypoints, self.durations, start_velocity=self.velocity, start_acceleration=self.acceleration
         )
 
 
@@ -184,27 +183,20 @@ class ActionLayout:
         self.duration_range = low, high = duration_range
         """Shortest and longest total duration, [s] or relative; an action of 0 is their geometric mean."""
         in_hand = space == "hand"
-        self.names_of_axes = ("along", "across") if in_hand else arm.joint_names
-        """Names of the D components of an offset."""
-        self.dimension = len(self.names_of_axes)
-        """Dimension D of the space."""
+        self.names_of_axes = ("along", "across") if in_hand else arm.joint_names  # Names of the D components
+        self.dimension = len(self.names_of_axes)  # Dimension D of the space
         width = arm.joint_range[:, 1] - arm.joint_range[:, 0]
         offsets = np.minimum(RANGE_SHARE * width, LARGEST_OFFSET)
         self.via_scale = np.array(HAND_OFFSETS) if in_hand else offsets
         """Largest offset of each component, shape (D,), [m] or [rad]."""
         limited = np.isfinite(arm.velocity_limit)
-        self.rate_limit = np.where(limited, arm.velocity_limit, UNLIMITED_SPEED)
-        """Velocity limits of the joints, [rad/s]."""
-        self.centre = float((low * high) ** 0.5)
-        """Duration of the zero action, [s] in hand space, relative in joint space."""
-        self.log_half_range = float(0.5 * np.log(high / low))
-        """Logarithm of the factor on the duration for an action of 1."""
+        self.rate_limit = np.where(limited, arm.velocity_limit, UNLIMITED_SPEED)  # Velocity limits, [rad/s]
+        self.centre = float((low * high) ** 0.5)  # Duration of the zero action, [s], in joint space relative
+        self.log_half_range = float(0.5 * np.log(high / low))  # Log factor on the duration for an action of 1
         vias = [f"via_{k}_{axis}" for k in range(1, n_via + 1) for axis in self.names_of_axes]
         splits = [f"split_{k}" for k in range(1, n_via + 1)] if timing == "learned" else []
-        self.names = (*vias, "duration", *splits)
-        """Names of the components, in order."""
-        self.size = len(self.names)
-        """Number of components m."""
+        self.names = (*vias, "duration", *splits)  # Names of the components, in order
+        self.size = len(self.names)  # Number of components m
         straight = np.linspace(0.0, 1.0, n_via + 2)[:, None]
         self._straight_split = np.diff(np.log(primitives.passage_durations(straight, np.asarray(1.0))))
         """Log ratios of neighbouring segments' durations on the straight movement with evenly spaced vias."""
@@ -272,11 +264,9 @@ class ActionLayout:
                 offset = turned(offset, line * np.array([1.0, -1.0]))
             parts.append(offset / self.via_scale)
         total = durations.sum(axis=-1)
-        unit = (
-            self.centre
-            if self.space == "hand"
-            else self.centre * self.shortest(waypoints, durations / total[..., None])
-        )
+        unit: Any = self.centre
+        if self.space != "hand":
+            unit = self.centre * self.shortest(waypoints, durations / total[..., None])
         parts.append((np.log(total / unit) / self.log_half_range)[..., None])
         if self.timing == "learned":
             ratios = np.log(durations[..., 1:] / durations[..., :-1])
@@ -308,4 +298,78 @@ def turned(offset: Float, line: Float) -> Float:
     return np.stack((u * x - v * y, u * y + v * x), axis=-1)
 
 
-MAX_START_OFFSET = 1e-3  # Greatest distance of a plan's beginning from the present reference, [m] or [rad]
+@dataclass(frozen=True, kw_only=True)
+class Steering:
+    """Layout of the actions of control steps, and the filter that turns them into references.
+
+    An action is the wanted velocity as a fraction of `top_speed`: of the hand along and across the line from start to
+    goal, or of the joints. The zero action brings the arm to rest. A critically damped filter of the second order makes
+    a smooth reference of the velocity u, so that its jerk is finite:
+
+        v'' = w^2 (u - v) - 2 w v'
+
+    With u held over a control step the solution is known: one step of N references is a few multiplications.
+    """
+
+    space: SpaceName
+    names: tuple[str, ...]  # Names of the components, in order
+    top_speed: tuple[float, ...]  # Velocity that an action of 1 stands for, [m/s] or [rad/s]
+    bandwidth: float  # Bandwidth w of the filter, [rad/s]
+    physics_steps: int  # Physics steps S of a control step
+    timestep: float  # Length of a physics step, [s]
+
+    @property
+    def greatest_acceleration(self) -> float:
+        """Bound of the acceleration of a component, [m/s^2] or [rad/s^2].
+
+        The filter's response to a short push never changes sign, so no component exceeds its top speed; that of its
+        rate is up to w / e twice.
+        """
+        return float(2.0 * np.sqrt(2.0) * max(self.top_speed) * self.bandwidth / np.e)
+
+    def decode(self, action: Float, start: Float, goal: Float) -> Float:
+        """Return the velocity of an action, shape (N, D), [m/s] or [rad/s]."""
+        wanted = action * np.array(self.top_speed)
+        return turned(wanted, goal - start) if self.space == "hand" else wanted
+
+    def follow(self, motion: Motion, wanted: Float, number: int) -> Motion:
+        """Return references now and after each of T physics steps, shape (N, T + 1, D) each."""
+        tables = self._tables(number)
+        return Motion(*(_combined(table, motion, wanted) for table in tables))
+
+    def jerk_cost(self, motion: Motion, wanted: Float) -> Float:
+        """Return half the integral of the squared jerk over one control step, exact, shape (N,)."""
+        nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE)
+        half = 0.5 * (self.physics_steps * self.timestep)
+        time = half * (nodes + 1.0)
+        w, decay = self.bandwidth, np.exp(-self.bandwidth * time)
+        of_velocity = -(w**2) * (1.0 - w * time) * decay
+        of_acceleration = (w * time - 2.0) * w * decay
+        table = np.stack((0.0 * time, of_velocity, of_acceleration, -of_velocity), axis=-1)
+        jerk = _combined(table, motion, wanted)
+        each = (jerk * jerk).sum(axis=-1)
+        cost = np.zeros(len(each))
+        for k, weight in enumerate(half * weights):  # one after the other: the same bits in any batch
+            cost += 0.5 * weight * each[:, k]
+        return cost
+
+    @functools.cache  # noqa: B019 - records of tasks live as long as the process
+    def _tables(self, number: int) -> tuple[Float, Float, Float]:
+        """Matrices from (p, v, a, u) at the beginning to position, velocity and acceleration, (T + 1, 4) each."""
+        time = self.timestep * np.arange(number + 1)
+        w, decay = self.bandwidth, np.exp(-self.bandwidth * time)
+        one, zero = np.ones_like(time), np.zeros_like(time)
+        fast = (1.0 - decay * (1.0 + w * time)) / w**2
+        slow = (1.0 - decay) / w + w * fast
+        position = (one, slow, fast, time - slow)
+        velocity = (zero, (1.0 + w * time) * decay, time * decay, 1.0 - (1.0 + w * time) * decay)
+        rate = (zero, -(w**2) * time * decay, (1.0 - w * time) * decay, w**2 * time * decay)
+        return np.stack(position, axis=-1), np.stack(velocity, axis=-1), np.stack(rate, axis=-1)
+
+
+def _combined(table: Float, motion: Motion, wanted: Float) -> Float:
+    """Return the product of a matrix with position, velocity, acceleration and wanted velocity, (N, rows, D)."""
+    total = table[:, 0, None] * motion.position[:, None]
+    for k, part in enumerate((motion.velocity, motion.acceleration, wanted)):
+        total = total + table[:, k + 1, None] * part[:, None]
+    return np.asarray(total)

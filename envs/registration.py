@@ -8,8 +8,7 @@ import gymnasium as gym
 
 from viapoint.envs.common.validation import did_you_mean
 
-# Events that end a decision in the tasks with replanning
-EVENTS = ("horizon", "target", "course", "clearance")
+EVENTS = ("horizon", "target", "course", "clearance")  # Events that end a decision with replanning
 # Keyword arguments that turn a task of whole movements into one of control steps
 STEPWISE: dict[str, Any] = {"decide_at": "steps", "reward_weights": {"progress": 1.0}}
 PANDA_OBSTACLES: dict[str, Any] = {"arm": "panda", "n_obstacles": (1, 16)}

@@ -22,11 +22,11 @@ from viapoint.envs.task import Task
 RENDER_MODES = ["human", "rgb_array", "rgb_array_list"]  # Values of `render_mode` besides None
 STILL_SUPERSAMPLING = 2  # Supersampling of single pictures; frames of films have none, because it takes time
 POINTS = 60  # Points along a planned path
-Geom = Any  # Decorative geom of a scene
+Geom = mujoco.mjtGeom
 MATT, GLOWING = 0.0, 1.0  # Emission relative to the colour: lines glow, bodies are lit
 CAMERA = "view"
 # Types of geoms that have a smaller copy inside
-SOLID = tuple(getattr(mujoco.mjtGeom, f"mjGEOM_{name}") for name in ("SPHERE", "CAPSULE", "CYLINDER", "BOX"))
+SOLID = (Geom.mjGEOM_SPHERE, Geom.mjGEOM_CAPSULE, Geom.mjGEOM_CYLINDER, Geom.mjGEOM_BOX)
 # Radii of the planned, the executed and a replaced path, [m]; the planned one shows as a rim of the executed
 PLAN, DONE, REPLACED = 0.0065, 0.0030, 0.0045
 SPACING = 0.02  # Distance of the points of a drawn path, [m]
@@ -207,22 +207,22 @@ class SceneView:
         self._pose(picture)
         self._draw_ends(picture)
         for path in picture.replaced:
-            add_line(self.scene, self._lowered(path), REPLACED, FADED)
+            self._add_line(self._lowered(path), REPLACED, FADED)
         if len(picture.planned):
-            add_line(self.scene, self._lowered(picture.planned), PLAN, PALETTE.plan)
+            self._add_line(self._lowered(picture.planned), PLAN, PALETTE.plan)
         for via in self._lowered(picture.vias):
-            add_ball(self.scene, via, 0.011, PALETTE.via, GLOWING)
+            self._add_ball(via, 0.011, PALETTE.via)
         seen = picture.seen[:: -(-len(picture.seen) // MOST_SEEN) or 1].copy()
         if self._flat and len(seen):  # on top of the obstacles, whose sides the camera hardly sees
             centre, half = bounding_boxes(picture.obstacles)
             seen[:, 2] = (centre + half)[0, picture.obstacles.present[0], 2].max()
         for point in seen:
-            add_ball(self.scene, point, SEEN if self._flat else 2.0 * SEEN, PALETTE.seen, GLOWING)
+            self._add_ball(point, SEEN if self._flat else 2.0 * SEEN, PALETTE.seen)
         free = picture.touched
         done = self._lowered(picture.done)
         for part, colour in ((done[: free + 1], PALETTE.executed), (done[free:], PALETTE.contact)):
             if len(part) > 1:
-                add_line(self.scene, part + np.array([0.0, 0.0, PLAN]), DONE, colour)
+                self._add_line(part + np.array([0.0, 0.0, PLAN]), DONE, colour)
 
     def _pose(self, picture: Picture) -> None:
         """Start the scene with the arm in a configuration among the obstacles; geoms in contact are red."""
@@ -234,16 +234,14 @@ class SceneView:
         mujoco.mj_camlight(model, data)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self.scene)
-        self.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = (
-            True  # the floor of arms in space fades into the background
-        )
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True  # the floor in space fades away
         table = model.geom("table").id
         for geom in self._shown({table}):
             geom.castshadow = False  # there is nothing below it, and its own surface would be speckled
         for geom in self.scene.geoms[: self.scene.ngeom]:
-            if geom.type == mujoco.mjtGeom.mjGEOM_PLANE and geom.objid != table:
+            if geom.type == Geom.mjGEOM_PLANE and geom.objid != table:
                 # MuJoCo draws the planes that the model was compiled with, and others as something else.
-                geom.type, geom.dataid, geom.size = mujoco.mjtGeom.mjGEOM_BOX, -1, HALF_SPACE_BOARD
+                geom.type, geom.dataid, geom.size = Geom.mjGEOM_BOX, -1, HALF_SPACE_BOARD
                 geom.pos = geom.pos - BELOW_SURFACE * geom.mat[:, 2]
                 geom.rgba[3], geom.transparent = GLASSY, True
                 geom.castshadow = False
@@ -261,11 +259,10 @@ class SceneView:
         """Add smaller bodies, inside those that are shown, which cast the shadows in their place."""
         for geom in self.scene.geoms[: self.scene.ngeom]:
             if geom.castshadow and geom.type in SOLID:
-                inner = _new_geom(self.scene, geom.type, (1.0,) * 3, geom.pos, PALETTE.joint, MATT)
-                if inner is not None:
-                    inner.mat = geom.mat
-                    inner.size = np.maximum(geom.size - SHADOW_DEPTH, 0.2 * geom.size)
-                    geom.castshadow = False
+                inner = self._add(geom.type, (1.0,) * 3, geom.pos, PALETTE.joint, MATT)
+                inner.mat = geom.mat
+                inner.size = np.maximum(geom.size - SHADOW_DEPTH, 0.2 * geom.size)
+                geom.castshadow = False
 
     def _shown(self, numbers: set[int]) -> list[Any]:
         """Return the scene's geoms that show some geoms of the model."""
@@ -284,60 +281,43 @@ class SceneView:
         """Draw start and goal."""
         start, goal = (self._lowered(end) for end in picture.ends)
         if not self._flat:
-            add_ball(self.scene, goal, 0.018, PALETTE.goal, GLOWING)
-            add_ball(self.scene, start, 0.010, PALETTE.start, GLOWING)
+            self._add_ball(goal, 0.018, PALETTE.goal)
+            self._add_ball(start, 0.010, PALETTE.start)
             return
         rings = (start, 0.021, 0.017, PALETTE.start), (goal, 0.031, 0.026, PALETTE.goal)
         for centre, radius, inner, colour in rings:  # two discs are far cheaper than a tube
-            add_disc(self.scene, centre, radius, 0.001, colour, GLOWING)
-            add_disc(self.scene, centre, inner, 0.002, PALETTE.table)
-        add_disc(self.scene, goal, 0.018, 0.003, PALETTE.goal, GLOWING)
+            self._add_disc(centre, radius, 0.001, colour, GLOWING)
+            self._add_disc(centre, inner, 0.002, PALETTE.table)
+        self._add_disc(goal, 0.018, 0.003, PALETTE.goal, GLOWING)
 
+    def _add_ball(self, centre: Float, radius: float, colour: Colour) -> None:
+        """Add a sphere at `centre`, shape (3,), [m], without a shadow."""
+        self._add(Geom.mjGEOM_SPHERE, (radius,) * 3, centre, colour, GLOWING).castshadow = False
 
-def add_ball(
-    scene: mujoco.MjvScene, centre: Float, radius: float, colour: Colour, glow: float = MATT
-) -> None:
-    """Add a sphere at `centre` (3,) [m] to a scene, without a shadow."""
-    geom = _new_geom(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (radius,) * 3, centre, colour, glow)
-    if geom is not None:
-        geom.castshadow = False
+    def _add_disc(
+        self, centre: Float, radius: float, height: float, colour: Colour, glow: float = MATT
+    ) -> None:
+        """Add a flat cylinder that stands on `centre`, shape (3,), [m]."""
+        middle = centre + np.array([0.0, 0.0, height / 2.0])
+        self._add(Geom.mjGEOM_CYLINDER, (radius, height / 2.0, 0.0), middle, colour, glow)
 
-
-def add_disc(
-    scene: mujoco.MjvScene, centre: Float, radius: float, height: float, colour: Colour, glow: float = MATT
-) -> None:
-    """Add a flat cylinder that stands on `centre` (3,) [m] to a scene."""
-    middle = np.array([*centre[:2], centre[2] + height / 2.0])
-    size = radius, height / 2.0, 0.0
-    _new_geom(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, middle, colour, glow)
-
-
-def add_line(scene: mujoco.MjvScene, points: Float, radius: float, colour: Colour) -> None:
-    """Add a tube along a polyline, shape (n, 3), [m], to a scene, without a shadow."""
-    for first, second in itertools.pairwise(_resampled(points, SPACING)):
-        geom = _new_geom(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, (radius,) * 3, first, colour, GLOWING)
-        if geom is not None:
-            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, radius, first, second)
+    def _add_line(self, points: Float, radius: float, colour: Colour) -> None:
+        """Add a tube along a polyline, shape (n, 3), [m], without a shadow."""
+        length = np.concatenate(([0.0], np.cumsum(norm(np.diff(points, axis=0)))))
+        count = max(int(np.ceil(length[-1] / SPACING)), 1) + 1
+        places = np.linspace(0.0, length[-1], count)
+        even = np.stack([np.interp(places, length, column) for column in points.T], axis=-1)
+        for first, second in itertools.pairwise(even):
+            geom = self._add(Geom.mjGEOM_CAPSULE, (radius,) * 3, first, colour, GLOWING)
+            mujoco.mjv_connector(geom, Geom.mjGEOM_CAPSULE, radius, first, second)
             geom.castshadow = False
 
-
-def _new_geom(
-    scene: mujoco.MjvScene, kind: int, size: tuple[float, ...], centre: Float, colour: Colour, glow: float
-) -> Geom | None:
-    """Add a MuJoCo geom of a size [m] at `centre` (3,) [m]; None where the scene has no room for it."""
-    if scene.ngeom >= scene.maxgeom:
-        return None
-    geom = scene.geoms[scene.ngeom]
-    lit = np.array((*(c / (1.0 + glow) for c in colour), 1.0), dtype=np.float32)
-    mujoco.mjv_initGeom(geom, kind, np.array(size), centre, np.eye(3).flatten(), lit)
-    geom.emission, geom.specular, geom.shininess = glow, 0.15, 0.3
-    scene.ngeom += 1
-    return geom
-
-
-def _resampled(points: Float, spacing: float) -> Float:
-    """Return points about `spacing` [m] apart along a polyline through `points` (n, 3) [m], with both ends."""
-    length = np.concatenate(([0.0], np.cumsum(norm(np.diff(points, axis=0)))))
-    count = max(int(np.ceil(length[-1] / spacing)), 1) + 1
-    places = np.linspace(0.0, length[-1], count)
-    return np.stack([np.interp(places, length, column) for column in points.T], axis=-1)
+    def _add(self, kind: int, size: Any, centre: Float, colour: Colour, glow: float) -> Any:
+        """Add a MuJoCo geom of a size, [m], and return it; where the scene is full, one that is not shown."""
+        scene = self.scene
+        geom = scene.geoms[scene.ngeom] if scene.ngeom < scene.maxgeom else mujoco.MjvGeom()
+        lit = np.array((*(c / (1.0 + glow) for c in colour), 1.0), dtype=np.float32)
+        mujoco.mjv_initGeom(geom, kind, np.array(size), centre, np.eye(3).flatten(), lit)
+        geom.emission, geom.specular, geom.shininess = glow, 0.15, 0.3
+        scene.ngeom = min(scene.ngeom + 1, scene.maxgeom)
+        return geom

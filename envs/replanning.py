@@ -56,8 +56,7 @@ def nominal_plan(
     anew = primitives.point_to_point(
         state.position, goal, whole, start_velocity=state.velocity, start_acceleration=state.acceleration
     )(whole[:, None] * shares)
-    # A target that moves a little changes the rest of the plan a little.
-    share = np.minimum(distance / nearby, 1.0)
+    share = np.minimum(distance / nearby, 1.0)  # a small move changes the rest of the plan a little
     mixed = rest + share[:, None, None] * (anew - rest)
     vias = np.where(begun[:, None, None], mixed, straight)
     left = np.maximum(plan.duration - time, 0.0)

@@ -23,14 +23,10 @@ class Simulator:
 
     def __init__(self, arm: Arm, *, n_obstacles: int, num_envs: int, meshes: Sequence[str] = ()) -> None:
         self.arm = arm
-        self.model = arm.compile(n_obstacles, meshes)
-        """MuJoCo model."""
-        self.timestep = float(self.model.opt.timestep)
-        """Length of a physics step, [s]."""
-        self.physics_steps = 0
-        """Physics steps simulated so far, all simulations together."""
-        self.batch = batch.Batch(self.model, num_envs, 1)
-        """MuJoCo's batch engine; row i of its state is simulation i."""
+        self.model = arm.compile(n_obstacles, meshes)  # MuJoCo model
+        self.timestep = float(self.model.opt.timestep)  # Length of a physics step, [s]
+        self.physics_steps = 0  # Physics steps simulated so far, all simulations together
+        self.batch = batch.Batch(self.model, num_envs, 1)  # MuJoCo's engine; row i is simulation i
         self.thinnest = _thinnest_geom(self.model)
         """Half the thickness of the thinnest geom of the arm that can touch an obstacle, [m]."""
         self._rest = self.batch.state[0].copy()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
@@ -15,22 +13,15 @@ from viapoint.envs.plans import Motion, SpaceName
 REACH_TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True)
 class Space:
     """Space in which a movement is a minimum-jerk trajectory: by default that of the joints; coordinates (..., D)."""
 
-    arm: Arm
     name: SpaceName = "joints"
+    of_hand = False  # True for the plane of the hand
 
-    @property
-    def of_hand(self) -> bool:
-        """True for the plane of the hand."""
-        return self.name == "hand"
-
-    @property
-    def dimension(self) -> int:
-        """Number of coordinates D."""
-        return 2 if self.of_hand else len(self.arm.joint_names)
+    def __init__(self, arm: Arm) -> None:
+        self.arm = arm
+        self.dimension = 2 if self.of_hand else len(arm.joint_names)  # Number of coordinates D
 
     def coordinates(self, joints: Float) -> Float:
         """Return joint positions as they are."""
@@ -51,11 +42,11 @@ class Space:
         return np.asarray(within.all(axis=-1))
 
 
-@dataclass(frozen=True)
 class HandPlane(Space):
     """Horizontal plane of the hand of an arm of two hinges with vertical axes; coordinates are x and y."""
 
     name: SpaceName = "hand"
+    of_hand = True
 
     def coordinates(self, joints: Float) -> Float:
         """Return the hand's x and y, [m]."""

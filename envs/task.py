@@ -30,6 +30,7 @@ from viapoint.envs.plans import (
     SHORTEST_DURATION,
     ActionLayout,
     SpaceName,
+    Steering,
     Timing,
 )
 from viapoint.envs.rewards import RewardWeights
@@ -38,13 +39,11 @@ from viapoint.envs.scenes.sampler import MOST_DRAWN, SceneSampler, farthest_reac
 from viapoint.envs.scenes.scene import MOST_JUMPS
 from viapoint.envs.sensors import Sensor, named_sensor
 from viapoint.envs.spaces import Space, space_of
-from viapoint.envs.steering import Steering
 
 Trigger = Literal["horizon", "target", "course", "clearance", "sight"]
 TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)  # Events that may end a decision before the goal
 COURSES = ("turns", "reaches")  # Courses of obstacles that move; the first is the default
-# Values of `decide_at` with one decision for a movement, and with one in every control step
-END, STEPS = "end", "steps"
+END, STEPS = "end", "steps"  # `decide_at` with one decision, and with one in every control step
 MOST_OBSTACLES = 256  # Greatest number of obstacles in a scene that is given
 PLANE_SHAPES = ("cylinder", "box")  # Default shapes of obstacles in the plane
 SPACE_SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")  # Default shapes of obstacles in space
@@ -179,9 +178,7 @@ class Task:
         if not task.whole_movement and timing != "optimal":
             raise ValueError(f"timing must be optimal where plans are revised or steered, got {timing!r}")
         if task.whole_movement and (task.moving_obstacles or task.n_jumps[1]):
-            raise ValueError(
-                "obstacles that move and targets that jump need decide_at with events of a movement"
-            )
+            raise ValueError("obstacles that move and targets that jump need decide_at with events")
         if task.stepwise:
             task.steering  # noqa: B018 - making it checks the control step
         return task
@@ -223,9 +220,7 @@ class Task:
         timestep = self.arm.timestep
         number = round(self.control_step / timestep)
         if abs(number * timestep - self.control_step) > 1e-6 * self.control_step or number > 500:
-            raise ValueError(
-                f"control_step must be 1 to 500 physics steps of {timestep} s, got {self.control_step!r}"
-            )
+            raise ValueError(f"control_step must be 1 to 500 times {timestep} s, got {self.control_step!r}")
         speeds = JOINT_SPEED_SHARE * np.minimum(self.arm.velocity_limit, 10.0)
         return Steering(
             space=self.space_name,

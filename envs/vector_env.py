@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.common.arrays import Bool, Float, Int, Observation, from_dict
+from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict
 from viapoint.envs.common.validation import finite_array, masked_rows, seeds_of, whole_number
 from viapoint.envs.episodes import Decision, Episodes, History
 from viapoint.envs.geometry.obstacles import geom_meshes
@@ -99,17 +99,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         for name, value in task.items():
             if isinstance(value, Mapping | list):  # the caller may change it later
                 task[name] = copy.copy(value)
-        EzPickle.__init__(
-            self,
-            num_envs,
-            autoreset_mode=autoreset_mode,
-            render_mode=render_mode,
-            width=width,
-            height=height,
-            threads=threads,
-            max_episode_steps=max_episode_steps,
-            **task,
-        )
+        pictures = {"render_mode": render_mode, "width": width, "height": height}
+        ends = {"autoreset_mode": autoreset_mode, "max_episode_steps": max_episode_steps}
+        EzPickle.__init__(self, num_envs, threads=threads, **pictures, **ends, **task)
         self.task = Task.of(**task)
         """Task of an episode: what an agent may compute with before it moves."""
         self.num_envs = whole_number("num_envs", num_envs, 1)
@@ -127,11 +119,10 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         n_threads = max(min(n_threads, self.num_envs // LEAST_SHARE), 1)
         self._shares = np.array_split(np.arange(self.num_envs), n_threads)
         self._episodes = [Episodes(self.task, len(share)) for share in self._shares]
-        self._renderers = [
-            EpisodeRenderer(episodes, row, render_mode, width, height, SINGLE_METADATA["render_fps"])
-            for episodes in self._episodes
-            for row in range(len(episodes.begun))
-        ]
+        # Running episodes of each environment, and their row
+        self._rows = [(each, row) for each in self._episodes for row in range(len(each.begun))]
+        look = render_mode, width, height, SINGLE_METADATA["render_fps"]
+        self._renderers = [EpisodeRenderer(each, row, *look) for each, row in self._rows]
         self._pool: ThreadPoolExecutor | None = None
         self._process = os.getpid()  # of the pool, whose threads do not survive a fork
         self.generators: list[np.random.Generator] = []
@@ -178,7 +169,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """Last movements at every physics step, one for each environment; empty before the first reset."""
         if not self._running:
             return ()
-        return tuple(each.recorded(row).rollout for each in self._episodes for row in range(len(each.begun)))
+        return tuple(each.recorded(row).rollout for each, row in self._rows)
 
     @property
     def last_plan(self) -> Plan | None:
@@ -191,7 +182,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     @property
     def last_plans(self) -> tuple[History, ...]:
         """All plans of the running episodes with the times at which they began, [s]."""
-        return tuple(list(history) for each in self._episodes for history in each.history)
+        return tuple(list(each.history[row]) for each, row in self._rows)
 
     # Episodes
 
@@ -304,9 +295,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """
         self._check_running()
         if self.task.stepwise:
-            raise TypeError(
-                "here an action steers the arm for one control step; plans need another decide_at"
-            )
+            raise TypeError("an action steers the arm for one control step; plans need another decide_at")
         number, dimension = self.num_envs, self.task.space.dimension
         waypoints = finite_array("waypoints of the plan", plan.waypoints, (number, None, dimension))
         durations = finite_array("durations of the plan", plan.durations, (number, waypoints.shape[1] - 1))
@@ -365,7 +354,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self._check_running()
         return {
             "generators": [generator.bit_generator.state for generator in self.generators],
-            "episodes": [each.state() for each in self._episodes],
+            "scenes": as_dict(self.scenes),
+            "episodes": _together([each.state() for each in self._episodes]),
+            "physics_steps": self.physics_steps,
             "over": self._over.copy(),
             "decisions": self._decisions.copy(),
             "ended": np.stack((self.terminated, self.truncated)),
@@ -378,15 +369,11 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             self._np_random = self.generators[0]
         for generator, place in zip(self.generators, state["generators"], strict=True):
             generator.bit_generator.state = place
-        parts = [dict(part) for part in state["episodes"]]
-        like = self._episodes[0].scenes
-        scenes = Scenes.together([from_dict(like, part.pop("scenes")) for part in parts])
-        steps = [int(part.pop("physics_steps")) for part in parts]
-        every = _together(parts)
+        scenes = from_dict(self._episodes[0].scenes, state["scenes"])
         for each, share in zip(self._episodes, self._shares, strict=True):
-            each.restore(_taken(every, share), scenes.take(share))
+            each.restore(_taken(state["episodes"], share), scenes.take(share))
             each.simulator.physics_steps = 0
-        self._episodes[0].simulator.physics_steps = sum(steps)
+        self._episodes[0].simulator.physics_steps = int(state["physics_steps"])
         self._over[:] = state["over"]
         self._decisions[:] = state["decisions"]
         self.terminated, self.truncated = np.array(state["ended"])

@@ -225,28 +225,20 @@ def asset(file: str) -> str:
 
 @compiled
 def _controls(
-    chain: Chain,
-    stiffness: Float,
-    damping: Float,
-    stride: int,
-    position: Float,
-    velocity: Float,
-    acceleration: Float,
+    chain: Chain, stiffness: Float, damping: Float, stride: int, q: Float, v: Float, a: Float
 ) -> Float:
     """Return controls, see :meth:`Arm.controls`."""
-    number, steps, joints = position.shape
-    out = np.empty(position.shape)
+    number, steps, joints = q.shape
+    out = np.empty(q.shape)
     before = np.empty(joints)
     after = np.empty(joints)
     for i in range(number):
         for first in range(0, steps, stride):
             if first == 0:
-                inverse_dynamics(chain, position[i, 0], velocity[i, 0], acceleration[i, 0], before)
+                inverse_dynamics(chain, q[i, 0], v[i, 0], a[i, 0], before)
             following = first + stride
             if following < steps:
-                inverse_dynamics(
-                    chain, position[i, following], velocity[i, following], acceleration[i, following], after
-                )
+                inverse_dynamics(chain, q[i, following], v[i, following], a[i, following], after)
             else:
                 for j in range(joints):  # assigned as arrays, Numba would compile messages about shapes
                     after[j] = before[j]
@@ -254,7 +246,7 @@ def _controls(
                 share = (k - first) / stride
                 for j in range(joints):
                     torque = before[j] + share * (after[j] - before[j])
-                    servo = stiffness[j] * position[i, k, j] + damping[j] * velocity[i, k, j]
+                    servo = stiffness[j] * q[i, k, j] + damping[j] * v[i, k, j]
                     out[i, k, j] = torque + servo
             for j in range(joints):
                 before[j] = after[j]
@@ -341,9 +333,7 @@ def _capsules(
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:
             half = 0.0
         elif model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_CAPSULE:
-            raise ValueError(
-                f"collision geoms must be capsules or spheres, geom {model.geom(geom).name!r} is none"
-            )
+            raise ValueError(f"collision geoms must be capsules or spheres, not {model.geom(geom).name!r}")
         axis = half * data.geom_xmat[geom].reshape(3, 3)[:, 2]
         turn, place = frames[links[name]]
         centre = data.geom_xpos[geom] - place

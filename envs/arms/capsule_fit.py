@@ -28,8 +28,7 @@ ROUNDING = 1e-6  # Added to the radius, so that rounding leaves nothing outside,
 SHORTEST = 1e-3  # Length of the axis below which a capsule becomes a sphere, [m]
 # Corners of each ring of the polytope around an ellipsoid, and half of those of the prism around a cylinder
 RIM_POINTS = 24
-# Places of the planes that cut a body, as shares of its length along a principal axis
-CUTS = (0.35, 0.5, 0.65)
+CUTS = (0.35, 0.5, 0.65)  # Planes that cut a body, as shares of its length along a principal axis
 LEAST_SHARE = 0.3  # Least length along an axis across which a body is cut, as a share of the greatest
 # First and last step of the search for the ends, and last one where cuts are compared, as shares of the size
 FIRST_STEP, LAST_STEP, COARSE_STEP = 0.25, 5e-4, 0.05
@@ -64,10 +63,17 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
         corners, radius, larger = hull_of(model, geom)
         if radius > 0.0:
             return [FittedCapsule(corners, radius, 0.0, np.empty((0, 3)), geom)]
-        found = _cover_points(corners, tolerance - larger, SMALL - larger)
+        body = ConvexMesh.hull(corners)
+        found = [_fit_capsule(np.asarray(body.vertices), body)]
+        while True:
+            worst = max(range(len(found)), key=lambda index: found[index].excess)
+            excess = found[worst].excess
+            most = MOST_SMALL if excess <= SMALL - larger else MOST_CAPSULES
+            if excess <= tolerance - larger or len(found) >= most:
+                return [each._replace(excess=each.excess + larger, geom=geom) for each in found]
+            found += _best_halves(found.pop(worst).corners, body, tolerance - larger)
     except ValueError as error:
         raise ValueError(f"geom {model.geom(geom).name or geom}: {error}") from None
-    return [each._replace(excess=each.excess + larger, geom=geom) for each in found]
 
 
 def split(model: mujoco.MjModel, capsule: FittedCapsule) -> list[FittedCapsule]:
@@ -122,22 +128,6 @@ def _rim(number: int) -> Float:
     angle = 2.0 * np.pi * np.arange(number) / number
     wide = 1.0 / np.cos(np.pi / number)
     return np.stack((wide * np.cos(angle), wide * np.sin(angle), 0.0 * angle), axis=-1)
-
-
-def _cover_points(points: Float, tolerance: float, small: float) -> list[FittedCapsule]:
-    """Return capsules and spheres that together contain the convex hull of points, shape (n, 3), [m].
-
-    Their excess is at most the tolerance, if MOST_CAPSULES suffice for that; below `small` MOST_SMALL are enough.
-    """
-    body = ConvexMesh.hull(points)
-    found = [_fit_capsule(np.asarray(body.vertices), body)]
-    while True:
-        worst = max(range(len(found)), key=lambda index: found[index].excess)
-        excess = found[worst].excess
-        most = MOST_SMALL if excess <= small else MOST_CAPSULES
-        if excess <= tolerance or len(found) >= most:
-            return found
-        found += _best_halves(found.pop(worst).corners, body, tolerance)
 
 
 def _fit_capsule(corners: Float, body: ConvexMesh, last_step: float = LAST_STEP) -> FittedCapsule:

@@ -15,10 +15,8 @@ from viapoint.envs.arms.urdf import WARNING
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.validation import finite_array
 
-# Types of joints that an arm may have
-MOVES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-# Types of geoms that are left out
-GROUNDS = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+MOVES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))  # Joints that an arm may have
+GROUNDS = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))  # Geoms that are left out
 # Usual names of tools, the most telling first; prefixes that end in `_`, `/` or `:` may precede them
 TOOL_NAMES = (
     r"attachment(_site)?", r"tcp", r"tool\d*(_?center)?(_?(point|frame|link))?", r"ee(f|_?site|_?link|_?frame)?",
@@ -81,9 +79,7 @@ def choose_tool(model: mujoco.MjModel, given: Any, base: str | None, notes: list
         try:
             name, point = given
         except (TypeError, ValueError):
-            raise ValueError(
-                f"tool must be a site, a body, or a pair of body and point, got {given!r:.60}"
-            ) from None
+            raise ValueError(f"tool must be a site, a body, or (body, point), got {given!r:.60}") from None
         tool = _named(name, bodies)
         tool = tool._replace(position=finite_array("tool", point, (3,)), name=f"a point of {name!r}")
     else:
@@ -150,7 +146,7 @@ def _usual_tool(
         raise ValueError(f"there are several tools: {listed}; name one with tool=, or a side with base=")
     if inner:
         notes.append(
-            f"{WARNING}the tool is {tool.name!r}, but could be {', '.join(inner)}: name one with tool="
+            f"{WARNING}the tool is {tool.name!r}, but could be {', '.join(inner)}: name it with tool="
         )
     return tool
 

@@ -11,7 +11,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.kinematics import Chain, link_frames, tool_jacobian, transform
 from viapoint.envs.common.arrays import Bool, Float, frame_matrices
 from viapoint.envs.common.validation import finite_array, unit_quaternion, whole_number
-from viapoint.envs.geometry.compiled import compiled, kernel
+from viapoint.envs.geometry.compiled import compiled, kernel, rotated
 
 ITERATIONS = 80  # Greatest number of iterations from one seed
 # Greatest distance from the target, [m], and greatest angle, [rad], of a solution
@@ -61,25 +61,20 @@ def descend(
     rotation, origin = np.empty((last + 1, 3, 3)), np.empty((last + 1, 3))
     jacobian = np.empty((6, last))
     error = np.zeros(6)
-    tool = np.empty(3)
     square = np.empty((6, 6))
     away = 1e9
     for _ in range(ITERATIONS):
         link_frames(chain, joints, rotation, origin)
         here = transform(rotation, origin, last, chain.tool_origin)
-        tool[0], tool[1], tool[2] = here
         for a in range(3):
             error[a] = position[a] - here[a]
             error[3 + a] = 0.0
         trace = -1.0
         if oriented:
             for column in range(3):
-                x, y, z = 0.0, 0.0, 0.0
-                for k in range(3):
-                    turn = chain.tool_rotation[k, column]
-                    x += rotation[last, 0, k] * turn
-                    y += rotation[last, 1, k] * turn
-                    z += rotation[last, 2, k] * turn
+                turn = chain.tool_rotation
+                axis = turn[0, column], turn[1, column], turn[2, column]
+                x, y, z = rotated(rotation[last], axis)
                 u = axes[0, column]
                 v = axes[1, column]
                 w = axes[2, column]
@@ -99,7 +94,7 @@ def descend(
         elif oriented and angle > 1.0:
             error[3] = 0.5  # half a turn: any axis will do
         scale = min(LONGEST_STEP / away, 1.0)  # the Jacobian holds for small steps
-        tool_jacobian(chain, rotation, origin, tool, jacobian)
+        tool_jacobian(chain, rotation, origin, here, jacobian)
         damping = (DAMPING * min(away, 1.0)) ** 2 + 1e-12
         for i in range(rows):
             error[i] *= scale
@@ -198,11 +193,7 @@ def planar_solutions(chain: Chain, joint_range: Float, places: Float) -> tuple[F
 
 @compiled
 def _planar_motion(
-    chain: Chain,
-    joint_range: Float,
-    position: Float,
-    velocity: Float,
-    acceleration: Float,
+    chain: Chain, joint_range: Float, position: Float, velocity: Float, acceleration: Float
 ) -> tuple[Float, Float, Float]:
     """Return joints, rates and accelerations for N states of the hand.
 
@@ -256,20 +247,8 @@ def planar_motion(
     return joints.reshape(shape), rates.reshape(shape), changes.reshape(shape)
 
 
-def _least_distance(arm: Arm, position: Float, begin: Float) -> float:
-    """Return the least distance between tool and a place that is found from some configurations, (N, J), [m]."""
-    from scipy.optimize import least_squares  # here, because it is needed where nothing was found only
-
-    low, high = arm.joint_range.T
-    nearest = begin[np.linalg.norm(arm.hand(begin) - position, axis=-1).argmin()]
-    descend(arm.chain, arm.joint_range, position, np.eye(3), False, nearest)
-    inside = np.clip(nearest, low + INSIDE, high - INSIDE)
-    found = least_squares(lambda joints: arm.hand(joints) - position, inside, bounds=(low, high))
-    return float(np.linalg.norm(found.fun))
-
-
-def _different_solutions(arm: Arm, position: Float, axes: Float | None, begin: Float) -> list[Float]:
-    """Return the different configurations that put the tool at a target from those to begin with, (N, J)."""
+def _solutions(arm: Arm, position: Float, axes: Float | None, begin: Float) -> list[Float]:
+    """Return different configurations with the tool at a target, found from those to begin with, (N, J)."""
     found: list[Float] = []
     target = np.eye(3) if axes is None else axes
     for joints in begin.copy():
@@ -284,13 +263,7 @@ class UnreachableError(ValueError):
 
 
 def inverse_kinematics(
-    arm: Arm,
-    position: Any,
-    quaternion: Any = None,
-    *,
-    seed: Any = None,
-    n_seeds: int = 64,
-    rng: np.random.Generator | None = None,
+    arm: Arm, position: Any, quaternion: Any = None, *, seed: Any = None, n_seeds: int = 64
 ) -> Float:
     """Return different joint positions that put the tool at a pose, the nearest to the first seed first, (S, J).
 
@@ -300,7 +273,6 @@ def inverse_kinematics(
         quaternion: Orientation (w, x, y, z) of the tool, shape (4,); None for any.
         seed: Joint positions to begin with, shape (J,); home by default.
         n_seeds: Number of seeds; as many again, four times, where these find nothing.
-        rng: Random generator of further seeds; one with a fixed seed by default.
 
     Raises:
         UnreachableError: No solution was found; the message tells the nearest distance.
@@ -318,15 +290,21 @@ def inverse_kinematics(
     axes = None if quaternion is None else frame_matrices(unit_quaternion("quaternion", quaternion))
     number = whole_number("n_seeds", n_seeds, 1)
     first = arm.home if seed is None else finite_array("seed", seed, arm.home.shape)
-    rng = np.random.default_rng(0) if rng is None else rng
+    rng = np.random.default_rng(0)
     low, high = arm.joint_range.T
     begin = np.concatenate((first[None], rng.uniform(low, high, (number - 1, len(low)))))
-    found = _different_solutions(arm, position, axes, begin)
+    found = _solutions(arm, position, axes, begin)
     if not found:  # some poses near the joint limits are reached from few places
         begin = rng.uniform(low, high, (PATIENCE * number, len(low)))
-        found = _different_solutions(arm, position, axes, begin)
+        found = _solutions(arm, position, axes, begin)
     if not found:
-        away = _least_distance(arm, position, begin)
+        from scipy.optimize import least_squares  # here, because it is rarely needed
+
+        nearest = begin[np.linalg.norm(arm.hand(begin) - position, axis=-1).argmin()]
+        descend(arm.chain, arm.joint_range, position, np.eye(3), False, nearest)
+        inside = np.clip(nearest, low + INSIDE, high - INSIDE)
+        place = least_squares(lambda joints: arm.hand(joints) - position, inside, bounds=(low, high))
+        away = float(np.linalg.norm(place.fun))
         pose = "position" if quaternion is None else "pose"
         nearest = f"the nearest place found is {1e3 * away:.1f} mm away"
         if quaternion is not None and away < PLACE_TOLERANCE:

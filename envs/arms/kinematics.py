@@ -13,9 +13,8 @@ import numpy as np
 
 from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel
+from viapoint.envs.geometry.compiled import Vector, compiled, inlined, inner, kernel, rotated, rotated_back
 
-Vector = tuple[float, float, float]  # Three components
 PART = 16  # Greatest number of spheres of a part of a group
 LIMIT_SHARE = 0.97  # Share of the velocity and torque limits that plans may use; feedback uses the rest
 # Least share of a joint's torque limit that counts as available for motion, however heavy the arm is
@@ -30,16 +29,14 @@ class Chain(NamedTuple):
     its z axis is the axis of the joint.
     """
 
-    # Origin of the frame of each joint at 0, in the frame of the link before, shape (J, 3), [m]
-    origin: Float
+    origin: Float  # Origin of each joint's frame at 0, in the frame of the link before, shape (J, 3), [m]
     rotation: Float  # Axes of this frame as columns, in the frame of the link before, shape (J, 3, 3)
     sliding: Bool  # True for joints that slide along their z axis, False for hinges about it, shape (J,)
     tool_origin: Float  # Origin of the tool's frame in that of the last link, shape (3,), [m]
     tool_rotation: Float  # Axes of the tool's frame as columns, shape (3, 3)
     mass: Float  # Mass of each moving link with all that is fixed to it, shape (J,), [kg]
     centre: Float  # Centre of mass in the link's frame, shape (J, 3), [m]
-    # Rotational inertia about the centre of mass, in the link's frame, shape (J, 3, 3), [kg m^2]
-    inertia: Float
+    inertia: Float  # Inertia about the centre of mass, in the link's frame, shape (J, 3, 3), [kg m^2]
     armature: Float  # Inertia of the motors seen at the joints, shape (J,), [kg m^2] or [kg]
     damping: Float  # Viscous friction of the joints, shape (J,), [N m s/rad] or [N s/m]
     gravity: Float  # Gravitational acceleration, shape (3,), [m/s^2]
@@ -89,9 +86,7 @@ def link_frames(chain: Chain, joints: Float, rotation: Float, origin: Float) -> 
             b = rotation[j, row, 1]
             c = rotation[j, row, 2]
             # A row of the frame of the joint at 0, and then turned about its z axis.
-            x = a * fixed[j, 0, 0] + b * fixed[j, 1, 0] + c * fixed[j, 2, 0]
-            y = a * fixed[j, 0, 1] + b * fixed[j, 1, 1] + c * fixed[j, 2, 1]
-            z = a * fixed[j, 0, 2] + b * fixed[j, 1, 2] + c * fixed[j, 2, 2]
+            x, y, z = rotated_back(fixed[j], (a, b, c))
             rotation[j + 1, row, 0] = cosine * x + sine * y
             rotation[j + 1, row, 1] = cosine * y - sine * x
             rotation[j + 1, row, 2] = z
@@ -139,11 +134,10 @@ def point_jacobian(
 
 
 @kernel
-def tool_jacobian(chain: Chain, rotation: Float, origin: Float, tool_origin: Float, jacobian: Float) -> None:
+def tool_jacobian(chain: Chain, rotation: Float, origin: Float, tool: Vector, jacobian: Float) -> None:
     """Fill the derivative of the tool's position and rotation vector by the joints, shape (6, J), world axes."""
     n_joints = chain.origin.shape[0]
-    x, y, z = tool_origin[0], tool_origin[1], tool_origin[2]
-    point_jacobian(chain, rotation, origin, n_joints, x, y, z, jacobian)
+    point_jacobian(chain, rotation, origin, n_joints, tool[0], tool[1], tool[2], jacobian)
     for j in range(n_joints):
         turns = 0.0 if chain.sliding[j] else 1.0
         for row in range(3):
@@ -170,24 +164,15 @@ def _row(array: Float, index: int) -> Vector:
 @kernel
 def _to_link(fixed: Float, j: int, cosine: float, sine: float, vector: Vector) -> Vector:
     """Return a vector of the frame of link j in the frame of link j + 1."""
-    a, b, c = vector
-    x = fixed[j, 0, 0] * a + fixed[j, 1, 0] * b + fixed[j, 2, 0] * c
-    y = fixed[j, 0, 1] * a + fixed[j, 1, 1] * b + fixed[j, 2, 1] * c
-    z = fixed[j, 0, 2] * a + fixed[j, 1, 2] * b + fixed[j, 2, 2] * c
+    x, y, z = rotated_back(fixed[j], vector)
     return cosine * x + sine * y, cosine * y - sine * x, z
 
 
 @kernel
 def _from_link(fixed: Float, j: int, cosine: float, sine: float, vector: Vector) -> Vector:
     """Return a vector of the frame of link j + 1 in the frame of link j."""
-    x = cosine * vector[0] - sine * vector[1]
-    y = sine * vector[0] + cosine * vector[1]
-    z = vector[2]
-    return (
-        fixed[j, 0, 0] * x + fixed[j, 0, 1] * y + fixed[j, 0, 2] * z,
-        fixed[j, 1, 0] * x + fixed[j, 1, 1] * y + fixed[j, 1, 2] * z,
-        fixed[j, 2, 0] * x + fixed[j, 2, 1] * y + fixed[j, 2, 2] * z,
-    )
+    x, y, z = vector
+    return rotated(fixed[j], (cosine * x - sine * y, sine * x + cosine * y, z))
 
 
 @kernel
@@ -239,8 +224,8 @@ def inverse_dynamics(chain: Chain, q: Float, v: Float, a: Float, torque: Float) 
         x, y, z = _rigid_acceleration(linear, spin, turn, centre)
         force = (chain.mass[j] * x, chain.mass[j] * y, chain.mass[j] * z)
         inertia = chain.inertia[j]
-        momentum = _product(inertia, spin)
-        moment = _add(_product(inertia, turn), _cross(spin, momentum))
+        momentum = rotated(inertia, spin)
+        moment = _add(rotated(inertia, turn), _cross(spin, momentum))
         moment = _add(moment, _cross(centre, force))
         work[j, 0], work[j, 1], work[j, 2] = force
         work[j, 3], work[j, 4], work[j, 5] = moment
@@ -259,24 +244,9 @@ def inverse_dynamics(chain: Chain, q: Float, v: Float, a: Float, torque: Float) 
         moment = _add(moment, _cross((work[j, 6], work[j, 7], work[j, 8]), force))
 
 
-@kernel
-def _product(matrix: Float, vector: Vector) -> Vector:
-    x, y, z = vector
-    return (
-        matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z,
-        matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z,
-        matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z,
-    )
-
-
 @compiled
 def slowdowns(
-    chain: Chain,
-    velocity_limit: Float,
-    torque_limit: Float,
-    position: Float,
-    velocity: Float,
-    acceleration: Float,
+    chain: Chain, velocity_limit: Float, torque_limit: Float, q: Float, v: Float, a: Float
 ) -> Float:
     """Return factors by which N movements must be slower to keep the limits; less than 1 for those that may be faster.
 
@@ -285,10 +255,10 @@ def slowdowns(
 
         |v| / s <= share limit_v,    |m| / s^2 + |f| / s <= share limit_t - g,
 
-    with the torques m of inertia, f of friction, and g of gravity in the direction of the motion's torque. Positions,
-    velocities and accelerations have the shape (N, T, J); limits are infinite for none.
+    with the torques m of inertia, f of friction, and g of gravity in the direction of the motion's torque. Positions q,
+    velocities v and accelerations a have the shape (N, T, J); limits are infinite for none.
     """
-    number, length, joints = position.shape
+    number, length, joints = q.shape
     found = np.empty(number)
     rest = np.zeros(joints)
     heavy = np.empty(joints)
@@ -297,13 +267,13 @@ def slowdowns(
         least = 0.0
         for k in range(length):
             for j in range(joints):
-                least = max(least, abs(velocity[n, k, j]) / (LIMIT_SHARE * velocity_limit[j]))
+                least = max(least, abs(v[n, k, j]) / (LIMIT_SHARE * velocity_limit[j]))
             if k % TORQUE_STRIDE and k < length - 1:  # torques change slowly
                 continue
-            inverse_dynamics(chain, position[n, k], rest, rest, heavy)
-            inverse_dynamics(chain, position[n, k], velocity[n, k], acceleration[n, k], whole)
+            inverse_dynamics(chain, q[n, k], rest, rest, heavy)
+            inverse_dynamics(chain, q[n, k], v[n, k], a[n, k], whole)
             for j in range(joints):
-                friction = chain.damping[j] * velocity[n, k, j]
+                friction = chain.damping[j] * v[n, k, j]
                 motion = whole[j] - heavy[j] - friction
                 against = heavy[j] if motion + friction >= 0.0 else -heavy[j]
                 room = max(LIMIT_SHARE * torque_limit[j] - against, LEAST_TORQUE_SHARE * torque_limit[j])
@@ -337,13 +307,9 @@ def _all_tools(chain: Chain, joints: Float) -> tuple[Float, Float]:
     places, axes = np.empty((number, 3)), np.empty((number, 3, 3))
     for n in range(number):
         places[n, 0], places[n, 1], places[n, 2] = tool_position(chain, joints[n], rotation, origin)
-        for row in range(3):
-            for column in range(3):
-                axes[n, row, column] = (
-                    rotation[last, row, 0] * chain.tool_rotation[0, column]
-                    + rotation[last, row, 1] * chain.tool_rotation[1, column]
-                    + rotation[last, row, 2] * chain.tool_rotation[2, column]
-                )
+        for column in range(3):
+            axis = rotated(rotation[last], _row(chain.tool_rotation.T, column))
+            axes[n, 0, column], axes[n, 1, column], axes[n, 2, column] = axis
     return places, axes
 
 

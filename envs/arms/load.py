@@ -50,8 +50,7 @@ LOOKED_AT, NEAR_LOOKED_AT = 16, 1000
 # Distance within which bodies are near in at least half of the configurations, and tolerance for these, which is the
 # least one, [m]
 NEAR, FINE = 0.03, 0.005
-# Damping beyond which a joint hardly moves: its torque at full speed, relative to the torque limit
-STUCK = 100.0
+STUCK = 100.0  # Damping beyond which a joint hardly moves: torque at full speed over the limit
 # Names of files that do not tell the arm; it gets the name of the model
 GENERIC_NAMES = ("arm", "model", "robot", "scene")
 MIN_JOINTS = 2  # Least number of joints
@@ -66,6 +65,7 @@ INERTIA_MARGIN = 2e-5  # Relative margin of the triangle inequality of principal
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 RESERVED = ("", "world", "meshes")  # Names that bodies of the arm cannot have, beside those of obstacles
 
+Names = tuple[str, ...]  # Names of joints, from the base to the tool
 Pair = tuple[int, int]  # Numbers of two bodies, that of the lower link first
 
 
@@ -76,7 +76,7 @@ class Parsed(NamedTuple):
     # Places with the arm's joints at 0, and all others as in the first keyframe or at their reference
     rest: mujoco.MjData
     moved: mujoco.MjData  # Places in any configuration
-    joints: tuple[str, ...]
+    joints: Names
     carriers: list[int]  # Body of each joint
     tool: Tool
     links: dict[int, int]  # Link of each body of the arm, 0 for the base, in the order of the file
@@ -171,12 +171,7 @@ def load_arm(
 
 
 def _load(
-    whole: mujoco.MjModel,
-    name: str,
-    known_as: str,
-    urdf: Urdf,
-    notes: list[str],
-    given: Mapping[str, Any],
+    whole: mujoco.MjModel, name: str, known_as: str, urdf: Urdf, notes: list[str], given: Mapping[str, Any]
 ) -> Arm:
     """Return the arm of a model and the given arguments; see :func:`load_arm`."""
     chosen = choose_tool(whole, given["tool"], given["base"], notes)
@@ -203,9 +198,7 @@ def _load(
     stuck = whole.dof_damping[dofs].reshape(len(names), -1)[:, 0] * velocity > STUCK * torque
     if stuck.any():
         some = ", ".join(itertools.compress(names, stuck))
-        notes.append(
-            f"{WARNING}damping of {some} is left out: it needs {STUCK:g} times the torque limit at full speed"
-        )
+        notes.append(f"{WARNING}damping of {some} is left out: it takes {STUCK:g} times the torque limit")
         whole.dof_damping[dofs[stuck]] = 0.0
     parsed = _parse(whole, names, chosen, notes)
     # Pairs that cannot touch are not compared: those of the file, and those that are always near and always apart.
@@ -254,7 +247,7 @@ def _load(
         some = ", ".join(itertools.compress(names, weak))
         if given["torque_limit"] is not None:
             raise ValueError(
-                f"the torque limits of {some} do not hold the arm's own weight at home; raise torque_limit"
+                f"torque limits of {some} do not hold the arm's weight at home; raise torque_limit"
             )
         notes.append(
             f"{WARNING}torque limits of {some}: {WEIGHTS:g} times the weight at home, which those of the file do not "
@@ -263,11 +256,7 @@ def _load(
         torque = np.where(weak, WEIGHTS * weight, torque)
     endless = itertools.compress(names, (whole.jnt_limited[numbers] == 0) & ~arm.chain.sliding)
     return replace(
-        arm,
-        excess=arm.excess + excess,
-        notes=tuple(notes),
-        continuous=tuple(endless),
-        torque_limit=torque,
+        arm, excess=arm.excess + excess, notes=tuple(notes), continuous=tuple(endless), torque_limit=torque
     )
 
 
@@ -366,7 +355,7 @@ def _leave_out(spec: mujoco.MjSpec, fault: str) -> str:
     raise ValueError(f"MuJoCo cannot read the file: {fault}")
 
 
-def _joint_names(joints: Any) -> tuple[str, ...]:
+def _joint_names(joints: Any) -> Names:
     """Return different names of joints."""
     names = tuple(joints) if isinstance(joints, Iterable) and not isinstance(joints, str) else ()
     are_strings = all(isinstance(each, str) for each in names)
@@ -377,13 +366,13 @@ def _joint_names(joints: Any) -> tuple[str, ...]:
     return names
 
 
-def _per_joint(name: str, values: Any, joints: tuple[str, ...]) -> Float:
+def _per_joint(name: str, values: Any, joints: Names) -> Float:
     """Return one number for each joint, shape (J,); a single number applies to all."""
     numbers = finite_array(name, values, (len(joints),), (1,), ())
     return np.array(np.broadcast_to(numbers, (len(joints),)))
 
 
-def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: list[str]) -> Float:
+def _ranges(model: mujoco.MjModel, joints: Names, given: Any, notes: list[str]) -> Float:
     """Return the range of each joint, as MuJoCo read it from the file or as given, shape (J, 2)."""
     numbers = [model.joint(name).id for name in joints]
     kinds = model.jnt_type[numbers]
@@ -398,15 +387,13 @@ def _ranges(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, notes: l
     endless = model.jnt_limited[numbers] == 0
     some = ", ".join(itertools.compress(joints, endless))
     if (endless & (kinds == MOVES[1])).any():
-        raise ValueError(
-            f"slides need limits, but {some} has none; give it a range in the file, or joint_range"
-        )
+        raise ValueError(f"slides need limits, but {some} has none; give a range in the file, or joint_range")
     if some:
         notes.append(f"range of {some}, continuous: +-pi")
     return np.where(endless[:, None], (-np.pi, np.pi), model.jnt_range[numbers])
 
 
-def _torques(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, arm: str, notes: list[str]) -> Float:
+def _torques(model: mujoco.MjModel, joints: Names, given: Any, arm: str, notes: list[str]) -> Float:
     """Return the torque limit of each joint, its own, or the greatest of the actuators that drive it."""
     if given is not None:
         return _per_joint("torque_limit", given, joints)
@@ -428,13 +415,7 @@ def _torques(model: mujoco.MjModel, joints: tuple[str, ...], given: Any, arm: st
 
 
 def _completed(
-    what: str,
-    joints: tuple[str, ...],
-    limits: Float,
-    known: Float | None,
-    default: Any,
-    how: str,
-    notes: list[str],
+    what: str, joints: Names, limits: Float, known: Float | None, default: Any, how: str, notes: list[str]
 ) -> Float:
     """Return limits of which missing ones, which are 0, are those of a known arm or a default; a note tells it."""
     missing = limits <= 0.0
@@ -446,7 +427,7 @@ def _completed(
     return np.where(missing, default if known is None else known, limits)
 
 
-def _greatest_weight(model: mujoco.MjModel, joints: tuple[str, ...]) -> Float:
+def _greatest_weight(model: mujoco.MjModel, joints: Names) -> Float:
     """Return the greatest torques that gravity needs in random configurations, shape (J,)."""
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     dofs = [int(model.joint(name).dofadr[0]) for name in joints]
@@ -476,12 +457,7 @@ def _symmetric_limit(limits: Float) -> float:
 
 
 def _velocities(
-    model: mujoco.MjModel,
-    joints: tuple[str, ...],
-    given: Any,
-    in_urdf: dict[str, float],
-    arm: str,
-    notes: list[str],
+    model: mujoco.MjModel, joints: Names, given: Any, in_urdf: dict[str, float], arm: str, notes: list[str]
 ) -> Float:
     """Return the velocity limit of each joint, shape (J,)."""
     if given is None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
@@ -527,7 +503,7 @@ def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[Pair], notes: l
     return max(drawn, key=apart)
 
 
-def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: list[str]) -> Parsed:
+def _parse(model: mujoco.MjModel, joints: Names, tool: Tool, notes: list[str]) -> Parsed:
     """Return the arm of a model: the bodies that its joints move, and what they stand on."""
     carriers = [int(model.joint(name).bodyid[0]) for name in joints]
     for i in range(1, len(joints)):
@@ -570,9 +546,7 @@ def _parse(model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, notes: li
     return Parsed(model, rest, copy.copy(rest), joints, carriers, tool, links, names, geoms, pairs)
 
 
-def _note_rest(
-    model: mujoco.MjModel, joints: tuple[str, ...], tool: Tool, bodies: list[int], notes: list[str]
-) -> None:
+def _note_rest(model: mujoco.MjModel, joints: Names, tool: Tool, bodies: list[int], notes: list[str]) -> None:
     """Note what the arm does not take from its file: other bodies and joints, planes, and forces such as of springs."""
     collides = (model.geom_contype | model.geom_conaffinity) > 0
     ground = np.isin(model.geom_type, GROUNDS)
@@ -604,7 +578,7 @@ def _note_rest(
     followers = ", ".join(itertools.compress(joints, np.isin(numbers, coupled)))
     if followers:
         notes.append(
-            f"{WARNING}{followers} follows another joint in the file, but not in plans; joints= without it fixes it"
+            f"{WARNING}{followers} follows another joint in the file, not in plans; leave it out of joints="
         )
 
 

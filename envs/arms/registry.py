@@ -118,7 +118,5 @@ def _of_file(path: Path, changed: int) -> Arm:
     try:
         arm = read_arm(path) or load_arm(path)
     except ValueError as error:
-        raise ValueError(
-            f"{error}; with arguments of load_arm, write_arm makes a file that needs none"
-        ) from None
+        raise ValueError(f"{error}; give arguments to load_arm, and keep its arm with write_arm") from None
     return dataclasses.replace(arm, file=str(path))

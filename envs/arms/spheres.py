@@ -68,9 +68,7 @@ def cover(
 
 
 def _pairs(
-    names: Sequence[str],
-    links: dict[str, int],
-    exclude: Mapping[frozenset[str], str],
+    names: Sequence[str], links: dict[str, int], exclude: Mapping[frozenset[str], str]
 ) -> tuple[list[tuple[int, int]], list[LeftOut]]:
     """Return the pairs of groups that are compared, and those of different links that are not.
 

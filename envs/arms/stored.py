@@ -26,6 +26,9 @@ from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
 from viapoint.envs.arms.spheres import LeftOut
 
 MARK = "viapoint_arm"  # Name of the text element with the choices
+# Fields of an arm that it is made with, and those that its file adds
+ARGUMENTS = ("home", "velocity_limit", "torque_limit", "space")
+ADDED = ("left_out", "excess", "continuous", "notes")
 COPY = "arm.xml"  # Name of a copy in the folder of a run or a model
 
 
@@ -58,20 +61,12 @@ def write_arm(path: str | Path, arm: Arm) -> None:
         >>> arm_of(file).joint_names
         ('shoulder', 'elbow')
     """
-    choices = {
-        "name": arm.name,
-        "joints": arm.joint_names,
-        "home": arm.home.tolist(),
-        "velocity_limit": arm.velocity_limit.tolist(),
-        "torque_limit": arm.torque_limit.tolist(),
-        "space": arm.space,
-        "left_out": arm.left_out,
-        "excess": arm.excess,
-        "continuous": arm.continuous,
-        "notes": arm.notes,
-    }
+    choices: dict[str, Any] = {"name": arm.name, "joints": arm.joint_names}
+    for each in (*ARGUMENTS, *ADDED):
+        choices[each] = getattr(arm, each)
     model, _, _ = arm.xml.rpartition("</mujoco>")
-    Path(path).expanduser().write_text(f"{model}{_element(json.dumps(choices))}</mujoco>\n", encoding="utf-8")
+    text = f"{model}{_element(json.dumps(choices, default=_plain))}</mujoco>\n"
+    Path(path).expanduser().write_text(text, encoding="utf-8")
 
 
 def _element(choices: str) -> str:
@@ -90,24 +85,12 @@ def read_arm(path: Path) -> Arm | None:
     data = mark.attrib["data"]
     choices: dict[str, Any] = json.loads(data)
     left_out = tuple(LeftOut(*each) for each in choices["left_out"])
-    arm = arm_from_xml(
-        choices["name"],
-        text.replace(_element(data), ""),
-        joints=choices["joints"],
-        tool="hand",
-        home=choices["home"],
-        velocity_limit=choices["velocity_limit"],
-        torque_limit=choices["torque_limit"],
-        space=choices["space"],
-        exclude={frozenset((pair.first, pair.second)): pair.reason for pair in left_out},
-    )
-    return replace(
-        arm,
-        left_out=left_out,
-        excess=choices["excess"],
-        continuous=tuple(choices["continuous"]),
-        notes=tuple(choices["notes"]),
-    )
+    exclude = {frozenset((pair.first, pair.second)): pair.reason for pair in left_out}
+    kept = {each: choices[each] for each in ("joints", *ARGUMENTS)}
+    xml = text.replace(_element(data), "")
+    arm = arm_from_xml(choices["name"], xml, tool="hand", exclude=exclude, **kept)
+    texts: dict[str, Any] = {each: tuple(choices[each]) for each in ("continuous", "notes")}
+    return replace(arm, left_out=left_out, excess=choices["excess"], **texts)
 
 
 def cached_arm(model: mujoco.MjModel, arguments: dict[str, Any], make: Callable[[], Arm]) -> Arm:

@@ -42,8 +42,7 @@ class Urdf(NamedTuple):
     name: str  # Name of the robot
     assets: dict[str, bytes]  # Meshes that MuJoCo cannot read as they are, by the names in the text
     velocity_limits: dict[str, float]  # Velocity limits of joints by name, [rad/s] or [m/s]
-    # Pairs of links that are not compared, from an SRDF file beside it
-    never_touch: tuple[tuple[str, str], ...]
+    never_touch: tuple[tuple[str, str], ...]  # Pairs of links that an SRDF file beside it does not compare
     notes: tuple[str, ...]  # Parts that were left out
 
 
@@ -270,8 +269,6 @@ def _srdf(path: Path, urdf: ET.Element, notes: list[str]) -> tuple[tuple[str, st
         links = {link.get("name") for link in urdf.findall("link")}
         unknown = dict.fromkeys(name for name in itertools.chain(*pairs) if name not in links)
         if unknown:
-            notes.append(
-                f"{WARNING}{place.name} names links that the URDF does not have: {', '.join(unknown)}"
-            )
+            notes.append(f"{WARNING}{place.name} names links that the URDF lacks: {', '.join(unknown)}")
         return tuple(pairs)
     return ()

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 Colour = tuple[float, float, float]  # Red, green and blue in [0, 1]
 
 
-class Palette(NamedTuple):
+class Palette:
     """Colour of each kind of thing that is drawn."""
 
     plan: Colour = (0.36, 0.62, 0.90)

@@ -23,9 +23,7 @@ def record_of(name: str, kind: type[Record], value: Any) -> Record:
         return value
     known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
     if not isinstance(value, Mapping) or not set(known) >= set(value):
-        raise ValueError(
-            f"{name} must be a {kind.__name__} or a mapping with some of {', '.join(known)}, got {value!r}"
-        )
+        raise ValueError(f"{name} must be a {kind.__name__}, or some of {', '.join(known)}, got {value!r}")
     return kind(**value)
 
 
@@ -99,7 +97,7 @@ def masked_rows(mask: Any, num_envs: int, running: bool) -> Int:
     mask = np.asarray(mask)
     if mask.shape != (num_envs,) or mask.dtype != np.bool_ or not mask.any():
         raise ValueError(
-            f"options['reset_mask'] must be a bool array of shape ({num_envs},) with a True in it, got {mask!r}"
+            f"options['reset_mask'] must be {num_envs} bools, of which one is True, got {mask!r}"
         )
     if not running and not mask.all():
         raise ValueError("options['reset_mask'] must be True for every environment at the first reset")

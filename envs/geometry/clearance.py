@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viapoint.envs.arms.kinematics import PART, Chain, Spheres, link_frames
+from viapoint.envs.arms.kinematics import PART, Chain, Spheres, link_frames, transform
 from viapoint.envs.common.arrays import Bool, Float
 from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel
 from viapoint.envs.geometry.distance import point_distance
@@ -43,15 +43,14 @@ class Bounds(NamedTuple):
     It is not a part of :class:`Placed`: compiled functions that pass a record on take longer the more arrays it has.
     """
 
-    apart: Float  # Lower bounds of the clearance of groups from obstacles, shape (G,), [m]
-    pair_apart: Float  # Lower bounds of the clearance of pairs of groups, shape (P,), [m]
+    # Lower bounds of the clearance of groups from obstacles, and then of pairs of groups, shape (G + P,), [m]
+    apart: Float
     way: Float  # Bounds of the way of the spheres of links 0 to J since another configuration, shape (J + 1,), [m]
     bend: Float  # Bounds of how much longer than its chord this way is, shape (J + 1,), [m]
     group_way: Float  # Bounds of the way of the spheres of groups, shape (G,), [m]
     rotation: Float  # Axes of the links' frames in the configuration before, shape (J + 1, 3, 3)
     ball: Float  # Centres of the bounding balls in the configuration before, shape (G, 3), [m]
-    # Joints between two configurations, shape (J,); empty if nothing counts between them
-    between: Float
+    between: Float  # Joints between two configurations, shape (J,); empty if nothing counts there
 
 
 @compiled
@@ -74,8 +73,7 @@ def bounds_memory(chain: Chain, spheres: Spheres, between: bool) -> Bounds:
     joints = len(chain.mass)
     groups = len(spheres.link)
     return Bounds(
-        np.empty(groups),
-        np.empty(len(spheres.pairs)),
+        np.empty(groups + len(spheres.pairs)),
         np.empty(joints + 1),
         np.empty(joints + 1),
         np.empty(groups),
@@ -97,13 +95,8 @@ def place(chain: Chain, spheres: Spheres, joints: Float, placed: Placed) -> None
 @inlined
 def _place_point(placed: Placed, link: int, points: Float, row: int, places: Float) -> None:
     """Place one of the points of a table that are fixed to links."""
-    for axis in range(3):
-        places[row, axis] = (
-            placed.origin[link, axis]
-            + placed.rotation[link, axis, 0] * points[row, 0]
-            + placed.rotation[link, axis, 1] * points[row, 1]
-            + placed.rotation[link, axis, 2] * points[row, 2]
-        )
+    here = transform(placed.rotation, placed.origin, link, points[row])
+    places[row, 0], places[row, 1], places[row, 2] = here
 
 
 @inlined
@@ -159,30 +152,6 @@ def group_clearance(
     return least, nearest
 
 
-@inlined
-def nearest_obstacle(
-    spheres: Spheres,
-    placed: Placed,
-    group: int,
-    obstacles: Obstacles,
-    scene: int,
-    time: float,
-    least: float,
-    floor: float,
-) -> float:
-    """Return the clearance of a group of spheres from all obstacles, at most `least`, [m].
-
-    The arguments are those of :func:`obstacle_clearance`.
-    """
-    for row in range(obstacles.kind.shape[1]):
-        if obstacles.kind[scene, row] == ABSENT:
-            continue
-        least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
-        if least < floor:
-            break
-    return least
-
-
 @inner
 def obstacle_clearance(
     spheres: Spheres,
@@ -192,15 +161,23 @@ def obstacle_clearance(
     time: float,
     least: float,
     floor: float,
+    only: int = -1,
+    link: int = 1,
 ) -> float:
     """Return the clearance of a placed arm from the obstacles of a scene at a time, at most `least`, [m].
 
-    The base does not count, as it may stand on an obstacle. The search stops at the first clearance below `floor`: the
-    exact value below it does not matter.
+    The search stops at the first clearance below `floor`: the exact value below it does not matter. Of the obstacles,
+    one may be the `only` one that counts, and links from `link` on: the base does not, as it may stand on an obstacle.
     """
+    first = max(only, 0)
+    last = obstacles.kind.shape[1] if only < 0 else only + 1
     for group in range(len(spheres.link)):
-        if spheres.link[group] > 0:  # the base may stand on an obstacle
-            least = nearest_obstacle(spheres, placed, group, obstacles, scene, time, least, floor)
+        if spheres.link[group] < link:
+            continue
+        for row in range(first, last):
+            if obstacles.kind[scene, row] == ABSENT:
+                continue
+            least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
             if least < floor:
                 return least
     return least
@@ -223,51 +200,23 @@ def nearest_spheres(
 def _nearest_spheres(
     spheres: Spheres, placed: Placed, first: int, second: int, least: float, floor: float
 ) -> tuple[float, int, int]:
-    """Return the same for two groups whose bounding balls are near."""
-    nearest, partner = -1, -1
-    place_group(spheres, first, placed)
-    place_group(spheres, second, placed)
-    # Groups that are divided leave out most pairs of parts.
-    if spheres.part[first] < spheres.part[first + 1] or spheres.part[second] < spheres.part[second + 1]:
-        return _nearest_by_parts(spheres, placed, first, second, least, floor)
-    for one in range(spheres.first[first], spheres.first[first + 1]):
-        # The ball of the second group excludes most spheres of the first.
-        size = spheres.radius[one]
-        if _are_apart(placed.centre, one, placed.ball, second, size + spheres.ball_radius[second] + least):
-            continue
-        for other in range(spheres.first[second], spheres.first[second + 1]):
-            sizes = size + spheres.radius[other]
-            if not _are_apart(placed.centre, one, placed.centre, other, sizes + least):
-                least = math.sqrt(_square(placed.centre, one, placed.centre, other)) - sizes
-                nearest, partner = one, other
-                if least < floor:
-                    return least, nearest, partner
-    return least, nearest, partner
-
-
-@inner
-def _nearest_by_parts(
-    spheres: Spheres, placed: Placed, first: int, second: int, least: float, floor: float
-) -> tuple[float, int, int]:
-    """Return the same for two placed groups, one of many spheres, of which most parts are apart.
-
-    The loop over spheres stands twice: with this one alone, checks of the Panda, whose links are mostly covered by few
-    spheres, took 10 % longer.
-    """
+    """Return the same for two groups whose bounding balls are near; most pairs of their parts are apart."""
     nearest, partner = -1, -1
     balls = spheres.ball_radius
+    place_group(spheres, first, placed)
+    place_group(spheres, second, placed)
     for start in range(spheres.first[first], spheres.first[first + 1], PART):
         part = _part(spheres, first, start)
         if _are_apart(placed.ball, part, placed.ball, second, balls[part] + balls[second] + least):
             continue
         for other_start in range(spheres.first[second], spheres.first[second + 1], PART):
             other_part = _part(spheres, second, other_start)
-            if _are_apart(
-                placed.ball, part, placed.ball, other_part, balls[part] + balls[other_part] + least
-            ):
+            sizes = balls[part] + balls[other_part]
+            if other_part != second and _are_apart(placed.ball, part, placed.ball, other_part, sizes + least):
                 continue
             for one in range(start, min(start + PART, spheres.first[first + 1])):
                 size = spheres.radius[one]
+                # The ball of the second part excludes most spheres of the first.
                 if _are_apart(placed.centre, one, placed.ball, other_part, size + balls[other_part] + least):
                     continue
                 for other in range(other_start, min(other_start + PART, spheres.first[second + 1])):
@@ -365,12 +314,13 @@ def movement_clearance(
     drift = step * fastest(obstacles, scene)  # the way of obstacles in one step
     # A coarse look comes first: with a small clearance from the start, the second one skips most configurations.
     for stride in (COARSE, 1):
-        _forget(bounds)
+        bounds.apart[:] = -FAR  # so low that they tell nothing
         last = -1  # the configuration whose places are kept
         for k in range(0, len(path), stride):
             _set_ways(reach, path[max(k - stride, 0)], path[k], spheres, bounds)
             is_placed = False
-            if len(between) > 0 and stride == 1 and k > 0 and _matters(spheres, bounds, drift, least):
+            looks_between = len(between) > 0 and stride == 1 and k > 0
+            if looks_between and _matters(spheres, bounds, drift, least):
                 if last != k - 1:
                     place(chain, spheres, path[k - 1], placed)
                     _keep_places(placed, bounds)
@@ -378,56 +328,58 @@ def movement_clearance(
                 _shorten_ways(spheres, placed, bounds)
                 _keep_places(placed, bounds)
                 is_placed, last = True, k
-            _move(stride * drift, spheres, bounds)
-            for group in range(len(spheres.link)):
-                if spheres.link[group] == 0 or bounds.apart[group] >= least:
+            for check in range(len(bounds.apart)):
+                bounds.apart[check] -= _way(spheres, bounds, check, stride * drift)
+            for check in range(len(bounds.apart)):
+                of_pair = check >= len(spheres.link)
+                bound = bounds.apart[check]
+                if bound >= (least_self if of_pair else least) or not (of_pair or spheres.link[check]):
                     continue
                 if not is_placed:
                     place(chain, spheres, path[k], placed)
                     is_placed = True
-                time, most = begin + k * step, least + WINDOW
-                bound = bounds.apart[group]
-                apart = nearest_obstacle(spheres, placed, group, obstacles, scene, time, most, -FAR)
-                bounds.apart[group] = apart
-                least = min(least, apart)
-                if len(between) == 0 or stride > 1 or k == 0:
-                    continue
-                way = bounds.group_way[group] + drift
-                low = min(least, least_self)
-                if way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
-                    continue
-                share = _until_next(bound + way, way, low, floor)
-                while share < 1.0:
-                    _place_between(chain, spheres, path, k, share, between, placed)
-                    time, most = begin + (k - 1 + share) * step, least + WINDOW
-                    apart = nearest_obstacle(spheres, placed, group, obstacles, scene, time, most, -FAR)
-                    least = min(least, apart)
-                    share += _until_next(apart, way, min(least, least_self), floor)
-                is_placed = False
-            for pair in range(len(spheres.pairs)):
-                if bounds.pair_apart[pair] >= least_self:
-                    continue
-                if not is_placed:
-                    place(chain, spheres, path[k], placed)
-                    is_placed = True
-                bound = bounds.pair_apart[pair]
-                apart, _, _ = nearest_spheres(spheres, placed, pair, least_self + WINDOW, -FAR)
-                bounds.pair_apart[pair] = apart
-                least_self = min(least_self, apart)
-                if len(between) == 0 or stride > 1 or k == 0:
-                    continue
-                way = _way_of_pair(spheres, bounds, pair)
-                low = min(least, least_self)
-                if way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
-                    continue
-                share = _until_next(bound + way, way, low, floor)
-                while share < 1.0:
-                    _place_between(chain, spheres, path, k, share, between, placed)
-                    apart, _, _ = nearest_spheres(spheres, placed, pair, least_self + WINDOW, -FAR)
+                most = (least_self if of_pair else least) + WINDOW
+                apart = _nearest(spheres, placed, check, obstacles, scene, begin + k * step, most)
+                bounds.apart[check] = apart
+                if of_pair:
                     least_self = min(least_self, apart)
+                else:
+                    least = min(least, apart)
+                if not looks_between:
+                    continue
+                way = _way(spheres, bounds, check, drift)
+                low = min(least, least_self)
+                if way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
+                    continue
+                share = _until_next(bound + way, way, low, floor)
+                while share < 1.0:
+                    _place_between(chain, spheres, path, k, share, between, placed)
+                    time = begin + (k - 1 + share) * step
+                    most = (least_self if of_pair else least) + WINDOW
+                    apart = _nearest(spheres, placed, check, obstacles, scene, time, most)
+                    if of_pair:
+                        least_self = min(least_self, apart)
+                    else:
+                        least = min(least, apart)
                     share += _until_next(apart, way, min(least, least_self), floor)
                 is_placed = False
     return least, least_self
+
+
+@inlined
+def _nearest(
+    spheres: Spheres, placed: Placed, check: int, obstacles: Obstacles, scene: int, time: float, most: float
+) -> float:
+    """Return the clearance of a group from all obstacles, or that of a pair of groups, at most `most`, [m]."""
+    groups = len(spheres.link)
+    if check >= groups:
+        return nearest_spheres(spheres, placed, check - groups, most, -FAR)[0]
+    for row in range(obstacles.kind.shape[1]):
+        if obstacles.kind[scene, row] != ABSENT:
+            most, _ = group_clearance(spheres, placed, check, obstacles, scene, row, time, most, -FAR)
+            if most < -FAR:
+                break
+    return most
 
 
 @inlined
@@ -457,24 +409,18 @@ def _place_between(
 
 
 @inlined
-def _way_of_pair(spheres: Spheres, bounds: Bounds, pair: int) -> float:
-    """Return how much a pair of groups may have moved, seen from one another, [m].
+def _way(spheres: Spheres, bounds: Bounds, check: int, drift: float) -> float:
+    """Return how much a group and the obstacles, or a pair of groups, may have come nearer to one another, [m].
 
-    That is by the joints between both alone, and not by more than both have moved.
+    Obstacles move by `drift`. A pair moves by the joints between both alone, and not by more than both have moved.
     """
-    one = spheres.pairs[pair, 0]
-    other = spheres.pairs[pair, 1]
+    groups = len(spheres.link)
+    if check < groups:
+        return float(bounds.group_way[check] + drift)
+    one = spheres.pairs[check - groups, 0]
+    other = spheres.pairs[check - groups, 1]
     between = abs(bounds.way[spheres.link[other]] - bounds.way[spheres.link[one]])
     return float(min(between, bounds.group_way[one] + bounds.group_way[other]))
-
-
-@inlined
-def _forget(bounds: Bounds) -> None:
-    """Set all lower bounds of clearance so low that they tell nothing."""
-    for group in range(len(bounds.apart)):
-        bounds.apart[group] = -FAR
-    for pair in range(len(bounds.pair_apart)):
-        bounds.pair_apart[pair] = -FAR
 
 
 @inlined
@@ -497,7 +443,7 @@ def _set_ways(reach: Float, first: Float, second: Float, spheres: Spheres, bound
 @inlined
 def _matters(spheres: Spheres, bounds: Bounds, drift: float, least: float) -> bool:
     """Return True if the ways of the groups must be known better, because one may now be nearer than the least."""
-    for group in range(len(bounds.apart)):
+    for group in range(len(spheres.link)):
         if spheres.link[group] > 0 and bounds.apart[group] - bounds.group_way[group] - drift < least:
             return True
     return False
@@ -510,7 +456,7 @@ def _keep_places(placed: Placed, bounds: Bounds) -> None:
         for row in range(3):
             for column in range(3):
                 bounds.rotation[link, row, column] = placed.rotation[link, row, column]
-    for group in range(len(bounds.apart)):
+    for group in range(len(bounds.ball)):
         for axis in range(3):
             bounds.ball[group, axis] = placed.ball[group, axis]
 
@@ -522,7 +468,7 @@ def _shorten_ways(spheres: Spheres, placed: Placed, bounds: Bounds) -> None:
     No sphere of a group has a longer chord than that of the group's ball and of a point at its edge. The chord is the
     mean of the velocity, from which the velocity differs by half of its greatest derivative at most.
     """
-    for group in range(len(bounds.apart)):
+    for group in range(len(bounds.ball)):
         link = spheres.link[group]
         turn = 0.0
         for row in range(3):
@@ -532,42 +478,6 @@ def _shorten_ways(spheres: Spheres, placed: Placed, bounds: Bounds) -> None:
         chord = math.sqrt(_square(placed.ball, group, bounds.ball, group))
         bound = chord + spheres.ball_radius[group] * math.sqrt(turn) + bounds.bend[link]
         bounds.group_way[group] = min(bounds.group_way[group], bound)
-
-
-@inlined
-def _move(drift: float, spheres: Spheres, bounds: Bounds) -> None:
-    """Lower the bounds of clearance by the ways of the spheres, and the one of the obstacles, `drift`, [m]."""
-    for group in range(len(bounds.apart)):
-        bounds.apart[group] -= bounds.group_way[group] + drift
-    for pair in range(len(bounds.pair_apart)):
-        bounds.pair_apart[pair] -= _way_of_pair(spheres, bounds, pair)
-
-
-@inner
-def row_clearance(
-    spheres: Spheres,
-    placed: Placed,
-    obstacles: Obstacles,
-    scene: int,
-    row: int,
-    time: float,
-    least: float,
-    floor: float,
-    link: int,
-) -> float:
-    """Return the clearance of links from `link` on of a placed arm from one obstacle, at most `least`, [m].
-
-    The search stops at the first clearance below `floor`; the exact value below it does not matter.
-    """
-    if obstacles.kind[scene, row] == ABSENT:
-        return least
-    for group in range(len(spheres.link)):
-        if spheres.link[group] < link:  # the base, or links that are not asked for
-            continue
-        least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
-        if least < floor:
-            return least
-    return least
 
 
 @compiled
@@ -585,5 +495,5 @@ def row_clearances(
         place(chain, spheres, joints[scene], placed)
         own[scene] = self_clearance(spheres, placed, most, -FAR)
         for row in range(rows):
-            found[scene, row] = row_clearance(spheres, placed, obstacles, scene, row, 0.0, most, -FAR, 1)
+            found[scene, row] = obstacle_clearance(spheres, placed, obstacles, scene, 0.0, most, -FAR, row)
     return found, own

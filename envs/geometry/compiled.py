@@ -1,4 +1,4 @@
-"""Decorators of compiled functions."""
+"""Decorators of compiled functions, and rotations of vectors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ import numpy as np
 from numba import njit, types
 from numba.core.caching import IndexDataCacheFile
 
+from viapoint.envs.common.arrays import Float
+
 TINY = 1e-12  # Length below which a vector has no direction, [m]
+Vector = tuple[float, float, float]  # Three components
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 # Arithmetic in another order would be 3 % faster. But the order would depend on which functions the compiler met first,
@@ -39,17 +42,10 @@ def kernel(function: Function) -> Function:
 def inner(function: Function) -> Function:
     """Compile a function that makes no arrays, and that compiled functions alone call; the code is cached on disk.
 
-    It has no entrance for calls from Python, which for packed obstacles takes half a second to compile.
+    It has no entrance for calls from Python, which for packed obstacles takes half a second to compile. Python must
+    not call it: Numba would end the interpreter.
     """
-    made: Any = njit(cache=True, **KERNEL, **INNER)(function)
-
-    def refuse(*_: Any, **__: Any) -> None:
-        raise TypeError(f"{function.__name__} is for compiled functions; from Python, call its `py_func`")
-
-    # Numba itself would end the interpreter.
-    made._compile_for_args = refuse
-    made._insert = lambda *_, **__: None
-    return cast("Function", made)
+    return cast("Function", njit(cache=True, **KERNEL, **INNER)(function))
 
 
 def inlined(function: Function) -> Function:
@@ -58,6 +54,28 @@ def inlined(function: Function) -> Function:
     A call with packed obstacles passes 150 numbers, which takes longer than a distance.
     """
     return cast("Function", njit(inline="always", **KERNEL)(function))
+
+
+@inlined
+def rotated(axes: Float, vector: Vector) -> Vector:
+    """Return a vector of a frame in the world, for the axes of the frame as columns, shape (3, 3)."""
+    x, y, z = vector
+    return (
+        axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z,
+        axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z,
+        axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z,
+    )
+
+
+@inlined
+def rotated_back(axes: Float, vector: Vector) -> Vector:
+    """Return a vector of the world in a frame, for the axes of the frame as columns, shape (3, 3)."""
+    x, y, z = vector
+    return (
+        axes[0, 0] * x + axes[1, 0] * y + axes[2, 0] * z,
+        axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z,
+        axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z,
+    )
 
 
 def _no_clock(kind: int, moment: Any) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.compiled import compiled, inlined
+from viapoint.envs.geometry.compiled import compiled, inlined, rotated, rotated_back
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.envs.geometry.shapes import Distance, Shape, as_obstacles, local_distance
 
@@ -36,25 +36,13 @@ def point_distance_and_normal(
     dx = x - centre[scene, row, 0] - time * velocity[scene, row, 0]
     dy = y - centre[scene, row, 1] - time * velocity[scene, row, 1]
     dz = z - centre[scene, row, 2] - time * velocity[scene, row, 2]
-    axes = obstacles.rotation
-    distance, nx, ny, nz = local_distance(
-        obstacles.kind[scene, row],
-        size[scene, row, 0],
-        size[scene, row, 1],
-        size[scene, row, 2],
-        obstacles.meshes,
-        obstacles.clouds,
-        axes[scene, row, 0, 0] * dx + axes[scene, row, 1, 0] * dy + axes[scene, row, 2, 0] * dz,
-        axes[scene, row, 0, 1] * dx + axes[scene, row, 1, 1] * dy + axes[scene, row, 2, 1] * dz,
-        axes[scene, row, 0, 2] * dx + axes[scene, row, 1, 2] * dy + axes[scene, row, 2, 2] * dz,
-        limit,
-    )
-    return (
-        distance,
-        axes[scene, row, 0, 0] * nx + axes[scene, row, 0, 1] * ny + axes[scene, row, 0, 2] * nz,
-        axes[scene, row, 1, 0] * nx + axes[scene, row, 1, 1] * ny + axes[scene, row, 1, 2] * nz,
-        axes[scene, row, 2, 0] * nx + axes[scene, row, 2, 1] * ny + axes[scene, row, 2, 2] * nz,
-    )
+    axes = obstacles.rotation[scene, row]
+    here = rotated_back(axes, (dx, dy, dz))
+    sizes = size[scene, row, 0], size[scene, row, 1], size[scene, row, 2]
+    kind, meshes, clouds = obstacles.kind[scene, row], obstacles.meshes, obstacles.clouds
+    distance, nx, ny, nz = local_distance(kind, sizes, meshes, clouds, here, limit)
+    nx, ny, nz = rotated(axes, (nx, ny, nz))
+    return distance, nx, ny, nz
 
 
 @compiled

@@ -132,7 +132,7 @@ def build_mesh(vertices: Float, faces: Int | None) -> Meshes:
         depth = ((corners[:, 0] - vertices[vertex]) * normals).sum(axis=1).min()
         if depth > DENT * size:
             raise ValueError(
-                f"vertices must be convex, but vertex {vertex} lies {depth:.3g} m inside; {HULL_HINT}"
+                f"vertices must be convex: vertex {vertex} lies {depth:.3g} m inside; {HULL_HINT}"
             )
     if faces is not None:
         _check_faces(vertices, faces, hull.volume, DENT * size**3)
@@ -156,9 +156,7 @@ def convex_hull(vertices: Float, coplanar: float = 0.0) -> Any:
     size = np.ptp(vertices, axis=0).max()
     around = (vertices - vertices.mean(axis=0)) / (size if size > 0.0 else 1.0)
     if len(vertices) < 4 or np.linalg.svd(around, compute_uv=False)[2] < DENT:
-        raise ValueError(
-            "vertices must span a volume, but they lie in a plane; use a thin box or a point cloud"
-        )
+        raise ValueError("vertices must span a volume, but lie in a plane; use a thin box or a point cloud")
     try:
         hull = ConvexHull(vertices, qhull_options=f"Qt C{coplanar * size:g}" if coplanar else "Qt")
         finite = np.isfinite(hull.equations).all()
@@ -174,9 +172,7 @@ def _check_faces(vertices: Float, faces: Int, volume: float, tolerance: float) -
     edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]])).tolist()
     known = {(first, second) for first, second in edges}
     if len(known) < len(edges) or any((second, first) not in known for first, second in known):
-        raise ValueError(
-            f"faces must be closed: each edge belongs to two of them, in both directions; {HULL_HINT}"
-        )
+        raise ValueError(f"faces must be closed: each edge belongs to two, in both directions; {HULL_HINT}")
     inside = np.linalg.det(vertices[faces]).sum() / 6.0
     if abs(abs(inside) - volume) > tolerance:
         raise ValueError(

@@ -151,12 +151,6 @@ def pack(scenes: Sequence[Iterable[Shape | Mapping[str, Any]]], rows: int | None
 
     Raises:
         ValueError: A scene has more obstacles than rows, or an obstacle is not allowed.
-
-    Example:
-        >>> from viapoint.envs.geometry.obstacles import pack
-        >>> from viapoint.envs.geometry.shapes import Box, Sphere
-        >>> pack([[Sphere(0.1), Box((0.1, 0.1, 0.2))], []]).present.tolist()
-        [[True, True], [False, False]]
     """
     shapes = [as_obstacles(scene) for scene in scenes]
     most = max(map(len, shapes), default=0)
@@ -357,9 +351,7 @@ def geom_meshes(obstacles: Obstacles, among: Iterable[str] | None = None) -> Any
     """
     kind = obstacles.kind
     if (kind == POINT_CLOUD).any():
-        raise ValueError(
-            "a point cloud is no single geom; use a sphere for each point of PointCloud.covering"
-        )
+        raise ValueError("a point cloud is no single geom; use a sphere for each of PointCloud.covering")
     meshes = kind == MESH
     names = np.array([*mesh_names(obstacles.meshes, among), ""])
     found = names[np.where(meshes, obstacles.size[..., 0], -1).astype(np.int64)]
@@ -399,16 +391,6 @@ def add_to_model(
         obstacles: Shapes or dictionaries, with different names; a point cloud becomes a sphere for each point.
         body: Body of the geoms; the world by default.
         **attributes: Attributes of all geoms, such as `contype` or `rgba`.
-
-    Example:
-        >>> import mujoco
-        >>> from viapoint.envs.geometry.obstacles import add_to_model
-        >>> from viapoint.envs.geometry.shapes import Box, Capsule
-        >>> spec = mujoco.MjSpec()
-        >>> add_to_model(spec, [Box((0.1, 0.1, 0.1)), Capsule(0.02, 0.1, position=(0.0, 0.0, 0.2), name="post")])
-        [['obstacle_0_0'], ['post_0']]
-        >>> spec.compile().ngeom
-        2
     """
     body = spec.worldbody if body is None else body
     shapes = as_obstacles(obstacles)

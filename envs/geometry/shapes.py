@@ -19,7 +19,7 @@ from viapoint.envs.common.arrays import Float, frame_matrices, frozen, quaternio
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, unit_quaternion
 from viapoint.envs.geometry.clouds import Clouds, build_cloud, cloud_distance, join_clouds
-from viapoint.envs.geometry.compiled import TINY, inlined, kernel
+from viapoint.envs.geometry.compiled import TINY, Vector, inlined, kernel
 from viapoint.envs.geometry.meshes import FAR, Meshes, build_mesh, convex_hull, join_meshes, mesh_distance
 
 # Kinds of obstacles; the number of a kind is its place in this table
@@ -99,22 +99,14 @@ def box_distance(a: float, b: float, c: float, x: float, y: float, z: float) -> 
 
 @inlined
 def local_distance(
-    kind: int,
-    a: float,
-    b: float,
-    c: float,
-    meshes: Meshes,
-    clouds: Clouds,
-    x: float,
-    y: float,
-    z: float,
-    limit: float,
+    kind: int, size: Vector, meshes: Meshes, clouds: Clouds, point: Vector, limit: float
 ) -> Distance:
     """Return the signed distance of a point in the frame of a shape, and its gradient.
 
-    The sizes a, b and c are those of :attr:`Shape.packed_size`. Beyond `limit`, any number between it and the distance
-    may be returned, [m].
+    The size is :attr:`Shape.packed_size`. Beyond `limit`, any number between it and the distance may be returned, [m].
     """
+    a, b, c = size
+    x, y, z = point
     if kind == SPHERE:
         found = sphere_distance(a, x, y, z)
     elif kind == CAPSULE:
@@ -135,19 +127,12 @@ def local_distance(
 
 
 @kernel
-def _distances(
-    kind: int, size: Float, rotation: Float, position: Float, meshes: Meshes, clouds: Clouds,
-    points: Float, found: Float,
-) -> None:  # fmt: skip
-    """Fill in the signed distances of points, shape (M, 3), from one shape."""
+def _distances(kind: int, size: Float, meshes: Meshes, clouds: Clouds, points: Float, found: Float) -> None:
+    """Fill in the signed distances of points, shape (M, 3), in the frame of a shape."""
+    sizes = size[0], size[1], size[2]
     for i in range(len(points)):
-        dx = points[i, 0] - position[0]
-        dy = points[i, 1] - position[1]
-        dz = points[i, 2] - position[2]
-        x = rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz
-        y = rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz
-        z = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
-        found[i] = local_distance(kind, size[0], size[1], size[2], meshes, clouds, x, y, z, FAR)[0]
+        point = points[i, 0], points[i, 1], points[i, 2]
+        found[i] = local_distance(kind, sizes, meshes, clouds, point, FAR)[0]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -237,11 +222,10 @@ class Shape:
         radius = finite_array("radius", radius)
         if (radius < 0.0).any():
             raise ValueError(f"radius must be 0 or greater, got {radius.min()}")
-        flat = np.array(points.reshape(-1, 3))
-        found = np.empty(len(flat))
-        pose = self.rotation, np.array(self.position)
+        local = (points.reshape(-1, 3) - self.position) @ self.rotation
         tables = self.mesh or join_meshes([]), self.cloud or join_clouds([])
-        _distances(self.number, self.packed_size, *pose, *tables, flat, found)
+        found = np.empty(len(local))
+        _distances(self.number, self.packed_size, *tables, local, found)
         return found.reshape(points.shape[:-1]) - radius
 
     @property
@@ -320,9 +304,7 @@ class Capsule(Shape):
         half = 0.5 * (second - first)
         length = float(np.linalg.norm(half))
         if not 0.0 < length < np.inf:
-            raise ValueError(
-                f"ends of a capsule must be different, got {first.tolist()} and {second.tolist()}"
-            )
+            raise ValueError(f"ends of a capsule must differ, got {first.tolist()} and {second.tolist()}")
         return cls(radius, length, position=first + half, quaternion=quaternion_to(half / length), **others)
 
 
@@ -499,8 +481,7 @@ class PointCloud(Shape):
 
 SHAPES: tuple[type[Shape], ...] = (Sphere, Capsule, Cylinder, Box, HalfSpace, ConvexMesh, PointCloud)
 """Classes of the kinds, in the order of KINDS."""
-# Meshes that have a name of their own, see :func:`register_mesh`
-REGISTERED_MESHES: dict[str, ConvexMesh] = {}
+REGISTERED_MESHES: dict[str, ConvexMesh] = {}  # Meshes with a name of their own, see :func:`register_mesh`
 
 
 def register_mesh(name: str, vertices: Any, faces: Any = None) -> None:
@@ -616,9 +597,7 @@ def check_kinds(names: Iterable[Any]) -> tuple[str, ...]:
     for name in names:
         if not isinstance(name, str) or (name not in KINDS and name not in REGISTERED_MESHES):
             known = ", ".join((*KINDS, *REGISTERED_MESHES))
-            raise ValueError(
-                f"shape must be one of {known}, got {name!r}; register_mesh names a convex mesh of your own"
-            )
+            raise ValueError(f"shape must be one of {known}, got {name!r}; register_mesh adds a convex mesh")
     if len(set(names)) < len(names):
         raise ValueError(f"shapes must not be repeated, got {', '.join(names)}")
     return names

@@ -9,8 +9,8 @@ import numpy as np
 from viapoint.envs.arms.inverse_kinematics import descend, solve_planar
 from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position, transform
 from viapoint.envs.common.arrays import Bool, Float, Int
-from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, row_clearance, self_clearance
-from viapoint.envs.geometry.compiled import inlined, inner, kernel
+from viapoint.envs.geometry.clearance import Placed, obstacle_clearance, place, self_clearance
+from viapoint.envs.geometry.compiled import inlined, inner, kernel, rotated
 from viapoint.envs.geometry.obstacles import ABSENT
 from viapoint.envs.scenes.scene import NEVER, Scenes, way_since_start
 
@@ -18,17 +18,14 @@ PAIRS, TRIES = 3, 6  # Pairs of start and goal for a layout, and attempts at eac
 # Share of starts at home or near it, and of these and starts in places of goals; others are free ones
 HOME, REACHING = 0.4, 0.8
 FREE_GOALS = 0.1  # Share of goals that are free configurations, where the layout has places
-# Share of pairs whose start and goal are exchanged, where the layout has no places of starts
-EXCHANGED = 0.25
+EXCHANGED = 0.25  # Share of pairs whose ends are exchanged, where the layout has no places of starts
 JITTER = 0.3  # Greatest deviation from home of half of the starts there, [rad]
 # Least clearance of the arm from itself at ends, [m], and the share of that at home that it is at most
 SELF_MARGIN, HOME_SHARE = 0.005, 0.5
 INSTANTS = 32  # Parts of the straight movement between which it is looked at
 ROLL = 0.3  # Greatest deviation of the tool's roll about its axis from quarter turns, [rad]
-# Spread around home of the seeds of inverse kinematics, as a share of the ranges of the joints
-SEED_SPREAD = 0.3
-BLOCKED, FREE, OUT_OF_REACH = 1, 0, -1
-"""Outcome of a straight movement."""
+SEED_SPREAD = 0.3  # Spread of seeds of inverse kinematics around home, as a share of the ranges
+BLOCKED, FREE, OUT_OF_REACH = 1, 0, -1  # Outcome of a straight movement
 
 
 class Setting(NamedTuple):
@@ -205,7 +202,8 @@ def is_row_clear(
     for axis in range(3):
         change = scenes.turn_velocity[scene, row, axis] - obstacles.velocity[scene, row, axis]
         obstacles.centre[scene, row, axis] += after * change + moved * scenes.reach[scene, row, 2 + axis]
-    least = row_clearance(draft.setting.spheres, placed, obstacles, scene, row, time, margin, margin, link)
+    spheres = draft.setting.spheres
+    least = obstacle_clearance(spheres, placed, obstacles, scene, time, margin, margin, row, link)
     obstacles.centre[scene, row, 0] = x
     obstacles.centre[scene, row, 1] = y
     obstacles.centre[scene, row, 2] = z
@@ -364,9 +362,7 @@ def _tool_axes(approach: Float, cone: float, numbers: Float, axes: Float) -> Non
     angle = 2.0 * np.pi * numbers[1]
     u = sine * np.cos(angle)
     v = sine * np.sin(angle)
-    x = u * axes[0, 0] + v * axes[0, 1] + cosine * axes[0, 2]
-    y = u * axes[1, 0] + v * axes[1, 1] + cosine * axes[1, 2]
-    z = u * axes[2, 0] + v * axes[2, 1] + cosine * axes[2, 2]
+    x, y, z = rotated(axes, (u, v, cosine))
     _fill_frame(x, y, z, axes)
     roll = 0.5 * np.pi * np.floor(4.0 * numbers[2]) + ROLL * (2.0 * numbers[3] - 1.0)
     c, s = np.cos(roll), np.sin(roll)

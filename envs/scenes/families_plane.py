@@ -24,8 +24,7 @@ TILT = 0.6  # Greatest angle between a bar of clutter and the perpendicular of t
 IN_THE_WAY = 0.03  # Greatest distance of the first obstacle from the straight line, [m]
 # Least distance of the next two from the line, what it grows by for every two more, and its range, [m]
 NEAREST, STEP, SPREAD = 0.05, 0.05, 0.08
-# Greatest distance of other obstacles from the forearm on the line, where links must clear, too, [m]
-ASIDE = 0.12
+ASIDE = 0.12  # Greatest distance of other obstacles from the forearm, where links must clear, too, [m]
 
 Point = tuple[float, float]
 

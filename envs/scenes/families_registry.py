@@ -28,6 +28,14 @@ class SceneFamily:
     # True if the family is one of those of training by default; those shipped without are hard
     trained: bool = False
 
+    def lack(self, kinds: Iterable[str], most: int) -> str:
+        """Return what scenes with some kinds, and at most so many obstacles, lack for the family; empty for nothing."""
+        missing = set(self.kinds) - set(kinds)
+        if missing:
+            return f"needs obstacles of the kinds {', '.join(sorted(missing))}"
+        enough = self.n_obstacles <= max(most, 1)
+        return "" if enough else f"needs n_obstacles of {self.n_obstacles} or more, got {most}"
+
 
 # Families by their place, True for the plane and False for space, and their name
 FAMILIES: dict[tuple[bool, str], SceneFamily] = {
@@ -49,24 +57,14 @@ FAMILIES: dict[tuple[bool, str], SceneFamily] = {
 
 
 def scene_families(plane: bool) -> Mapping[str, SceneFamily]:
-    """Return the families of scenes in the plane or in space, by name.
-
-    Example:
-        >>> from viapoint.envs.scenes.families_registry import scene_families
-        >>> families = scene_families(plane=False)
-        >>> families["shelf"].trained, families["cage"].trained
-        (True, False)
-    """
+    """Return the families of scenes in the plane or in space, by name."""
     return {name: each for (there, name), each in FAMILIES.items() if there == plane}
 
 
 def default_families(plane: bool, kinds: Iterable[str], most: int) -> tuple[str, ...]:
     """Return the families of training that scenes with some kinds, and at most so many obstacles, have room for."""
-    names = []
-    for name, family in scene_families(plane).items():
-        if family.trained and set(family.kinds) <= set(kinds) and family.n_obstacles <= max(most, 1):
-            names.append(name)
-    return tuple(names)
+    known = scene_families(plane)
+    return tuple(name for name, each in known.items() if each.trained and not each.lack(kinds, most))
 
 
 def check_families(families: Sequence[str], plane: bool, kinds: Iterable[str], most: int) -> tuple[str, ...]:
@@ -79,14 +77,9 @@ def check_families(families: Sequence[str], plane: bool, kinds: Iterable[str], m
     for name in families:
         if name not in known:
             raise ValueError(f"families must be some of {', '.join(known)}, got {name!r}")
-        family = known[name]
-        missing = set(family.kinds) - set(kinds)
-        if missing:
-            raise ValueError(f"the family {name!r} needs obstacles of the kinds {', '.join(sorted(missing))}")
-        if family.n_obstacles > max(most, 1):
-            raise ValueError(
-                f"the family {name!r} needs {family.n_obstacles} obstacles, n_obstacles allows {most}"
-            )
+        lack = known[name].lack(kinds, most)
+        if lack:
+            raise ValueError(f"the family {name!r} {lack}")
     return tuple(families)
 
 

@@ -91,8 +91,7 @@ class Layout(NamedTuple):
     goals: list[float]  # PLACE numbers for each place of goals; without any, goals are free configurations
     # PLACE numbers for each place of starts; without any, starts are home, in a place of goals, or free
     starts: list[float]
-    # Number of obstacles that are kept, the first ones that leave both ends free; 0 if they belong together
-    keep: int = 0
+    keep: int = 0  # Number of obstacles that are kept, the first with free ends; 0 if they belong together
 
 
 class Place(NamedTuple):
@@ -242,11 +241,7 @@ class Furniture:
         """Return a point of the frame in the world, [m]."""
         x, y = self._turned(point[0], point[1])
         scale, foot = self.room.scale, self.room.foot
-        return (
-            foot[0] + scale * (self._x + x),
-            foot[1] + scale * (self._y + y),
-            foot[2] + scale * point[2],
-        )
+        return (foot[0] + scale * (self._x + x), foot[1] + scale * (self._y + y), foot[2] + scale * point[2])
 
 
 def mix(limits: tuple[float, float], share: float) -> float:

@@ -25,8 +25,7 @@ FIRST_JUMP, NEXT_JUMP = (0.1, 0.7), (0.4, 0.9)
 JUMP_OF_HAND, JUMP_OF_JOINTS = (0.10, 0.30), (0.25, 0.75)
 SPEED = (0.05, 0.30)  # Speed of obstacles, [m/s]
 STEEPNESS = 0.5  # Greatest height that an obstacle in space gains, relative to its way
-# Share of obstacles that turn, and the time of the turn, relative to the centre duration
-TURNING, TURN = 0.5, (0.2, 0.7)
+TURNING, TURN = 0.5, (0.2, 0.7)  # Share of obstacles that turn, and the relative time of the turn
 # Duration of a reach of an obstacle, [s], its least and greatest length, [m], and its greatest peak speed, [m/s]
 REACH_TIME, REACH_LENGTH, REACH_SPEED = (0.6, 1.2), (0.15, 0.45), 0.9 * FASTEST
 MET_AT = (0.35, 0.65)  # Share of the duration of a reach after which an obstacle is where it was drawn

@@ -28,8 +28,7 @@ from viapoint.envs.scenes.sampler import VIEW_MARGIN, SceneSampler
 from viapoint.envs.scenes.scene import ENDS, MOST_JUMPS, NEVER, Scenes, check_scenes, resting
 from viapoint.envs.spaces import space_of
 
-# Options of `reset` that give a scene, or a part of one
-OPTIONS = (*ENDS, "obstacles", "jumps", "turns", "reaches")
+OPTIONS = (*ENDS, "obstacles", "jumps", "turns", "reaches")  # Options of `reset` that give a part of a scene
 FORMAT = "viapoint-scene"  # Value of the key `format` of a scene file
 REACHED = 1e-6  # Greatest distance of the hand from a given place, [m]
 
@@ -151,9 +150,7 @@ def _check_shape(row: int, shape: Shape, sampler: SceneSampler) -> None:
                 f"environment, {', '.join(allowed)}"
             )
     if kind not in allowed:
-        raise ValueError(
-            f"obstacle {row} must be one of the shapes of the task, {', '.join(allowed)}, got {kind}"
-        )
+        raise ValueError(f"obstacle {row} must be one of the task's shapes, {', '.join(allowed)}, got {kind}")
     arm = sampler.task.arm
     base = np.repeat(arm.spheres.link, np.diff(arm.spheres.first)) == 0
     centres = sphere_centres(arm.chain, arm.spheres, arm.home)[base]
@@ -186,9 +183,7 @@ def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles) -> 
     array = finite_array(label, value, (2,), (3,), (number, 2), (number, 3))
     height = sampler.room.foot[2]
     if array.shape[-1] == 3 and (np.abs(array[..., 2] - height) > REACHED).any():
-        raise ValueError(
-            f"{label} must have z = {height:g} m, which is the plane of the hand, got {array.tolist()}"
-        )
+        raise ValueError(f"{label} must have z = {height:g} m, as the hand has, got {array.tolist()}")
     return _planar(label, sampler.task.arm, np.broadcast_to(array[..., :2], (number, 2)))
 
 

@@ -46,11 +46,9 @@ if TYPE_CHECKING:
 # Half heights of obstacles in the plane that the hand alone must clear, and that links must clear, too, [m]
 LOW_HALF_HEIGHT, TALL_HALF_HEIGHT = 0.04, 0.3
 PLANE_MARGIN, SPACE_MARGIN = 0.025, 0.02  # Least clearance of starts and goals from obstacles, [m]
-# Least distance of ends from the joint limits, [rad] or [m]; at most a tenth of the range
-LIMIT_MARGIN = 0.02
+LIMIT_MARGIN = 0.02  # Least distance of ends from joint limits, [rad] or [m]; at most a tenth of the range
 LEAST_WAY = 0.5  # Least length of the way from start to goal in joint space, [rad]
-# Reaches of the tools of the reference arms, measured from joint 2, [m]
-PLANE_REACH, SPACE_REACH = 0.6755, 0.947
+PLANE_REACH, SPACE_REACH = 0.6755, 0.947  # Reaches of the reference arms from joint 2, [m]
 SHOULDER = 0.333  # Height of joint 2 of the reference arm in space, [m]
 REACH_SAMPLES = 2000  # Configurations among which the reach of an arm is looked for
 # Greatest number of obstacles that are drawn, unless a task asks for more in every scene; more can be given
@@ -71,12 +69,10 @@ class SceneSampler:
         self.task = task
         self.plane = is_planar(task.arm)
         fewest, most = task.n_obstacles
-        self.rows = most
-        """Number of rows for obstacles."""
+        self.rows = most  # Number of rows for obstacles
         most = min(most, max(fewest, MOST_DRAWN))
         self.room = room_of(task.arm, task.shapes, (fewest, most), task.whole_arm)
-        self.viewpoint = None if task.sensor is None else task.sensor.viewpoint
-        """Place of a sensor that does not move, [m]."""
+        self.viewpoint = None if task.sensor is None else task.sensor.viewpoint  # Place of a still sensor
         self._setting = _setting_of(task, self.plane)
         known = scene_families(self.plane)
         self._builds = [known[name].build for name in task.families]

@@ -5,12 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 import pytest
-from helpers import (
-    check_contact_implies_overlap,
-    configuration_clearances,
-    least_pair_distance,
-    random_shape,
-)
+from helpers import check_contact_implies_overlap, configuration_clearances, least_pair_distance, random_shape
 
 from viapoint.envs.arms.capsule_fit import cover_geom, hull_of
 from viapoint.envs.arms.kinematics import sphere_centres

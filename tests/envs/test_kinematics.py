@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from viapoint import primitives
 from viapoint.envs.arms.arm import arm_from_xml
 from viapoint.envs.arms.inverse_kinematics import (
     in_planar_reach,
@@ -16,13 +15,7 @@ from viapoint.envs.arms.inverse_kinematics import (
     planar_motion,
     solve_planar,
 )
-from viapoint.envs.arms.kinematics import (
-    forward,
-    link_poses,
-    sphere_centres,
-    tool_jacobian,
-    torques,
-)
+from viapoint.envs.arms.kinematics import forward, link_poses, sphere_centres, tool_jacobian, torques
 from viapoint.envs.arms.registry import arm_of
 
 GANTRY = """
@@ -174,30 +167,3 @@ def test_spheres_contain_the_geoms_and_stick_out_little(arm):
             from_axis = np.linalg.norm(centres - centre - share[:, None] * axis, axis=1)
             outside = np.minimum(outside, from_axis + radii - radius)
         assert outside.max() <= arm.excess + 1e-9 <= 0.005 + 2e-9
-
-
-@pytest.mark.parametrize("name", ["planar", "panda"])
-@pytest.mark.parametrize("stride", [1, 4])
-def test_movements_at_half_of_the_speed_limits_are_tracked_within_a_milliradian(name, stride):
-    arm = arm_of(name)
-    rng = np.random.default_rng(0)
-    low, high = arm.joint_range.T
-    limit = np.minimum(arm.velocity_limit, 3.0)
-    model = arm.compile(0)
-    data = mujoco.MjData(model)
-    for _ in range(8):
-        start, goal = rng.uniform(low, high, (2, len(low)))
-        duration = float((1.875 * np.abs(goal - start) / (0.5 * limit)).max())
-        movement = primitives.point_to_point(start, goal, duration)
-        time = arm.timestep * np.arange(round(duration / arm.timestep) + 1)
-        motion = [part[None] for part in movement.sample(time)]
-        controls = arm.controls(*motion, stride)[0]
-        mujoco.mj_resetData(model, data)
-        data.qpos[:] = start
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-        error = 0.0
-        for k in range(len(time) - 1):
-            data.ctrl[:] = controls[k]
-            mujoco.mj_step(model, data)
-            error = max(error, np.abs(data.qpos - motion[0][0, k + 1]).max())
-        assert error < 1e-3

@@ -6,20 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from helpers import (
-    CRATE,
-    ENDS,
-    HOME,
-    JUMPS,
-    MOVING,
-    OTHER,
-    PANDA,
-    PANDA_ENDS,
-    PLANE,
-    STEP,
-    post,
-    same_scenes,
-)
+from helpers import CRATE, ENDS, HOME, JUMPS, MOVING, OTHER, PANDA, PANDA_ENDS, PLANE, STEP, post, same_scenes
 
 import viapoint.envs as ve
 from viapoint.envs.geometry.obstacles import add_to_model, geom_meshes, pack

@@ -5,20 +5,7 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import (
-    GOAL,
-    JUMPS,
-    MOVING,
-    OTHER,
-    PANDA,
-    PANDA_MOVING,
-    PLANE,
-    events,
-    given,
-    play,
-    post,
-    same,
-)
+from helpers import GOAL, JUMPS, MOVING, OTHER, PANDA, PANDA_MOVING, PLANE, events, given, play, post, same
 
 from viapoint import primitives
 from viapoint.envs.arms.kinematics import LIMIT_SHARE, slowdowns

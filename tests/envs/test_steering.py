@@ -9,9 +9,8 @@ from helpers import GOAL, STEP, WALL, given, post
 from scipy.integrate import simpson
 
 from viapoint.envs.outcome import SETTLING
-from viapoint.envs.plans import Motion
+from viapoint.envs.plans import Motion, Steering
 from viapoint.envs.scenes.scene import NEVER
-from viapoint.envs.steering import Steering
 
 
 def steering(timestep=0.002, physics_steps=20, space="hand"):
