@@ -220,27 +220,6 @@ def as_number(value: Any) -> float:
         return math.nan
 
 
-def check_buffers(out: Sequence[Array], count: int, shape: tuple[int, ...], xp: Namespace) -> None:
-    """Raise ValueError unless `out` holds `count` writeable floating arrays of the given library and shape."""
-
-    def fits(buffer: Array) -> bool:
-        if namespace_of(buffer) is not xp or tuple(buffer.shape) != shape:
-            return False
-        if xp is np:
-            return bool(buffer.dtype.kind == "f" and buffer.flags.writeable)
-        return bool(xp.isdtype(buffer.dtype, "real floating"))
-
-    try:
-        fitting = [fits(buffer) for buffer in out]
-    except TypeError:
-        fitting = []
-    if fitting != [True] * count:
-        raise ValueError(
-            f"out must hold {count} writeable floating arrays of shape {shape} of the trajectory's own kind, "
-            f"got {[getattr(buffer, 'shape', buffer) for buffer in out] if fitting else type(out).__name__}"
-        )
-
-
 def broadcast_to(xp: Namespace, array: Array, shape: tuple[int, ...]) -> Array:
     """Broadcast an array, without the overhead of a call if it has the shape already."""
     return array if tuple(array.shape) == tuple(shape) else xp.broadcast_to(array, shape)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import perm, prod
-from typing import Any
 
 from ._passage_newton import duration_gradient
 from .array_api import Array
-from .trajectory import Trajectory, require_trajectory
+from .trajectory import Trajectory, derivative_coefficients, require_trajectory
 
 
 @dataclass(frozen=True)
@@ -48,12 +46,6 @@ def cost_gradient(trajectory: Trajectory) -> CostGradient:
     optimum over everything that was left open: the states at the via-points, and the passage times if the
     segment durations came from `passage_durations`.
 
-    Args:
-        trajectory: least-cost movements.
-
-    Returns:
-        The derivatives [cost / unit of the argument], with the trajectory's leading shape.
-
     Raises:
         ValueError: the argument is not a Trajectory.
 
@@ -65,7 +57,8 @@ def cost_gradient(trajectory: Trajectory) -> CostGradient:
     """
     require_trajectory(trajectory)
     xp, m = trajectory.namespace, trajectory.order
-    highest = _segment_derivative(trajectory, 2 * m - 1, at_end=False) * (-1.0) ** (m - 1)
+    coefficients, rates = trajectory.coefficients, trajectory.rates
+    highest = derivative_coefficients(xp, coefficients, rates, 2 * m - 1)[..., 0, :, :] * (-1.0) ** (m - 1)
     rows = [-highest[..., :1, :], highest[..., :-1, :] - highest[..., 1:, :], highest[..., -1:, :]]
     ends = []
     for i in (1, 2):
@@ -73,16 +66,7 @@ def cost_gradient(trajectory: Trajectory) -> CostGradient:
             ends += [0.0 * highest[..., 0, :]] * 2
             continue
         sign = (-1.0) ** (m - 1 - i)
-        ends.append(-sign * _segment_derivative(trajectory, 2 * m - 1 - i, at_end=False)[..., 0, :])
-        ends.append(sign * _segment_derivative(trajectory, 2 * m - 1 - i, at_end=True)[..., -1, :])
-    durations = duration_gradient(trajectory.coefficients, trajectory.rates)
-    return CostGradient(xp.concat(rows, axis=-2), durations, *ends)
-
-
-def _segment_derivative(trajectory: Trajectory, nu: int, *, at_end: bool) -> Array:
-    """Return the nu-th derivative of each segment at its own beginning or end, (..., S, D)."""
-    total: Any = 0.0
-    for k in range(nu, 2 * trajectory.order if at_end else nu + 1):
-        total = total + perm(k, nu) * trajectory.coefficients[..., k, :, :]
-    scale: Array = prod([trajectory.rates] * (nu - 1), start=trajectory.rates)
-    return total * scale[..., None]
+        derivative = derivative_coefficients(xp, coefficients, rates, 2 * m - 1 - i)
+        ends.append(-sign * derivative[..., 0, 0, :])  # at the beginning of the first segment, u = 0
+        ends.append(sign * derivative[..., -1, :].sum(-2))  # at the end of the last one, u = 1
+    return CostGradient(xp.concat(rows, axis=-2), duration_gradient(coefficients, rates), *ends)

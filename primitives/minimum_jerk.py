@@ -5,15 +5,7 @@ from __future__ import annotations
 import math
 
 from ._boundary import check_durations, check_order, end_shapes, knot_states, read_arguments, waypoint_shapes
-from .array_api import (
-    Array,
-    Boundary,
-    as_floats,
-    broadcast_batch,
-    broadcast_to,
-    leading_shape,
-    require,
-)
+from .array_api import Array, Boundary, as_floats, broadcast_batch, broadcast_to, leading_shape, require
 from .trajectory import Trajectory, connect
 
 
@@ -43,9 +35,6 @@ def point_to_point(
         goal_acceleration: (..., D) [m/s^2]; likewise.
         order: 2, 3 or 4: least acceleration, jerk or snap. Order 2 leaves accelerations open; with order 4
             the jerk is zero at both ends.
-
-    Returns:
-        A trajectory of one segment with the broadcast leading shape.
 
     Raises:
         ValueError: an argument is not finite, has a wrong shape, or duration <= 0 (0 is allowed for a movement
@@ -101,9 +90,6 @@ def through(
         via_velocities: (..., K, D) prescribed velocities at the via-points [m/s]; None = those of least cost.
         order: 2, 3 or 4: least acceleration, jerk or snap.
 
-    Returns:
-        A trajectory of K + 1 segments with the broadcast leading shape.
-
     Raises:
         ValueError: an argument is not finite or has a wrong shape; a duration is negative, or 0 between
             different waypoints, or all are 0 while an end moves.
@@ -127,7 +113,7 @@ def through(
     if via_velocities is not None:
         shapes["via_velocities"] = leading_shape("via_velocities", via_velocities, knots - 2, dimension)
     batch = broadcast_batch(**shapes)
-    waypoints = broadcast_to(xp, waypoints, (*batch, *waypoints.shape[-2:]))
+    waypoints = broadcast_to(xp, waypoints, (*batch, knots, dimension))
     check_durations("durations", durations, waypoints, ends)
     states = knot_states(order, ends, knots - 2)
     if via_velocities is not None:
@@ -147,17 +133,8 @@ def minimum_jerk_coefficients(
         a_4 T^4 = -15 D + 8 V0 + 7 VT + 3/2 A0 -     AT
         a_5 T^5 =   6 D - 3 V0 - 3 VT - 1/2 A0 + 1/2 AT
 
-    Args:
-        x0: (...,) start position [m].
-        dx0: (...,) start velocity [m/s].
-        ddx0: (...,) start acceleration [m/s^2].
-        xT: (...,) goal position [m].
-        dxT: (...,) goal velocity [m/s].
-        ddxT: (...,) goal acceleration [m/s^2].
-        T: (...,) duration [s].
-
-    Returns:
-        (..., 6) coefficients, a_k in m/s^k.
+    Position [m], velocity [m/s] and acceleration [m/s^2] at start and goal and the duration T [s] have the shape
+    (...,), the coefficients (..., 6), a_k in m/s^k.
 
     Raises:
         ValueError: an argument is not finite, does not broadcast, or T <= 0.
@@ -167,10 +144,10 @@ def minimum_jerk_coefficients(
         >>> minimum_jerk_coefficients(0, 0, 0, 1, 0, 0, 1).tolist()
         [0.0, 0.0, 0.0, 10.0, -15.0, 6.0]
     """
-    names = ("x0", "dx0", "ddx0", "xT", "dxT", "ddxT", "T")
-    xp, arrays = as_floats(**dict(zip(names, (x0, dx0, ddx0, xT, dxT, ddxT, T), strict=True)))
+    given = {"x0": x0, "dx0": dx0, "ddx0": ddx0, "xT": xT, "dxT": dxT, "ddxT": ddxT, "T": T}
+    xp, arrays = as_floats(**given)
     require(arrays[-1] > 0, "T", arrays[-1], "must be positive")
-    shape = broadcast_batch(**{name: tuple(a.shape) for name, a in zip(names, arrays, strict=True)})
+    shape = broadcast_batch(**{name: tuple(a.shape) for name, a in zip(given, arrays, strict=True)})
     x0, dx0, ddx0, xT, dxT, ddxT, T = (broadcast_to(xp, a, shape)[..., None] for a in arrays)
     movement = connect(xp, 3, xp.stack([x0, xT], axis=-2), T, [[dx0, ddx0], [dxT, ddxT]])
     unit = movement.coefficients[..., 0, :]

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ._evaluate import derivative_coefficients, evaluate
-from ._hermite_tables import energy_table
+from ._hermite_tables import derivative_factors, energy_table
 from ._knot_solver import States, least_cost_coefficients
 from ._polynomial import Extrema, axis_extrema, largest_norm
 from .array_api import (
@@ -19,7 +18,6 @@ from .array_api import (
     as_floats,
     broadcast_batch,
     broadcast_to,
-    check_buffers,
     leading_shape,
     like,
     namespace_of,
@@ -27,6 +25,9 @@ from .array_api import (
     to_numpy,
     whole_orders,
 )
+
+# Size of the basis of one block of trajectories, which stays in a core's second-level cache.
+_BLOCK_BYTES = 1_200_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -126,38 +127,27 @@ class Trajectory:
             return self.sample(time.reshape(1), (nu,))[0][..., 0, :]
         return self.sample(time, (nu,))[0]
 
-    def sample(
-        self, time: Array | int, nu: int | Sequence[int] = (0, 1, 2), *, out: Sequence[Array] | None = None
-    ) -> tuple[Array, ...]:
-        """Return several time derivatives at once, optionally in the caller's buffers.
+    def sample(self, time: Array | int, nu: int | Sequence[int] = (0, 1, 2)) -> tuple[Array, ...]:
+        """Return several time derivatives at once, one array (..., T, D) per order [m/s^nu].
 
         Args:
             time: as in a call; or a whole number of at least 2, the number of evenly spaced times from 0 to
                 the duration of each trajectory, both included.
             nu: orders of derivative; one number counts as a sequence of one.
-            out: one array per order, each (..., T, D) with the full batch shape, for example the planes of
-                one array (len(nu), ..., T, D). Written without intermediate copies where they are NumPy
-                arrays of the trajectory's dtype and the batch has one dimension.
-
-        Returns:
-            One array (..., T, D) per order [m/s^nu], the given buffers if there are any.
 
         Raises:
-            ValueError: bad time or nu, or buffers of a wrong number, kind, shape or dtype.
+            ValueError: bad time or nu.
         """
         xp = self.namespace
         time, inside = self._times(time, xp)
         orders = whole_orders(nu)
-        batch = self.batch_shape
         if time.ndim > 1:
-            batch = broadcast_batch(trajectory=batch, time=tuple(time.shape[:-1]))
-        if out is not None:
-            check_buffers(out, len(orders), (*batch, time.shape[-1], self.dimension), xp)
-        kept = [min(order, 2 * self.order - 1) for order in orders]
-        results = evaluate(self.coefficients, self.starts, self.rates, time, kept, out, xp)
-        if inside is not None or max(orders) >= 2 * self.order:
-            self._hold(xp, results, orders, inside, xp is np or out is not None)
-        return tuple(results)
+            broadcast_batch(trajectory=self.batch_shape, time=tuple(time.shape[:-1]))
+        values = _evaluate(self.coefficients, self.starts, self.rates, time, orders, xp)
+        if inside is None:
+            return tuple(values)
+        moving = xp.astype(inside, self.coefficients.dtype)[..., None]
+        return tuple(v * moving if order else v for order, v in zip(orders, values, strict=True))
 
     def _times(self, time: Array | int, xp: Namespace) -> tuple[Array, Array | None]:
         """Return times (..., T) clipped to the movement, and True where they were inside (None: all)."""
@@ -193,20 +183,6 @@ class Trajectory:
                 if array is not None and array.dtype != coefficients.dtype:
                     arrays[i] = xp.astype(array, coefficients.dtype)
         return arrays
-
-    def _hold(
-        self, xp: Namespace, values: list[Array], orders: Sequence[int], inside: Array | None, in_place: bool
-    ) -> None:
-        """Set derivatives to zero outside the movement and beyond the polynomial's degree."""
-        mask = None if inside is None else xp.astype(inside, self.coefficients.dtype)[..., None]
-        for i, order in enumerate(orders):
-            factor = 0.0 if order >= 2 * self.order else mask
-            if order == 0 or factor is None:
-                continue
-            if in_place:
-                values[i] *= factor
-            else:
-                values[i] = values[i] * factor
 
     def cost(self) -> Array:
         """Return (...,) the cost 1/2 integral of |x^(order)|^2 [m^2 / s^(2 order - 1)], in closed form."""
@@ -342,3 +318,64 @@ def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, state
     starts = xp.where(starts >= end, 2 * end, starts)
     rates = xp.where(empty, 0.0, 1.0 / xp.where(empty, 1.0, durations))
     return Trajectory(coefficients, durations, order, starts, rates, end)
+
+
+def derivative_coefficients(xp: Namespace, coefficients: Array, rates: Array, nu: int) -> Array:
+    """Return the coefficients (..., 2m - nu, S, D) of the nu-th derivative in seconds, in unit time.
+
+    Beyond the degree it is the constant zero, (..., 1, S, D).
+    """
+    if nu == 0:
+        return coefficients
+    if nu >= coefficients.shape[-3]:
+        return 0.0 * coefficients[..., :1, :, :]
+    table = derivative_factors(coefficients.shape[-3] // 2, nu)
+    scale: Array = math.prod([rates] * (nu - 1), start=rates)
+    factors = like(xp, table, coefficients) * scale[..., None, :]
+    return coefficients[..., nu:, :, :] * factors[..., None]
+
+
+def _evaluate(
+    coefficients: Array, starts: Array, rates: Array, time: Array, orders: Sequence[int], xp: Namespace
+) -> list[Array]:
+    """Return derivatives of some orders, each (..., T, D), at times (..., T).
+
+    All segments go into one small matrix product per trajectory, with the same inner sizes alone and in a batch, so
+    that an item of a batch gives the same bits as alone:
+
+        x^(nu)(t) = sum_(k, s) B_(k, s)(t) c^(nu)_(k, s),   B_(k, s)(t) = u_s^k if segment s is current, else 0.
+    """
+    powers, segments, dimension = coefficients.shape[-3:]
+    batch = coefficients.shape[:-3]
+    if xp is np and len(batch) == 1 and time.ndim < 3:
+        size = max(1, _BLOCK_BYTES // max(1, powers * segments * time.shape[-1] * coefficients.itemsize))
+        if size < batch[0] and batch in (starts.shape[:-1], time.shape[:-1]):
+            blocks = []
+            for first in range(0, batch[0], size):
+                rows = slice(first, first + size)
+                own = (each[rows] if each.shape[:-1] == batch else each for each in (starts, rates, time))
+                blocks.append(_evaluate(coefficients[rows], *own, orders, xp))
+            return [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
+    basis = _basis(time, starts, rates, powers - min(orders), xp)
+    results = []
+    for nu in orders:
+        weight = derivative_coefficients(xp, coefficients, rates, nu)
+        weight = weight.reshape(*weight.shape[:-3], weight.shape[-3] * segments, dimension)
+        results.append(xp.matmul(basis[..., : weight.shape[-2], :].mT, weight))
+    return results
+
+
+def _basis(time: Array, starts: Array, rates: Array, number: int, xp: Namespace) -> Array:
+    """Return the transposed basis of `_evaluate`: rows k S + s of u_s^k, k < number, where segment s is current."""
+    local = (time[..., None, :] - starts[..., None]) * rates[..., None]
+    current = xp.ones_like(local)
+    if starts.shape[-1] > 1:  # start_s <= time < start_(s+1); the last segment has no end
+        reached = time[..., None, :] >= starts[..., 1:, None]
+        edge = xp.ones_like(reached[..., :1, :])
+        reached = xp.concat([edge, reached, ~edge], axis=-2)
+        current = xp.astype(reached[..., :-1, :] & ~reached[..., 1:, :], starts.dtype)
+        local = local * current
+    rows = [current, local]
+    while len(rows) < number:
+        rows.append(rows[-1] * local)
+    return xp.concat(rows, axis=-2)
