@@ -60,13 +60,13 @@ class Straight:
         return np.zeros((len(scenes.start), self._size))
 
 
-class RandomVias:
+class RandomVias(Straight):
     """Uniformly random actions."""
 
     name = "random"
 
     def __init__(self, simulation: SceneSimulation) -> None:
-        self._size = len(simulation.task.action_names)
+        super().__init__(simulation)
         self._generator = np.random.default_rng(0)  # the same actions in every evaluation
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
@@ -78,9 +78,6 @@ class PlannerMethod:
     """Planner whose movements have as many via-points as they need, and durations of their own.
 
     A decision is a row: number of via-points, durations of the segments [s], waypoints, then zeros.
-
-    Raises:
-        ValueError: The library of the planner is not installed.
     """
 
     def __init__(self, simulation: SceneSimulation, name: str) -> None:
@@ -112,10 +109,10 @@ class PlannerMethod:
         outcomes: Outcomes = {}
         for count in np.unique(counts):
             rows = np.flatnonzero(counts == count)
-            waypoints = decisions[rows, 2 + count : 2 + count + (count + 2) * dimension]
-            plan = Plan.at_rest(
-                waypoints.reshape(len(rows), count + 2, dimension), decisions[rows, 1 : 2 + count]
+            _, durations, waypoints, _ = np.split(
+                decisions[rows], (1, 2 + count, 2 + count + (count + 2) * dimension), axis=1
             )
+            plan = Plan.at_rest(waypoints.reshape(len(rows), count + 2, dimension), durations)
             result = self._simulation.execute_plan(scenes.take(rows), plan)
             for name, values in result.items():
                 outcomes.setdefault(name, np.zeros(len(decisions), dtype=values.dtype))[rows] = values
@@ -123,10 +120,7 @@ class PlannerMethod:
 
 
 class AgentMethod:
-    """Trained agent, which checks and refines some of its proposals in each decision.
-
-    Their numbers are `checks` and `refine`; None for the numbers of the model.
-    """
+    """Trained agent that checks and refines this many of its proposals; None for the numbers of the model."""
 
     def __init__(self, name: str, model: Any, checks: int | None = None, refine: int | None = None) -> None:
         self.name, self._model = name, model
@@ -176,8 +170,6 @@ class StepAgentMethod:
 def agent_method(name: str, model: Any, checks: int | None = None, refine: int | None = None) -> Method:
     """Return a trained agent as a method, for whole movements or for actions in every control step.
 
-    Its name tells how many proposals are checked and refined, as :class:`AgentMethod` explains.
-
     Raises:
         ValueError: The agent cannot check or refine its proposals.
     """
@@ -196,7 +188,7 @@ def agent_method(name: str, model: Any, checks: int | None = None, refine: int |
 
 
 def _refined_search(simulation: SceneSimulation, checks: int) -> Method:
-    """Return a search that spends half of its checks on refinement, which solves more scenes."""
+    """Return a search that spends half of its checks on refinement."""
     rounds = 2 if checks < 512 else 4
     each = checks // 2 // rounds
     return GeometrySearch(simulation.task, checks - rounds * each, refinements=rounds, per_round=each)

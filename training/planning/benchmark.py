@@ -37,15 +37,7 @@ from viapoint.training.planning.search import GeometrySearch
 
 DATA = files("viapoint.training.planning") / "data"
 # Names of the sets
-SETS = (
-    "bookshelf_small",
-    "bookshelf_tall",
-    "bookshelf_thin",
-    "box",
-    "cage",
-    "table_pick",
-    "table_under_pick",
-)
+SETS = ("bookshelf_small", "bookshelf_tall", "bookshelf_thin", "box", "cage", "table_pick", "table_under_pick")
 KINDS: dict[type[Shape], int] = {Box: 0, Cylinder: 1}  # Numbers of shapes in the numeric file
 JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))  # Names of the joints in the files
 TOGETHER = 20  # Number of plans that are simulated together
@@ -64,7 +56,7 @@ class BenchmarkProblem(NamedTuple):
     number: int  # Number within the set, from 1
     start: Float  # Joint positions, shape (J,), [rad] or [m]
     goal: Float  # Joint positions, shape (J,), [rad] or [m]
-    obstacles: tuple[Shape, ...]  # Obstacles
+    obstacles: tuple[Shape, ...]
 
     @property
     def name(self) -> str:
@@ -85,22 +77,16 @@ def benchmark_problems() -> list[BenchmarkProblem]:
     """Return the 700 problems, of which one, `table_pick 41`, has a goal in contact."""
     with (DATA / "motionbenchmaker.npz").open("rb") as file:
         parts = dict(np.load(file))
+    shapes = list[Shape]()
+    for kind, pose, size in zip(parts["kind"], parts["pose"], parts["size"], strict=True):
+        place = {"position": pose[:3], "quaternion": pose[3:] / np.linalg.norm(pose[3:])}
+        shapes.append(Box(size, **place) if kind == KINDS[Box] else Cylinder(size[0], size[1], **place))
     problems, first = [], 0
-    for k, count in enumerate(parts["count"]):
-        shapes: list[Shape] = []
-        for row in range(first, first + count):
-            size = parts["size"][row]
-            position = parts["pose"][row, :3]
-            quaternion = parts["pose"][row, 3:]
-            quaternion = quaternion / np.linalg.norm(quaternion)
-            if parts["kind"][row] == KINDS[Box]:
-                shapes.append(Box(size, position=position, quaternion=quaternion))
-            else:
-                shapes.append(Cylinder(size[0], size[1], position=position, quaternion=quaternion))
+    rows = (parts[name] for name in ("set", "number", "start", "goal", "count"))
+    for group, number, start, goal, count in zip(*rows, strict=True):
+        obstacles = tuple(shapes[first : first + count])
         first += count
-        name = SETS[parts["set"][k]]
-        number = int(parts["number"][k])
-        problems.append(BenchmarkProblem(name, number, parts["start"][k], parts["goal"][k], tuple(shapes)))
+        problems.append(BenchmarkProblem(SETS[group], int(number), start, goal, obstacles))
     return problems
 
 
@@ -112,11 +98,8 @@ def read_problems(
     The files are `sceneNNNN.yaml` and `requestNNNN.yaml`, in folders named after their sets; `joints` are the names of
     the arm's joints in them, those of the Panda by default. Obstacles are placed relative to the base of the robot,
     which a joint such as `virtual_joint` moves. Values of other joints, frames of objects, and goals after the first
-    are not looked at. The second result has a line for each problem that cannot be read, which names its file; meshes,
-    planes and objects that are attached to the arm cannot be read.
-
-    Raises:
-        ValueError: There is no problem that can be read.
+    are not looked at. The second result has a line for each problem that cannot be read; if none can, ValueError.
+    Meshes, planes and objects that are attached to the arm cannot be read.
     """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
@@ -232,21 +215,20 @@ def benchmark_planner(name: str) -> Planner:
     Raises:
         ValueError: There is no such planner, or its library is not installed.
     """
-    planners: dict[str, Planner] = {
-        "straight": lambda arm, each: plan_motion(arm, each.start, each.goal, each.obstacles, time_limit=0.0),
-        "plan_motion": lambda arm, each: plan_motion(arm, each.start, each.goal, each.obstacles, ompl=False),
-        "plan_motion+ompl": lambda arm, each: plan_motion(
-            arm, each.start, each.goal, each.obstacles, time_limit=10.0
-        ),
-        "ompl": lambda arm, each: ompl_motion(arm, each.start, each.goal, pack([each.obstacles])),
+    settings: dict[str, dict[str, Any]] = {
+        "straight": {"time_limit": 0.0},
+        "plan_motion": {"ompl": False},
+        "plan_motion+ompl": {"time_limit": 10.0},
     }
     if "ompl" in name:
         import_ompl()
-    if name in planners:
-        return planners[name]
+    if name == "ompl":
+        return lambda arm, each: ompl_motion(arm, each.start, each.goal, pack([each.obstacles]))
+    if name in settings:
+        return lambda arm, each: plan_motion(arm, each.start, each.goal, each.obstacles, **settings[name])
     checks = re.fullmatch(r"search([1-9]\d*)", name)
     if checks is None:
-        raise ValueError(unknown_name("planner", name, [*planners, "searchN"]))
+        raise ValueError(unknown_name("planner", name, [*settings, "ompl", "searchN"]))
     number = whole_number("N of searchN", int(checks[1]), 1, MOST_CANDIDATES)
     return lambda arm, each: _searched(arm, each, number)
 
