@@ -21,8 +21,7 @@ from .smoothness import (
     speed_peaks,
     speed_valleys,
 )
-from .time_scaling import minimum_duration
-from .trajectory import Trajectory
+from .trajectory import Trajectory, minimum_duration
 
 __all__ = [
     "FREE",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -102,15 +102,8 @@ def knot_states(order: int, ends: Ends, vias: int = 0) -> list[list[Any]]:
     return [*states, [*values[2:], None][: order - 1]]
 
 
-def unit_time_ends(ends: Ends, duration: Array) -> list[Any]:
-    """Return the boundary values in unit time, V = v T and A = a T^2; None and FREE stay."""
-    values, time = list(ends.values()), duration[..., None]
-    for i, (name, value) in enumerate(ends.items()):
-        if is_given(value):
-            values[i] = value * (time if "velocity" in name else time * time)
-    return values
-
-
-def chosen_items(value: Any, items: Any) -> Any:
-    """Return the rows `items` of a NumPy boundary value; None and FREE stay."""
-    return value[items] if isinstance(value, np.ndarray) else value
+def unit_time_ends(ends: Sequence[Boundary], duration: Array) -> list[Any]:
+    """Return the values of END_NAMES in unit time, V = v T and A = a T^2; None and FREE stay."""
+    time = duration[..., None]
+    powers = time, time * time, time, time * time
+    return [value * power if is_given(value) else value for value, power in zip(ends, powers, strict=True)]

@@ -32,7 +32,7 @@ import numpy as np
 from ._hermite_tables import mode_table
 from ._passage_one_via import attach_root_gradient, nearer_fraction
 from ._weighted_solver import fit_modes, mode_weights
-from .array_api import FREE, Array, Floats, Namespace, like, ordered_sum, to_numpy
+from .array_api import FREE, Array, Floats, Namespace, change_given, like, ordered_sum, to_numpy
 from .trajectory import connect
 
 # Starts with moving ends: even durations, durations by chord, eight from a flat Dirichlet distribution.
@@ -41,8 +41,8 @@ _STARTS = 10
 _MOST_SEGMENTS = 16
 # Bound on the entries of the inverse Hessian of the log-cost: knots about to merge keep a finite gradient.
 _LARGEST = 1e3
-# Steps of the log-durations for one-sided and for central difference quotients of the gradient.
-_DIFFERENCE, _WIDE_DIFFERENCE = 1e-8, 1e-6
+# Step of the log-durations for difference quotients of the gradient.
+_DIFFERENCE = 1e-8
 _LONGEST_STEP = 1.5
 # Relative error of a cost.
 _NOISE = 1e-13
@@ -74,13 +74,13 @@ class PassageCost:
     @classmethod
     def from_points(cls, points: Floats, ends: Sequence[Any], slack: Floats) -> PassageCost:
         """Return the cost of movements through points (N, S + 1, D) with four boundary values (N, D)."""
-        rows = [np.ascontiguousarray(v.T) if isinstance(v, np.ndarray) else v for v in ends]
+        rows = change_given(lambda value: np.ascontiguousarray(value.T), ends)
         steps = np.ascontiguousarray(np.diff(points, axis=1).transpose(1, 2, 0))
         return cls(steps, rows, slack)
 
     def chosen(self, items: Any) -> PassageCost:
         """Return the movements `items`, in that order."""
-        ends = [value[:, items] if isinstance(value, np.ndarray) else value for value in self.ends]
+        ends = change_given(lambda value: value[:, items], self.ends)
         return PassageCost(self.steps[..., items], ends, self.slack[items])
 
     def reference(self) -> Floats:
@@ -188,9 +188,8 @@ def _lowest(cost: PassageCost, candidates: list[Floats]) -> Floats:
 def _log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, Floats, Floats]:
     """Return log(J + reference), its gradient and its Hessian with respect to z.
 
-    The Hessian consists of difference quotients of the gradient, all computed at once, central ones for many
-    segments, which make it ill conditioned. The cost does not change if all z shift: that gives the last row, and
-    1 1^T, which makes the Hessian regular, changes no step.
+    The Hessian consists of difference quotients of the gradient, all computed at once. The cost does not change if all
+    z shift: that gives the last row, and 1 1^T, which makes the Hessian regular, changes no step.
     """
     size, count = z.shape
     columns = [z]

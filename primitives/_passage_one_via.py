@@ -29,15 +29,15 @@ around either end, roots are sought on every scale of time, and Newton steps use
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from ._boundary import chosen_items
 from ._polynomial import differentiate, evaluate, multiply, root_candidates
-from .array_api import FREE, Array, Floats, Namespace, like, ordered_sum, to_numpy
+from .array_api import FREE, Array, Floats, Namespace, change_given, like, ordered_sum, to_numpy
 from .trajectory import connect
 
 Number: TypeAlias = Any  # A NumPy scalar, or an array with one entry per movement; both give the same bits
@@ -239,7 +239,7 @@ def fractions_moving(points: Floats, ends: list[Any], slack: Floats) -> Floats:
     fractions = np.stack([best, 1.0 - best], axis=-1)
     hard = np.flatnonzero(_inaccurate(stationary, best))
     if hard.size:
-        chosen = [chosen_items(value, hard) for value in ends]
+        chosen = change_given(operator.itemgetter(hard), ends)
         found = _from_both_ends(points[hard], chosen, slack[hard], cost[hard])
         wrong = (np.abs(found - fractions[hard]) > _TOLERANCE * found).any(axis=-1)
         fractions[hard[wrong]] = found[wrong]
@@ -293,7 +293,7 @@ def _expand(points: Floats, ends: list[Any], slack: Floats, *, from_goal: bool) 
         powers = (q, 5)
         g = Polynomial(g)(Polynomial([1.0, -1.0])).coef
         first, last = last, first
-        states = [[-v if isinstance(v, np.ndarray) else v, a] for v, a in reversed(states)]
+        states = [[*change_given(operator.neg, state[:1]), state[1]] for state in reversed(states)]
     free = connect(np, 3, np.stack([first, last], axis=1), np.ones(1), states)
     miss = -np.moveaxis(free.coefficients[:, :, 0, :], 1, -1)  # (N, D, 6)
     miss[..., 0] = via - first

@@ -11,7 +11,7 @@ import functools
 import math
 import operator
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, Literal, TypeAlias, TypeGuard
 
 import numpy as np
@@ -56,6 +56,11 @@ _MAY_BE_FREE = ("goal_velocity", "goal_acceleration")
 def is_given(value: Boundary) -> TypeGuard[Array]:
     """Return True for a boundary value that is an array, neither None nor FREE."""
     return value is not None and value is not FREE
+
+
+def change_given(function: Callable[[Array], Array], values: Iterable[Boundary]) -> list[Boundary]:
+    """Return boundary values of which arrays are changed by a function; None and FREE stay."""
+    return [function(value) if is_given(value) else value for value in values]
 
 
 def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> tuple[Namespace, list[Any]]:

@@ -46,14 +46,7 @@ class SpeedEvents:
 
 
 def speed(trajectory: Trajectory, time: Array) -> Array:
-    """Return the tangential speed |v| at given times.
-
-    Args:
-        trajectory: the movements.
-        time: (T,) or (..., T) [s].
-
-    Returns:
-        (..., T) [m/s].
+    """Return the tangential speed |v|, (..., T) [m/s], at times (T,) or (..., T) [s].
 
     Example:
         >>> from viapoint.primitives import point_to_point, speed
@@ -74,8 +67,8 @@ def curvature(trajectory: Trajectory, time: Array) -> Array:
     """Return the curvature of the path at given times.
 
     In the plane it is signed, (x' y'' - y' x'') / |v|^3, positive to the left (Flash & Hogan 1985, footnote 4).
-    In space it is |v x a| / |v|^3. It is NaN at rest. The curvature of a rest-to-rest movement through a
-    via-point grows without bound at its ends.
+    In space it is |v x a| / |v|^3. It is NaN at rest, and grows without bound at the ends of a movement through a
+    via-point from rest to rest.
 
     Args:
         trajectory: movements in two or three dimensions.
@@ -83,9 +76,6 @@ def curvature(trajectory: Trajectory, time: Array) -> Array:
 
     Returns:
         (..., T) [1/m].
-
-    Raises:
-        ValueError: the dimension is neither 2 nor 3; time is not finite or does not broadcast.
 
     Example:
         >>> from viapoint.primitives import curvature, through
@@ -121,12 +111,9 @@ def _ratio(xp: Namespace, numerator: Array, denominator: Array) -> Array:
 
 
 def dimensionless_jerk(trajectory: Trajectory) -> Array:
-    """Return the dimensionless jerk, integral |jerk|^2 dt duration^3 / peak speed^2; smaller is smoother.
+    """Return the dimensionless jerk (...,), integral |jerk|^2 dt duration^3 / peak speed^2; smaller is smoother.
 
-    The definition of Hogan & Sternad 2009, normalised by the peak speed.
-
-    Returns:
-        (...,); 204.8 for a straight reach, NaN where nothing moves.
+    The definition of Hogan & Sternad 2009, normalised by the peak speed. It is NaN where nothing moves.
 
     Example:
         >>> from viapoint.primitives import dimensionless_jerk, point_to_point
@@ -143,10 +130,9 @@ def dimensionless_jerk(trajectory: Trajectory) -> Array:
 
 
 def log_dimensionless_jerk(trajectory: Trajectory) -> Array:
-    """Return minus the natural logarithm of the dimensionless jerk; greater is smoother.
+    """Return minus the natural logarithm of the dimensionless jerk (...,); greater is smoother.
 
-    Returns:
-        (...,); -5.3220 for a straight reach, infinite without jerk, NaN where nothing moves.
+    It is infinite without jerk, and NaN where nothing moves.
 
     Example:
         >>> from viapoint.primitives import log_dimensionless_jerk, point_to_point
@@ -171,8 +157,7 @@ def spectral_arc_length(
 
     Args:
         trajectory: the movements.
-        cutoff: highest frequency [Hz]; the measure is 0 for movements so brief that the first frequency
-            exceeds it.
+        cutoff: highest frequency [Hz].
         threshold: amplitude below which the tail of the spectrum is left out, 0 to 1.
         padding: powers of two of zero padding, 0 to 16.
 

@@ -1,4 +1,4 @@
-"""Trajectories: positions as piecewise polynomials of time, as immutable values."""
+"""Trajectories: positions as piecewise polynomials of time, as immutable values, and their scaling to limits."""
 
 from __future__ import annotations
 
@@ -34,15 +34,12 @@ _BLOCK_BYTES = 1_200_000
 class Trajectory:
     """Batch of movements x(t), 0 <= t <= duration, each a chain of S polynomials.
 
-    Segment s runs from knot s to knot s + 1 and is sum_k c_k u^k in unit time u = (t - t_s) / h_s, so that no
-    duration, short or long, over- or underflows.
-
-    A trajectory owns its arrays: NumPy arrays become read-only; do not write into torch tensors.
+    Segment s runs from knot s to knot s + 1 and is sum_k c_k u^k in unit time u = (t - t_s) / h_s. A trajectory owns
+    its arrays: NumPy arrays become read-only; do not write into torch tensors.
 
     Attributes:
         coefficients: (..., 2 order, S, D), c_k of segment s [m].
-        durations: (..., S) the segments' durations h [s]; its leading shape may be shorter than the
-            coefficients' (shared).
+        durations: (..., S) the segments' durations h [s], which movements of a batch may share.
         order: order of the derivative whose square is least: 2 acceleration, 3 jerk, 4 snap.
         starts: (..., S) first instant of each segment [s].
         rates: (..., S) 1 / h [1/s].
@@ -108,18 +105,12 @@ class Trajectory:
         return f"Trajectory({shape}, order {self.order})"
 
     def __call__(self, time: Array, nu: int = 0) -> Array:
-        """Return the nu-th time derivative.
+        """Return the nu-th time derivative, (..., T, D) [m/s^nu].
 
         Args:
             time: (T,) for all trajectories or (..., T) for each [s]; a single number gives (..., D). Before 0
-                and after the duration the end point is held at rest.
+                and after the duration the end point is held at rest. A knot belongs to the segment that begins there.
             nu: order of the derivative, at least 0 (from 2 order on it is zero).
-
-        Returns:
-            (..., T, D) [m/s^nu]. A knot belongs to the segment that begins there, the end to the last one.
-
-        Raises:
-            ValueError: time is not finite or does not broadcast; nu is not a whole number of at least 0.
         """
         if isinstance(time, int | float):
             return self.sample([time], (nu,))[0][..., 0, :]
@@ -134,9 +125,6 @@ class Trajectory:
             time: as in a call; or a whole number of at least 2, the number of evenly spaced times from 0 to
                 the duration of each trajectory, both included.
             nu: orders of derivative; one number counts as a sequence of one.
-
-        Raises:
-            ValueError: bad time or nu.
         """
         xp = self.namespace
         time, inside = self._times(time, xp)
@@ -189,11 +177,7 @@ class Trajectory:
         return 0.5 * self.energy(self.order)
 
     def energy(self, nu: int) -> Array:
-        """Return (...,) the integral of |x^(nu)|^2 [m^2 / s^(2 nu - 1)], in closed form as a sum of squares.
-
-        Raises:
-            ValueError: nu is not a whole number from 0 to 2 order - 1.
-        """
+        """Return (...,) the integral of |x^(nu)|^2 [m^2 / s^(2 nu - 1)], nu < 2 order, in closed form."""
         (nu,) = whole_orders((nu,))
         if nu >= 2 * self.order:
             raise ValueError(f"nu must lie in 0 ... {2 * self.order - 1}, got {nu}")
@@ -205,21 +189,11 @@ class Trajectory:
         return xp.sum(xp.sum(xp.sum(modes * modes, axis=-1), axis=-2) * scale, axis=-1)
 
     def extrema(self, nu: int = 0) -> Extrema:
-        """Return the least and greatest nu-th derivative per axis, with their times.
-
-        Where the derivative jumps at a knot both sides count.
-
-        Raises:
-            ValueError: as in `peak`.
-        """
+        """Return the least and greatest nu-th derivative per axis, with their times; at a jump, both sides count."""
         return axis_extrema(self, self._finite_derivative(nu))
 
     def peak(self, nu: int = 0) -> Array:
-        """Return (...,) the largest Euclidean norm of the nu-th derivative [m/s^nu].
-
-        Raises:
-            ValueError: nu is not a whole number, or the movement is so short that the derivative overflows.
-        """
+        """Return (...,) the largest Euclidean norm of the nu-th derivative [m/s^nu]; ValueError if it overflows."""
         return largest_norm(self, self._finite_derivative(nu))
 
     def _finite_derivative(self, nu: int) -> Array:
@@ -237,12 +211,7 @@ class Trajectory:
         return coefficients
 
     def stretched(self, duration: Array) -> Trajectory:
-        """Return the movement along the same path with time scaled to a new total duration (...,) [s].
-
-        Raises:
-            ValueError: duration is not finite, does not broadcast, or is not positive (0 is allowed where nothing
-                moves).
-        """
+        """Return the movement along the same path with time scaled to a new duration (...,) [s], 0 where none moves."""
         xp = self.namespace
         (duration,) = self.floats(duration=duration)
         batch = broadcast_batch(trajectory=self.batch_shape, duration=tuple(duration.shape))
@@ -267,9 +236,6 @@ class Trajectory:
             rotation: (..., D', D) matrix (any linear map), default the identity.
             translation: (..., D') [m], default zero.
             scale: (...,) factor, default one.
-
-        Raises:
-            ValueError: an argument is not finite or has a wrong shape.
         """
         named = {"rotation": rotation, "translation": translation, "scale": scale}
         xp, moved = self.namespace, self.coefficients
@@ -296,11 +262,65 @@ def require_trajectory(value: object) -> None:
         raise ValueError(f"trajectory must be a viapoint.primitives.Trajectory, got {type(value).__name__}")
 
 
-def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Trajectory:
-    """Return the least-cost trajectory through all waypoints at fixed times.
+def minimum_duration(
+    trajectory: Trajectory,
+    *,
+    velocity: Array | None = None,
+    acceleration: Array | None = None,
+    jerk: Array | None = None,
+) -> Array:
+    """Return the shortest duration to which the movement can be scaled within the limits.
 
-    The arguments are those of `least_cost_coefficients`; durations may be 0 between equal waypoints.
+    Scaling time by a factor s divides the nu-th derivative by s^nu and keeps the path, so
+    s = max_nu (peak_nu / limit_nu)^(1 / nu), with the exact extrema of the trajectory.
+
+    Args:
+        trajectory: the movement, of any duration.
+        velocity: limit [m/s]: a number or an array (..., 1) limits the Euclidean norm, an array (..., D) each
+            axis.
+        acceleration: limit [m/s^2], likewise.
+        jerk: limit [m/s^3], likewise.
+
+    Returns:
+        (...,) [s]; 0 where nothing moves.
+
+    Example:
+        >>> from viapoint.primitives import minimum_duration, point_to_point
+        >>> reach = point_to_point([0.0], [0.4], 1.0)
+        >>> fastest = reach.stretched(minimum_duration(reach, velocity=1.5))
+        >>> round(float(fastest.duration), 9), round(float(fastest.peak(1)), 9)
+        (0.5, 1.5)
     """
+    require_trajectory(trajectory)
+    named = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk}
+    if all(limit is None for limit in named.values()):
+        raise ValueError("give at least one limit: velocity, acceleration or jerk")
+    xp, limits = trajectory.namespace, trajectory.floats(named, widest=True)
+    factor = 0.0 * trajectory.duration
+    for nu, (name, limit) in enumerate(zip(named, limits, strict=True), start=1):
+        if limit is None:
+            continue
+        require(limit > 0, name, limit, "must be positive")
+        if limit.ndim and limit.shape[-1] not in (1, trajectory.dimension):
+            allowed = f"a number, (..., 1) or (..., {trajectory.dimension})"
+            raise ValueError(f"{name} must be {allowed}, got shape {tuple(limit.shape)}")
+        broadcast_batch(trajectory=trajectory.batch_shape, **{name: tuple(limit.shape[:-1])})
+        if limit.ndim == 0:
+            excess = trajectory.peak(nu) / limit
+        elif limit.shape[-1] == 1:
+            excess = trajectory.peak(nu) / limit[..., 0]
+        else:
+            extrema = trajectory.extrema(nu)
+            excess = xp.max(xp.maximum(-extrema.minimum, extrema.maximum) / limit, axis=-1)
+        # The slope of a root is infinite at 0, and torch would multiply it by 0: take the root of positive ratios only.
+        moves = excess > 0
+        root = xp.where(moves, excess, 1.0) ** (1.0 / nu)
+        factor = xp.maximum(factor, xp.where(moves, root, 0.0))
+    return factor * trajectory.duration
+
+
+def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Trajectory:
+    """Return the least-cost trajectory through all waypoints at fixed times, see `least_cost_coefficients`."""
     durations = 1.0 * durations  # a copy of its own
     empty = durations <= 0
     some_empty = bool(empty.any())

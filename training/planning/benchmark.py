@@ -37,7 +37,15 @@ from viapoint.training.planning.search import GeometrySearch
 
 DATA = files("viapoint.training.planning") / "data"
 # Names of the sets
-SETS = ("bookshelf_small", "bookshelf_tall", "bookshelf_thin", "box", "cage", "table_pick", "table_under_pick")
+SETS = (
+    "bookshelf_small",
+    "bookshelf_tall",
+    "bookshelf_thin",
+    "box",
+    "cage",
+    "table_pick",
+    "table_under_pick",
+)
 KINDS: dict[type[Shape], int] = {Box: 0, Cylinder: 1}  # Numbers of shapes in the numeric file
 JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))  # Names of the joints in the files
 TOGETHER = 20  # Number of plans that are simulated together

@@ -43,7 +43,14 @@ from viapoint.training.planning.movements import (
     table_with,
 )
 from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl, path_around, points_on
-from viapoint.training.planning.refine import SMOOTH, Found, exact_clearance, is_free, refine_seeds, unit_of_jerk
+from viapoint.training.planning.refine import (
+    SMOOTH,
+    Found,
+    exact_clearance,
+    is_free,
+    refine_seeds,
+    unit_of_jerk,
+)
 
 # Once enough movements are free, more seeds are tried around the one with the least jerk: MORE for each doubling of its
 # relative jerk cost beyond ROUGH, and at most MOST_MORE.

@@ -495,8 +495,8 @@ def refine_seeds(
         seeds: Via-points as offsets from the start, shape (S, K, D).
         bounds: Least and greatest offsets of the via-points beside joint limits, shape (2, K, D).
         duration: Duration during which obstacles move, [s].
-        obstacles: Obstacles, of which those of the scene `scene` count.
-        scene: Index of the scene.
+        obstacles: Obstacles of several scenes.
+        scene: Index of the one that counts.
         margin: Least clearance of movements that count as free, [m].
         unit: Unit of jerk costs in unit time.
         smooth: Jerk cost in this unit with which a movement that was polished once is smooth enough.
