@@ -154,7 +154,10 @@ def _starts(cost: PassageCost, guess: Floats, several: bool) -> list[Floats]:
     guesses = [np.cbrt(chord), _straight_durations(chord)]
     if not np.isnan(guess).all():
         guesses.append(guess)
-    starts = [_lowest(cost, guesses)]
+    shares = np.stack([each / each.sum(axis=0) for each in guesses])
+    costs = np.stack([cost.derivatives(each)[0] for each in shares])
+    best = np.argmin(np.where(costs >= 0, costs, np.inf), axis=0)
+    starts = [np.take_along_axis(shares, best[None, None], axis=0)[0]]
     if several and segments <= _MOST_SEGMENTS:
         starts.append(np.ones_like(chord))
         drawn = np.random.default_rng(0).dirichlet(np.ones(segments), _STARTS - 2)
@@ -174,15 +177,6 @@ def _straight_durations(chord: Floats) -> Floats:
     # No segment is passed faster than at the peak speed 15/8: a very short one keeps a positive duration.
     positive: Floats = np.maximum(durations, chord / (1.875 * total))
     return positive
-
-
-def _lowest(cost: PassageCost, candidates: list[Floats]) -> Floats:
-    """Return, for each movement, those candidates of the durations (S, N) that cost least."""
-    shares = np.stack([each / each.sum(axis=0) for each in candidates])
-    costs = np.stack([cost.derivatives(each)[0] for each in shares])
-    best = np.argmin(np.where(costs >= 0, costs, np.inf), axis=0)
-    chosen: Floats = np.take_along_axis(shares, best[None, None], axis=0)[0]
-    return chosen
 
 
 def _log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, Floats, Floats]:

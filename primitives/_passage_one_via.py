@@ -237,21 +237,18 @@ def fractions_moving(points: Floats, ends: list[Any], slack: Floats) -> Floats:
     u = root_candidates(stationary)
     best = _earliest(u, expansion.excess(u), cost)
     fractions = np.stack([best, 1.0 - best], axis=-1)
-    hard = np.flatnonzero(_inaccurate(stationary, best))
+    # Rounding of the coefficients of F may spoil the root, or hide one near an end.
+    slope = np.abs(evaluate(differentiate(stationary), best)) * np.minimum(best, 1.0 - best)
+    noise = np.finfo(np.float64).eps * evaluate(np.abs(stationary), best) + np.abs(evaluate(stationary, best))
+    at_ends = np.minimum(np.abs(stationary[:, 0]), np.abs(evaluate(stationary, np.ones_like(best))))
+    hidden = ~(at_ends > _NEAR * np.abs(stationary).sum(axis=-1))
+    hard = np.flatnonzero(~(noise < _DOUBT * slope) | hidden)
     if hard.size:
         chosen = change_given(operator.itemgetter(hard), ends)
         found = _from_both_ends(points[hard], chosen, slack[hard], cost[hard])
         wrong = (np.abs(found - fractions[hard]) > _TOLERANCE * found).any(axis=-1)
         fractions[hard[wrong]] = found[wrong]
     return fractions
-
-
-def _inaccurate(stationary: Floats, u: Floats) -> Any:
-    """Return True where rounding of the coefficients of F may spoil the root u (N,), or hide one near an end."""
-    slope = np.abs(evaluate(differentiate(stationary), u)) * np.minimum(u, 1.0 - u)
-    noise = np.finfo(np.float64).eps * evaluate(np.abs(stationary), u) + np.abs(evaluate(stationary, u))
-    at_ends = np.minimum(np.abs(stationary[:, 0]), np.abs(evaluate(stationary, np.ones_like(u))))
-    return ~(noise < _DOUBT * slope) | ~(at_ends > _NEAR * np.abs(stationary).sum(axis=-1))
 
 
 def _candidates_on_every_scale(polynomial: Floats) -> Floats:

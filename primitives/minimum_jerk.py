@@ -75,9 +75,8 @@ def through(
 ) -> Trajectory:
     """Return the movement through all waypoints with the least integral of |x^(order)|^2.
 
-    Velocity and acceleration at the K via-points are those of least cost. They solve a symmetric block
-    tridiagonal system in a time proportional to K. The result is continuous up to x^(2 order - 2) (Flash &
-    Hogan 1985, Appendix C).
+    Velocity and acceleration at the K via-points are those of least cost. The result is continuous up to
+    x^(2 order - 2) (Flash & Hogan 1985, Appendix C).
 
     Args:
         waypoints: (..., K + 2, D) start, via-points, goal [m].

@@ -144,23 +144,19 @@ def _fractions(points: Any, ends: list[Any], eps: float) -> Any:
     return result
 
 
-def _scaled(points: Any, ends: list[Any]) -> tuple[Any, list[Any]]:
-    """Scale each movement to a size of about 1 by a power of two: exact, and no square under- or overflows."""
-    size = np.abs(points - points[:, :1]).max(axis=(1, 2))
-    for value in ends:
-        if isinstance(value, np.ndarray):
-            size = np.maximum(size, np.abs(value).max(axis=1))
-    exponent = -np.frexp(size)[1]
-    scaled = change_given(lambda value: np.ldexp(value, exponent[:, None]), ends)
-    return np.ldexp(points, exponent[:, None, None]), scaled
-
-
 def _solve(points: Any, ends: list[Any], moving: bool) -> Any:
     """Return fractions (N, S) where neighbouring waypoints differ."""
     count, knots, _ = points.shape
     if knots == 2:
         return np.ones((count, 1))
-    points, ends = _scaled(points, ends)
+    # A size of about 1, by a power of two, is exact, and no square under- or overflows.
+    size = np.abs(points - points[:, :1]).max(axis=(1, 2))
+    for value in ends:
+        if isinstance(value, np.ndarray):
+            size = np.maximum(size, np.abs(value).max(axis=1))
+    exponent = -np.frexp(size)[1]
+    points = np.ldexp(points, exponent[:, None, None])
+    ends = change_given(lambda value: np.ldexp(value, exponent[:, None]), ends)
     slack = rounding_slack(points, (ends[:2], ends[2:]))
     if knots == 3:
         return fractions_moving(points, ends, slack) if moving else fractions_at_rest(points)

@@ -142,7 +142,10 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
         for held in (read.get("robot_state"), asked["start_state"]):
             if held and held.get("attached_collision_objects"):
                 raise ValueError("an object is attached to the arm; plan for an arm whose model holds it")
-        base: Float = np.linalg.inv(_base(asked["start_state"])).astype(np.float64)
+        base: Float = np.eye(4)  # Place of the robot's base
+        for each in (asked["start_state"].get("multi_dof_joint_state") or {}).get("transforms") or ():
+            base = base @ _matrix({"position": each["translation"], "orientation": each["rotation"]})
+        base = np.linalg.inv(base)
         obstacles = tuple(_shapes_of(read["world"]["collision_objects"], base))
         if len(obstacles) > MOST_OBSTACLES:
             raise ValueError(
@@ -166,15 +169,6 @@ def _positions(name: str, there: Mapping[str, Any], joints: Sequence[str]) -> Fl
                 f"joint {joint!r} of the arm is not among those of the {name}: {', '.join(there)}"
             )
     return finite_array(name, [there[joint] for joint in joints], (len(joints),))
-
-
-def _base(state: Mapping[str, Any]) -> Float:
-    """Return the place of the robot's base in a state, shape (4, 4)."""
-    joints = state.get("multi_dof_joint_state") or {}
-    place = np.eye(4)
-    for each in joints.get("transforms") or ():
-        place = place @ _matrix({"position": each["translation"], "orientation": each["rotation"]})
-    return place
 
 
 def _shapes_of(objects: list[Mapping[str, Any]], base: Float) -> Iterator[Shape]:
@@ -238,16 +232,15 @@ def benchmark_planner(name: str) -> Planner:
     if checks is None:
         raise ValueError(unknown_name("planner", name, [*settings, "ompl", "searchN"]))
     number = whole_number("N of searchN", int(checks[1]), 1, MOST_CANDIDATES)
-    return lambda arm, each: _searched(arm, each, number)
+    half = number // 2  # Number of plans with one via-point around the best of the others
 
+    def searched(arm: Arm, problem: BenchmarkProblem) -> MotionPlan:
+        task = Task.of(arm=arm, n_obstacles=(0, 32))
+        search = GeometrySearch(task, number - half, refinements=4, per_round=max(half // 4, 1))
+        scene = resting(problem.start[None], problem.goal[None], pack([problem.obstacles]))
+        return search.plan_scene(scene, shortest=True)
 
-def _searched(arm: Arm, problem: BenchmarkProblem, checks: int) -> MotionPlan:
-    """Return the best of some checked plans with one via-point, half of them around the best of the others."""
-    half = checks // 2
-    task = Task.of(arm=arm, n_obstacles=(0, 32))
-    search = GeometrySearch(task, checks - half, refinements=4, per_round=max(half // 4, 1))
-    scene = resting(problem.start[None], problem.goal[None], pack([problem.obstacles]))
-    return search.plan_scene(scene, shortest=True)
+    return searched
 
 
 def measure_planner(
