@@ -88,7 +88,7 @@ def _rows_of(vias: int) -> list[Row]:
     label = f"K={vias}"
     return [
         Row(f"{label} shared knots", common, "times SciPy's batch", common / batch, 1.0),
-        Row(f"{label} own knots", own, "times SciPy, one call each", own / single, 1 / 12),
+        Row(f"{label} own knots", own, "times SciPy, one call each", own / single, 1 / 15),
         Row(f"{label} batch of one", one, "times SciPy, one call", one / single, 2.0),
     ]
 

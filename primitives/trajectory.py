@@ -370,12 +370,13 @@ def _evaluate(
     if xp is np and len(batch) == 1 and time.ndim < 3:
         size = max(1, _BLOCK_BYTES // max(1, powers * segments * time.shape[-1] * coefficients.itemsize))
         if size < batch[0] and batch in (starts.shape[:-1], time.shape[:-1]):
-            blocks = []
+            whole = [np.empty((*batch, time.shape[-1], dimension), coefficients.dtype) for _ in orders]
             for first in range(0, batch[0], size):
                 rows = slice(first, first + size)
                 own = (each[rows] if each.shape[:-1] == batch else each for each in (starts, rates, time))
-                blocks.append(_evaluate(coefficients[rows], *own, orders, xp))
-            return [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
+                for values, part in zip(whole, _evaluate(coefficients[rows], *own, orders, xp), strict=True):
+                    values[rows] = part
+            return whole
     basis = _basis(time, starts, rates, powers - min(orders), xp)
     results = []
     for nu in orders:
