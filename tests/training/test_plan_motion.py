@@ -190,10 +190,10 @@ def test_a_plan_that_leaves_the_joint_limits_has_no_success() -> None:
 
 def objective(setting, table, row, start, offsets, scene, aim, gradient):
     """Compute the objective of the refinement, and its gradient by as many coordinates as there is room for."""
-    work = refine._work(setting, len(offsets), len(start), scene, 0)
+    work = refine._work(setting, len(offsets), len(start), scene)
     movement = Movement(table, row, np.ascontiguousarray(start), offsets, 1.0)
     hessian = np.empty((len(gradient), len(gradient)))
-    return refine._assemble(setting, movement, scene, 0, aim, 360.0, np.inf, hessian, gradient, work)[0]
+    return refine._assemble(setting, movement, scene, aim, 360.0, np.inf, hessian, gradient, work)[0]
 
 
 def test_nothing_is_refined_further_after_the_time_limit() -> None:
@@ -203,7 +203,7 @@ def test_nothing_is_refined_further_after_the_time_limit() -> None:
     bounds = np.full((2, 2, 7), [[[-np.inf]], [[np.inf]]])
     given = (
         arm_setting(PANDA, False, pack([[POST]])), movement_table(2), fine_table(2), PANDA.home, fixed, seeds, bounds,
-        2.0, pack([[POST]]), 0, 0.001, refine.unit_of_jerk(line, False), 1.0, 4,
+        2.0, pack([[POST]]), 0.001, refine.unit_of_jerk(line, False), 1.0, 4,
     )  # fmt: skip
     tried, found = refine.refine_seeds(*given, np.inf)
     few, first = refine.refine_seeds(*given, 0.0)
@@ -304,8 +304,8 @@ def test_within_bounds_no_allowed_direction_is_better() -> None:
         low = offsets[:2] - generator.uniform(0.0, 0.3, (2, 7))
         high = offsets[:2] + generator.uniform(0.0, 0.3, (2, 7))
         movement = Movement(table, 0, PANDA.home, offsets, 1.0)
-        work = refine._work(setting, 5, 7, scene, 0)
-        row = refine._refine(setting, movement, np.stack((low, high)), scene, 0, aim, 360.0, work)
+        work = refine._work(setting, 5, 7, scene)
+        row = refine._refine(setting, movement, np.stack((low, high)), scene, aim, 360.0, work)
         assert ((offsets[:2] >= low) & (offsets[:2] <= high)).all()
         objective(setting, table, row, PANDA.home, offsets, scene, aim, gradient)
         wanted = np.where(gradient.reshape(2, 7) > 0.0, low, high)

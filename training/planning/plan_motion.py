@@ -383,7 +383,7 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     still = np.zeros_like(start)
     problem = _Problem(arm, space, start, still, still, start + 0.01, pack([[]]))
     straight = _straight(problem)
-    is_free(problem.setting(), straight, problem.obstacles, 0, 0.0)
+    is_free(problem.setting(), straight, problem.obstacles, 0.0)
     _known(problem, straight, "straight", 0.0, _fault(problem)[0])
     tables = movement_table(n_via), fine_table(n_via)
     _refined(problem, problem.setting(), 0.0, tables, np.zeros((0, n_via, len(start))), 1.0, np.inf)
@@ -499,7 +499,7 @@ def _plan(problem: _Problem, number: int, until: float, ompl: bool) -> MotionPla
     fault, kept = _fault(problem)
     straight = _straight(problem)
     coarse = straight._replace(table=movement_table(0))
-    if fault or is_free(problem.setting(), coarse, problem.obstacles, 0, kept):
+    if fault or is_free(problem.setting(), coarse, problem.obstacles, kept):
         plan = _known(problem, straight, "straight", problem.least, fault)
         if plan.success or fault or problem.duration is not None:
             return plan
@@ -622,7 +622,7 @@ def _refined(
     endless = np.full(seeds.shape[1:], np.inf)
     return refine_seeds(
         setting, *tables, problem.start, fixed, seeds, np.stack((-endless, endless)), duration,
-        problem.obstacles, 0, kept, unit, smooth, enough, until - time.perf_counter(),
+        problem.obstacles, kept, unit, smooth, enough, until - time.perf_counter(),
     )  # fmt: skip
 
 
@@ -700,12 +700,12 @@ def _known(
     vias = offsets[:-3]
     movement = problem.movement(vias, table, times, duration)
     if clearance is None or clearance >= NEAR:
-        clearance = exact_clearance(problem.setting(), movement, problem.obstacles, 0, problem.margin)
+        clearance = exact_clearance(problem.setting(), movement, problem.obstacles, problem.margin)
     if problem.obstacles.velocity[0].any():  # also while the arm comes to rest at the goal
         obstacles = problem.obstacles
         later = obstacles._replace(centre=obstacles.centre + duration * obstacles.velocity)
         rest = Movement(fine_table(0), 0, problem.goal, np.zeros((3, len(problem.goal))), SETTLING)
-        clearance = min(clearance, exact_clearance(problem.setting(), rest, later, 0, problem.margin))
+        clearance = min(clearance, exact_clearance(problem.setting(), rest, later, problem.margin))
     cost = np.einsum("ij,id,jd->", table.cost[times], movement.offsets, movement.offsets)
     straight_cost = float(straight_jerk_cost(float(np.linalg.norm(problem.goal - problem.start)), 1.0))
     jerk = 1.0 if cost == 0.0 else max(float(cost) / straight_cost, 1.0) if straight_cost else np.nan

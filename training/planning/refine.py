@@ -117,7 +117,7 @@ class _Work(NamedTuple):
 
 
 @compiled
-def _work(setting: Setting, columns: int, dimension: int, obstacles: Obstacles, scene: int) -> _Work:
+def _work(setting: Setting, columns: int, dimension: int, obstacles: Obstacles) -> _Work:
     """Return memory for a refinement."""
     joints = len(setting.joint_range)
     return _Work(
@@ -131,7 +131,7 @@ def _work(setting: Setting, columns: int, dimension: int, obstacles: Obstacles, 
         np.empty(dimension),
         np.empty((columns, columns)),
         np.empty((len(setting.spheres.link), 5)),
-        fastest(obstacles, scene),
+        fastest(obstacles, 0),
     )
 
 
@@ -187,7 +187,7 @@ def _pull(
 
 @inlined
 def _add_obstacles(
-    setting: Setting, obstacles: Obstacles, scene: int, time: float, wanted: float, work: _Work
+    setting: Setting, obstacles: Obstacles, time: float, wanted: float, work: _Work
 ) -> tuple[float, float]:
     """Add the residuals of the placed arm from the obstacles; return their sum of squares, and the least clearance."""
     spheres, placed, total, nearest = setting.spheres, work.placed, 0.0, wanted
@@ -206,19 +206,19 @@ def _add_obstacles(
         far = wanted + WINDOW
         seen[0], seen[1], seen[2], seen[3], seen[4] = u, v, w, far, time
         for row in range(obstacles.kind.shape[1]):
-            if obstacles.kind[scene, row] == ABSENT:
+            if obstacles.kind[0, row] == ABSENT:
                 continue
-            apart = point_distance(obstacles, scene, row, u, v, w, time, far + size) - size
+            apart = point_distance(obstacles, 0, row, u, v, w, time, far + size) - size
             seen[3] = min(seen[3], apart)
             if apart >= wanted:
                 continue
-            least, sphere = group_clearance(spheres, placed, group, obstacles, scene, row, time, wanted, -1e9)
+            least, sphere = group_clearance(spheres, placed, group, obstacles, 0, row, time, wanted, -1e9)
             if sphere < 0:
                 continue
             x = placed.centre[sphere, 0]
             y = placed.centre[sphere, 1]
             z = placed.centre[sphere, 2]
-            _, a, b, c = point_distance_and_normal(obstacles, scene, row, x, y, z, time, 1e9)
+            _, a, b, c = point_distance_and_normal(obstacles, 0, row, x, y, z, time, 1e9)
             work.pull[:] = 0.0
             _pull(setting, work, sphere, spheres.link[group], a, b, c, -1.0)
             nearest = min(nearest, least)
@@ -293,7 +293,6 @@ def _assemble(
     setting: Setting,
     movement: Movement,
     obstacles: Obstacles,
-    scene: int,
     aim: Aim,
     unit: float,
     limit: float,
@@ -333,7 +332,7 @@ def _assemble(
         work.square[:] = 0.0
         work.force[:] = 0.0
         time = movement.duration * k / last
-        from_obstacles, first = _add_obstacles(setting, obstacles, scene, time, aim.clearance, work)
+        from_obstacles, first = _add_obstacles(setting, obstacles, time, aim.clearance, work)
         from_itself, second = 0.0, OWN_CLEARANCE
         if (k - begin) % (4 * STRIDE) == 0:  # bodies of the arm are less often near one another
             from_itself, second = _add_own(setting, OWN_CLEARANCE, work)
@@ -387,7 +386,6 @@ def _refine(
     movement: Movement,
     bounds: Float,
     obstacles: Obstacles,
-    scene: int,
     aim: Aim,
     unit: float,
     work: _Work,
@@ -406,9 +404,7 @@ def _refine(
     longest = LONGEST_STEP[1] if setting.of_hand else LONGEST_STEP[0]
     times, _ = best_times(table, offsets, work.gram)
     movement = Movement(table, times, start, offsets, duration)
-    objective, nearest = _assemble(
-        setting, movement, obstacles, scene, aim, unit, np.inf, hessian, gradient, work
-    )
+    objective, nearest = _assemble(setting, movement, obstacles, aim, unit, np.inf, hessian, gradient, work)
     damping = DAMPING
     for _ in range(ITERATIONS):
         largest = 0.0
@@ -441,7 +437,7 @@ def _refine(
         other, _ = best_times(table, trial, work.gram)
         movement = Movement(table, other, start, trial, duration)
         value, apart = _assemble(
-            setting, movement, obstacles, scene, aim, unit, objective, other_hessian, other_gradient, work
+            setting, movement, obstacles, aim, unit, objective, other_hessian, other_gradient, work
         )
         if value < objective:
             nearest = apart
@@ -477,7 +473,6 @@ def refine_seeds(
     bounds: Float,
     duration: float,
     obstacles: Obstacles,
-    scene: int,
     margin: float,
     unit: float,
     smooth: float,
@@ -495,8 +490,7 @@ def refine_seeds(
         seeds: Via-points as offsets from the start, shape (S, K, D).
         bounds: Least and greatest offsets of the via-points beside joint limits, shape (2, K, D).
         duration: Duration during which obstacles move, [s].
-        obstacles: Obstacles of several scenes.
-        scene: Index of the one that counts.
+        obstacles: Obstacles of one scene.
         margin: Least clearance of movements that count as free, [m].
         unit: Unit of jerk costs in unit time.
         smooth: Jerk cost in this unit with which a movement that was polished once is smooth enough.
@@ -505,7 +499,7 @@ def refine_seeds(
     """
     end = clock() + patience
     number, vias, dimension = seeds.shape
-    work = _work(setting, vias + 3, dimension, obstacles, scene)
+    work = _work(setting, vias + 3, dimension, obstacles)
     found = Found(seeds.copy(), np.zeros(number, np.int64), np.full(number, np.inf), np.full(number, -1.0))
     # The refined movement, and the polished ones, each of which is smoother than the one before.
     offsets = np.empty((ATTEMPTS + 1, vias + 3, dimension))
@@ -521,9 +515,9 @@ def refine_seeds(
         _copy(seeds[each], offsets[0])
         for aim in (SEED, NARROW):
             movement = Movement(table, 0, start, offsets[0], duration)
-            times[0] = _refine(setting, movement, bounds, obstacles, scene, aim, unit, work)
+            times[0] = _refine(setting, movement, bounds, obstacles, aim, unit, work)
             movement = Movement(table, times[0], start, offsets[0], duration)
-            apart = _clearance(setting, movement, obstacles, scene, margin, NEARLY)
+            apart = _clearance(setting, movement, obstacles, margin, NEARLY)
             if not NEARLY < apart < margin or clock() > end:
                 break
         _copy(offsets[0, :vias], found.vias[each])
@@ -531,7 +525,7 @@ def refine_seeds(
         if apart < margin:
             if apart >= 0.0:
                 movement = Movement(fine, times[0], start, offsets[0], duration)
-                exact = exact_clearance(setting, movement, obstacles, scene, margin)
+                exact = exact_clearance(setting, movement, obstacles, margin)
                 found.clearance[each] = min(exact, apart)
             continue
         stage, weight = 0, POLISH.jerk
@@ -542,10 +536,10 @@ def refine_seeds(
             _copy(offsets[stage], trial)
             movement = Movement(table, 0, start, trial, duration)
             aim = Aim(POLISH.clearance, weight, POLISH.gain)
-            other = _refine(setting, movement, bounds, obstacles, scene, aim, unit, work)
+            other = _refine(setting, movement, bounds, obstacles, aim, unit, work)
             _, less = best_times(table, trial, work.gram)
             movement = Movement(table, other, start, trial, duration)
-            if less >= cost or not is_free(setting, movement, obstacles, scene, margin):
+            if less >= cost or not is_free(setting, movement, obstacles, margin):
                 if stage:
                     break
                 weight *= LIGHTER
@@ -559,7 +553,7 @@ def refine_seeds(
                 break
         while stage >= 0:
             movement = Movement(fine, times[stage], start, offsets[stage], duration)
-            clearance = exact_clearance(setting, movement, obstacles, scene, margin)
+            clearance = exact_clearance(setting, movement, obstacles, margin)
             if clearance >= margin:
                 break
             stage -= 1
@@ -577,23 +571,21 @@ def refine_seeds(
 
 @inlined
 def _clearance(
-    setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, margin: float, floor: float
+    setting: Setting, movement: Movement, obstacles: Obstacles, margin: float, floor: float
 ) -> float:
     """Return the least clearance of a movement at the instants of a table, [m]; exact from `floor` to `margin`."""
     memory = memory_of(setting, movement.table, len(movement.start))
-    return least_clearance(setting, movement, obstacles, scene, margin + ROUNDING, floor, 1e9, memory)
+    return least_clearance(setting, movement, obstacles, 0, margin + ROUNDING, floor, 1e9, memory)
 
 
 @compiled
-def is_free(setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, margin: float) -> bool:
+def is_free(setting: Setting, movement: Movement, obstacles: Obstacles, margin: float) -> bool:
     """Return True if a movement keeps a margin at the instants of a table; it stops at the first that does not."""
-    return bool(_clearance(setting, movement, obstacles, scene, margin, margin) >= margin)
+    return bool(_clearance(setting, movement, obstacles, margin, margin) >= margin)
 
 
 @compiled
-def exact_clearance(
-    setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, margin: float
-) -> float:
+def exact_clearance(setting: Setting, movement: Movement, obstacles: Obstacles, margin: float) -> float:
     """Return the least clearance of a movement at all times, at most 1, [m]; OUTSIDE out of reach.
 
     Between two instants of the table, the joints are taken to move straight. There the clearance may be less by
@@ -609,7 +601,7 @@ def exact_clearance(
     placed = memory(setting.chain, setting.spheres)
     step = movement.duration / (number - 1)
     apart, own = movement_clearance(
-        setting.chain, setting.spheres, setting.reach, path, obstacles, scene, 0.0, step, placed,
+        setting.chain, setting.spheres, setting.reach, path, obstacles, 0, 0.0, step, placed,
         bounds_memory(setting.chain, setting.spheres, True), margin,
     )  # fmt: skip
     return min(apart, own)
