@@ -180,13 +180,11 @@ def _banded_coefficients(
         durations, states = durations * scale, scaled
     segments = waypoints.shape[-2] - 1
     steps = waypoints[..., 1:, :] - waypoints[..., :-1, :]
-    pieces = [steps[..., s, :] for s in range(segments)]
+    lengths = xp.moveaxis(durations[..., None], -2, 0)
     if xp is np and durations.size == segments and durations.dtype == np.float64:
-        lengths = durations.reshape(-1).tolist()  # Python floats: the same bits, without an array's overhead
-    else:
-        lengths = [durations[..., s : s + 1] for s in range(segments)]
-    states = _solve_states(order, lengths, pieces, states)
-    rest = 0.0 * pieces[0]
+        lengths = lengths.reshape(-1).tolist()  # Python floats: the same bits, without an array's overhead
+    states = _solve_states(order, lengths, xp.moveaxis(steps, -2, 0), states)
+    rest = 0.0 * steps[..., 0, :]
     # Rows of s = (x0, V0_1, ..., D, V1_1, ...), see Eq. 1 of _hermite_tables; V_i = h^i x^(i).
     first, last = [waypoints[..., :-1, :]], [steps]
     power = length = durations[..., None]
@@ -257,7 +255,7 @@ def _connect_kind(
     solved = solve(xp, order, points, lengths, chosen)
     if len(full) == len(empty):
         return solved
-    columns = [still[..., s, :] for s in range(len(empty))]
+    columns = list(xp.moveaxis(still, -2, 0))
     for k, s in enumerate(full):
         columns[s] = solved[..., k, :]
     return xp.stack(columns, axis=-2)
