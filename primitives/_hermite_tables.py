@@ -26,7 +26,7 @@ ORDERS = (2, 3, 4)
 @cache
 def coefficient_table(order: int) -> Floats:
     """Return the matrix that maps s of Eq. 1 to the coefficients of 1, u, ..., u^(2m-1)."""
-    return _coefficients(order).astype(float)
+    return np.asarray(_coefficients(order), dtype=float)
 
 
 @cache

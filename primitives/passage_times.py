@@ -200,7 +200,7 @@ def _from_fewer_points(points: Any, ends: list[Any], moving: bool) -> tuple[Any,
         chosen = change_given(itemgetter(where), ends)
         fewer = points[where][:, kept]
         fractions = _solve(fewer, chosen, moving)
-        states = [chosen[:2], *([FREE, FREE] for _ in kept[1:-1]), chosen[2:]]
+        states: list[list[Any]] = [chosen[:2], *([FREE, FREE] for _ in kept[1:-1]), chosen[2:]]
         movement = connect(np, 3, fewer, fractions, states)
         coefficients, cost[where] = movement.coefficients, movement.cost()
         for i, (first, last) in enumerate(pairwise(kept)):

@@ -373,8 +373,9 @@ def _evaluate(
             whole = [np.empty((*batch, time.shape[-1], dimension), coefficients.dtype) for _ in orders]
             for first in range(0, batch[0], size):
                 rows = slice(first, first + size)
-                own = (each[rows] if each.shape[:-1] == batch else each for each in (starts, rates, time))
-                for values, part in zip(whole, _evaluate(coefficients[rows], *own, orders, xp), strict=True):
+                own = [each[rows] if each.shape[:-1] == batch else each for each in (starts, rates, time)]
+                parts = _evaluate(coefficients[rows], own[0], own[1], own[2], orders, xp)
+                for values, part in zip(whole, parts, strict=True):
                     values[rows] = part
             return whole
     basis = _basis(time, starts, rates, powers - min(orders), xp)

@@ -142,7 +142,7 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
         for held in (read.get("robot_state"), asked["start_state"]):
             if held and held.get("attached_collision_objects"):
                 raise ValueError("an object is attached to the arm; plan for an arm whose model holds it")
-        base: Float = np.eye(4)  # Place of the robot's base
+        base: Any = np.eye(4)  # Place of the robot's base
         for each in (asked["start_state"].get("multi_dof_joint_state") or {}).get("transforms") or ():
             base = base @ _matrix({"position": each["translation"], "orientation": each["rotation"]})
         base = np.linalg.inv(base)
