@@ -193,7 +193,7 @@ def objective(setting, table, row, start, offsets, scene, aim, gradient):
     work = refine._work(setting, len(offsets), len(start), scene)
     movement = Movement(table, row, np.ascontiguousarray(start), offsets, 1.0)
     hessian = np.empty((len(gradient), len(gradient)))
-    return refine._assemble(setting, movement, scene, aim, 360.0, np.inf, hessian, gradient, work)[0]
+    return refine._assemble(movement, aim, 360.0, np.inf, hessian, gradient, work)[0]
 
 
 def test_nothing_is_refined_further_after_the_time_limit() -> None:
@@ -305,7 +305,7 @@ def test_within_bounds_no_allowed_direction_is_better() -> None:
         high = offsets[:2] + generator.uniform(0.0, 0.3, (2, 7))
         movement = Movement(table, 0, PANDA.home, offsets, 1.0)
         work = refine._work(setting, 5, 7, scene)
-        row = refine._refine(setting, movement, np.stack((low, high)), scene, aim, 360.0, work)
+        row = refine._refine(movement, np.stack((low, high)), aim, 360.0, work)
         assert ((offsets[:2] >= low) & (offsets[:2] <= high)).all()
         objective(setting, table, row, PANDA.home, offsets, scene, aim, gradient)
         wanted = np.where(gradient.reshape(2, 7) > 0.0, low, high)

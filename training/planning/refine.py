@@ -100,8 +100,10 @@ class Found(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """Memory of a refinement in a space of D dimensions, with J joints and K via-points."""
+    """Arm, obstacles and memory of a refinement in a space of D dimensions, with J joints and K via-points."""
 
+    setting: Setting
+    obstacles: Obstacles
     position: Float
     joints: Float
     placed: Placed
@@ -121,6 +123,8 @@ def _work(setting: Setting, columns: int, dimension: int, obstacles: Obstacles) 
     """Return memory for a refinement."""
     joints = len(setting.joint_range)
     return _Work(
+        setting,
+        obstacles,
         np.empty(dimension),
         np.empty(joints),
         memory(setting.chain, setting.spheres),
@@ -136,12 +140,12 @@ def _work(setting: Setting, columns: int, dimension: int, obstacles: Obstacles) 
 
 
 @inner
-def _add_residual(setting: Setting, missing: float, work: _Work) -> None:
+def _add_residual(missing: float, work: _Work) -> None:
     """Add a residual, whose derivative by the joints is in `work.pull`, to those of an instant."""
     row, dimension = work.row, len(work.row)
-    if setting.of_hand:
+    if work.setting.of_hand:
         # Joints q and hand x of the plane: dq = J^-1 dx, so the derivative by x is J^-T times that by q.
-        chain, placed = setting.chain, work.placed
+        chain, placed = work.setting.chain, work.placed
         point_jacobian(
             chain, placed.rotation, placed.origin, 2, work.position[0], work.position[1], 0.0, work.jacobian
         )
@@ -163,11 +167,9 @@ def _add_residual(setting: Setting, missing: float, work: _Work) -> None:
 
 
 @inner
-def _pull(
-    setting: Setting, work: _Work, sphere: int, link: int, x: float, y: float, z: float, sign: float
-) -> None:
+def _pull(work: _Work, sphere: int, link: int, x: float, y: float, z: float, sign: float) -> None:
     """Add to `work.pull` the derivative of the way of a sphere in a direction (x, y, z) by the joints, times a sign."""
-    placed, sliding = work.placed, setting.chain.sliding
+    placed, sliding = work.placed, work.setting.chain.sliding
     u = placed.centre[sphere, 0]
     v = placed.centre[sphere, 1]
     w = placed.centre[sphere, 2]
@@ -186,11 +188,10 @@ def _pull(
 
 
 @inlined
-def _add_obstacles(
-    setting: Setting, obstacles: Obstacles, time: float, wanted: float, work: _Work
-) -> tuple[float, float]:
+def _add_obstacles(time: float, wanted: float, work: _Work) -> tuple[float, float]:
     """Add the residuals of the placed arm from the obstacles; return their sum of squares, and the least clearance."""
-    spheres, placed, total, nearest = setting.spheres, work.placed, 0.0, wanted
+    spheres, obstacles, placed = work.setting.spheres, work.obstacles, work.placed
+    total, nearest = 0.0, wanted
     for group in range(len(spheres.link)):
         if spheres.link[group] == 0:
             continue
@@ -220,18 +221,18 @@ def _add_obstacles(
             z = placed.centre[sphere, 2]
             _, a, b, c = point_distance_and_normal(obstacles, 0, row, x, y, z, time, 1e9)
             work.pull[:] = 0.0
-            _pull(setting, work, sphere, spheres.link[group], a, b, c, -1.0)
+            _pull(work, sphere, spheres.link[group], a, b, c, -1.0)
             nearest = min(nearest, least)
             missing = wanted - least
             total += missing * missing
-            _add_residual(setting, missing, work)
+            _add_residual(missing, work)
     return total, nearest
 
 
 @inlined
-def _add_own(setting: Setting, wanted: float, work: _Work) -> tuple[float, float]:
+def _add_own(wanted: float, work: _Work) -> tuple[float, float]:
     """Add the residuals of the placed arm from itself; return their sum of squares, and the least clearance."""
-    spheres, placed, total, nearest = setting.spheres, work.placed, 0.0, wanted
+    spheres, placed, total, nearest = work.setting.spheres, work.placed, 0.0, wanted
     for pair in range(len(spheres.pairs)):
         least, one, other = nearest_spheres(spheres, placed, pair, wanted, -1e9)
         if one < 0:
@@ -242,19 +243,19 @@ def _add_own(setting: Setting, wanted: float, work: _Work) -> tuple[float, float
         length = math.sqrt(x * x + y * y + z * z) + 1e-9
         x, y, z = x / length, y / length, z / length
         work.pull[:] = 0.0
-        _pull(setting, work, one, spheres.link[spheres.pairs[pair, 0]], x, y, z, -1.0)
-        _pull(setting, work, other, spheres.link[spheres.pairs[pair, 1]], x, y, z, 1.0)
+        _pull(work, one, spheres.link[spheres.pairs[pair, 0]], x, y, z, -1.0)
+        _pull(work, other, spheres.link[spheres.pairs[pair, 1]], x, y, z, 1.0)
         nearest = min(nearest, least)
         missing = wanted - least
         total += missing * missing
-        _add_residual(setting, missing, work)
+        _add_residual(missing, work)
     return total, nearest
 
 
 @inlined
-def _add_ranges(setting: Setting, reached: bool, work: _Work) -> tuple[float, float]:
+def _add_ranges(reached: bool, work: _Work) -> tuple[float, float]:
     """Add what is missing to the margin from the joint limits; return the sum of squares, and the least distance."""
-    total, nearest, joints, limits = 0.0, RANGE_MARGIN, work.joints, setting.joint_range
+    total, nearest, joints, limits = 0.0, RANGE_MARGIN, work.joints, work.setting.joint_range
     for j in range(len(joints)):
         low = limits[j, 0] + RANGE_MARGIN - joints[j]
         high = joints[j] - limits[j, 1] + RANGE_MARGIN
@@ -264,10 +265,10 @@ def _add_ranges(setting: Setting, reached: bool, work: _Work) -> tuple[float, fl
             work.pull[j] = -1.0 if low > high else 1.0
             total += missing * missing
             nearest = min(nearest, RANGE_MARGIN - missing)
-            _add_residual(setting, missing, work)
+            _add_residual(missing, work)
     if not reached:
         # The hand is beyond the reach: a pull towards where the straight or bent arm has it.
-        chain, placed = setting.chain, work.placed
+        chain, placed = work.setting.chain, work.placed
         x = y = 0.0
         last = len(joints)
         for a in range(3):
@@ -290,21 +291,13 @@ def _add_ranges(setting: Setting, reached: bool, work: _Work) -> tuple[float, fl
 
 @kernel
 def _assemble(
-    setting: Setting,
-    movement: Movement,
-    obstacles: Obstacles,
-    aim: Aim,
-    unit: float,
-    limit: float,
-    hessian: Float,
-    gradient: Float,
-    work: _Work,
+    movement: Movement, aim: Aim, unit: float, limit: float, hessian: Float, gradient: Float, work: _Work
 ) -> tuple[float, float]:
     """Fill in matrix and gradient of the objective; return the objective, and the least clearance, [m] or [rad].
 
     It ends as soon as the objective is `limit` or more, which is then returned.
     """
-    table, times, offsets = movement.table, movement.times, movement.offsets
+    setting, table, times, offsets = work.setting, movement.table, movement.times, movement.offsets
     columns, dimension = offsets.shape
     vias = columns - 3
     weight = aim.jerk * 2.0 / (STRIDE * unit)
@@ -332,11 +325,11 @@ def _assemble(
         work.square[:] = 0.0
         work.force[:] = 0.0
         time = movement.duration * k / last
-        from_obstacles, first = _add_obstacles(setting, obstacles, time, aim.clearance, work)
+        from_obstacles, first = _add_obstacles(time, aim.clearance, work)
         from_itself, second = 0.0, OWN_CLEARANCE
         if (k - begin) % (4 * STRIDE) == 0:  # bodies of the arm are less often near one another
-            from_itself, second = _add_own(setting, OWN_CLEARANCE, work)
-        from_ranges, third = _add_ranges(setting, reached or not setting.of_hand, work)
+            from_itself, second = _add_own(OWN_CLEARANCE, work)
+        from_ranges, third = _add_ranges(reached or not setting.of_hand, work)
         missing = from_obstacles + from_itself + from_ranges
         if missing == 0.0:
             continue
@@ -381,16 +374,9 @@ def _copy(source: Float, target: Float) -> None:
 
 
 @compiled
-def _refine(
-    setting: Setting,
-    movement: Movement,
-    bounds: Float,
-    obstacles: Obstacles,
-    aim: Aim,
-    unit: float,
-    work: _Work,
-) -> int:
+def _refine(movement: Movement, bounds: Float, aim: Aim, unit: float, work: _Work) -> int:
     """Move the via-points of a movement, the first rows of its offsets, and return the index of its passage times."""
+    setting = work.setting
     table, _, start, offsets, duration = movement
     columns, dimension = offsets.shape
     vias = columns - 3
@@ -404,7 +390,7 @@ def _refine(
     longest = LONGEST_STEP[1] if setting.of_hand else LONGEST_STEP[0]
     times, _ = best_times(table, offsets, work.gram)
     movement = Movement(table, times, start, offsets, duration)
-    objective, nearest = _assemble(setting, movement, obstacles, aim, unit, np.inf, hessian, gradient, work)
+    objective, nearest = _assemble(movement, aim, unit, np.inf, hessian, gradient, work)
     damping = DAMPING
     for _ in range(ITERATIONS):
         largest = 0.0
@@ -436,9 +422,7 @@ def _refine(
                 trial[a, d] = min(max(wanted, bounds[0, a, d]), bounds[1, a, d])
         other, _ = best_times(table, trial, work.gram)
         movement = Movement(table, other, start, trial, duration)
-        value, apart = _assemble(
-            setting, movement, obstacles, aim, unit, objective, other_hessian, other_gradient, work
-        )
+        value, apart = _assemble(movement, aim, unit, objective, other_hessian, other_gradient, work)
         if value < objective:
             nearest = apart
             done = objective - value < aim.gain * objective and nearest >= FREE
@@ -515,7 +499,7 @@ def refine_seeds(
         _copy(seeds[each], offsets[0])
         for aim in (SEED, NARROW):
             movement = Movement(table, 0, start, offsets[0], duration)
-            times[0] = _refine(setting, movement, bounds, obstacles, aim, unit, work)
+            times[0] = _refine(movement, bounds, aim, unit, work)
             movement = Movement(table, times[0], start, offsets[0], duration)
             apart = _clearance(setting, movement, obstacles, margin, NEARLY)
             if not NEARLY < apart < margin or clock() > end:
@@ -536,7 +520,7 @@ def refine_seeds(
             _copy(offsets[stage], trial)
             movement = Movement(table, 0, start, trial, duration)
             aim = Aim(POLISH.clearance, weight, POLISH.gain)
-            other = _refine(setting, movement, bounds, obstacles, aim, unit, work)
+            other = _refine(movement, bounds, aim, unit, work)
             _, less = best_times(table, trial, work.gram)
             movement = Movement(table, other, start, trial, duration)
             if less >= cost or not is_free(setting, movement, obstacles, margin):
