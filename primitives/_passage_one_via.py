@@ -290,7 +290,8 @@ def _expand(points: Floats, ends: list[Any], slack: Floats, *, from_goal: bool) 
         powers = (q, 5)
         g = Polynomial(g)(Polynomial([1.0, -1.0])).coef
         first, last = last, first
-        states = [[*change_given(operator.neg, state[:1]), state[1]] for state in reversed(states)]
+        backwards = change_given(operator.neg, ends)
+        states = [[backwards[2], ends[3]], [backwards[0], ends[1]]]
     free = connect(np, 3, np.stack([first, last], axis=1), np.ones(1), states)
     miss = -np.moveaxis(free.coefficients[:, :, 0, :], 1, -1)  # (N, D, 6)
     miss[..., 0] = via - first

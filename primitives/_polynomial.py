@@ -93,8 +93,11 @@ def root_candidates(coefficients: Floats) -> Floats:
 @cache
 def _shift_matrix(degree: int) -> Floats:
     """Return the matrix that maps coefficients in u = v - s to those in v, by the binomial theorem."""
-    size = range(degree + 1)
-    return np.array([[comb(k, j) * (-_SHIFT) ** (k - j) if j <= k else 0.0 for j in size] for k in size])
+    table = np.zeros((degree + 1, degree + 1))
+    for k in range(degree + 1):
+        for j in range(k + 1):
+            table[k, j] = comb(k, j) * (-_SHIFT) ** (k - j)
+    return table
 
 
 @dataclass(frozen=True)

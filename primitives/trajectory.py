@@ -327,8 +327,6 @@ def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, state
     if some_empty:
         durations = broadcast_to(xp, durations, (*waypoints.shape[:-2], durations.shape[-1]))
     coefficients = least_cost_coefficients(xp, order, waypoints, durations, states)
-    if durations.shape[-1] == 1 and not some_empty:
-        return Trajectory(coefficients, durations, order, 0.0 * durations, 1.0 / durations, durations)
     ends = xp.cumulative_sum(durations, axis=-1)
     end = ends[..., -1:]
     starts = xp.concat([0.0 * end, ends[..., :-1]], axis=-1)

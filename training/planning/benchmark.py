@@ -290,13 +290,13 @@ def measure_planner(
 
 def succeeding(plans: Sequence[MotionPlan]) -> list[int]:
     """Return the indices of the plans that succeed by geometry and in physics."""
-    found = []
-    for count in {len(plan.durations) for plan in plans}:
-        rows = [row for row, plan in enumerate(plans) if plan.success and len(plan.durations) == count]
-        for first in range(0, len(rows), TOGETHER):
-            some = rows[first : first + TOGETHER]
+    found = list[int]()
+    counts = np.array([plan.success * len(plan.durations) for plan in plans])
+    for count in np.unique(counts[counts > 0]):
+        rows = np.flatnonzero(counts == count)
+        for some in np.split(rows, range(TOGETHER, len(rows), TOGETHER)):
             outcome, _ = execute_plans([plans[row] for row in some])
-            found += [row for row, success in zip(some, outcome.is_success, strict=True) if success]
+            found += some[outcome.is_success].tolist()
     return found
 
 
