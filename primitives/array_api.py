@@ -64,20 +64,11 @@ def change_given(function: Callable[[Array], Array], values: Iterable[Boundary])
 
 
 def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> tuple[Namespace, list[Any]]:
-    """Convert all arguments to one array library and one floating dtype.
+    """Convert arguments by name to one array library and one floating dtype; return it and them, required ones first.
 
-    Args:
-        optional: further arguments by name; None among these, and FREE for the goal's velocity and acceleration,
-            is returned unchanged.
-        **required: arrays, numbers or nested lists by argument name.
-
-    Returns:
-        The namespace and the arrays in the order given, required ones first. The dtype is the widest floating
-        dtype among the arrays. Numbers, lists and integer arrays do not count; without any floating array it
-        is float64.
-
-    Raises:
-        ValueError: an argument is missing, not numeric, or not finite.
+    Among the optional ones None is returned as it is, and FREE for the goal's velocity and acceleration. The dtype is
+    the widest floating dtype among the arrays. Numbers, lists and integer arrays do not count; without any floating
+    array it is float64. An argument that is missing, not numeric, or not finite raises ValueError.
     """
     # Every call of the package passes here: loops and inlined tests of `is_given` halve the calls of a movement.
     named = {**required, **optional} if optional else required

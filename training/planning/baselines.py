@@ -168,11 +168,7 @@ class StepAgentMethod:
 
 
 def agent_method(name: str, model: Any, checks: int | None = None, refine: int | None = None) -> Method:
-    """Return a trained agent as a method, for whole movements or for actions in every control step.
-
-    Raises:
-        ValueError: The agent cannot check or refine its proposals.
-    """
+    """Return a trained agent as a method; ValueError if it cannot check or refine its proposals."""
     if checks and not hasattr(model.policy, "checks"):
         raise ValueError(f"proposals are checked by ViaQ only; this agent is a {type(model).__name__}")
     if refine and not getattr(model.policy, "can_refine", False):
@@ -216,11 +212,7 @@ def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
 
 
 def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
-    """Return the factory of a baseline for a task.
-
-    Raises:
-        ValueError: There is no such baseline, or it would check too many plans.
-    """
+    """Return the factory of a baseline for a task; ValueError where there is none."""
     sensed = task.sensor is not None
     predicted = task.replanning and task.moving_obstacles
     counted = tuple(COUNTED) if sensed else SEARCHES

@@ -154,10 +154,7 @@ class MotionPlan:
 
         Args:
             rate: Instants per second, from 0.001 to less than 1e6, [Hz]; the last interval may be shorter.
-            force: True for plans without success, too.
-
-        Raises:
-            UnsafePlanError: The plan has no success, or there is no movement at all.
+            force: True for plans without success, too, which raise UnsafePlanError otherwise.
         """
         self.refuse_unsafe(force)
         number_of_at_least("rate", rate, 1e-3, HIGHEST_RATE)
@@ -169,11 +166,7 @@ class MotionPlan:
     def execute(self, *, force: bool = False) -> Outcome:
         """Execute the movement in MuJoCo among its obstacles, and return the metrics, shape (1,) each.
 
-        Args:
-            force: True for plans without success, too.
-
-        Raises:
-            UnsafePlanError: The plan has no success, or there is no movement at all.
+        Plans without success raise UnsafePlanError unless `force` is True.
         """
         self.refuse_unsafe(force)
         outcome, _ = execute_plans([self])

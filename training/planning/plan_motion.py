@@ -419,10 +419,7 @@ def _goals(problem: _Problem, goal: Any) -> Float:
 def _goals_of_poses(problem: _Problem, poses: list[Pose]) -> Float:
     """Return coordinates of configurations with the tool at a pose, shape (G, D); free ones where there are any.
 
-    For each pose the nearest come first; poses out of reach are passed over.
-
-    Raises:
-        UnreachableError: All are out of reach.
+    For each pose the nearest come first; poses out of reach are passed over unless all are.
     """
     arm, found = problem.arm, []
     fault = None
