@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ._boundary import check_durations, read_arguments, unit_time_ends, waypoint_shapes
 from ._passage_newton import PassageCost, attach_gradient, fractions_by_newton
 from ._passage_one_via import fractions_at_rest, fractions_moving
 from ._polynomial import differentiate, evaluate
@@ -25,6 +24,7 @@ from .array_api import (
     ordered_sum,
     to_numpy,
 )
+from .minimum_jerk import check_durations, read_arguments, unit_time_ends, waypoint_shapes
 from .trajectory import connect
 
 # Fraction of the duration below which a segment is dropped in lower than double precision, which it would overflow.

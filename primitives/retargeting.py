@@ -5,9 +5,8 @@ from __future__ import annotations
 from math import inf
 from typing import Any
 
-from ._boundary import END_NAMES, end_shapes
 from .array_api import FREE, Array, Boundary, as_number, broadcast_batch, broadcast_to, require
-from .minimum_jerk import through
+from .minimum_jerk import END_NAMES, end_shapes, through
 from .passage_times import passage_durations
 from .trajectory import Trajectory, require_trajectory
 
