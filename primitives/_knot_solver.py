@@ -50,7 +50,7 @@ _DIGITS = 0.15
 _MISS = 1e-9
 # Least relative change of the cost for which the tolerance of waypoints counts.
 _GAIN = 1e-8
-# Durations [s] between which no power of them over- or underflows, even in single precision.
+# Durations [s] between which no power of them over- or underflows, even in single precision; others are scaled.
 _SHORT, _LONG = 1e-3, 1e3
 
 
@@ -164,20 +164,9 @@ def _is_extreme(durations: Any, eps: float) -> Any:
 def _banded_coefficients(
     xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
 ) -> Array:
-    """Return the coefficients (..., 2m, S, D) by the normal equations.
-
-    Time is scaled where powers of it would over- or underflow. The scale is a power of two: x^(i) / scale^i is exact.
-    """
+    """Return the coefficients (..., 2m, S, D) by the normal equations."""
     if 0 not in durations.shape and not (durations.min() >= _SHORT and durations.max() <= _LONG):
-        scale = unit_factors(xp, durations)
-        scaled: States = []
-        for state in states:
-            row, factor = [], xp.ones_like(scale)
-            for value in state:
-                factor = factor / scale
-                row.append(value * factor if is_given(value) else value)
-            scaled.append(row)
-        durations, states = durations * scale, scaled
+        durations, states = _rescaled(xp, durations, states)
     segments = waypoints.shape[-2] - 1
     steps = waypoints[..., 1:, :] - waypoints[..., :-1, :]
     lengths = xp.moveaxis(durations[..., None], -2, 0)
@@ -202,6 +191,19 @@ def _banded_coefficients(
     data = xp.reshape(data, (*batch, 2 * order, segments * data.shape[-1]))
     coefficients = xp.matmul(like(xp, coefficient_table(order), data), data)
     return xp.reshape(coefficients, (*batch, 2 * order, segments, rest.shape[-1]))
+
+
+def _rescaled(xp: Namespace, durations: Array, states: States) -> tuple[Array, States]:
+    """Return durations of about 1 and the states in their unit, a power of two: x^(i) / scale^i is exact."""
+    scale = unit_factors(xp, durations)
+    scaled: States = []
+    for state in states:
+        row, factor = [], xp.ones_like(scale)
+        for value in state:
+            factor = factor / scale
+            row.append(value * factor if is_given(value) else value)
+        scaled.append(row)
+    return durations * scale, scaled
 
 
 def _weighted_coefficients(
