@@ -22,7 +22,6 @@ With the states at the via-points eliminated, J(h) is the least sum of the segme
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -33,7 +32,7 @@ from ._hermite_tables import mode_table
 from ._passage_one_via import attach_root_gradient, nearer_fraction
 from ._weighted_solver import fit_modes, mode_weights
 from .array_api import FREE, Array, Floats, Namespace, change_given, like, ordered_sum, to_numpy
-from .trajectory import connect
+from .trajectory import connect, duration_gradient
 
 # Starts with moving ends: even durations, durations by chord, eight from a flat Dirichlet distribution.
 _STARTS = 10
@@ -109,21 +108,6 @@ class PassageCost:
             slope += weight * (ordered_sum(mode * change, 1) + 0.5 * rate * square)
             total += 0.5 * weight * square
         return ordered_sum(total), slope
-
-
-def duration_gradient(coefficients: Array, rates: Array) -> Array:
-    """Return dJ/dh of each segment, (..., S), minus its Hamiltonian (Flash & Hogan 1985, Eqs. C6, C7).
-
-    For order m, dJ/dh = -1/2 |x^(m)|^2 - sum_{i=1}^{m-1} (-1)^i x^(m+i) . x^(m-i), constant along a segment; for jerk
-    it is -|jerk|^2/2 + snap . acceleration - crackle . velocity. Coefficients are (..., 2m, S, D) in unit time.
-    """
-    order = coefficients.shape[-3] // 2
-    total: Any = 0.0
-    for i in range(order):  # at the beginning of the segment, where x^(k) = k! c_k / h^k
-        weight = (0.5 if i == 0 else (-1.0) ** i) * math.factorial(order + i) * math.factorial(order - i)
-        product = coefficients[..., order + i, :, :] * coefficients[..., order - i, :, :]
-        total = total + weight * product.sum(-1)
-    return -total * math.prod([rates * rates] * order)
 
 
 def fractions_by_newton(
