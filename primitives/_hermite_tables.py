@@ -59,8 +59,9 @@ def stiffness_table(order: int) -> Table:
 
     Its rows and columns are the columns of `mode_table`. For m = 3 the entries are 720, 360, 192, 168, 60, ...
     """
-    modes, weights = _modes(order), np.arange(1, 2 * order, 2)
-    return _floats(modes.T @ (weights[:, None] * modes))
+    modes = _modes(order)
+    weights = np.arange(1, 2 * order, 2)[:, None]
+    return _floats(modes.T @ (weights * modes))
 
 
 @cache

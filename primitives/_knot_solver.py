@@ -211,7 +211,8 @@ def _weighted_coefficients(
 ) -> Array:
     """Return the coefficients (N, 2m, S, D) by weighted least squares, in double precision."""
     dtype = waypoints.dtype
-    waypoints, durations = xp.astype(waypoints, xp.float64), xp.astype(durations, xp.float64)
+    waypoints = xp.astype(waypoints, xp.float64)
+    durations = xp.astype(durations, xp.float64)
     states = [change_given(lambda value: xp.astype(value, xp.float64), state) for state in states]
     total = xp.sum(durations, axis=-1)
     points = to_numpy(waypoints)

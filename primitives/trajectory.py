@@ -367,7 +367,8 @@ def cost_gradient(trajectory: Trajectory) -> CostGradient:
     """
     require_trajectory(trajectory)
     xp, m = trajectory.namespace, trajectory.order
-    coefficients, rates = trajectory.coefficients, trajectory.rates
+    coefficients = trajectory.coefficients
+    rates = trajectory.rates
     highest = derivative_coefficients(xp, coefficients, rates, 2 * m - 1)[..., 0, :, :] * (-1.0) ** (m - 1)
     rows = [-highest[..., :1, :], highest[..., :-1, :] - highest[..., 1:, :], highest[..., -1:, :]]
     ends = []

@@ -672,13 +672,16 @@ def _timed(problem: _Problem, movement: Movement, least: float | None) -> tuple[
     shares = np.stack((np.abs(rate) / arm.velocity_limit, np.abs(torque) / arm.torque_limit)).max(axis=1)
     limits = Limits(float(shares[0].max()), float(shares[1].max()))
     kind = "velocity" if limits.velocity > limits.torque else "torque"
-    share, worst = max(limits), shares.max(axis=0).argmax()
+    share = max(limits)
+    worst = shares.max(axis=0).argmax()
     when = f"in {factor * duration:.2f} s; the shortest duration is {needed * duration:.2f} s"
     if limits.torque > 1.0:
         at_rest = np.abs(torques(arm.chain, motion.position, np.zeros(1), np.zeros(1))) / arm.torque_limit
         if at_rest.max() > 1.0:
-            kind, when = "torque", "for the weight of the arm"
-            share, worst = at_rest.max(), at_rest.max(axis=0).argmax()
+            kind = "torque"
+            when = "for the weight of the arm"
+            share = float(at_rest.max())
+            worst = at_rest.max(axis=0).argmax()
     beyond = f"joint {arm.joint_names[worst]!r} needs {share:.2f} times its {kind} limit {when}"
     return factor * duration, limits, beyond
 
