@@ -60,13 +60,13 @@ class Straight:
         return np.zeros((len(scenes.start), self._size))
 
 
-class RandomVias(Straight):
+class RandomVias:
     """Uniformly random actions."""
 
     name = "random"
 
     def __init__(self, simulation: SceneSimulation) -> None:
-        super().__init__(simulation)
+        self._size = len(simulation.task.action_names)
         self._generator = np.random.default_rng(0)  # the same actions in every evaluation
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
