@@ -1,4 +1,4 @@
-"""Measure the speed of the primitives relative to a plain copy of their output and to SciPy's spline.
+"""Measure the speed of the primitives relative to SciPy's spline.
 
     OMP_NUM_THREADS=1 python benchmarks/primitives.py [--json FILE]
 
@@ -68,37 +68,27 @@ def scipy_spline(knots: np.ndarray, waypoints: np.ndarray, at: np.ndarray) -> li
 
 
 def sampling_rows() -> list[Row]:
-    """Measure solving and sampling, with separate and with shared knot times, against a copy of the output."""
-    out = np.zeros((3, MOVEMENTS, SAMPLES, DIMENSION))
-    source = np.ones_like(out)
-    copy = best(lambda: np.copyto(out, source), MOVEMENTS)
-    first = Row("copy of the output", copy, "times the copy", 1.0, None)
-    return [first, *(row for vias in (1, 3) for row in _rows_of(vias, copy, out))]
+    """Measure solving and sampling, with separate and with shared knot times, against SciPy."""
+    return [*_rows_of(1), *_rows_of(3)]
 
 
-def _rows_of(vias: int, copy: float, out: np.ndarray) -> list[Row]:
-    """Measure movements through `vias` via-points; as SciPy does, those compared with it make new arrays."""
+def _rows_of(vias: int) -> list[Row]:
+    """Measure movements through `vias` via-points."""
     waypoints, durations = scene(vias)
     shared = durations[0]
     knots = np.concatenate([[0.0], np.cumsum(shared)])
     at = np.linspace(0, knots[-1], SAMPLES)
     together = np.moveaxis(waypoints, 1, 0)
 
-    common = best(lambda: through(waypoints, shared).sample(at, out=out), MOVEMENTS)
-    common_new = best(lambda: through(waypoints, shared).sample(at), MOVEMENTS)
-    own = best(lambda: through(waypoints, durations).sample(SAMPLES, out=out), MOVEMENTS)
-    own_new = best(lambda: through(waypoints, durations).sample(SAMPLES), MOVEMENTS)
+    common = best(lambda: through(waypoints, shared).sample(at), MOVEMENTS)
+    own = best(lambda: through(waypoints, durations).sample(SAMPLES), MOVEMENTS)
     one = best(lambda: through(waypoints[:1], durations[:1]).sample(SAMPLES), 1)
     batch = best(lambda: scipy_spline(knots, together, at), MOVEMENTS, 3)
     single = best(lambda: scipy_spline(knots, waypoints[0], at), 1)
     label = f"K={vias}"
     return [
-        Row(f"{label} shared knots", common, "times the copy", common / copy, 4.0),
-        Row(f"{label} shared knots, new arrays", common_new, "times SciPy's batch", common_new / batch, 1.0),
-        Row(f"{label} own knots", own, "times the copy", own / copy, 12.0),
-        Row(
-            f"{label} own knots, new arrays", own_new, "times SciPy, one call each", own_new / single, 1 / 15
-        ),
+        Row(f"{label} shared knots", common, "times SciPy's batch", common / batch, 1.0),
+        Row(f"{label} own knots", own, "times SciPy, one call each", own / single, 1 / 15),
         Row(f"{label} batch of one", one, "times SciPy, one call", one / single, 2.0),
     ]
 
@@ -115,9 +105,8 @@ def passage_rows() -> list[Row]:
 def decision_row() -> Row:
     """Measure what a batch of one spends per decision: passage time, movement, 500 samples."""
     waypoints, _ = scene(1, 1)
-    out = np.zeros((3, 1, 500, DIMENSION))
     duration = np.ones(1)
-    spent = best(lambda: through(waypoints, passage_durations(waypoints, duration)).sample(500, out=out), 1)
+    spent = best(lambda: through(waypoints, passage_durations(waypoints, duration)).sample(500), 1)
     return Row("K=1 batch of one, passage time + movement + 500 samples", spent, "microseconds", spent, 250.0)
 
 

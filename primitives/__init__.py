@@ -7,7 +7,6 @@ kind. Units are metres and seconds.
 from ._polynomial import Extrema
 from .array_api import FREE
 from .fitting import ViaPointFit, fit_via_points
-from .gradients import CostGradient, cost_gradient
 from .minimum_jerk import minimum_jerk_coefficients, point_to_point, through
 from .passage_times import passage_durations
 from .retargeting import retarget
@@ -21,8 +20,7 @@ from .smoothness import (
     speed_peaks,
     speed_valleys,
 )
-from .time_scaling import minimum_duration
-from .trajectory import Trajectory
+from .trajectory import CostGradient, Trajectory, cost_gradient, minimum_duration
 
 __all__ = [
     "FREE",

@@ -19,7 +19,6 @@ import numpy as np
 from .array_api import Floats
 
 Table: TypeAlias = tuple[tuple[float, ...], ...]
-Exact: TypeAlias = list[list[Fraction]]
 
 ORDERS = (2, 3, 4)
 
@@ -27,7 +26,7 @@ ORDERS = (2, 3, 4)
 @cache
 def coefficient_table(order: int) -> Floats:
     """Return the matrix that maps s of Eq. 1 to the coefficients of 1, u, ..., u^(2m-1)."""
-    return np.array(_coefficients(order), dtype=float)
+    return np.asarray(_coefficients(order), dtype=float)
 
 
 @cache
@@ -46,12 +45,11 @@ def series_table(order: int) -> Table:
 
     It follows from x^(m) = sum_i (2 i + 1) q_i P_i(2 u - 1), P_i(2 u - 1) = sum_k (-1)^(i+k) C(i, k) C(i + k, k) u^k.
     """
-    m = order
-    table = [[Fraction(0)] * m for _ in range(m)]
-    for i in range(m):
+    table = np.full((order, order), Fraction(0))
+    for i in range(order):
         for k in range(i + 1):
             legendre = (-1) ** (i + k) * comb(i, k) * comb(i + k, k)
-            table[k][i] = Fraction((2 * i + 1) * legendre * factorial(k), factorial(m + k))
+            table[k, i] = Fraction((2 * i + 1) * legendre * factorial(k), factorial(order + k))
     return _floats(table)
 
 
@@ -61,9 +59,9 @@ def stiffness_table(order: int) -> Table:
 
     Its rows and columns are the columns of `mode_table`. For m = 3 the entries are 720, 360, 192, 168, 60, ...
     """
-    modes = np.array(_modes(order))
-    weights = np.diag([Fraction(2 * i + 1) for i in range(order)])
-    return _floats(modes.T @ weights @ modes)
+    modes = _modes(order)
+    weights = np.arange(1, 2 * order, 2)[:, None]
+    return _floats(modes.T @ (weights * modes))
 
 
 @cache
@@ -76,7 +74,7 @@ def energy_table(order: int, nu: int) -> Floats:
     table = []
     for i, row in enumerate(_moments(order, nu)):
         norm = sqrt((2 * i + 1) * row[i] ** 2)
-        table.append([norm * float(value / row[i]) for value in row])
+        table.append(norm * (row / row[i]).astype(float))
     return np.array(table)
 
 
@@ -86,7 +84,7 @@ def derivative_factors(order: int, nu: int) -> Floats:
     return np.array([[float(perm(k, nu))] for k in range(nu, 2 * order)])
 
 
-def _coefficients(order: int) -> Exact:
+def _coefficients(order: int) -> Any:
     """Return the coefficients of the two-point Taylor interpolation, exactly.
 
     With b_i(u) = u^i / i! (1 - u)^m sum_(k < m-i) C(m - 1 + k, k) u^k it is (Davis 1975, Interpolation and
@@ -95,41 +93,39 @@ def _coefficients(order: int) -> Exact:
         x(u) = x0 + sum_(0 < i < m) V0_i b_i(u) + D b_0(1 - u) + sum_(0 < i < m) (-1)^i V1_i b_i(1 - u).   (4)
     """
     m = order
-    table = [[Fraction(0)] * (2 * m) for _ in range(2 * m)]
+    table = np.full((2 * m, 2 * m), Fraction(0))
     for i in range(m):
         for k in range(m - i):
             weight = Fraction(comb(m - 1 + k, k), factorial(i))
             for n in range(m + 1):
-                table[i + k + n][i] += weight * comb(m, n) * (-1) ** n
+                table[i + k + n, i] += weight * comb(m, n) * (-1) ** n
             for n in range(i + k + 1):
-                table[m + n][m + i] += weight * comb(i + k, n) * (-1) ** (n + i)
-    for row in table:  # D instead of x1: x0 moves the whole segment
-        row[0] = Fraction(0)
-    table[0][0] = Fraction(1)
+                table[m + n, m + i] += weight * comb(i + k, n) * (-1) ** (n + i)
+    table[:, 0] = Fraction(0)  # D instead of x1: x0 moves the whole segment
+    table[0, 0] = Fraction(1)
     return table
 
 
-def _moments(order: int, nu: int) -> Exact:
+def _moments(order: int, nu: int) -> Any:
     """Return the integrals over [0, 1] of the nu-th derivative of u^(nu+j) times P_i(2 u - 1), by rows i.
 
     The integral of u^j P_i(2 u - 1) is j!^2 / ((j - i)! (j + i + 1)!), and 0 for j < i.
     """
     size = 2 * order - nu
-    table = [[Fraction(0)] * size for _ in range(size)]
+    table = np.full((size, size), Fraction(0))
     for i in range(size):
         for j in range(i, size):
             integral = Fraction(factorial(j) ** 2, factorial(j - i) * factorial(j + i + 1))
-            table[i][j] = perm(j + nu, nu) * integral
+            table[i, j] = perm(j + nu, nu) * integral
     return table
 
 
 def _modes(order: int) -> Any:
     """Return the table of `mode_table`, exactly."""
     columns = [order, *range(1, order), *range(order + 1, 2 * order)]
-    upper = np.array(_coefficients(order)[order:])[:, columns]
-    return np.array(_moments(order, order)) @ upper
+    return _moments(order, order) @ _coefficients(order)[order:, columns]
 
 
 def _floats(table: Any) -> Table:
-    """Return a table of fractions, a list of rows or a NumPy array of objects, as floats."""
-    return tuple(tuple(float(value) for value in row) for row in table)
+    """Return a table of fractions as Python floats."""
+    return tuple(map(tuple, table.astype(float).tolist()))

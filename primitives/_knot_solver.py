@@ -15,16 +15,26 @@ durations. So an item of a batch gives the same bits as alone, which LAPACK does
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from itertools import accumulate, product, repeat
-from operator import mul
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from ._hermite_tables import coefficient_table, energy_table, stiffness_table
 from ._weighted_solver import rounding_slack, weighted_coefficients
-from .array_api import FREE, Array, Namespace, broadcast_to, is_given, like, to_numpy, unit_factors
+from .array_api import (
+    FREE,
+    Array,
+    Namespace,
+    broadcast_to,
+    change_given,
+    is_given,
+    like,
+    to_numpy,
+    unit_factors,
+)
 
 Entry: TypeAlias = Any  # An array or a Python float
 
@@ -40,7 +50,7 @@ _DIGITS = 0.15
 _MISS = 1e-9
 # Least relative change of the cost for which the tolerance of waypoints counts.
 _GAIN = 1e-8
-# Durations [s] between which no power of them over- or underflows, even in single precision.
+# Durations [s] between which no power of them over- or underflows, even in single precision; others are scaled.
 _SHORT, _LONG = 1e-3, 1e3
 
 
@@ -85,7 +95,7 @@ def _assemble(
     right: list[Any] = [None] * len(nodes)
     for s, (duration, step) in enumerate(zip(durations, steps, strict=True)):
         # 1, 1/h, 1/h^2, ...; index = exponent
-        powers = [1.0, *accumulate(repeat(1.0 / duration, 2 * order - 2), mul)]
+        powers = [1.0, *accumulate(repeat(1.0 / duration, 2 * order - 2), operator.mul)]
         local = list(product((s, s + 1), range(order - 1)))
         for a, node in enumerate(local):
             p = nodes.get(node)
@@ -124,7 +134,12 @@ def least_cost_coefficients(
         return like(xp, np.zeros((*batch, 2 * order, segments, dimension)), waypoints)
     flat_points = xp.reshape(waypoints, (count, knots, dimension))
     flat_durations = xp.reshape(broadcast_to(xp, durations, (*batch, segments)), (count, segments))
-    flat_states = [[_flat(value, tuple(batch), xp) for value in state] for state in states]
+
+    def flat(value: Array) -> Array:
+        full = broadcast_to(xp, value, (*batch, value.shape[-1]))
+        return xp.reshape(full, (count, value.shape[-1]))
+
+    flat_states = [change_given(flat, state) for state in states]
     numbers = to_numpy(flat_durations)
     empty = numbers <= 0
     positive = np.where(empty, numbers.max(axis=-1, keepdims=True), numbers)
@@ -133,7 +148,7 @@ def least_cost_coefficients(
     parts, members = [], []
     for kind in np.unique(kinds, axis=0):  # movements with the same empty segments are solved together
         where = np.flatnonzero((kinds == kind).all(axis=1))
-        chosen = [[value[where] if is_given(value) else value for value in state] for state in flat_states]
+        chosen = [change_given(operator.itemgetter(where), state) for state in flat_states]
         group = (flat_points[where], flat_durations[where], chosen)
         parts.append(_connect_kind(xp, order, *group, kind[:-1], bool(kind[-1])))
         members.append(where)
@@ -149,72 +164,16 @@ def _is_extreme(durations: Any, eps: float) -> Any:
 def _banded_coefficients(
     xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
 ) -> Array:
-    """Return the coefficients (..., 2m, S, D) by the normal equations.
-
-    Time is scaled where powers of it would over- or underflow. The scale is a power of two: x^(i) / scale^i is exact.
-    """
+    """Return the coefficients (..., 2m, S, D) by the normal equations."""
     if 0 not in durations.shape and not (durations.min() >= _SHORT and durations.max() <= _LONG):
-        scale = unit_factors(xp, durations)
-        scaled: States = []
-        for state in states:
-            row, factor = [], xp.ones_like(scale)
-            for value in state:
-                factor = factor / scale
-                row.append(value * factor if is_given(value) else value)
-            scaled.append(row)
-        durations, states = durations * scale, scaled
-    return _coefficients(xp, order, waypoints, durations, states)
-
-
-def _weighted_coefficients(
-    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
-) -> Array:
-    """Return the coefficients (N, 2m, S, D) by weighted least squares, in double precision."""
-    dtype = waypoints.dtype
-    given = [[waypoints, durations], *states]
-    double = [[xp.astype(value, xp.float64) if is_given(value) else value for value in row] for row in given]
-    (waypoints, durations), *states = double
-    total = xp.sum(durations, axis=-1)
-    points = to_numpy(waypoints)
-    pace = to_numpy(total)[:, None]
-    ends = []
-    for state in (states[0], states[-1]):
-        scaled = [to_numpy(v) * pace ** (i + 1) if is_given(v) else v for i, v in enumerate(state)]
-        ends.append(scaled)
-    slack = like(xp, rounding_slack(points, ends), durations)
-    for _ in range(2 * order - 1):
-        slack = slack * total
-    soft = weighted_coefficients(xp, order, waypoints, durations, states, slack)
-    exact = weighted_coefficients(xp, order, waypoints, durations, states, 0.0 * slack)
-    # The tolerance is for rounding alone: it must lower the cost, and no waypoint may be missed by more.
-    lengths = to_numpy(durations / total[:, None])
-    costs = _costs(order, exact, lengths), _costs(order, soft, lengths)
-    steps = to_numpy(soft)[:, 1:].sum(axis=1)
-    missed = np.abs(steps - np.diff(points, axis=1)).max(axis=(1, 2))
-    far = missed > _MISS * np.abs(points - points[:, :1]).max(axis=(1, 2))
-    better = far | (costs[0] <= (1.0 + _GAIN) * costs[1])
-    chosen = like(xp, 1.0 * better, slack)[:, None, None, None]
-    return xp.astype(xp.where(chosen > 0, exact, soft), dtype)
-
-
-def _costs(order: int, coefficients: Array, lengths: Any) -> Any:
-    """Return (N,) the costs of movements with durations (N, S)."""
-    table = energy_table(order, order)
-    modes = np.einsum("ik,nksd->nisd", table, to_numpy(coefficients)[:, order:])
-    return ((modes * modes).sum(axis=(1, 3)) / lengths ** (2 * order - 1)).sum(axis=-1)
-
-
-def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Array:
-    """Return the coefficients (..., 2m, S, D) in unit time, by the table of `_hermite_tables`."""
+        durations, states = _rescaled(xp, durations, states)
     segments = waypoints.shape[-2] - 1
     steps = waypoints[..., 1:, :] - waypoints[..., :-1, :]
-    pieces = [steps[..., s, :] for s in range(segments)]
+    lengths = xp.moveaxis(durations[..., None], -2, 0)
     if xp is np and durations.size == segments and durations.dtype == np.float64:
-        lengths = durations.reshape(-1).tolist()  # Python floats: the same bits, without an array's overhead
-    else:
-        lengths = [durations[..., s : s + 1] for s in range(segments)]
-    states = _solve_states(order, lengths, pieces, states)
-    rest = 0.0 * pieces[0]
+        lengths = lengths.reshape(-1).tolist()  # Python floats: the same bits, without an array's overhead
+    states = _solve_states(order, lengths, xp.moveaxis(steps, -2, 0), states)
+    rest = 0.0 * steps[..., 0, :]
     # Rows of s = (x0, V0_1, ..., D, V1_1, ...), see Eq. 1 of _hermite_tables; V_i = h^i x^(i).
     first, last = [waypoints[..., :-1, :]], [steps]
     power = length = durations[..., None]
@@ -234,11 +193,51 @@ def _coefficients(xp: Namespace, order: int, waypoints: Array, durations: Array,
     return xp.reshape(coefficients, (*batch, 2 * order, segments, rest.shape[-1]))
 
 
-def _flat(value: Any, batch: tuple[int, ...], xp: Namespace) -> Any:
-    """Return a derivative with the batch in one axis, (N, D); None and FREE stay."""
-    if not is_given(value):
-        return value
-    return xp.reshape(broadcast_to(xp, value, (*batch, value.shape[-1])), (-1, value.shape[-1]))
+def _rescaled(xp: Namespace, durations: Array, states: States) -> tuple[Array, States]:
+    """Return durations of about 1 and the states in their unit, a power of two: x^(i) / scale^i is exact."""
+    scale = unit_factors(xp, durations)
+    scaled: States = []
+    for state in states:
+        row, factor = [], xp.ones_like(scale)
+        for value in state:
+            factor = factor / scale
+            row.append(value * factor if is_given(value) else value)
+        scaled.append(row)
+    return durations * scale, scaled
+
+
+def _weighted_coefficients(
+    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
+) -> Array:
+    """Return the coefficients (N, 2m, S, D) by weighted least squares, in double precision."""
+    dtype = waypoints.dtype
+    waypoints = xp.astype(waypoints, xp.float64)
+    durations = xp.astype(durations, xp.float64)
+    states = [change_given(lambda value: xp.astype(value, xp.float64), state) for state in states]
+    total = xp.sum(durations, axis=-1)
+    points = to_numpy(waypoints)
+    pace = to_numpy(total)[:, None]
+    ends = []
+    for state in (states[0], states[-1]):
+        ends.append([to_numpy(v) * pace ** (i + 1) if is_given(v) else v for i, v in enumerate(state)])
+    slack = like(xp, rounding_slack(points, ends), durations)
+    for _ in range(2 * order - 1):
+        slack = slack * total
+    soft = weighted_coefficients(xp, order, waypoints, durations, states, slack)
+    exact = weighted_coefficients(xp, order, waypoints, durations, states, 0.0 * slack)
+    # The tolerance is for rounding alone: it must lower the cost, and no waypoint may be missed by more.
+    table = energy_table(order, order)
+    lengths = to_numpy(durations / total[:, None]) ** (2 * order - 1)
+    costs = []
+    for found in (exact, soft):
+        modes = np.einsum("ik,nksd->nisd", table, to_numpy(found)[:, order:])
+        costs.append(((modes * modes).sum(axis=(1, 3)) / lengths).sum(axis=-1))
+    steps = to_numpy(soft)[:, 1:].sum(axis=1)
+    missed = np.abs(steps - np.diff(points, axis=1)).max(axis=(1, 2))
+    far = missed > _MISS * np.abs(points - points[:, :1]).max(axis=(1, 2))
+    better = far | (costs[0] <= (1.0 + _GAIN) * costs[1])
+    chosen = like(xp, 1.0 * better, slack)[:, None, None, None]
+    return xp.astype(xp.where(chosen > 0, exact, soft), dtype)
 
 
 def _connect_kind(
@@ -251,15 +250,15 @@ def _connect_kind(
     if not full:
         return still
     # Keep the start and the end of every full segment; merged knots share one state, the goal's at the end.
-    kept = [0, *(s + 1 for s in full)]
-    chosen = [states[0], *(states[k] for k in kept[1:-1]), states[-1]]
-    points = xp.stack([waypoints[..., k, :] for k in kept[:-1]] + [waypoints[..., -1, :]], axis=-2)
+    kept = [0, *(s + 1 for s in full[:-1]), len(empty)]
+    chosen = [states[k] for k in kept]
+    points = xp.stack([waypoints[..., k, :] for k in kept], axis=-2)
     lengths = xp.stack([durations[..., s] for s in full], axis=-1)
     solve = _weighted_coefficients if extreme else _banded_coefficients
     solved = solve(xp, order, points, lengths, chosen)
     if len(full) == len(empty):
         return solved
-    columns = [
-        still[..., s, :] if is_empty else solved[..., full.index(s), :] for s, is_empty in enumerate(empty)
-    ]
+    columns = list(xp.moveaxis(still, -2, 0))
+    for k, s in enumerate(full):
+        columns[s] = solved[..., k, :]
     return xp.stack(columns, axis=-2)

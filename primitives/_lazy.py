@@ -14,12 +14,6 @@ def lazy_imports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
 
     The names are those that its `__init__.py` imports under `if TYPE_CHECKING:`, where type checkers see them, too. So
     there is one list of them.
-
-    Example:
-        >>> from viapoint.primitives._lazy import lazy_imports
-        >>> get, names = lazy_imports("viapoint.envs")
-        >>> get("Sphere").__module__
-        'viapoint.envs.geometry.shapes'
     """
     module: Any = sys.modules[package]
     places: dict[str, str] = {}

@@ -22,7 +22,6 @@ With the states at the via-points eliminated, J(h) is the least sum of the segme
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,8 +31,8 @@ import numpy as np
 from ._hermite_tables import mode_table
 from ._passage_one_via import attach_root_gradient, nearer_fraction
 from ._weighted_solver import fit_modes, mode_weights
-from .array_api import FREE, Array, Floats, Namespace, like, ordered_sum, to_numpy
-from .trajectory import connect
+from .array_api import FREE, Array, Floats, Namespace, change_given, like, ordered_sum, to_numpy
+from .trajectory import connect, duration_gradient
 
 # Starts with moving ends: even durations, durations by chord, eight from a flat Dirichlet distribution.
 _STARTS = 10
@@ -41,8 +40,8 @@ _STARTS = 10
 _MOST_SEGMENTS = 16
 # Bound on the entries of the inverse Hessian of the log-cost: knots about to merge keep a finite gradient.
 _LARGEST = 1e3
-# Steps of the log-durations for one-sided and for central difference quotients of the gradient.
-_DIFFERENCE, _WIDE_DIFFERENCE = 1e-8, 1e-6
+# Step of the log-durations for difference quotients of the gradient.
+_DIFFERENCE = 1e-8
 _LONGEST_STEP = 1.5
 # Relative error of a cost.
 _NOISE = 1e-13
@@ -74,13 +73,13 @@ class PassageCost:
     @classmethod
     def from_points(cls, points: Floats, ends: Sequence[Any], slack: Floats) -> PassageCost:
         """Return the cost of movements through points (N, S + 1, D) with four boundary values (N, D)."""
-        rows = [np.ascontiguousarray(v.T) if isinstance(v, np.ndarray) else v for v in ends]
+        rows = change_given(lambda value: np.ascontiguousarray(value.T), ends)
         steps = np.ascontiguousarray(np.diff(points, axis=1).transpose(1, 2, 0))
         return cls(steps, rows, slack)
 
     def chosen(self, items: Any) -> PassageCost:
         """Return the movements `items`, in that order."""
-        ends = [value[:, items] if isinstance(value, np.ndarray) else value for value in self.ends]
+        ends = change_given(lambda value: value[:, items], self.ends)
         return PassageCost(self.steps[..., items], ends, self.slack[items])
 
     def reference(self) -> Floats:
@@ -111,21 +110,6 @@ class PassageCost:
         return ordered_sum(total), slope
 
 
-def duration_gradient(coefficients: Array, rates: Array) -> Array:
-    """Return dJ/dh of each segment, (..., S), minus its Hamiltonian (Flash & Hogan 1985, Eqs. C6, C7).
-
-    For order m, dJ/dh = -1/2 |x^(m)|^2 - sum_{i=1}^{m-1} (-1)^i x^(m+i) . x^(m-i), constant along a segment; for jerk
-    it is -|jerk|^2/2 + snap . acceleration - crackle . velocity. Coefficients are (..., 2m, S, D) in unit time.
-    """
-    order = coefficients.shape[-3] // 2
-    total: Any = 0.0
-    for i in range(order):  # at the beginning of the segment, where x^(k) = k! c_k / h^k
-        weight = (0.5 if i == 0 else (-1.0) ** i) * math.factorial(order + i) * math.factorial(order - i)
-        product = coefficients[..., order + i, :, :] * coefficients[..., order - i, :, :]
-        total = total + weight * product.sum(-1)
-    return -total * math.prod([rates * rates] * order)
-
-
 def fractions_by_newton(
     cost: PassageCost, guess: Floats, bound: Floats, *, several: bool
 ) -> tuple[Floats, Any]:
@@ -154,7 +138,10 @@ def _starts(cost: PassageCost, guess: Floats, several: bool) -> list[Floats]:
     guesses = [np.cbrt(chord), _straight_durations(chord)]
     if not np.isnan(guess).all():
         guesses.append(guess)
-    starts = [_lowest(cost, guesses)]
+    shares = np.stack([each / each.sum(axis=0) for each in guesses])
+    costs = np.stack([cost.derivatives(each)[0] for each in shares])
+    best = np.argmin(np.where(costs >= 0, costs, np.inf), axis=0)
+    starts = [np.take_along_axis(shares, best[None, None], axis=0)[0]]
     if several and segments <= _MOST_SEGMENTS:
         starts.append(np.ones_like(chord))
         drawn = np.random.default_rng(0).dirichlet(np.ones(segments), _STARTS - 2)
@@ -176,21 +163,11 @@ def _straight_durations(chord: Floats) -> Floats:
     return positive
 
 
-def _lowest(cost: PassageCost, candidates: list[Floats]) -> Floats:
-    """Return, for each movement, those candidates of the durations (S, N) that cost least."""
-    shares = np.stack([each / each.sum(axis=0) for each in candidates])
-    costs = np.stack([cost.derivatives(each)[0] for each in shares])
-    best = np.argmin(np.where(costs >= 0, costs, np.inf), axis=0)
-    chosen: Floats = np.take_along_axis(shares, best[None, None], axis=0)[0]
-    return chosen
-
-
 def _log_cost(cost: PassageCost, z: Floats, reference: Floats) -> tuple[Floats, Floats, Floats]:
     """Return log(J + reference), its gradient and its Hessian with respect to z.
 
-    The Hessian consists of difference quotients of the gradient, all computed at once, central ones for many
-    segments, which make it ill conditioned. The cost does not change if all z shift: that gives the last row, and
-    1 1^T, which makes the Hessian regular, changes no step.
+    The Hessian consists of difference quotients of the gradient, all computed at once. The cost does not change if all
+    z shift: that gives the last row, and 1 1^T, which makes the Hessian regular, changes no step.
     """
     size, count = z.shape
     columns = [z]

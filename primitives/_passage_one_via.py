@@ -29,15 +29,15 @@ around either end, roots are sought on every scale of time, and Newton steps use
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from ._boundary import chosen_items
 from ._polynomial import differentiate, evaluate, multiply, root_candidates
-from .array_api import FREE, Array, Floats, Namespace, like, ordered_sum, to_numpy
+from .array_api import FREE, Array, Floats, Namespace, change_given, like, ordered_sum, to_numpy
 from .trajectory import connect
 
 Number: TypeAlias = Any  # A NumPy scalar, or an array with one entry per movement; both give the same bits
@@ -237,21 +237,18 @@ def fractions_moving(points: Floats, ends: list[Any], slack: Floats) -> Floats:
     u = root_candidates(stationary)
     best = _earliest(u, expansion.excess(u), cost)
     fractions = np.stack([best, 1.0 - best], axis=-1)
-    hard = np.flatnonzero(_inaccurate(stationary, best))
+    # Rounding of the coefficients of F may spoil the root, or hide one near an end.
+    slope = np.abs(evaluate(differentiate(stationary), best)) * np.minimum(best, 1.0 - best)
+    noise = np.finfo(np.float64).eps * evaluate(np.abs(stationary), best) + np.abs(evaluate(stationary, best))
+    at_ends = np.minimum(np.abs(stationary[:, 0]), np.abs(evaluate(stationary, np.ones_like(best))))
+    hidden = ~(at_ends > _NEAR * np.abs(stationary).sum(axis=-1))
+    hard = np.flatnonzero(~(noise < _DOUBT * slope) | hidden)
     if hard.size:
-        chosen = [chosen_items(value, hard) for value in ends]
+        chosen = change_given(operator.itemgetter(hard), ends)
         found = _from_both_ends(points[hard], chosen, slack[hard], cost[hard])
         wrong = (np.abs(found - fractions[hard]) > _TOLERANCE * found).any(axis=-1)
         fractions[hard[wrong]] = found[wrong]
     return fractions
-
-
-def _inaccurate(stationary: Floats, u: Floats) -> Any:
-    """Return True where rounding of the coefficients of F may spoil the root u (N,), or hide one near an end."""
-    slope = np.abs(evaluate(differentiate(stationary), u)) * np.minimum(u, 1.0 - u)
-    noise = np.finfo(np.float64).eps * evaluate(np.abs(stationary), u) + np.abs(evaluate(stationary, u))
-    at_ends = np.minimum(np.abs(stationary[:, 0]), np.abs(evaluate(stationary, np.ones_like(u))))
-    return ~(noise < _DOUBT * slope) | ~(at_ends > _NEAR * np.abs(stationary).sum(axis=-1))
 
 
 def _candidates_on_every_scale(polynomial: Floats) -> Floats:
@@ -293,7 +290,8 @@ def _expand(points: Floats, ends: list[Any], slack: Floats, *, from_goal: bool) 
         powers = (q, 5)
         g = Polynomial(g)(Polynomial([1.0, -1.0])).coef
         first, last = last, first
-        states = [[-v if isinstance(v, np.ndarray) else v, a] for v, a in reversed(states)]
+        backwards = change_given(operator.neg, ends)
+        states = [[backwards[2], ends[3]], [backwards[0], ends[1]]]
     free = connect(np, 3, np.stack([first, last], axis=1), np.ones(1), states)
     miss = -np.moveaxis(free.coefficients[:, :, 0, :], 1, -1)  # (N, D, 6)
     miss[..., 0] = via - first

@@ -79,25 +79,25 @@ def root_candidates(coefficients: Floats) -> Floats:
     w = np.linalg.eigvals(companion)
     square = w.real * w.real + w.imag * w.imag
     u = w.real / np.where(square > 0, square, 1.0) - _SHIFT  # Re(1/w) - s
-    return np.sort(_polish(scaled, np.clip(u, 0.0, 1.0)), axis=-1)
-
-
-def _polish(coefficients: Floats, u: Floats) -> Floats:
-    """Improve roots by Newton steps within [0, 1]; long steps belong to points that are no roots."""
-    polynomial = coefficients[..., None, :]
+    u = np.clip(u, 0.0, 1.0)
+    # Newton steps within [0, 1]; long steps belong to points that are no roots.
+    polynomial = scaled[..., None, :]
     slope = differentiate(polynomial)
     for _ in range(_POLISHING_STEPS):
         rate = evaluate(slope, u)
         step = evaluate(polynomial, u) / np.where(rate == 0, 1.0, rate)
         u = np.where(np.abs(step) < 1e-2, np.clip(u - step, 0.0, 1.0), u)
-    return u
+    return np.sort(u, axis=-1)
 
 
 @cache
 def _shift_matrix(degree: int) -> Floats:
     """Return the matrix that maps coefficients in u = v - s to those in v, by the binomial theorem."""
-    size = range(degree + 1)
-    return np.array([[comb(k, j) * (-_SHIFT) ** (k - j) if j <= k else 0.0 for j in size] for k in size])
+    table = np.zeros((degree + 1, degree + 1))
+    for k in range(degree + 1):
+        for j in range(k + 1):
+            table[k, j] = comb(k, j) * (-_SHIFT) ** (k - j)
+    return table
 
 
 @dataclass(frozen=True)

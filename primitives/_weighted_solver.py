@@ -39,7 +39,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ._hermite_tables import mode_table, series_table
-from .array_api import FREE, Array, Namespace, is_given
+from .array_api import FREE, Array, Namespace, change_given
 
 Entry: TypeAlias = Any  # An array or a Python float
 
@@ -223,7 +223,7 @@ def weighted_coefficients(
     """
     lengths = durations.mT
     steps = xp.permute_dims(waypoints[:, 1:] - waypoints[:, :-1], (1, 2, 0))
-    turned = [[value.mT if is_given(value) else value for value in state] for state in states]
+    turned = [change_given(lambda value: value.mT, state) for state in states]
     solved, modes = fit_modes(xp, order, lengths, steps, turned, slack)
     columns = []
     for s, length in enumerate(lengths):

@@ -11,7 +11,7 @@ import functools
 import math
 import operator
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, Literal, TypeAlias, TypeGuard
 
 import numpy as np
@@ -58,21 +58,17 @@ def is_given(value: Boundary) -> TypeGuard[Array]:
     return value is not None and value is not FREE
 
 
+def change_given(function: Callable[[Array], Array], values: Iterable[Boundary]) -> list[Boundary]:
+    """Return boundary values of which arrays are changed by a function; None and FREE stay."""
+    return [function(value) if is_given(value) else value for value in values]
+
+
 def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> tuple[Namespace, list[Any]]:
-    """Convert all arguments to one array library and one floating dtype.
+    """Convert arguments by name to one array library and one floating dtype; return it and them, required ones first.
 
-    Args:
-        optional: further arguments by name; None among these, and FREE for the goal's velocity and acceleration,
-            is returned unchanged.
-        **required: arrays, numbers or nested lists by argument name.
-
-    Returns:
-        The namespace and the arrays in the order given, required ones first. The dtype is the widest floating
-        dtype among the arrays. Numbers, lists and integer arrays do not count; without any floating array it
-        is float64.
-
-    Raises:
-        ValueError: an argument is missing, not numeric, or not finite.
+    Among the optional ones None is returned as it is, and FREE for the goal's velocity and acceleration. The dtype is
+    the widest floating dtype among the arrays. Numbers, lists and integer arrays do not count; without any floating
+    array it is float64. An argument that is missing, not numeric, or not finite raises ValueError.
     """
     # Every call of the package passes here: loops and inlined tests of `is_given` halve the calls of a movement.
     named = {**required, **optional} if optional else required
@@ -218,27 +214,6 @@ def as_number(value: Any) -> float:
         return float(value) if single else math.nan
     except (TypeError, ValueError, RuntimeError, OverflowError):
         return math.nan
-
-
-def check_buffers(out: Sequence[Array], count: int, shape: tuple[int, ...], xp: Namespace) -> None:
-    """Raise ValueError unless `out` holds `count` writeable floating arrays of the given library and shape."""
-
-    def fits(buffer: Array) -> bool:
-        if namespace_of(buffer) is not xp or tuple(buffer.shape) != shape:
-            return False
-        if xp is np:
-            return bool(buffer.dtype.kind == "f" and buffer.flags.writeable)
-        return bool(xp.isdtype(buffer.dtype, "real floating"))
-
-    try:
-        fitting = [fits(buffer) for buffer in out]
-    except TypeError:
-        fitting = []
-    if fitting != [True] * count:
-        raise ValueError(
-            f"out must hold {count} writeable floating arrays of shape {shape} of the trajectory's own kind, "
-            f"got {[getattr(buffer, 'shape', buffer) for buffer in out] if fitting else type(out).__name__}"
-        )
 
 
 def broadcast_to(xp: Namespace, array: Array, shape: tuple[int, ...]) -> Array:

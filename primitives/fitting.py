@@ -14,7 +14,6 @@ import math
 import warnings
 from dataclasses import dataclass
 from itertools import combinations
-from operator import itemgetter
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -111,26 +110,18 @@ class ViaPointFit:
         return self.end - self.onset
 
     def __call__(self, time: Array, nu: int = 0) -> Array:
-        """Return the nu-th derivative of the fitted movement at times (T,) or (..., T) of the measurement, or at one.
-
-        Returns:
-            (..., T, D), or (..., D) for one time [m/s^nu]. Before the onset and after the end the movement rests.
-
-        Raises:
-            ValueError: time is not finite or does not broadcast; nu is not a whole number of at least 0.
-        """
+        """Return the nu-th derivative of the fitted movement, see `Trajectory`; `time` is that of the measurement."""
         (time,) = self.trajectory.floats(time=time)
         if time.ndim == 0:
             return self(time[None], nu)[..., 0, :]
         return self.trajectory(time - self.onset[..., None], nu)
 
 
+# Times (N,) [s] and positions (N, D) [m] of each movement, leading shape of the results, an array of their kind
 _Recordings: TypeAlias = tuple[list[tuple[Floats, Floats]], tuple[int, ...], Array]
-"""Times (N,) [s] and positions (N, D) [m] of each movement, leading shape of the results, an array of their kind."""
 
-
+# Times of start, via-points and goal of one movement (K + 2,) [s], the points (K + 2, D) [m], R^2, noise, BIC
 _Fit: TypeAlias = tuple[Floats, Floats, float, float, float]
-"""Fit of one movement: times of start, via-points and goal (K + 2,) [s], the points (K + 2, D) [m], R^2, noise, BIC."""
 
 
 def fit_via_points(
@@ -147,19 +138,14 @@ def fit_via_points(
     that were cut at a threshold of speed.
 
     The number of via-points, where it is not given, has the least Bayesian information criterion
-    n log(squares / n) + p log n of n coordinates and p fitted numbers. The search for the times begins at the best of a
-    grid of passage times; a better minimum elsewhere cannot be excluded.
-
-    The computation runs in NumPy and double precision for every input and has no gradient.
+    n log(squares / n) + p log n of n coordinates and p fitted numbers. A better minimum than the one found cannot be
+    excluded. The computation runs in NumPy and double precision for every input and has no gradient.
 
     Args:
         time: (N,) or (..., N) ascending times of the samples [s].
         position: (..., N, D) [m]; or a list of movements of different length (N_i, D), and then `time` is a list too.
         n_via: number of via-points; (fewest, most) to choose among; None for (0, 3).
         free_ends: False for a movement that begins with the first sample and ends with the last one.
-
-    Returns:
-        The fit, with the leading shape of the positions, or (M,) for a list of M movements.
 
     Raises:
         ValueError: an argument is not finite or has a wrong shape; times do not ascend; nothing moves; there are
@@ -182,7 +168,7 @@ def fit_via_points(
     for times, positions in movements:
         _warn_of_outliers(positions)
         candidates = [_fit(times, positions, count, free_ends) for count in counts]
-        fits.append(min(candidates, key=itemgetter(-1)))
+        fits.append(min(candidates, key=lambda fit: fit[-1]))  # the least BIC
     return _record(fits, batch, kind)
 
 
@@ -334,9 +320,8 @@ def _expansion(
     """Return half the squares (S,), their gradient (S, P) and the Gauss-Newton matrix (S, P, P) at theta (S, P)."""
     starts, count = theta.shape
     tried = theta[:, None] + _STEP * np.eye(count + 1, count, k=-1)  # the first row is theta itself
-    residuals = _residuals(
-        _knots(tried.reshape(starts * (count + 1), count), free_ends), time, position
-    ).reshape(starts, count + 1, -1)
+    knots = _knots(tried.reshape(starts * (count + 1), count), free_ends)
+    residuals = _residuals(knots, time, position).reshape(starts, count + 1, -1)
     base = residuals[:, :1]
     jacobian = (residuals[:, 1:] - base) / _STEP
     return 0.5 * (base * base).sum(axis=(1, 2)), (jacobian @ base.mT)[..., 0], jacobian @ jacobian.mT
@@ -420,11 +405,9 @@ def _record(fits: list[_Fit], batch: tuple[int, ...], kind: Array) -> ViaPointFi
     times, places, *numbers = zip(*fits, strict=True)
     n_via = np.array(list(map(len, times))) - 2
     # A goal that is repeated after no time is no via-point for `through`.
-    missing = n_via.max() - n_via
-    knots = np.stack([np.pad(own, (0, more), "edge") for own, more in zip(times, missing, strict=True)])
-    waypoints = np.stack(
-        [np.pad(own, ((0, more), (0, 0)), "edge") for own, more in zip(places, missing, strict=True)]
-    )
+    last = np.arange(n_via.max() + 2)
+    knots = np.stack([own[np.minimum(last, len(own) - 1)] for own in times])
+    waypoints = np.stack([own[np.minimum(last, len(own) - 1)] for own in places])
     exists = np.arange(n_via.max()) < n_via[:, None]
 
     def shaped(values: Any) -> Array:

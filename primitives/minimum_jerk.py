@@ -1,20 +1,35 @@
-"""Minimum-jerk trajectories between two states and through via-points at given times."""
+"""Minimum-jerk trajectories between two states and through via-points at given times, and checks of their arguments."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from ._boundary import check_durations, check_order, end_shapes, knot_states, read_arguments, waypoint_shapes
+import numpy as np
+
+from ._hermite_tables import ORDERS
 from .array_api import (
+    FREE,
     Array,
     Boundary,
+    Namespace,
     as_floats,
     broadcast_batch,
     broadcast_to,
+    is_given,
     leading_shape,
     require,
+    to_numpy,
 )
 from .trajectory import Trajectory, connect
+
+Ends = dict[str, Boundary]  # The four boundary values by name, in the order of END_NAMES
+
+# Distance of waypoints that count as equal, in units of the rounding of their greatest coordinate.
+_EQUAL = 64.0
+
+END_NAMES = ("start_velocity", "start_acceleration", "goal_velocity", "goal_acceleration")
 
 
 def point_to_point(
@@ -43,9 +58,6 @@ def point_to_point(
         goal_acceleration: (..., D) [m/s^2]; likewise.
         order: 2, 3 or 4: least acceleration, jerk or snap. Order 2 leaves accelerations open; with order 4
             the jerk is zero at both ends.
-
-    Returns:
-        A trajectory of one segment with the broadcast leading shape.
 
     Raises:
         ValueError: an argument is not finite, has a wrong shape, or duration <= 0 (0 is allowed for a movement
@@ -86,9 +98,8 @@ def through(
 ) -> Trajectory:
     """Return the movement through all waypoints with the least integral of |x^(order)|^2.
 
-    Velocity and acceleration at the K via-points are those of least cost. They solve a symmetric block
-    tridiagonal system in a time proportional to K. The result is continuous up to x^(2 order - 2) (Flash &
-    Hogan 1985, Appendix C).
+    Velocity and acceleration at the K via-points are those of least cost. The result is continuous up to
+    x^(2 order - 2) (Flash & Hogan 1985, Appendix C).
 
     Args:
         waypoints: (..., K + 2, D) start, via-points, goal [m].
@@ -100,9 +111,6 @@ def through(
         goal_acceleration: (..., D) [m/s^2]; likewise.
         via_velocities: (..., K, D) prescribed velocities at the via-points [m/s]; None = those of least cost.
         order: 2, 3 or 4: least acceleration, jerk or snap.
-
-    Returns:
-        A trajectory of K + 1 segments with the broadcast leading shape.
 
     Raises:
         ValueError: an argument is not finite or has a wrong shape; a duration is negative, or 0 between
@@ -127,7 +135,7 @@ def through(
     if via_velocities is not None:
         shapes["via_velocities"] = leading_shape("via_velocities", via_velocities, knots - 2, dimension)
     batch = broadcast_batch(**shapes)
-    waypoints = broadcast_to(xp, waypoints, (*batch, *waypoints.shape[-2:]))
+    waypoints = broadcast_to(xp, waypoints, (*batch, knots, dimension))
     check_durations("durations", durations, waypoints, ends)
     states = knot_states(order, ends, knots - 2)
     if via_velocities is not None:
@@ -147,17 +155,8 @@ def minimum_jerk_coefficients(
         a_4 T^4 = -15 D + 8 V0 + 7 VT + 3/2 A0 -     AT
         a_5 T^5 =   6 D - 3 V0 - 3 VT - 1/2 A0 + 1/2 AT
 
-    Args:
-        x0: (...,) start position [m].
-        dx0: (...,) start velocity [m/s].
-        ddx0: (...,) start acceleration [m/s^2].
-        xT: (...,) goal position [m].
-        dxT: (...,) goal velocity [m/s].
-        ddxT: (...,) goal acceleration [m/s^2].
-        T: (...,) duration [s].
-
-    Returns:
-        (..., 6) coefficients, a_k in m/s^k.
+    Position [m], velocity [m/s] and acceleration [m/s^2] at start and goal and the duration T [s] have the shape
+    (...,), the coefficients (..., 6), a_k in m/s^k.
 
     Raises:
         ValueError: an argument is not finite, does not broadcast, or T <= 0.
@@ -167,10 +166,10 @@ def minimum_jerk_coefficients(
         >>> minimum_jerk_coefficients(0, 0, 0, 1, 0, 0, 1).tolist()
         [0.0, 0.0, 0.0, 10.0, -15.0, 6.0]
     """
-    names = ("x0", "dx0", "ddx0", "xT", "dxT", "ddxT", "T")
-    xp, arrays = as_floats(**dict(zip(names, (x0, dx0, ddx0, xT, dxT, ddxT, T), strict=True)))
+    given = {"x0": x0, "dx0": dx0, "ddx0": ddx0, "xT": xT, "dxT": dxT, "ddxT": ddxT, "T": T}
+    xp, arrays = as_floats(**given)
     require(arrays[-1] > 0, "T", arrays[-1], "must be positive")
-    shape = broadcast_batch(**{name: tuple(a.shape) for name, a in zip(names, arrays, strict=True)})
+    shape = broadcast_batch(**{name: tuple(a.shape) for name, a in zip(given, arrays, strict=True)})
     x0, dx0, ddx0, xT, dxT, ddxT, T = (broadcast_to(xp, a, shape)[..., None] for a in arrays)
     movement = connect(xp, 3, xp.stack([x0, xT], axis=-2), T, [[dx0, ddx0], [dxT, ddxT]])
     unit = movement.coefficients[..., 0, :]
@@ -178,3 +177,84 @@ def minimum_jerk_coefficients(
     upper = [unit[..., k, :] * math.prod([rate] * k) for k in range(3, 6)]
     # a_1 and a_2 are given: conversion to unit time and back would round them.
     return xp.concat([unit[..., 0, :], dx0, ddx0 / 2, *upper], axis=-1)
+
+
+def read_arguments(
+    ends: tuple[Boundary, Boundary, Boundary, Boundary],
+    optional: Mapping[str, Any] | None = None,
+    /,
+    **required: Any,
+) -> tuple[Namespace, list[Any], Ends]:
+    """Convert the arguments of a movement to one library and dtype, see `as_floats`.
+
+    `ends` are the values of END_NAMES. They are returned by name, after the namespace and the other arrays.
+    """
+    named = dict(zip(END_NAMES, ends, strict=True))
+    xp, arrays = as_floats({**(optional or {}), **named}, **required)
+    return xp, arrays[:-4], dict(zip(END_NAMES, arrays[-4:], strict=True))
+
+
+def check_order(order: int, start_acceleration: Boundary, goal_acceleration: Boundary) -> None:
+    """Raise ValueError for an unknown order, or for order 2 with boundary accelerations."""
+    if not isinstance(order, int | np.integer) or order not in ORDERS:
+        raise ValueError(f"order must be 2 (acceleration), 3 (jerk) or 4 (snap), got {order!r}")
+    given = {"start_acceleration": start_acceleration, "goal_acceleration": goal_acceleration}
+    for name, value in given.items():
+        if order == 2 and is_given(value):
+            raise ValueError(f"{name} cannot be given for order 2: least acceleration leaves it open")
+
+
+def end_shapes(ends: Mapping[str, Boundary], dimension: int) -> dict[str, tuple[int, ...]]:
+    """Return the leading shapes of the given boundary values; raise ValueError if a last axis is not D."""
+    shapes = {}
+    for name, value in ends.items():
+        if value is not None and value is not FREE:
+            shapes[name] = leading_shape(name, value, dimension)
+    return shapes
+
+
+def waypoint_shapes(waypoints: Array, ends: Ends) -> dict[str, tuple[int, ...]]:
+    """Return the leading shapes of waypoints and of boundary values, or raise ValueError."""
+    shape = leading_shape("waypoints", waypoints, None, None)
+    if waypoints.shape[-2] < 2:
+        raise ValueError("waypoints must hold start and goal, got one point")
+    return {"waypoints": shape, **end_shapes(ends, waypoints.shape[-1])}
+
+
+def check_durations(name: str, durations: Array, waypoints: Array, ends: Ends) -> None:
+    """Raise ValueError for durations (..., S) below 0, and for 0 between waypoints (..., S + 1, D) that differ.
+
+    All durations of a movement may be 0 only if its ends are at rest.
+    """
+    if (durations > 0).all():
+        return
+    require(durations >= 0, name, durations, "must not be negative")
+    points, numbers = to_numpy(waypoints), to_numpy(durations)
+    positive = np.broadcast_to(numbers > 0, (*points.shape[:-2], numbers.shape[-1]))
+    rounding = _EQUAL * np.finfo(points.dtype).eps * np.abs(points).max(axis=(-2, -1), initial=0.0)
+    equal = np.abs(np.diff(points, axis=-2)).max(axis=-1) <= rounding[..., None]
+    require(positive | equal, name, 1.0 * positive, "may be 0 only between equal waypoints")
+    moves = np.zeros(positive.shape[:-1], dtype=bool)
+    for value in ends.values():
+        if is_given(value):
+            moves = moves | (to_numpy(value) != 0).any(axis=-1)
+    require(positive.any(axis=-1) | ~moves, name, 1.0 * moves, "must not be 0 for a movement whose ends move")
+
+
+def knot_states(order: int, ends: Ends, vias: int = 0) -> list[list[Any]]:
+    """Return the m - 1 derivatives at every knot: given at the ends, FREE at via-points.
+
+    Order 4 (snap) has the jerk zero at both ends.
+    """
+    values = list(ends.values())
+    states = [[*values[:2], None][: order - 1]]
+    for _ in range(vias):
+        states.append([FREE] * (order - 1))
+    return [*states, [*values[2:], None][: order - 1]]
+
+
+def unit_time_ends(ends: Sequence[Boundary], duration: Array) -> list[Any]:
+    """Return the values of END_NAMES in unit time, V = v T and A = a T^2; None and FREE stay."""
+    time = duration[..., None]
+    powers = time, time * time, time, time * time
+    return [value * power if is_given(value) else value for value, power in zip(ends, powers, strict=True)]

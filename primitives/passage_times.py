@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import warnings
 from itertools import pairwise
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
-from ._boundary import check_durations, chosen_items, read_arguments, unit_time_ends, waypoint_shapes
 from ._passage_newton import PassageCost, attach_gradient, fractions_by_newton
 from ._passage_one_via import fractions_at_rest, fractions_moving
 from ._polynomial import differentiate, evaluate
@@ -19,11 +19,12 @@ from .array_api import (
     Boundary,
     broadcast_batch,
     broadcast_to,
-    is_given,
+    change_given,
     like,
     ordered_sum,
     to_numpy,
 )
+from .minimum_jerk import check_durations, read_arguments, unit_time_ends, waypoint_shapes
 from .trajectory import connect
 
 # Fraction of the duration below which a segment is dropped in lower than double precision, which it would overflow.
@@ -46,12 +47,10 @@ def passage_durations(
 ) -> Array:
     """Return the segment durations with the least jerk cost, for a given total duration.
 
-    They satisfy Flash & Hogan's condition pi . v(t_k) = 0 at every via-point (1985, Eq. C16). One via-point,
-    rest to rest: the only root of a polynomial, the global minimum. One via-point, moving or free ends: the
-    best of all roots. Several via-points: damped Newton steps on the cost; local minima cannot be excluded.
-
-    The computation runs in NumPy and double precision for every input. torch gradients follow from the
-    implicit function theorem and are clipped where a via-point meets its neighbour.
+    They satisfy Flash & Hogan's condition pi . v(t_k) = 0 at every via-point (1985, Eq. C16). With one via-point they
+    are the global minimum; with several, local minima cannot be excluded. The computation runs in NumPy and double
+    precision for every input. torch gradients follow from the implicit function theorem and are clipped where a
+    via-point meets its neighbour.
 
     Args:
         waypoints: (..., K + 2, D) start, via-points, goal [m].
@@ -85,10 +84,7 @@ def passage_durations(
     batch = broadcast_batch(**waypoint_shapes(waypoints, ends), duration=tuple(duration.shape))
     waypoints = broadcast_to(xp, waypoints, (*batch, *waypoints.shape[-2:]))
     check_durations("duration", duration[..., None], waypoints, ends)
-    flat_ends = dict(ends)
-    for name, value in ends.items():
-        if is_given(value):
-            flat_ends[name] = _flat(value, batch, 1)
+    flat_ends = change_given(lambda value: _flat(value, batch, 1), ends.values())
     unit_ends = unit_time_ends(flat_ends, _flat(duration, batch, 0))
     points, dtype = _flat(waypoints, batch, 2), waypoints.dtype
     eps = float(xp.finfo(dtype).eps)
@@ -100,12 +96,10 @@ def passage_durations(
     if not recorded:
         return like(xp, numbers, waypoints) * duration[..., None]
     cost = PassageCost.from_points(points, unit_ends, rounding_slack(points, (unit_ends[:2], unit_ends[2:])))
-    given = [
-        value if value is None or value is FREE else xp.astype(value, xp.float64) for value in ends.values()
-    ]
+    given = change_given(lambda value: xp.astype(value, xp.float64), ends.values())
     waypoints = xp.astype(waypoints, xp.float64)
     time = xp.astype(duration, xp.float64)
-    moving = unit_time_ends(dict(zip(ends, given, strict=True)), time)
+    moving = unit_time_ends(given, time)
     fractions = attach_gradient(like(xp, numbers, waypoints), waypoints, moving, cost, xp)
     return xp.astype(fractions * time[..., None], dtype)
 
@@ -145,20 +139,9 @@ def _fractions(points: Any, ends: list[Any], eps: float) -> Any:
             result[where, -1] = 1.0  # all waypoints are equal
             continue
         kept = points[where][:, [*full, knots - 1]]
-        chosen = [chosen_items(value, where) for value in ends]
+        chosen = change_given(itemgetter(where), ends)
         result[np.ix_(where, full)] = _solve(kept, chosen, bool(kind[-1]))
     return result
-
-
-def _scaled(points: Any, ends: list[Any]) -> tuple[Any, list[Any]]:
-    """Scale each movement to a size of about 1 by a power of two: exact, and no square under- or overflows."""
-    size = np.abs(points - points[:, :1]).max(axis=(1, 2))
-    for value in ends:
-        if isinstance(value, np.ndarray):
-            size = np.maximum(size, np.abs(value).max(axis=1))
-    exponent = -np.frexp(size)[1]
-    scaled = [np.ldexp(v, exponent[:, None]) if isinstance(v, np.ndarray) else v for v in ends]
-    return np.ldexp(points, exponent[:, None, None]), scaled
 
 
 def _solve(points: Any, ends: list[Any], moving: bool) -> Any:
@@ -166,7 +149,14 @@ def _solve(points: Any, ends: list[Any], moving: bool) -> Any:
     count, knots, _ = points.shape
     if knots == 2:
         return np.ones((count, 1))
-    points, ends = _scaled(points, ends)
+    # A size of about 1, by a power of two, is exact, and no square under- or overflows.
+    size = np.abs(points - points[:, :1]).max(axis=(1, 2))
+    for value in ends:
+        if isinstance(value, np.ndarray):
+            size = np.maximum(size, np.abs(value).max(axis=1))
+    exponent = -np.frexp(size)[1]
+    points = np.ldexp(points, exponent[:, None, None])
+    ends = change_given(lambda value: np.ldexp(value, exponent[:, None]), ends)
     slack = rounding_slack(points, (ends[:2], ends[2:]))
     if knots == 3:
         return fractions_moving(points, ends, slack) if moving else fractions_at_rest(points)
@@ -207,10 +197,10 @@ def _from_fewer_points(points: Any, ends: list[Any], moving: bool) -> tuple[Any,
     for pattern in np.unique(left_out[left_out.any(axis=1)], axis=0):
         where = np.flatnonzero((left_out == pattern).all(axis=1))
         kept = np.flatnonzero(~pattern)
-        chosen = [chosen_items(value, where) for value in ends]
+        chosen = change_given(itemgetter(where), ends)
         fewer = points[where][:, kept]
         fractions = _solve(fewer, chosen, moving)
-        states = [chosen[:2], *([FREE, FREE] for _ in kept[1:-1]), chosen[2:]]
+        states: list[list[Any]] = [chosen[:2], *([FREE, FREE] for _ in kept[1:-1]), chosen[2:]]
         movement = connect(np, 3, fewer, fractions, states)
         coefficients, cost[where] = movement.coefficients, movement.cost()
         for i, (first, last) in enumerate(pairwise(kept)):

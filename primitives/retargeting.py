@@ -5,9 +5,8 @@ from __future__ import annotations
 from math import inf
 from typing import Any
 
-from ._boundary import END_NAMES, end_shapes
 from .array_api import FREE, Array, Boundary, as_number, broadcast_batch, broadcast_to, require
-from .minimum_jerk import through
+from .minimum_jerk import END_NAMES, end_shapes, through
 from .passage_times import passage_durations
 from .trajectory import Trajectory, require_trajectory
 
@@ -32,11 +31,6 @@ def retarget(
     acceleration are the old ones. A via-point of the old movement that still lies ahead is dropped unless it is
     given again as `via`. A single one whose passage time was free is then passed as before.
 
-    Near arrival an error of the state becomes a jerk of 60 dx / R^3 + 36 dv / R^2 + 9 da / R, where R is the
-    remaining time. The state of the trajectory itself is exact up to rounding. A caller who plans from measured
-    states (`point_to_point` with start values) must stop replanning while R is long enough; `freeze`
-    implements this rule.
-
     Args:
         trajectory: the movement under way, of order 3.
         time: (...,) present time on the trajectory's clock [s].
@@ -46,8 +40,8 @@ def retarget(
         goal_velocity: (..., D) [m/s]; None = zero, FREE = the value of least cost.
         goal_acceleration: (..., D) [m/s^2]; likewise.
         freeze: remaining time to the old arrival [s] below which the old goal, arrival and final state are
-            kept, whatever the arguments say. Via-points are dropped: those of the old movement that lie ahead,
-            and a given one.
+            kept, whatever the arguments say, and all via-points are dropped. Near arrival an error of the state
+            becomes a jerk of 60 dx / R^3 + 36 dv / R^2 + 9 da / R, where R is the remaining time.
 
     Returns:
         The movement from `time` on; its own clock starts at 0.

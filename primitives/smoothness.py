@@ -7,7 +7,7 @@ spectral arc length -1.4024. Where nothing moves the ratios are undefined and Na
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -46,17 +46,7 @@ class SpeedEvents:
 
 
 def speed(trajectory: Trajectory, time: Array) -> Array:
-    """Return the tangential speed |v| at given times.
-
-    Args:
-        trajectory: the movements.
-        time: (T,) or (..., T) [s].
-
-    Returns:
-        (..., T) [m/s].
-
-    Raises:
-        ValueError: time is not finite or does not broadcast.
+    """Return the tangential speed |v|, (..., T) [m/s], at times (T,) or (..., T) [s].
 
     Example:
         >>> from viapoint.primitives import point_to_point, speed
@@ -77,8 +67,8 @@ def curvature(trajectory: Trajectory, time: Array) -> Array:
     """Return the curvature of the path at given times.
 
     In the plane it is signed, (x' y'' - y' x'') / |v|^3, positive to the left (Flash & Hogan 1985, footnote 4).
-    In space it is |v x a| / |v|^3. It is NaN at rest. The curvature of a rest-to-rest movement through a
-    via-point grows without bound at its ends.
+    In space it is |v x a| / |v|^3. It is NaN at rest, and grows without bound at the ends of a movement through a
+    via-point from rest to rest.
 
     Args:
         trajectory: movements in two or three dimensions.
@@ -86,9 +76,6 @@ def curvature(trajectory: Trajectory, time: Array) -> Array:
 
     Returns:
         (..., T) [1/m].
-
-    Raises:
-        ValueError: the dimension is neither 2 nor 3; time is not finite or does not broadcast.
 
     Example:
         >>> from viapoint.primitives import curvature, through
@@ -124,18 +111,9 @@ def _ratio(xp: Namespace, numerator: Array, denominator: Array) -> Array:
 
 
 def dimensionless_jerk(trajectory: Trajectory) -> Array:
-    """Return the dimensionless jerk, integral |jerk|^2 dt duration^3 / peak speed^2; smaller is smoother.
+    """Return the dimensionless jerk (...,), integral |jerk|^2 dt duration^3 / peak speed^2; smaller is smoother.
 
-    The definition of Hogan & Sternad 2009, normalised by the peak speed.
-
-    Args:
-        trajectory: the movements.
-
-    Returns:
-        (...,); 204.8 for a straight reach, NaN where nothing moves.
-
-    Raises:
-        ValueError: the argument is not a Trajectory.
+    The definition of Hogan & Sternad 2009, normalised by the peak speed. It is NaN where nothing moves.
 
     Example:
         >>> from viapoint.primitives import dimensionless_jerk, point_to_point
@@ -152,16 +130,9 @@ def dimensionless_jerk(trajectory: Trajectory) -> Array:
 
 
 def log_dimensionless_jerk(trajectory: Trajectory) -> Array:
-    """Return minus the natural logarithm of the dimensionless jerk; greater is smoother.
+    """Return minus the natural logarithm of the dimensionless jerk (...,); greater is smoother.
 
-    Args:
-        trajectory: the movements.
-
-    Returns:
-        (...,); -5.3220 for a straight reach, infinite without jerk, NaN where nothing moves.
-
-    Raises:
-        ValueError: the argument is not a Trajectory.
+    It is infinite without jerk, and NaN where nothing moves.
 
     Example:
         >>> from viapoint.primitives import log_dimensionless_jerk, point_to_point
@@ -186,16 +157,12 @@ def spectral_arc_length(
 
     Args:
         trajectory: the movements.
-        cutoff: highest frequency [Hz]; the measure is 0 for movements so brief that the first frequency
-            exceeds it.
+        cutoff: highest frequency [Hz].
         threshold: amplitude below which the tail of the spectrum is left out, 0 to 1.
         padding: powers of two of zero padding, 0 to 16.
 
     Returns:
         (...,); -1.4024 for a straight reach of 1 s, NaN where nothing moves.
-
-    Raises:
-        ValueError: cutoff or threshold is out of range, or padding is not a whole number from 0 to 16.
 
     Example:
         >>> from viapoint.primitives import point_to_point, spectral_arc_length
@@ -210,11 +177,26 @@ def spectral_arc_length(
     if not is_whole(padding) or padding > _MOST_PADDING:
         raise ValueError(f"padding must be a whole number from 0 to {_MOST_PADDING}, got {padding!r}")
     xp, dtype = trajectory.namespace, trajectory.coefficients.dtype
+    if 0 in trajectory.batch_shape:  # not all libraries transform empty batches
+        return 0.0 * trajectory.duration
+    length = 2 ** (int(np.ceil(np.log2(_SPECTRUM_SAMPLES))) + int(padding))
+    velocity = trajectory.sample(_SPECTRUM_SAMPLES + 1, 1)[0][..., :-1, :]
+    speeds = _length(xp, velocity)
     if xp is not np and dtype.itemsize < 4:  # torch has no Fourier transform of half precision
-        arrays = {f.name: getattr(trajectory, f.name) for f in fields(trajectory) if f.name != "order"}
-        single = replace(trajectory, **{name: xp.astype(array, xp.float32) for name, array in arrays.items()})
-        return xp.astype(_arc_length(single, cutoff, threshold, padding), dtype)
-    return _arc_length(trajectory, cutoff, threshold, padding)
+        speeds = xp.astype(speeds, xp.float32)
+    spectrum = xp.abs(xp.fft.rfft(speeds, n=length, axis=-1))
+    spectrum = _ratio(xp, spectrum, spectrum[..., :1])
+    numbers = to_numpy(spectrum)
+    index = np.arange(numbers.shape[-1])
+    with np.errstate(divide="ignore", invalid="ignore"):  # a movement that stands still may last no time
+        step = _SPECTRUM_SAMPLES / (length * to_numpy(trajectory.duration)[..., None])  # [Hz]
+        counts = (numbers >= threshold) & (index * step <= cutoff)
+    last = np.max(np.where(counts, index, 0), axis=-1, keepdims=True)
+    used = like(xp, (index[:-1] < last).astype(float), spectrum)
+    width = like(xp, 1.0 / np.maximum(last, 1), spectrum)
+    rise = spectrum[..., 1:] - spectrum[..., :-1]
+    lengths = -xp.sum(used * xp.sqrt(width * width + rise * rise), axis=-1)
+    return lengths if lengths.dtype == dtype else xp.astype(lengths, dtype)
 
 
 def _unit_sized(trajectory: Trajectory) -> Trajectory:
@@ -227,74 +209,35 @@ def _unit_sized(trajectory: Trajectory) -> Trajectory:
     return t.transformed(scale=size).stretched(t.duration * pace)
 
 
-def _arc_length(trajectory: Trajectory, cutoff: float, threshold: float, padding: int) -> Array:
-    """Return the spectral arc length (...,)."""
-    xp = trajectory.namespace
-    if 0 in trajectory.batch_shape:  # not all libraries transform empty batches
-        return 0.0 * trajectory.duration
-    length = 2 ** (int(np.ceil(np.log2(_SPECTRUM_SAMPLES))) + int(padding))
-    velocity = trajectory.sample(_SPECTRUM_SAMPLES + 1, 1)[0][..., :-1, :]
-    spectrum = xp.abs(xp.fft.rfft(_length(xp, velocity), n=length, axis=-1))
-    spectrum = _ratio(xp, spectrum, spectrum[..., :1])
-    numbers = to_numpy(spectrum)
-    index = np.arange(numbers.shape[-1])
-    with np.errstate(divide="ignore", invalid="ignore"):  # a movement that stands still may last no time
-        step = _SPECTRUM_SAMPLES / (length * to_numpy(trajectory.duration)[..., None])  # [Hz]
-        counts = (numbers >= threshold) & (index * step <= cutoff)
-    last = np.max(np.where(counts, index, 0), axis=-1, keepdims=True)
-    used = like(xp, (index[:-1] < last).astype(float), spectrum)
-    width = like(xp, 1.0 / np.maximum(last, 1), spectrum)
-    rise = spectrum[..., 1:] - spectrum[..., :-1]
-    return -xp.sum(used * xp.sqrt(width * width + rise * rise), axis=-1)
-
-
 def speed_valleys(trajectory: Trajectory) -> SpeedEvents:
     """Return the local minima of the speed strictly inside the movement, exact from the roots of v . a.
-
-    Args:
-        trajectory: the movements.
-
-    Returns:
-        Times and speeds, padded with NaN.
-
-    Raises:
-        ValueError: the argument is not a Trajectory.
 
     Example:
         >>> from viapoint.primitives import speed_valleys, through
         >>> speed_valleys(through([[0.0, 0.0], [0.5, 0.5], [1.0, 0.0]], [0.5, 0.5])).time.round(9).tolist()
         [0.5]
     """
-    return _speed_events(trajectory, rising_after=True)
+    return _speed_events(trajectory, 1.0)
 
 
 def speed_peaks(trajectory: Trajectory) -> SpeedEvents:
     """Return the local maxima of the speed strictly inside the movement, exact from the roots of v . a.
-
-    Args:
-        trajectory: the movements.
-
-    Returns:
-        Times and speeds, padded with NaN.
-
-    Raises:
-        ValueError: the argument is not a Trajectory.
 
     Example:
         >>> from viapoint.primitives import speed_peaks, through
         >>> speed_peaks(through([[0.0, 0.0], [0.5, 0.5], [1.0, 0.0]], [0.5, 0.5])).time.shape
         (2,)
     """
-    return _speed_events(trajectory, rising_after=False)
+    return _speed_events(trajectory, -1.0)
 
 
-def _speed_events(trajectory: Trajectory, *, rising_after: bool) -> SpeedEvents:
-    """Return the minima (`rising_after`) or maxima of the speed."""
+def _speed_events(trajectory: Trajectory, sign: float) -> SpeedEvents:
+    """Return the minima of the speed times a sign."""
     require_trajectory(trajectory)
     xp = trajectory.namespace
     times = _turning_times(trajectory)
     before, after = _speed_trend(trajectory, times)
-    found = (before < 0) & (after > 0) if rising_after else (before > 0) & (after < 0)
+    found = (sign * before < 0) & (sign * after > 0)
     count = int(found.sum(axis=-1).max(initial=0))
     order = np.argsort(~found, axis=-1, kind="stable")[..., :count]
     place = np.take_along_axis(times, order, axis=-1)

@@ -1,4 +1,4 @@
-"""Trajectories: positions as piecewise polynomials of time, as immutable values."""
+"""Trajectories: positions as piecewise polynomials of time, their scaling to limits, and derivatives of their cost."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ._evaluate import derivative_coefficients, evaluate
-from ._hermite_tables import energy_table
+from ._hermite_tables import derivative_factors, energy_table
 from ._knot_solver import States, least_cost_coefficients
 from ._polynomial import Extrema, axis_extrema, largest_norm
 from .array_api import (
@@ -19,7 +18,6 @@ from .array_api import (
     as_floats,
     broadcast_batch,
     broadcast_to,
-    check_buffers,
     leading_shape,
     like,
     namespace_of,
@@ -28,20 +26,20 @@ from .array_api import (
     whole_orders,
 )
 
+# Size of the basis of one block of trajectories, which stays in a core's second-level cache.
+_BLOCK_BYTES = 1_200_000
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
     """Batch of movements x(t), 0 <= t <= duration, each a chain of S polynomials.
 
-    Segment s runs from knot s to knot s + 1 and is sum_k c_k u^k in unit time u = (t - t_s) / h_s, so that no
-    duration, short or long, over- or underflows.
-
-    A trajectory owns its arrays: NumPy arrays become read-only; do not write into torch tensors.
+    Segment s runs from knot s to knot s + 1 and is sum_k c_k u^k in unit time u = (t - t_s) / h_s. A trajectory owns
+    its arrays: NumPy arrays become read-only; do not write into torch tensors.
 
     Attributes:
         coefficients: (..., 2 order, S, D), c_k of segment s [m].
-        durations: (..., S) the segments' durations h [s]; its leading shape may be shorter than the
-            coefficients' (shared).
+        durations: (..., S) the segments' durations h [s], which movements of a batch may share.
         order: order of the derivative whose square is least: 2 acceleration, 3 jerk, 4 snap.
         starts: (..., S) first instant of each segment [s].
         rates: (..., S) 1 / h [1/s].
@@ -107,18 +105,12 @@ class Trajectory:
         return f"Trajectory({shape}, order {self.order})"
 
     def __call__(self, time: Array, nu: int = 0) -> Array:
-        """Return the nu-th time derivative.
+        """Return the nu-th time derivative, (..., T, D) [m/s^nu].
 
         Args:
             time: (T,) for all trajectories or (..., T) for each [s]; a single number gives (..., D). Before 0
-                and after the duration the end point is held at rest.
+                and after the duration the end point is held at rest. A knot belongs to the segment that begins there.
             nu: order of the derivative, at least 0 (from 2 order on it is zero).
-
-        Returns:
-            (..., T, D) [m/s^nu]. A knot belongs to the segment that begins there, the end to the last one.
-
-        Raises:
-            ValueError: time is not finite or does not broadcast; nu is not a whole number of at least 0.
         """
         if isinstance(time, int | float):
             return self.sample([time], (nu,))[0][..., 0, :]
@@ -126,38 +118,24 @@ class Trajectory:
             return self.sample(time.reshape(1), (nu,))[0][..., 0, :]
         return self.sample(time, (nu,))[0]
 
-    def sample(
-        self, time: Array | int, nu: int | Sequence[int] = (0, 1, 2), *, out: Sequence[Array] | None = None
-    ) -> tuple[Array, ...]:
-        """Return several time derivatives at once, optionally in the caller's buffers.
+    def sample(self, time: Array | int, nu: int | Sequence[int] = (0, 1, 2)) -> tuple[Array, ...]:
+        """Return several time derivatives at once, one array (..., T, D) per order [m/s^nu].
 
         Args:
             time: as in a call; or a whole number of at least 2, the number of evenly spaced times from 0 to
                 the duration of each trajectory, both included.
             nu: orders of derivative; one number counts as a sequence of one.
-            out: one array per order, each (..., T, D) with the full batch shape, for example the planes of
-                one array (len(nu), ..., T, D). Written without intermediate copies where they are NumPy
-                arrays of the trajectory's dtype and the batch has one dimension.
-
-        Returns:
-            One array (..., T, D) per order [m/s^nu], the given buffers if there are any.
-
-        Raises:
-            ValueError: bad time or nu, or buffers of a wrong number, kind, shape or dtype.
         """
         xp = self.namespace
         time, inside = self._times(time, xp)
         orders = whole_orders(nu)
-        batch = self.batch_shape
         if time.ndim > 1:
-            batch = broadcast_batch(trajectory=batch, time=tuple(time.shape[:-1]))
-        if out is not None:
-            check_buffers(out, len(orders), (*batch, time.shape[-1], self.dimension), xp)
-        kept = [min(order, 2 * self.order - 1) for order in orders]
-        results = evaluate(self.coefficients, self.starts, self.rates, time, kept, out, xp)
-        if inside is not None or max(orders) >= 2 * self.order:
-            self._hold(xp, results, orders, inside, xp is np or out is not None)
-        return tuple(results)
+            broadcast_batch(trajectory=self.batch_shape, time=tuple(time.shape[:-1]))
+        values = _evaluate(self.coefficients, self.starts, self.rates, time, orders, xp)
+        if inside is None:
+            return tuple(values)
+        moving = xp.astype(inside, self.coefficients.dtype)[..., None]
+        return tuple(v * moving if order else v for order, v in zip(orders, values, strict=True))
 
     def _times(self, time: Array | int, xp: Namespace) -> tuple[Array, Array | None]:
         """Return times (..., T) clipped to the movement, and True where they were inside (None: all)."""
@@ -194,30 +172,12 @@ class Trajectory:
                     arrays[i] = xp.astype(array, coefficients.dtype)
         return arrays
 
-    def _hold(
-        self, xp: Namespace, values: list[Array], orders: Sequence[int], inside: Array | None, in_place: bool
-    ) -> None:
-        """Set derivatives to zero outside the movement and beyond the polynomial's degree."""
-        mask = None if inside is None else xp.astype(inside, self.coefficients.dtype)[..., None]
-        for i, order in enumerate(orders):
-            factor = 0.0 if order >= 2 * self.order else mask
-            if order == 0 or factor is None:
-                continue
-            if in_place:
-                values[i] *= factor
-            else:
-                values[i] = values[i] * factor
-
     def cost(self) -> Array:
         """Return (...,) the cost 1/2 integral of |x^(order)|^2 [m^2 / s^(2 order - 1)], in closed form."""
         return 0.5 * self.energy(self.order)
 
     def energy(self, nu: int) -> Array:
-        """Return (...,) the integral of |x^(nu)|^2 [m^2 / s^(2 nu - 1)], in closed form as a sum of squares.
-
-        Raises:
-            ValueError: nu is not a whole number from 0 to 2 order - 1.
-        """
+        """Return (...,) the integral of |x^(nu)|^2 [m^2 / s^(2 nu - 1)], nu < 2 order, in closed form."""
         (nu,) = whole_orders((nu,))
         if nu >= 2 * self.order:
             raise ValueError(f"nu must lie in 0 ... {2 * self.order - 1}, got {nu}")
@@ -229,21 +189,11 @@ class Trajectory:
         return xp.sum(xp.sum(xp.sum(modes * modes, axis=-1), axis=-2) * scale, axis=-1)
 
     def extrema(self, nu: int = 0) -> Extrema:
-        """Return the least and greatest nu-th derivative per axis, with their times.
-
-        Where the derivative jumps at a knot both sides count.
-
-        Raises:
-            ValueError: as in `peak`.
-        """
+        """Return the least and greatest nu-th derivative per axis, with their times; at a jump, both sides count."""
         return axis_extrema(self, self._finite_derivative(nu))
 
     def peak(self, nu: int = 0) -> Array:
-        """Return (...,) the largest Euclidean norm of the nu-th derivative [m/s^nu].
-
-        Raises:
-            ValueError: nu is not a whole number, or the movement is so short that the derivative overflows.
-        """
+        """Return (...,) the largest Euclidean norm of the nu-th derivative [m/s^nu]; ValueError if it overflows."""
         return largest_norm(self, self._finite_derivative(nu))
 
     def _finite_derivative(self, nu: int) -> Array:
@@ -261,12 +211,7 @@ class Trajectory:
         return coefficients
 
     def stretched(self, duration: Array) -> Trajectory:
-        """Return the movement along the same path with time scaled to a new total duration (...,) [s].
-
-        Raises:
-            ValueError: duration is not finite, does not broadcast, or is not positive (0 is allowed where nothing
-                moves).
-        """
+        """Return the movement along the same path with time scaled to a new duration (...,) [s], 0 where none moves."""
         xp = self.namespace
         (duration,) = self.floats(duration=duration)
         batch = broadcast_batch(trajectory=self.batch_shape, duration=tuple(duration.shape))
@@ -291,9 +236,6 @@ class Trajectory:
             rotation: (..., D', D) matrix (any linear map), default the identity.
             translation: (..., D') [m], default zero.
             scale: (...,) factor, default one.
-
-        Raises:
-            ValueError: an argument is not finite or has a wrong shape.
         """
         named = {"rotation": rotation, "translation": translation, "scale": scale}
         xp, moved = self.namespace, self.coefficients
@@ -320,19 +262,150 @@ def require_trajectory(value: object) -> None:
         raise ValueError(f"trajectory must be a viapoint.primitives.Trajectory, got {type(value).__name__}")
 
 
-def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Trajectory:
-    """Return the least-cost trajectory through all waypoints at fixed times.
+def minimum_duration(
+    trajectory: Trajectory,
+    *,
+    velocity: Array | None = None,
+    acceleration: Array | None = None,
+    jerk: Array | None = None,
+) -> Array:
+    """Return the shortest duration to which the movement can be scaled within the limits.
 
-    The arguments are those of `least_cost_coefficients`; durations may be 0 between equal waypoints.
+    Scaling time by a factor s divides the nu-th derivative by s^nu and keeps the path, so
+    s = max_nu (peak_nu / limit_nu)^(1 / nu), with the exact extrema of the trajectory.
+
+    Args:
+        trajectory: the movement, of any duration.
+        velocity: limit [m/s]: a number or an array (..., 1) limits the Euclidean norm, an array (..., D) each
+            axis.
+        acceleration: limit [m/s^2], likewise.
+        jerk: limit [m/s^3], likewise.
+
+    Returns:
+        (...,) [s]; 0 where nothing moves.
+
+    Example:
+        >>> from viapoint.primitives import minimum_duration, point_to_point
+        >>> reach = point_to_point([0.0], [0.4], 1.0)
+        >>> fastest = reach.stretched(minimum_duration(reach, velocity=1.5))
+        >>> round(float(fastest.duration), 9), round(float(fastest.peak(1)), 9)
+        (0.5, 1.5)
     """
+    require_trajectory(trajectory)
+    named = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk}
+    if all(limit is None for limit in named.values()):
+        raise ValueError("give at least one limit: velocity, acceleration or jerk")
+    xp, limits = trajectory.namespace, trajectory.floats(named, widest=True)
+    factor = 0.0 * trajectory.duration
+    for nu, (name, limit) in enumerate(zip(named, limits, strict=True), start=1):
+        if limit is None:
+            continue
+        require(limit > 0, name, limit, "must be positive")
+        if limit.ndim and limit.shape[-1] not in (1, trajectory.dimension):
+            allowed = f"a number, (..., 1) or (..., {trajectory.dimension})"
+            raise ValueError(f"{name} must be {allowed}, got shape {tuple(limit.shape)}")
+        broadcast_batch(trajectory=trajectory.batch_shape, **{name: tuple(limit.shape[:-1])})
+        if limit.ndim == 0:
+            excess = trajectory.peak(nu) / limit
+        elif limit.shape[-1] == 1:
+            excess = trajectory.peak(nu) / limit[..., 0]
+        else:
+            extrema = trajectory.extrema(nu)
+            excess = xp.max(xp.maximum(-extrema.minimum, extrema.maximum) / limit, axis=-1)
+        # The slope of a root is infinite at 0, and torch would multiply it by 0: take the root of positive ratios only.
+        moves = excess > 0
+        root = xp.where(moves, excess, 1.0) ** (1.0 / nu)
+        factor = xp.maximum(factor, xp.where(moves, root, 0.0))
+    return factor * trajectory.duration
+
+
+@dataclass(frozen=True)
+class CostGradient:
+    """Derivatives of Trajectory.cost() with respect to waypoints, durations and boundary values.
+
+    Attributes:
+        waypoints: (..., S + 1, D) with respect to start, via-points and goal. At a via-point it is minus
+            Flash & Hogan's multiplier pi. A dropped via-point and its neighbour share the derivative of the
+            point they have in common.
+        durations: (..., S) with respect to each segment's duration; equal for all segments at free passage
+            times, and then also the derivative with respect to the total duration (-5 cost / duration from
+            rest to rest, order 3).
+        start_velocity, goal_velocity: (..., D) with respect to the boundary velocities; zero where FREE.
+        start_acceleration, goal_acceleration: (..., D) likewise (zero for order 2).
+
+    Example:
+        >>> from viapoint.primitives import cost_gradient, point_to_point
+        >>> gradient = cost_gradient(point_to_point([0.0], [1.0], 1.0))
+        >>> gradient.waypoints.tolist(), gradient.durations.tolist()  # the cost is 360 A^2 / T^5
+        ([[-720.0], [720.0]], [-1800.0])
+    """
+
+    waypoints: Array
+    durations: Array
+    start_velocity: Array
+    goal_velocity: Array
+    start_acceleration: Array
+    goal_acceleration: Array
+
+
+def cost_gradient(trajectory: Trajectory) -> CostGradient:
+    """Return all derivatives of the least cost.
+
+    For order m, dJ/dx^(i)(T) = (-1)^(m-1-i) x^(2m-1-i)(T) at the goal, the opposite at the start, and at a
+    via-point the jump of (-1)^(m-1) x^(2m-1), left minus right. By the envelope theorem they hold for the
+    optimum over everything that was left open: the states at the via-points, and the passage times if the
+    segment durations came from `passage_durations`.
+
+    Raises:
+        ValueError: the argument is not a Trajectory.
+
+    Example:
+        >>> from viapoint.primitives import cost_gradient, through
+        >>> movement = through([[0.0, 0.0], [0.5, 0.2], [1.0, 0.0]], [0.5, 0.5])
+        >>> cost_gradient(movement).waypoints[1].round(6).tolist()  # -pi: only across the line
+        [0.0, 4096.0]
+    """
+    require_trajectory(trajectory)
+    xp, m = trajectory.namespace, trajectory.order
+    coefficients = trajectory.coefficients
+    rates = trajectory.rates
+    highest = derivative_coefficients(xp, coefficients, rates, 2 * m - 1)[..., 0, :, :] * (-1.0) ** (m - 1)
+    rows = [-highest[..., :1, :], highest[..., :-1, :] - highest[..., 1:, :], highest[..., -1:, :]]
+    ends = []
+    for i in (1, 2):
+        if i >= m:
+            ends += [0.0 * highest[..., 0, :]] * 2
+            continue
+        sign = (-1.0) ** (m - 1 - i)
+        derivative = derivative_coefficients(xp, coefficients, rates, 2 * m - 1 - i)
+        ends.append(-sign * derivative[..., 0, 0, :])  # at the beginning of the first segment, u = 0
+        ends.append(sign * derivative[..., -1, :].sum(-2))  # at the end of the last one, u = 1
+    return CostGradient(xp.concat(rows, axis=-2), duration_gradient(coefficients, rates), *ends)
+
+
+def duration_gradient(coefficients: Array, rates: Array) -> Array:
+    """Return dJ/dh of each segment, (..., S), minus its Hamiltonian (Flash & Hogan 1985, Eqs. C6, C7).
+
+    For order m, dJ/dh = -1/2 |x^(m)|^2 - sum_{i=1}^{m-1} (-1)^i x^(m+i) . x^(m-i), constant along a segment; for jerk
+    it is -|jerk|^2/2 + snap . acceleration - crackle . velocity. Coefficients are (..., 2m, S, D) in unit time.
+    """
+    order = coefficients.shape[-3] // 2
+    total: Any = 0.0
+    for i in range(order):  # at the beginning of the segment, where x^(k) = k! c_k / h^k
+        weight = (0.5 if i == 0 else (-1.0) ** i) * math.factorial(order + i) * math.factorial(order - i)
+        product = coefficients[..., order + i, :, :] * coefficients[..., order - i, :, :]
+        total = total + weight * product.sum(-1)
+    return -total * math.prod([rates * rates] * order)
+
+
+def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, states: States) -> Trajectory:
+    """Return the least-cost trajectory through all waypoints at fixed times, see `least_cost_coefficients`."""
     durations = 1.0 * durations  # a copy of its own
     empty = durations <= 0
     some_empty = bool(empty.any())
     if some_empty:
         durations = broadcast_to(xp, durations, (*waypoints.shape[:-2], durations.shape[-1]))
     coefficients = least_cost_coefficients(xp, order, waypoints, durations, states)
-    if durations.shape[-1] == 1 and not some_empty:
-        return Trajectory(coefficients, durations, order, 0.0 * durations, 1.0 / durations, durations)
     ends = xp.cumulative_sum(durations, axis=-1)
     end = ends[..., -1:]
     starts = xp.concat([0.0 * end, ends[..., :-1]], axis=-1)
@@ -342,3 +415,66 @@ def connect(xp: Namespace, order: int, waypoints: Array, durations: Array, state
     starts = xp.where(starts >= end, 2 * end, starts)
     rates = xp.where(empty, 0.0, 1.0 / xp.where(empty, 1.0, durations))
     return Trajectory(coefficients, durations, order, starts, rates, end)
+
+
+def derivative_coefficients(xp: Namespace, coefficients: Array, rates: Array, nu: int) -> Array:
+    """Return the coefficients (..., 2m - nu, S, D) of the nu-th derivative in seconds, in unit time.
+
+    Beyond the degree it is the constant zero, (..., 1, S, D).
+    """
+    if nu == 0:
+        return coefficients
+    if nu >= coefficients.shape[-3]:
+        return 0.0 * coefficients[..., :1, :, :]
+    table = derivative_factors(coefficients.shape[-3] // 2, nu)
+    scale: Array = math.prod([rates] * (nu - 1), start=rates)
+    factors = like(xp, table, coefficients) * scale[..., None, :]
+    return coefficients[..., nu:, :, :] * factors[..., None]
+
+
+def _evaluate(
+    coefficients: Array, starts: Array, rates: Array, time: Array, orders: Sequence[int], xp: Namespace
+) -> list[Array]:
+    """Return derivatives of some orders, each (..., T, D), at times (..., T).
+
+    All segments go into one small matrix product per trajectory, with the same inner sizes alone and in a batch, so
+    that an item of a batch gives the same bits as alone:
+
+        x^(nu)(t) = sum_(k, s) B_(k, s)(t) c^(nu)_(k, s),   B_(k, s)(t) = u_s^k if segment s is current, else 0.
+    """
+    powers, segments, dimension = coefficients.shape[-3:]
+    batch = coefficients.shape[:-3]
+    if xp is np and len(batch) == 1 and time.ndim < 3:
+        size = max(1, _BLOCK_BYTES // max(1, powers * segments * time.shape[-1] * coefficients.itemsize))
+        if size < batch[0] and batch in (starts.shape[:-1], time.shape[:-1]):
+            whole = [np.empty((*batch, time.shape[-1], dimension), coefficients.dtype) for _ in orders]
+            for first in range(0, batch[0], size):
+                rows = slice(first, first + size)
+                own = [each[rows] if each.shape[:-1] == batch else each for each in (starts, rates, time)]
+                parts = _evaluate(coefficients[rows], own[0], own[1], own[2], orders, xp)
+                for values, part in zip(whole, parts, strict=True):
+                    values[rows] = part
+            return whole
+    basis = _basis(time, starts, rates, powers - min(orders), xp)
+    results = []
+    for nu in orders:
+        weight = derivative_coefficients(xp, coefficients, rates, nu)
+        weight = weight.reshape(*weight.shape[:-3], weight.shape[-3] * segments, dimension)
+        results.append(xp.matmul(basis[..., : weight.shape[-2], :].mT, weight))
+    return results
+
+
+def _basis(time: Array, starts: Array, rates: Array, number: int, xp: Namespace) -> Array:
+    """Return the transposed basis of `_evaluate`: rows k S + s of u_s^k, k < number, where segment s is current."""
+    local = (time[..., None, :] - starts[..., None]) * rates[..., None]
+    current = xp.ones_like(local)
+    if starts.shape[-1] > 1:  # start_s <= time < start_(s+1); the last segment has no end
+        reached = time[..., None, :] >= starts[..., 1:, None]
+        edge = xp.ones_like(reached[..., :1, :])
+        reached = xp.concat([edge, reached, ~edge], axis=-2)
+        current = xp.astype(reached[..., :-1, :] & ~reached[..., 1:, :], starts.dtype)
+        local = local * current
+    rows = [current, local]
+    while len(rows) < number:
+        rows.append(rows[-1] * local)
+    return xp.concat(rows, axis=-2)

@@ -119,11 +119,3 @@ def test_no_movements_have_every_property_of_movements(name, batch, kind):
     for ends in ({}, {"start_velocity": kind.ones(2), "goal_acceleration": vp.FREE}):
         durations = vp.passage_durations(waypoints, kind.ones(batch), **ends)
         assert ask(vp.through(waypoints, durations, **ends)).shape == (*batch, *shape)
-
-
-def test_the_gradient_of_nothing_is_empty():
-    waypoints, velocity = torch.ones((0, 4, 2), requires_grad=True), torch.ones(2, requires_grad=True)
-    durations = vp.passage_durations(waypoints, torch.ones(0), start_velocity=velocity)
-    vp.through(waypoints, durations, start_velocity=velocity).sample(5)[2].sum().backward()
-    assert waypoints.grad.shape == (0, 4, 2)
-    assert (velocity.grad == 0).all()

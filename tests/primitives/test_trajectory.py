@@ -140,24 +140,6 @@ def test_a_batch_gives_bit_for_bit_what_each_item_gives_alone(vias, dimension, r
                     np.testing.assert_array_equal(whole[items], part)
 
 
-def test_sample_fills_given_buffers(rng):
-    waypoints, durations, ends = random_movement(rng, 2, batch=(9,))
-    trajectory = through(waypoints, durations, **ends)
-    buffers = np.full((3, 9, 40, 2), np.nan)
-    filled = trajectory.sample(40, out=buffers)
-    for nu, (given, expected) in enumerate(zip(filled, trajectory.sample(40), strict=True)):
-        assert np.shares_memory(given, buffers)
-        np.testing.assert_array_equal(buffers[nu], expected)
-    interleaved = np.full((9, 40, 3, 2), np.nan)
-    trajectory.sample(40, out=[interleaved[..., nu, :] for nu in range(3)])
-    np.testing.assert_array_equal(interleaved[..., 2, :], buffers[2])
-    time = np.linspace(-1, 9, 40)
-    trajectory.sample(time, out=buffers)
-    np.testing.assert_array_equal(buffers[1], trajectory(time, 1))
-    single = trajectory.sample(time, out=buffers.astype(np.float32))
-    np.testing.assert_allclose(single, buffers, rtol=1e-6, atol=1e-4)
-
-
 def test_a_dropped_via_point_leaves_the_others():
     waypoints = np.array([[0.0, 0], [0, 0], [1, 1], [2, 0], [2, 0]])
     ends = {"start_velocity": np.array([2.0, 1.0]), "goal_velocity": np.array([3.0, 1.0])}

@@ -78,9 +78,6 @@ class PlannerMethod:
     """Planner whose movements have as many via-points as they need, and durations of their own.
 
     A decision is a row: number of via-points, durations of the segments [s], waypoints, then zeros.
-
-    Raises:
-        ValueError: The library of the planner is not installed.
     """
 
     def __init__(self, simulation: SceneSimulation, name: str) -> None:
@@ -112,10 +109,10 @@ class PlannerMethod:
         outcomes: Outcomes = {}
         for count in np.unique(counts):
             rows = np.flatnonzero(counts == count)
-            waypoints = decisions[rows, 2 + count : 2 + count + (count + 2) * dimension]
-            plan = Plan.at_rest(
-                waypoints.reshape(len(rows), count + 2, dimension), decisions[rows, 1 : 2 + count]
+            _, durations, waypoints, _ = np.split(
+                decisions[rows], (1, 2 + count, 2 + count + (count + 2) * dimension), axis=1
             )
+            plan = Plan.at_rest(waypoints.reshape(len(rows), count + 2, dimension), durations)
             result = self._simulation.execute_plan(scenes.take(rows), plan)
             for name, values in result.items():
                 outcomes.setdefault(name, np.zeros(len(decisions), dtype=values.dtype))[rows] = values
@@ -123,10 +120,7 @@ class PlannerMethod:
 
 
 class AgentMethod:
-    """Trained agent, which checks and refines some of its proposals in each decision.
-
-    Their numbers are `checks` and `refine`; None for the numbers of the model.
-    """
+    """Trained agent that checks and refines this many of its proposals; None for the numbers of the model."""
 
     def __init__(self, name: str, model: Any, checks: int | None = None, refine: int | None = None) -> None:
         self.name, self._model = name, model
@@ -174,13 +168,7 @@ class StepAgentMethod:
 
 
 def agent_method(name: str, model: Any, checks: int | None = None, refine: int | None = None) -> Method:
-    """Return a trained agent as a method, for whole movements or for actions in every control step.
-
-    Its name tells how many proposals are checked and refined, as :class:`AgentMethod` explains.
-
-    Raises:
-        ValueError: The agent cannot check or refine its proposals.
-    """
+    """Return a trained agent as a method; ValueError if it cannot check or refine its proposals."""
     if checks and not hasattr(model.policy, "checks"):
         raise ValueError(f"proposals are checked by ViaQ only; this agent is a {type(model).__name__}")
     if refine and not getattr(model.policy, "can_refine", False):
@@ -196,7 +184,7 @@ def agent_method(name: str, model: Any, checks: int | None = None, refine: int |
 
 
 def _refined_search(simulation: SceneSimulation, checks: int) -> Method:
-    """Return a search that spends half of its checks on refinement, which solves more scenes."""
+    """Return a search that spends half of its checks on refinement."""
     rounds = 2 if checks < 512 else 4
     each = checks // 2 // rounds
     return GeometrySearch(simulation.task, checks - rounds * each, refinements=rounds, per_round=each)
@@ -224,11 +212,7 @@ def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
 
 
 def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
-    """Return the factory of a baseline for a task.
-
-    Raises:
-        ValueError: There is no such baseline, or it would check too many plans.
-    """
+    """Return the factory of a baseline for a task; ValueError where there is none."""
     sensed = task.sensor is not None
     predicted = task.replanning and task.moving_obstacles
     counted = tuple(COUNTED) if sensed else SEARCHES

@@ -64,7 +64,7 @@ class BenchmarkProblem(NamedTuple):
     number: int  # Number within the set, from 1
     start: Float  # Joint positions, shape (J,), [rad] or [m]
     goal: Float  # Joint positions, shape (J,), [rad] or [m]
-    obstacles: tuple[Shape, ...]  # Obstacles
+    obstacles: tuple[Shape, ...]
 
     @property
     def name(self) -> str:
@@ -85,22 +85,16 @@ def benchmark_problems() -> list[BenchmarkProblem]:
     """Return the 700 problems, of which one, `table_pick 41`, has a goal in contact."""
     with (DATA / "motionbenchmaker.npz").open("rb") as file:
         parts = dict(np.load(file))
+    shapes = list[Shape]()
+    for kind, pose, size in zip(parts["kind"], parts["pose"], parts["size"], strict=True):
+        place = {"position": pose[:3], "quaternion": pose[3:] / np.linalg.norm(pose[3:])}
+        shapes.append(Box(size, **place) if kind == KINDS[Box] else Cylinder(size[0], size[1], **place))
     problems, first = [], 0
-    for k, count in enumerate(parts["count"]):
-        shapes: list[Shape] = []
-        for row in range(first, first + count):
-            size = parts["size"][row]
-            position = parts["pose"][row, :3]
-            quaternion = parts["pose"][row, 3:]
-            quaternion = quaternion / np.linalg.norm(quaternion)
-            if parts["kind"][row] == KINDS[Box]:
-                shapes.append(Box(size, position=position, quaternion=quaternion))
-            else:
-                shapes.append(Cylinder(size[0], size[1], position=position, quaternion=quaternion))
+    rows = (parts[name] for name in ("set", "number", "start", "goal", "count"))
+    for group, number, start, goal, count in zip(*rows, strict=True):
+        obstacles = tuple(shapes[first : first + count])
         first += count
-        name = SETS[parts["set"][k]]
-        number = int(parts["number"][k])
-        problems.append(BenchmarkProblem(name, number, parts["start"][k], parts["goal"][k], tuple(shapes)))
+        problems.append(BenchmarkProblem(SETS[group], int(number), start, goal, obstacles))
     return problems
 
 
@@ -112,11 +106,8 @@ def read_problems(
     The files are `sceneNNNN.yaml` and `requestNNNN.yaml`, in folders named after their sets; `joints` are the names of
     the arm's joints in them, those of the Panda by default. Obstacles are placed relative to the base of the robot,
     which a joint such as `virtual_joint` moves. Values of other joints, frames of objects, and goals after the first
-    are not looked at. The second result has a line for each problem that cannot be read, which names its file; meshes,
-    planes and objects that are attached to the arm cannot be read.
-
-    Raises:
-        ValueError: There is no problem that can be read.
+    are not looked at. The second result has a line for each problem that cannot be read; if none can, ValueError.
+    Meshes, planes and objects that are attached to the arm cannot be read.
     """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
@@ -151,7 +142,10 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
         for held in (read.get("robot_state"), asked["start_state"]):
             if held and held.get("attached_collision_objects"):
                 raise ValueError("an object is attached to the arm; plan for an arm whose model holds it")
-        base: Float = np.linalg.inv(_base(asked["start_state"])).astype(np.float64)
+        base: Any = np.eye(4)  # Place of the robot's base
+        for each in (asked["start_state"].get("multi_dof_joint_state") or {}).get("transforms") or ():
+            base = base @ _matrix({"position": each["translation"], "orientation": each["rotation"]})
+        base = np.linalg.inv(base)
         obstacles = tuple(_shapes_of(read["world"]["collision_objects"], base))
         if len(obstacles) > MOST_OBSTACLES:
             raise ValueError(
@@ -175,15 +169,6 @@ def _positions(name: str, there: Mapping[str, Any], joints: Sequence[str]) -> Fl
                 f"joint {joint!r} of the arm is not among those of the {name}: {', '.join(there)}"
             )
     return finite_array(name, [there[joint] for joint in joints], (len(joints),))
-
-
-def _base(state: Mapping[str, Any]) -> Float:
-    """Return the place of the robot's base in a state, shape (4, 4)."""
-    joints = state.get("multi_dof_joint_state") or {}
-    place = np.eye(4)
-    for each in joints.get("transforms") or ():
-        place = place @ _matrix({"position": each["translation"], "orientation": each["rotation"]})
-    return place
 
 
 def _shapes_of(objects: list[Mapping[str, Any]], base: Float) -> Iterator[Shape]:
@@ -232,32 +217,30 @@ def benchmark_planner(name: str) -> Planner:
     Raises:
         ValueError: There is no such planner, or its library is not installed.
     """
-    planners: dict[str, Planner] = {
-        "straight": lambda arm, each: plan_motion(arm, each.start, each.goal, each.obstacles, time_limit=0.0),
-        "plan_motion": lambda arm, each: plan_motion(arm, each.start, each.goal, each.obstacles, ompl=False),
-        "plan_motion+ompl": lambda arm, each: plan_motion(
-            arm, each.start, each.goal, each.obstacles, time_limit=10.0
-        ),
-        "ompl": lambda arm, each: ompl_motion(arm, each.start, each.goal, pack([each.obstacles])),
+    settings: dict[str, dict[str, Any]] = {
+        "straight": {"time_limit": 0.0},
+        "plan_motion": {"ompl": False},
+        "plan_motion+ompl": {"time_limit": 10.0},
     }
     if "ompl" in name:
         import_ompl()
-    if name in planners:
-        return planners[name]
+    if name == "ompl":
+        return lambda arm, each: ompl_motion(arm, each.start, each.goal, pack([each.obstacles]))
+    if name in settings:
+        return lambda arm, each: plan_motion(arm, each.start, each.goal, each.obstacles, **settings[name])
     checks = re.fullmatch(r"search([1-9]\d*)", name)
     if checks is None:
-        raise ValueError(unknown_name("planner", name, [*planners, "searchN"]))
+        raise ValueError(unknown_name("planner", name, [*settings, "ompl", "searchN"]))
     number = whole_number("N of searchN", int(checks[1]), 1, MOST_CANDIDATES)
-    return lambda arm, each: _searched(arm, each, number)
+    half = number // 2  # Number of plans with one via-point around the best of the others
 
+    def searched(arm: Arm, problem: BenchmarkProblem) -> MotionPlan:
+        task = Task.of(arm=arm, n_obstacles=(0, 32))
+        search = GeometrySearch(task, number - half, refinements=4, per_round=max(half // 4, 1))
+        scene = resting(problem.start[None], problem.goal[None], pack([problem.obstacles]))
+        return search.plan_scene(scene, shortest=True)
 
-def _searched(arm: Arm, problem: BenchmarkProblem, checks: int) -> MotionPlan:
-    """Return the best of some checked plans with one via-point, half of them around the best of the others."""
-    half = checks // 2
-    task = Task.of(arm=arm, n_obstacles=(0, 32))
-    search = GeometrySearch(task, checks - half, refinements=4, per_round=max(half // 4, 1))
-    scene = resting(problem.start[None], problem.goal[None], pack([problem.obstacles]))
-    return search.plan_scene(scene, shortest=True)
+    return searched
 
 
 def measure_planner(
@@ -307,13 +290,13 @@ def measure_planner(
 
 def succeeding(plans: Sequence[MotionPlan]) -> list[int]:
     """Return the indices of the plans that succeed by geometry and in physics."""
-    found = []
-    for count in {len(plan.durations) for plan in plans}:
-        rows = [row for row, plan in enumerate(plans) if plan.success and len(plan.durations) == count]
-        for first in range(0, len(rows), TOGETHER):
-            some = rows[first : first + TOGETHER]
+    found = list[int]()
+    counts = np.array([plan.success * len(plan.durations) for plan in plans])
+    for count in np.unique(counts[counts > 0]):
+        rows = np.flatnonzero(counts == count)
+        for some in np.split(rows, range(TOGETHER, len(rows), TOGETHER)):
             outcome, _ = execute_plans([plans[row] for row in some])
-            found += [row for row, success in zip(some, outcome.is_success, strict=True) if success]
+            found += some[outcome.is_success].tolist()
     return found
 
 

@@ -17,9 +17,8 @@ MOST_ROUNDS = 64  # Greatest number of rounds of refinement; usual are up to 4
 def candidate_actions(task: Task, number: int, *, replanning: bool) -> Single:
     """Return candidate actions, shape (number, m), of which the first is the zero action.
 
-    From rest, clearance and reach do not depend on the duration. So all candidates but the first have the duration of
-    the greatest reward, and only their via-points and the split of their duration differ.
-    With `replanning`, a movement may be under way; then they differ in their duration, too.
+    From rest, clearance and reach do not depend on the duration, and all others have that of the greatest reward. With
+    `replanning`, a movement may be under way; then they differ in their duration, too.
     """
     size, at = task.action.size, task.n_via * task.action.dimension
     if replanning or not at:

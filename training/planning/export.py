@@ -15,8 +15,7 @@ from viapoint.envs.common.validation import finite_array
 from viapoint.training.files import write_bytes
 from viapoint.training.planning.motion_plan import JointMotion, MotionPlan
 
-# Quantities of a table, each of which has a column for each joint
-PARTS = ("position", "velocity", "acceleration", "torque")
+PARTS = JointMotion._fields[1:]  # Quantities of a table, each of which has a column for each joint
 # Names of the same quantities in a point of `trajectory_msgs/JointTrajectory`
 ROS_PARTS = ("positions", "velocities", "accelerations", "effort")
 
@@ -32,13 +31,9 @@ def write_motion(
 
     Args:
         plan: Plan.
-        path: File that ends in .csv, .yaml or .yml.
+        path: File that ends in .csv, .yaml or .yml; others raise ValueError.
         rate: Instants per second, [Hz].
-        force: True for plans without success, too.
-
-    Raises:
-        UnsafePlanError: The plan has no success.
-        ValueError: The file has another suffix.
+        force: True for plans without success, too, which raise UnsafePlanError otherwise.
 
     Example:
         >>> import numpy as np
@@ -59,10 +54,7 @@ def write_motion(
 
 
 def read_motion(path: str | Path) -> tuple[tuple[str, ...], JointMotion]:
-    """Return the names of the joints and the movement of a file of :func:`write_motion`.
-
-    Raises:
-        ValueError: The file is no such file.
+    """Return the names of the joints and the movement of a file of :func:`write_motion`; ValueError for other files.
 
     Example:
         >>> from viapoint.envs import arm_of
@@ -94,11 +86,15 @@ def _form(path: Path) -> str:
     return form
 
 
+def _columns(names: tuple[str, ...]) -> list[str]:
+    """Return the first line of a table."""
+    return ["time", *(f"{part}:{name}" for part in PARTS for name in names)]
+
+
 def _table(names: tuple[str, ...], motion: JointMotion) -> str:
     """Return a movement as comma-separated values."""
     text = io.StringIO()
-    head = ["time", *(f"{part}:{name}" for part in PARTS for name in names)]
-    csv.writer(text, lineterminator="\n").writerow(head)
+    csv.writer(text, lineterminator="\n").writerow(_columns(names))
     np.savetxt(text, np.column_stack(motion), "%.12g", ",")
     return text.getvalue()
 
@@ -108,7 +104,7 @@ def _read_table(text: str) -> tuple[tuple[str, ...], Float, list[Float]]:
     rows = csv.reader(io.StringIO(text))
     head = next(rows)
     names = tuple(column.removeprefix("position:") for column in head if column.startswith("position:"))
-    if head != ["time", *(f"{part}:{name}" for part in PARTS for name in names)]:
+    if head != _columns(names):
         raise ValueError("its columns are others")
     numbers = np.array(list(rows), np.float64)
     return names, numbers[:, 0], np.split(numbers[:, 1:], len(PARTS), axis=1)
@@ -118,12 +114,11 @@ def _message(names: tuple[str, ...], motion: JointMotion) -> str:
     """Return a movement as a message of ROS 2."""
     points = []
     for time, *values in zip(*motion, strict=True):
+        point: dict[str, Any] = {}
+        for name, value in zip(ROS_PARTS, values, strict=True):
+            point[name] = [float(f"{number:.12g}") for number in value]
         # Whole nanoseconds, which carry over into seconds.
         seconds, rest = divmod(round(1e9 * float(time)), 1_000_000_000)
-        point: dict[str, Any] = {
-            name: [float(f"{number:.12g}") for number in value]
-            for name, value in zip(ROS_PARTS, values, strict=True)
-        }
         points.append({**point, "time_from_start": {"sec": seconds, "nanosec": rest}})
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
     message = {"header": header, "joint_names": list(names), "points": points}

@@ -40,24 +40,21 @@ class Limits(NamedTuple):
     """Greatest shares of the limits of the joints that a movement uses; more than 1 is beyond a limit."""
 
     velocity: float
-    """Share of a velocity limit."""
     torque: float
-    """Share of a torque or force limit."""
 
 
 class JointMotion(NamedTuple):
-    """Movement of the joints at N instants."""
+    """Movement of the joints at N instants: times, shape (N,), [s]; the others have the shape (N, J).
+
+    Positions are in [rad] or [m], velocities and accelerations per second; torques or forces by inverse dynamics are in
+    [N m] or [N].
+    """
 
     time: Float
-    """Shape (N,), [s]."""
     position: Float
-    """Shape (N, J), [rad] or [m]."""
     velocity: Float
-    """Shape (N, J), [rad/s] or [m/s]."""
     acceleration: Float
-    """Shape (N, J), [rad/s^2] or [m/s^2]."""
     torque: Float
-    """Torques or forces by inverse dynamics, shape (N, J), [N m] or [N]."""
 
 
 class UnsafePlanError(ValueError):
@@ -94,7 +91,6 @@ class MotionPlan:
     """
 
     arm: Arm
-    """Arm."""
     space: SpaceName
     """Space of the coordinates."""
     waypoints: Float
@@ -121,7 +117,7 @@ class MotionPlan:
     """Origin of the via-points: `straight`, `straight, refined`, `given`, `random`, `ompl`, or another planner;
     `refused` where there is no movement."""
     reason: str = ""
-    """Reason why there is no better plan; empty for success."""
+    """Reason why there is no success; empty for success."""
     seeds: int = 0
     """Number of seeds that were refined."""
     milliseconds: float = 0.0
@@ -158,10 +154,7 @@ class MotionPlan:
 
         Args:
             rate: Instants per second, from 0.001 to less than 1e6, [Hz]; the last interval may be shorter.
-            force: True for plans without success, too.
-
-        Raises:
-            UnsafePlanError: The plan has no success, or there is no movement at all.
+            force: True for plans without success, too, which raise UnsafePlanError otherwise.
         """
         self.refuse_unsafe(force)
         number_of_at_least("rate", rate, 1e-3, HIGHEST_RATE)
@@ -173,11 +166,7 @@ class MotionPlan:
     def execute(self, *, force: bool = False) -> Outcome:
         """Execute the movement in MuJoCo among its obstacles, and return the metrics, shape (1,) each.
 
-        Args:
-            force: True for plans without success, too.
-
-        Raises:
-            UnsafePlanError: The plan has no success, or there is no movement at all.
+        Plans without success raise UnsafePlanError unless `force` is True.
         """
         self.refuse_unsafe(force)
         outcome, _ = execute_plans([self])
@@ -198,11 +187,10 @@ def joint_motion(space: Space, position: Float, velocity: Float, acceleration: F
 
 
 def execute_plans(plans: Sequence[MotionPlan]) -> tuple[Outcome, Episodes]:
-    """Execute plans of one arm in MuJoCo, each among its obstacles.
+    """Execute plans of one arm in MuJoCo, each among its obstacles; return metrics, shape (N,), and the simulations.
 
     All plans must have equally many via-points; plans without success are executed, too. Beyond a limit of the arm,
-    plans from rest are slowed down, and plans that begin in motion, which cannot be, have no success. The results are
-    the metrics, shape (N,) each, and the simulations, which hold the records of the movements until the next ones.
+    plans from rest are slowed down, and plans that begin in motion, which cannot be, have no success.
     """
     parts = zip(*(each.plan for each in plans), strict=True)
     plan = Plan(*map(np.stack, parts))
@@ -222,16 +210,12 @@ def execute_plans(plans: Sequence[MotionPlan]) -> tuple[Outcome, Episodes]:
     decision = episodes.execute(plan)
     outcome = Outcome(**{name: decision.info[name] for name in Outcome._fields})
     moving = plan.velocity.any(axis=-1) | plan.acceleration.any(axis=-1)
-    beyond = np.array([max(each.limits) > 1.0 for each in plans])
+    beyond = np.array([each.limits for each in plans]).max(axis=1) > 1.0
     return outcome._replace(is_success=outcome.is_success & ~(moving & beyond)), episodes
 
 
 def _solids(obstacles: Obstacles) -> Obstacles:
-    """Return the obstacles of one scene as MuJoCo takes them: clouds as spheres, meshes with a registered name.
-
-    Raises:
-        ValueError: A cloud has too many points.
-    """
+    """Return the obstacles of one scene as MuJoCo takes them: clouds as spheres, meshes with a registered name."""
     if not np.isin(obstacles.kind, IN_TABLES).any() and obstacles.kind.shape[1] <= MOST_OBSTACLES:
         return obstacles
     found = list[Shape]()

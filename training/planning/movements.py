@@ -48,17 +48,6 @@ INSTANTS = 64  # Instants of a movement that are checked; a power of two
 FINE_INSTANTS = 256
 NOWHERE = 1e9  # Clearance that nothing limits, [m]
 OUTSIDE = -2.0  # Clearance of movements that leave the reach or the joint ranges, [m]
-# Passage times in unit time by the number of via-points; more via-points are passed at even times
-TABLES: dict[int, list[tuple[float, ...]]] = {
-    0: [()],
-    1: [(float(t),) for t in np.linspace(0.1, 0.9, 161)],
-    2: [
-        (float(a), float(b))
-        for a, b in itertools.product(np.linspace(0.1, 0.7, 16), np.linspace(0.3, 0.9, 16))
-        if b - a > 0.14
-    ],
-    3: list(itertools.combinations([float(t) for t in np.linspace(0.1, 0.9, 13)], 3)),
-}
 # Step between the passage times whose cost is computed first, with one via-point; those beside the best follow
 STRIDE = 4
 # Vertical distance from obstacles beyond which spheres of an arm in the plane do not matter, [m]
@@ -170,9 +159,10 @@ def _setting(arm: Arm, of_hand: bool, wanted: tuple[bool, ...], room: float) -> 
     spheres = arm.spheres
     if not all(wanted):
         kept = np.flatnonzero(wanted) if any(wanted) else np.array([len(wanted) - 1])
-        some = [slice(spheres.first[group], spheres.first[group + 1]) for group in kept]
-        centres = [spheres.centre[rows] for rows in some]
-        spheres = grouped(centres, [spheres.radius[rows] for rows in some], spheres.link[kept].tolist(), ())
+        centres = np.split(spheres.centre, spheres.first[1:-1])
+        radii = np.split(spheres.radius, spheres.first[1:-1])
+        links = spheres.link[kept].tolist()
+        spheres = grouped([centres[group] for group in kept], [radii[group] for group in kept], links, ())
     alone = of_hand and len(spheres.radius) == 1 and np.allclose(spheres.centre[0], arm.chain.tool_origin)
     ranges = arm.joint_range + room * np.array([1.0, -1.0])
     return Setting(arm.chain, spheres, ranges, of_hand, arm.reach, bool(alone))
@@ -180,9 +170,16 @@ def _setting(arm: Arm, of_hand: bool, wanted: tuple[bool, ...], room: float) -> 
 
 @functools.cache
 def movement_table(n_via: int) -> MovementTable:
-    """Return the table of movements through some via-points."""
-    sets = TABLES.get(n_via, [tuple(np.arange(1, n_via + 1) / (n_via + 1))])
-    return table_with(np.array([np.diff((0.0, *times, 1.0)) for times in sets]))
+    """Return the table of movements through some via-points; more than three are passed at even times."""
+    times: Float = np.arange(1, n_via + 1)[None] / (n_via + 1)
+    if n_via == 1:
+        times = np.linspace(0.1, 0.9, 161)[:, None]
+    elif n_via == 2:
+        first, second = np.meshgrid(np.linspace(0.1, 0.7, 16), np.linspace(0.3, 0.9, 16), indexing="ij")
+        times = np.stack((first, second), axis=-1)[second - first > 0.14]
+    elif n_via == 3:
+        times = np.array(list(itertools.combinations(np.linspace(0.1, 0.9, 13), 3)))
+    return table_with(np.diff(times, prepend=0.0, append=1.0))
 
 
 @functools.cache

@@ -26,11 +26,7 @@ VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12)  # Numbers of via-points, tried in this orde
 
 
 def import_ompl() -> Any:
-    """Import the library `ompl`.
-
-    Raises:
-        ValueError: The library is not installed.
-    """
+    """Import the library `ompl`; ValueError if it is not installed."""
     with FIRST:
         return _ompl()
 

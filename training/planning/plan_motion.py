@@ -21,12 +21,7 @@ from viapoint.envs.arms.inverse_kinematics import UnreachableError, inverse_kine
 from viapoint.envs.arms.kinematics import motion_torques, slowdowns, torques
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.arrays import Float
-from viapoint.envs.common.validation import (
-    as_real_array,
-    finite_array,
-    number_of_at_least,
-    whole_number,
-)
+from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, whole_number
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape
@@ -152,10 +147,8 @@ def plan_motion(
     The straight movement is taken if it is free. Otherwise via-points are refined by the gradient of clearance and jerk
     (see `viapoint.training.planning.refine`), from the straight line first, and then from random seeds, until
     `enough` free movements are found; if all are rough, from some more seeds around the best one. Each is checked at
-    256 instants and polished; the one with the least jerk is taken. The duration is the shortest that keeps 97 % of the
-    velocity and torque limits, 0.25 s or more, if none is given. Among moving obstacles, movements with via-points are
-    tried with 1.3 times the duration of the straight one, and then with longer ones, each 1.3 times as long as the one
-    before, up to five times.
+    256 instants and polished; the one with the least jerk is taken. Among moving obstacles, several durations are
+    tried, each 1.3 times as long as the one before.
 
     Args:
         arm: Arm, or name of one.
@@ -170,7 +163,7 @@ def plan_motion(
         time_limit: Time after which no further seed is tried, [s]; with 0, only the straight movement is looked at.
             Inverse kinematics of poses, some 20 ms, comes before.
         margin: Least clearance of the movement from obstacles, and of the arm from itself, [m].
-        duration: Duration, [s]; None for the shortest.
+        duration: Duration, [s]; None for the shortest that keeps 97 % of the limits, 0.25 s or more.
         space: `joints` or `hand`; that of the arm by default.
         velocity: Initial velocity, shape (D,); 0 by default.
         acceleration: Initial acceleration, shape (D,); 0 by default.
@@ -266,11 +259,11 @@ def plan_motions(
 ) -> list[MotionPlan]:
     """Plan N movements on threads; the other arguments are those of :func:`plan_motion`.
 
-    Each movement is planned as :func:`plan_motion` plans it alone, whatever the number of threads is, except where the
-    time limit is reached, and where a path of OMPL is followed: all threads have its random generator in common. The
-    `reason` of each plan without success begins with the number of its problem, such as `problem 3: `, from 0. A
-    problem with an argument that is not allowed, or a pose out of reach, is refused: its plan has the source `refused`
-    and no waypoints, and raises UnsafePlanError when it is executed or exported, also with `force=True`.
+    Each movement is planned as :func:`plan_motion` plans it alone, except where the time limit is reached, or a path of
+    OMPL is followed: all threads have its random generator in common. The `reason` of each plan without success begins
+    with the number of its problem, such as `problem 3: `, from 0. A problem with an argument that is not allowed, or a
+    pose out of reach, is refused: its plan has the source `refused` and no waypoints, and raises UnsafePlanError when
+    it is executed or exported, also with `force=True`.
 
     Args:
         arm: Arm, or name of one.
@@ -279,9 +272,6 @@ def plan_motions(
         obstacles: Obstacles of the N problems, each as :func:`plan_motion` takes them.
         threads: Number of threads; as many as the machine has processors by default.
         **kwargs: Arguments of :func:`plan_motion`; a random generator `rng` gives each problem one of its own.
-
-    Raises:
-        ValueError: The problems are not equally many, or an argument of all is not allowed.
 
     Example:
         >>> from viapoint.training import plan_motions
@@ -359,9 +349,9 @@ def ompl_motion(
 ) -> MotionPlan:
     """Return the smooth movement along a path of RRT-Connect, or the one with the most clearance if none is free.
 
-    The minimum-jerk movement through as few points of the path as stay clear makes it smooth, the usual method of
-    robotics. OMPL has one random generator for all its planners, so that results depend on those before. Start and goal
-    are coordinates of the space in which the movement is smooth; the path is one of joints. Obstacles are at rest.
+    It is the minimum-jerk movement through as few points of the path as stay clear. OMPL has one random generator for
+    all its planners, so that results depend on those before. Start and goal are coordinates of the space in which the
+    movement is smooth; the path is one of joints. Obstacles are at rest.
     """
     where = space_of(arm, space)
 
@@ -393,10 +383,10 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     still = np.zeros_like(start)
     problem = _Problem(arm, space, start, still, still, start + 0.01, pack([[]]))
     straight = _straight(problem)
-    is_free(problem.setting(), straight, problem.obstacles, 0, 0.0)
+    is_free(problem.setting(), straight, problem.obstacles, 0.0)
     _known(problem, straight, "straight", 0.0, _fault(problem)[0])
-    seeds = np.zeros((0, n_via, len(start)))
-    _refined(problem, problem.setting(), 0.0, movement_table(n_via), fine_table(n_via), seeds, 1.0, np.inf)
+    tables = movement_table(n_via), fine_table(n_via)
+    _refined(problem, problem.setting(), 0.0, tables, np.zeros((0, n_via, len(start))), 1.0, np.inf)
 
 
 def _goals(problem: _Problem, goal: Any) -> Float:
@@ -429,10 +419,7 @@ def _goals(problem: _Problem, goal: Any) -> Float:
 def _goals_of_poses(problem: _Problem, poses: list[Pose]) -> Float:
     """Return coordinates of configurations with the tool at a pose, shape (G, D); free ones where there are any.
 
-    For each pose the nearest come first; poses out of reach are passed over.
-
-    Raises:
-        UnreachableError: All are out of reach.
+    For each pose the nearest come first; poses out of reach are passed over unless all are.
     """
     arm, found = problem.arm, []
     fault = None
@@ -489,12 +476,10 @@ def _fault(problem: _Problem) -> tuple[str, float]:
             return f"the {name} is {where} obstacle {row}, clearance {1e3 * rows[end, row]:.1f} mm", most
     if problem.in_motion:
         moving = joint_motion(space, ends[:1], problem.velocity[None], problem.acceleration[None])
-        torque = motion_torques(arm.chain, *moving)
-        for kind, values, limit in (
-            ("velocity", moving.velocity, arm.velocity_limit),
-            ("torque", torque, arm.torque_limit),
-        ):
-            share = np.abs(values[0]) / limit
+        torque = motion_torques(arm.chain, *moving)[0]
+        shares = {"velocity": moving.velocity[0] / arm.velocity_limit, "torque": torque / arm.torque_limit}
+        for kind, share in shares.items():
+            share = np.abs(share)
             if share.max() > 1.0:
                 joint = arm.joint_names[int(share.argmax())]
                 return f"the start has {share.max():.2f} times the {kind} limit of joint {joint!r}", most
@@ -511,7 +496,7 @@ def _plan(problem: _Problem, number: int, until: float, ompl: bool) -> MotionPla
     fault, kept = _fault(problem)
     straight = _straight(problem)
     coarse = straight._replace(table=movement_table(0))
-    if fault or is_free(problem.setting(), coarse, problem.obstacles, 0, kept):
+    if fault or is_free(problem.setting(), coarse, problem.obstacles, kept):
         plan = _known(problem, straight, "straight", problem.least, fault)
         if plan.success or fault or problem.duration is not None:
             return plan
@@ -564,7 +549,7 @@ def _search(
     straight = np.arange(1, n_via + 1)[:, None] / (n_via + 1) * way
     unit = unit_of_jerk(way, problem.space.of_hand)
     near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
-    table, fine = movement_table(n_via), fine_table(n_via)
+    tables = movement_table(n_via), fine_table(n_via)
     setting = problem.setting(kept + NEAR)  # clearances below NEAR are right
     best, least = None, np.inf
     tight, widest = None, problem.margin  # the best of those that keep the margin and nothing more
@@ -572,8 +557,9 @@ def _search(
     total = len(given) + 1 + number
     while time.perf_counter() < until:
         left = total - tried
-        if free >= enough:
-            left = min(left, since + _more(least / unit) - tried)
+        if free >= enough:  # rough movements are worth many more seeds
+            more = int(MORE * math.log2(max(least / unit / ROUGH, 1.0)))
+            left = min(left, since + min(more, MOST_MORE) - tried)
         if left <= 0:
             break
         seeds = np.empty((min(CHUNKS[min(tried, len(CHUNKS) - 1)], left), *straight.shape))
@@ -589,10 +575,10 @@ def _search(
                 spread = 0.0 if rank == 0 else near if rank < NARROW else far
                 seeds[k] = straight + spread * away
         wanted = max(enough - free, 1)
-        done, found = _refined(problem, setting, kept, table, fine, seeds, duration, until, enough=wanted)
+        done, found = _refined(problem, setting, kept, tables, seeds, duration, until, enough=wanted)
         for k in range(done):
             clearance = float(found.clearance[k])
-            movement = problem.movement(found.vias[k], fine, int(found.times[k]), duration)
+            movement = problem.movement(found.vias[k], tables[1], int(found.times[k]), duration)
             if clearance < kept:
                 if clearance >= widest:
                     widest = clearance
@@ -615,17 +601,11 @@ def _search(
     return _known(problem, movement, source, problem.least, clearance=known), tried
 
 
-def _more(cost: float) -> int:
-    """Return how many more seeds a free movement is worth by its relative jerk cost: rough ones are worth many."""
-    return min(int(MORE * math.log2(max(cost / ROUGH, 1.0))), MOST_MORE)
-
-
 def _refined(
     problem: _Problem,
     setting: Setting,
     kept: float,
-    table: MovementTable,
-    fine: MovementTable,
+    tables: tuple[MovementTable, MovementTable],
     seeds: Float,
     duration: float,
     until: float,
@@ -634,12 +614,12 @@ def _refined(
     enough: int = 1,
 ) -> tuple[int, Found]:
     """Refine seeds, shape (S, K, D); see :func:`~viapoint.training.planning.refine.refine_seeds`."""
-    fixed = problem.movement(seeds[:0, 0], table, 0, duration).offsets
+    fixed = problem.movement(seeds[:0, 0], tables[0], 0, duration).offsets
     unit = unit_of_jerk(problem.goal - problem.start, problem.space.of_hand)
     endless = np.full(seeds.shape[1:], np.inf)
     return refine_seeds(
-        setting, table, fine, problem.start, fixed, seeds, np.stack((-endless, endless)), duration,
-        problem.obstacles, 0, kept, unit, smooth, enough, until - time.perf_counter(),
+        setting, *tables, problem.start, fixed, seeds, np.stack((-endless, endless)), duration,
+        problem.obstacles, kept, unit, smooth, enough, until - time.perf_counter(),
     )  # fmt: skip
 
 
@@ -659,13 +639,12 @@ def _along_path(problem: _Problem, kept: float, duration: float, until: float) -
     for count in VIA_COUNTS:
         points = problem.space.coordinates(points_on(path, count))
         durations = np.asarray(primitives.passage_durations(points, 1.0))[None]
-        table = table_with(durations)
-        fine = table_with(durations, FINE_INSTANTS)
+        tables = table_with(durations), table_with(durations, FINE_INSTANTS)
         vias = points[None, 1:-1] - problem.start
-        _, found = _refined(problem, problem.setting(), kept, table, fine, vias, duration, until, smooth=0.0)
+        _, found = _refined(problem, problem.setting(), kept, tables, vias, duration, until, smooth=0.0)
         clearance = float(found.clearance[0])
         if clearance >= kept:
-            movement = problem.movement(found.vias[0], fine, 0, duration)
+            movement = problem.movement(found.vias[0], tables[1], 0, duration)
             return _known(problem, movement, "ompl", problem.least, clearance=clearance)
     return None
 
@@ -693,27 +672,18 @@ def _timed(problem: _Problem, movement: Movement, least: float | None) -> tuple[
     shares = np.stack((np.abs(rate) / arm.velocity_limit, np.abs(torque) / arm.torque_limit)).max(axis=1)
     limits = Limits(float(shares[0].max()), float(shares[1].max()))
     kind = "velocity" if limits.velocity > limits.torque else "torque"
-    worst = arm.joint_names[int(shares.max(axis=0).argmax())]
-    beyond = (
-        f"joint {worst!r} needs {max(limits):.2f} times its {kind} limit in {factor * duration:.2f} s; "
-        f"the shortest duration is {needed * duration:.2f} s"
-    )
+    share = max(limits)
+    worst = shares.max(axis=0).argmax()
+    when = f"in {factor * duration:.2f} s; the shortest duration is {needed * duration:.2f} s"
     if limits.torque > 1.0:
         at_rest = np.abs(torques(arm.chain, motion.position, np.zeros(1), np.zeros(1))) / arm.torque_limit
         if at_rest.max() > 1.0:
-            worst = arm.joint_names[int(at_rest.max(axis=0).argmax())]
-            beyond = (
-                f"joint {worst!r} needs {at_rest.max():.2f} times its torque limit for the weight of the arm"
-            )
+            kind = "torque"
+            when = "for the weight of the arm"
+            share = float(at_rest.max())
+            worst = at_rest.max(axis=0).argmax()
+    beyond = f"joint {arm.joint_names[worst]!r} needs {share:.2f} times its {kind} limit {when}"
     return factor * duration, limits, beyond
-
-
-def _clearance_at_rest(problem: _Problem, end: float) -> float:
-    """Return the least clearance at the goal while the arm comes to rest after the end of a movement, [m]."""
-    obstacles = problem.obstacles
-    later = obstacles._replace(centre=obstacles.centre + end * obstacles.velocity)
-    rest = Movement(fine_table(0), 0, problem.goal, np.zeros((3, len(problem.goal))), SETTLING)
-    return exact_clearance(problem.setting(), rest, later, 0, problem.margin)
 
 
 def _known(
@@ -730,9 +700,12 @@ def _known(
     vias = offsets[:-3]
     movement = problem.movement(vias, table, times, duration)
     if clearance is None or clearance >= NEAR:
-        clearance = exact_clearance(problem.setting(), movement, problem.obstacles, 0, problem.margin)
-    if problem.obstacles.velocity[0].any():
-        clearance = min(clearance, _clearance_at_rest(problem, duration))
+        clearance = exact_clearance(problem.setting(), movement, problem.obstacles, problem.margin)
+    if problem.obstacles.velocity[0].any():  # also while the arm comes to rest at the goal
+        obstacles = problem.obstacles
+        later = obstacles._replace(centre=obstacles.centre + duration * obstacles.velocity)
+        rest = Movement(fine_table(0), 0, problem.goal, np.zeros((3, len(problem.goal))), SETTLING)
+        clearance = min(clearance, exact_clearance(problem.setting(), rest, later, problem.margin))
     cost = np.einsum("ij,id,jd->", table.cost[times], movement.offsets, movement.offsets)
     straight_cost = float(straight_jerk_cost(float(np.linalg.norm(problem.goal - problem.start)), 1.0))
     jerk = 1.0 if cost == 0.0 else max(float(cost) / straight_cost, 1.0) if straight_cost else np.nan

@@ -100,8 +100,10 @@ class Found(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """Memory of a refinement in a space of D dimensions, with J joints and K via-points."""
+    """Arm, obstacles and memory of a refinement in a space of D dimensions, with J joints and K via-points."""
 
+    setting: Setting
+    obstacles: Obstacles
     position: Float
     joints: Float
     placed: Placed
@@ -117,10 +119,12 @@ class _Work(NamedTuple):
 
 
 @compiled
-def _work(setting: Setting, columns: int, dimension: int, obstacles: Obstacles, scene: int) -> _Work:
+def _work(setting: Setting, columns: int, dimension: int, obstacles: Obstacles) -> _Work:
     """Return memory for a refinement."""
     joints = len(setting.joint_range)
     return _Work(
+        setting,
+        obstacles,
         np.empty(dimension),
         np.empty(joints),
         memory(setting.chain, setting.spheres),
@@ -131,17 +135,17 @@ def _work(setting: Setting, columns: int, dimension: int, obstacles: Obstacles, 
         np.empty(dimension),
         np.empty((columns, columns)),
         np.empty((len(setting.spheres.link), 5)),
-        fastest(obstacles, scene),
+        fastest(obstacles, 0),
     )
 
 
 @inner
-def _add_residual(setting: Setting, missing: float, work: _Work) -> None:
+def _add_residual(missing: float, work: _Work) -> None:
     """Add a residual, whose derivative by the joints is in `work.pull`, to those of an instant."""
     row, dimension = work.row, len(work.row)
-    if setting.of_hand:
+    if work.setting.of_hand:
         # Joints q and hand x of the plane: dq = J^-1 dx, so the derivative by x is J^-T times that by q.
-        chain, placed = setting.chain, work.placed
+        chain, placed = work.setting.chain, work.placed
         point_jacobian(
             chain, placed.rotation, placed.origin, 2, work.position[0], work.position[1], 0.0, work.jacobian
         )
@@ -163,11 +167,9 @@ def _add_residual(setting: Setting, missing: float, work: _Work) -> None:
 
 
 @inner
-def _pull(
-    setting: Setting, work: _Work, sphere: int, link: int, x: float, y: float, z: float, sign: float
-) -> None:
+def _pull(work: _Work, sphere: int, link: int, x: float, y: float, z: float, sign: float) -> None:
     """Add to `work.pull` the derivative of the way of a sphere in a direction (x, y, z) by the joints, times a sign."""
-    placed, sliding = work.placed, setting.chain.sliding
+    placed, sliding = work.placed, work.setting.chain.sliding
     u = placed.centre[sphere, 0]
     v = placed.centre[sphere, 1]
     w = placed.centre[sphere, 2]
@@ -186,11 +188,10 @@ def _pull(
 
 
 @inlined
-def _add_obstacles(
-    setting: Setting, obstacles: Obstacles, scene: int, time: float, wanted: float, work: _Work
-) -> tuple[float, float]:
+def _add_obstacles(time: float, wanted: float, work: _Work) -> tuple[float, float]:
     """Add the residuals of the placed arm from the obstacles; return their sum of squares, and the least clearance."""
-    spheres, placed, total, nearest = setting.spheres, work.placed, 0.0, wanted
+    spheres, obstacles, placed = work.setting.spheres, work.obstacles, work.placed
+    total, nearest = 0.0, wanted
     for group in range(len(spheres.link)):
         if spheres.link[group] == 0:
             continue
@@ -206,32 +207,32 @@ def _add_obstacles(
         far = wanted + WINDOW
         seen[0], seen[1], seen[2], seen[3], seen[4] = u, v, w, far, time
         for row in range(obstacles.kind.shape[1]):
-            if obstacles.kind[scene, row] == ABSENT:
+            if obstacles.kind[0, row] == ABSENT:
                 continue
-            apart = point_distance(obstacles, scene, row, u, v, w, time, far + size) - size
+            apart = point_distance(obstacles, 0, row, u, v, w, time, far + size) - size
             seen[3] = min(seen[3], apart)
             if apart >= wanted:
                 continue
-            least, sphere = group_clearance(spheres, placed, group, obstacles, scene, row, time, wanted, -1e9)
+            least, sphere = group_clearance(spheres, placed, group, obstacles, 0, row, time, wanted, -1e9)
             if sphere < 0:
                 continue
             x = placed.centre[sphere, 0]
             y = placed.centre[sphere, 1]
             z = placed.centre[sphere, 2]
-            _, a, b, c = point_distance_and_normal(obstacles, scene, row, x, y, z, time, 1e9)
+            _, a, b, c = point_distance_and_normal(obstacles, 0, row, x, y, z, time, 1e9)
             work.pull[:] = 0.0
-            _pull(setting, work, sphere, spheres.link[group], a, b, c, -1.0)
+            _pull(work, sphere, spheres.link[group], a, b, c, -1.0)
             nearest = min(nearest, least)
             missing = wanted - least
             total += missing * missing
-            _add_residual(setting, missing, work)
+            _add_residual(missing, work)
     return total, nearest
 
 
 @inlined
-def _add_own(setting: Setting, wanted: float, work: _Work) -> tuple[float, float]:
+def _add_own(wanted: float, work: _Work) -> tuple[float, float]:
     """Add the residuals of the placed arm from itself; return their sum of squares, and the least clearance."""
-    spheres, placed, total, nearest = setting.spheres, work.placed, 0.0, wanted
+    spheres, placed, total, nearest = work.setting.spheres, work.placed, 0.0, wanted
     for pair in range(len(spheres.pairs)):
         least, one, other = nearest_spheres(spheres, placed, pair, wanted, -1e9)
         if one < 0:
@@ -242,19 +243,19 @@ def _add_own(setting: Setting, wanted: float, work: _Work) -> tuple[float, float
         length = math.sqrt(x * x + y * y + z * z) + 1e-9
         x, y, z = x / length, y / length, z / length
         work.pull[:] = 0.0
-        _pull(setting, work, one, spheres.link[spheres.pairs[pair, 0]], x, y, z, -1.0)
-        _pull(setting, work, other, spheres.link[spheres.pairs[pair, 1]], x, y, z, 1.0)
+        _pull(work, one, spheres.link[spheres.pairs[pair, 0]], x, y, z, -1.0)
+        _pull(work, other, spheres.link[spheres.pairs[pair, 1]], x, y, z, 1.0)
         nearest = min(nearest, least)
         missing = wanted - least
         total += missing * missing
-        _add_residual(setting, missing, work)
+        _add_residual(missing, work)
     return total, nearest
 
 
 @inlined
-def _add_ranges(setting: Setting, reached: bool, work: _Work) -> tuple[float, float]:
+def _add_ranges(reached: bool, work: _Work) -> tuple[float, float]:
     """Add what is missing to the margin from the joint limits; return the sum of squares, and the least distance."""
-    total, nearest, joints, limits = 0.0, RANGE_MARGIN, work.joints, setting.joint_range
+    total, nearest, joints, limits = 0.0, RANGE_MARGIN, work.joints, work.setting.joint_range
     for j in range(len(joints)):
         low = limits[j, 0] + RANGE_MARGIN - joints[j]
         high = joints[j] - limits[j, 1] + RANGE_MARGIN
@@ -264,10 +265,10 @@ def _add_ranges(setting: Setting, reached: bool, work: _Work) -> tuple[float, fl
             work.pull[j] = -1.0 if low > high else 1.0
             total += missing * missing
             nearest = min(nearest, RANGE_MARGIN - missing)
-            _add_residual(setting, missing, work)
+            _add_residual(missing, work)
     if not reached:
         # The hand is beyond the reach: a pull towards where the straight or bent arm has it.
-        chain, placed = setting.chain, work.placed
+        chain, placed = work.setting.chain, work.placed
         x = y = 0.0
         last = len(joints)
         for a in range(3):
@@ -290,22 +291,13 @@ def _add_ranges(setting: Setting, reached: bool, work: _Work) -> tuple[float, fl
 
 @kernel
 def _assemble(
-    setting: Setting,
-    movement: Movement,
-    obstacles: Obstacles,
-    scene: int,
-    aim: Aim,
-    unit: float,
-    limit: float,
-    hessian: Float,
-    gradient: Float,
-    work: _Work,
+    movement: Movement, aim: Aim, unit: float, limit: float, hessian: Float, gradient: Float, work: _Work
 ) -> tuple[float, float]:
     """Fill in matrix and gradient of the objective; return the objective, and the least clearance, [m] or [rad].
 
     It ends as soon as the objective is `limit` or more, which is then returned.
     """
-    table, times, offsets = movement.table, movement.times, movement.offsets
+    setting, table, times, offsets = work.setting, movement.table, movement.times, movement.offsets
     columns, dimension = offsets.shape
     vias = columns - 3
     weight = aim.jerk * 2.0 / (STRIDE * unit)
@@ -333,11 +325,11 @@ def _assemble(
         work.square[:] = 0.0
         work.force[:] = 0.0
         time = movement.duration * k / last
-        from_obstacles, first = _add_obstacles(setting, obstacles, scene, time, aim.clearance, work)
+        from_obstacles, first = _add_obstacles(time, aim.clearance, work)
         from_itself, second = 0.0, OWN_CLEARANCE
         if (k - begin) % (4 * STRIDE) == 0:  # bodies of the arm are less often near one another
-            from_itself, second = _add_own(setting, OWN_CLEARANCE, work)
-        from_ranges, third = _add_ranges(setting, reached or not setting.of_hand, work)
+            from_itself, second = _add_own(OWN_CLEARANCE, work)
+        from_ranges, third = _add_ranges(reached or not setting.of_hand, work)
         missing = from_obstacles + from_itself + from_ranges
         if missing == 0.0:
             continue
@@ -382,17 +374,9 @@ def _copy(source: Float, target: Float) -> None:
 
 
 @compiled
-def _refine(
-    setting: Setting,
-    movement: Movement,
-    bounds: Float,
-    obstacles: Obstacles,
-    scene: int,
-    aim: Aim,
-    unit: float,
-    work: _Work,
-) -> int:
+def _refine(movement: Movement, bounds: Float, aim: Aim, unit: float, work: _Work) -> int:
     """Move the via-points of a movement, the first rows of its offsets, and return the index of its passage times."""
+    setting = work.setting
     table, _, start, offsets, duration = movement
     columns, dimension = offsets.shape
     vias = columns - 3
@@ -406,9 +390,7 @@ def _refine(
     longest = LONGEST_STEP[1] if setting.of_hand else LONGEST_STEP[0]
     times, _ = best_times(table, offsets, work.gram)
     movement = Movement(table, times, start, offsets, duration)
-    objective, nearest = _assemble(
-        setting, movement, obstacles, scene, aim, unit, np.inf, hessian, gradient, work
-    )
+    objective, nearest = _assemble(movement, aim, unit, np.inf, hessian, gradient, work)
     damping = DAMPING
     for _ in range(ITERATIONS):
         largest = 0.0
@@ -440,9 +422,7 @@ def _refine(
                 trial[a, d] = min(max(wanted, bounds[0, a, d]), bounds[1, a, d])
         other, _ = best_times(table, trial, work.gram)
         movement = Movement(table, other, start, trial, duration)
-        value, apart = _assemble(
-            setting, movement, obstacles, scene, aim, unit, objective, other_hessian, other_gradient, work
-        )
+        value, apart = _assemble(movement, aim, unit, objective, other_hessian, other_gradient, work)
         if value < objective:
             nearest = apart
             done = objective - value < aim.gain * objective and nearest >= FREE
@@ -477,7 +457,6 @@ def refine_seeds(
     bounds: Float,
     duration: float,
     obstacles: Obstacles,
-    scene: int,
     margin: float,
     unit: float,
     smooth: float,
@@ -495,8 +474,7 @@ def refine_seeds(
         seeds: Via-points as offsets from the start, shape (S, K, D).
         bounds: Least and greatest offsets of the via-points beside joint limits, shape (2, K, D).
         duration: Duration during which obstacles move, [s].
-        obstacles: Obstacles, of which those of the scene `scene` count.
-        scene: Index of the scene.
+        obstacles: Obstacles of one scene.
         margin: Least clearance of movements that count as free, [m].
         unit: Unit of jerk costs in unit time.
         smooth: Jerk cost in this unit with which a movement that was polished once is smooth enough.
@@ -505,7 +483,7 @@ def refine_seeds(
     """
     end = clock() + patience
     number, vias, dimension = seeds.shape
-    work = _work(setting, vias + 3, dimension, obstacles, scene)
+    work = _work(setting, vias + 3, dimension, obstacles)
     found = Found(seeds.copy(), np.zeros(number, np.int64), np.full(number, np.inf), np.full(number, -1.0))
     # The refined movement, and the polished ones, each of which is smoother than the one before.
     offsets = np.empty((ATTEMPTS + 1, vias + 3, dimension))
@@ -521,9 +499,9 @@ def refine_seeds(
         _copy(seeds[each], offsets[0])
         for aim in (SEED, NARROW):
             movement = Movement(table, 0, start, offsets[0], duration)
-            times[0] = _refine(setting, movement, bounds, obstacles, scene, aim, unit, work)
+            times[0] = _refine(movement, bounds, aim, unit, work)
             movement = Movement(table, times[0], start, offsets[0], duration)
-            apart = _clearance(setting, movement, obstacles, scene, margin, NEARLY)
+            apart = _clearance(setting, movement, obstacles, margin, NEARLY)
             if not NEARLY < apart < margin or clock() > end:
                 break
         _copy(offsets[0, :vias], found.vias[each])
@@ -531,7 +509,7 @@ def refine_seeds(
         if apart < margin:
             if apart >= 0.0:
                 movement = Movement(fine, times[0], start, offsets[0], duration)
-                exact = exact_clearance(setting, movement, obstacles, scene, margin)
+                exact = exact_clearance(setting, movement, obstacles, margin)
                 found.clearance[each] = min(exact, apart)
             continue
         stage, weight = 0, POLISH.jerk
@@ -542,10 +520,10 @@ def refine_seeds(
             _copy(offsets[stage], trial)
             movement = Movement(table, 0, start, trial, duration)
             aim = Aim(POLISH.clearance, weight, POLISH.gain)
-            other = _refine(setting, movement, bounds, obstacles, scene, aim, unit, work)
+            other = _refine(movement, bounds, aim, unit, work)
             _, less = best_times(table, trial, work.gram)
             movement = Movement(table, other, start, trial, duration)
-            if less >= cost or not is_free(setting, movement, obstacles, scene, margin):
+            if less >= cost or not is_free(setting, movement, obstacles, margin):
                 if stage:
                     break
                 weight *= LIGHTER
@@ -559,7 +537,7 @@ def refine_seeds(
                 break
         while stage >= 0:
             movement = Movement(fine, times[stage], start, offsets[stage], duration)
-            clearance = exact_clearance(setting, movement, obstacles, scene, margin)
+            clearance = exact_clearance(setting, movement, obstacles, margin)
             if clearance >= margin:
                 break
             stage -= 1
@@ -577,23 +555,21 @@ def refine_seeds(
 
 @inlined
 def _clearance(
-    setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, margin: float, floor: float
+    setting: Setting, movement: Movement, obstacles: Obstacles, margin: float, floor: float
 ) -> float:
     """Return the least clearance of a movement at the instants of a table, [m]; exact from `floor` to `margin`."""
     memory = memory_of(setting, movement.table, len(movement.start))
-    return least_clearance(setting, movement, obstacles, scene, margin + ROUNDING, floor, 1e9, memory)
+    return least_clearance(setting, movement, obstacles, 0, margin + ROUNDING, floor, 1e9, memory)
 
 
 @compiled
-def is_free(setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, margin: float) -> bool:
+def is_free(setting: Setting, movement: Movement, obstacles: Obstacles, margin: float) -> bool:
     """Return True if a movement keeps a margin at the instants of a table; it stops at the first that does not."""
-    return bool(_clearance(setting, movement, obstacles, scene, margin, margin) >= margin)
+    return bool(_clearance(setting, movement, obstacles, margin, margin) >= margin)
 
 
 @compiled
-def exact_clearance(
-    setting: Setting, movement: Movement, obstacles: Obstacles, scene: int, margin: float
-) -> float:
+def exact_clearance(setting: Setting, movement: Movement, obstacles: Obstacles, margin: float) -> float:
     """Return the least clearance of a movement at all times, at most 1, [m]; OUTSIDE out of reach.
 
     Between two instants of the table, the joints are taken to move straight. There the clearance may be less by
@@ -609,7 +585,7 @@ def exact_clearance(
     placed = memory(setting.chain, setting.spheres)
     step = movement.duration / (number - 1)
     apart, own = movement_clearance(
-        setting.chain, setting.spheres, setting.reach, path, obstacles, scene, 0.0, step, placed,
+        setting.chain, setting.spheres, setting.reach, path, obstacles, 0, 0.0, step, placed,
         bounds_memory(setting.chain, setting.spheres, True), margin,
     )  # fmt: skip
     return min(apart, own)

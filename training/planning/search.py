@@ -62,9 +62,7 @@ class GeometrySearch:
     """Planner that checks a fixed set of actions with computed geometry and takes the best one.
 
     The candidates are the zero action and the points of a Sobol sequence, the same in every scene. They are checked
-    in the order of the reward that they would have without obstacles, until no other one can be better. Where nothing
-    moves, clearance does not depend on the duration; then all candidates but the first have the duration of the
-    greatest reward.
+    in the order of the reward that they would have without obstacles, until no other one can be better.
 
     When replanning, the present plan is kept as long as it is clear and no other plan is better by KEEP_BONUS. Where no
     plan is clear to its end, the search takes one that is clear for the longest of HORIZONS.
@@ -75,9 +73,6 @@ class GeometrySearch:
         refinements: Rounds in which `per_round` more candidates are checked around the best ones.
         per_round: Candidates of each round.
         **kwargs: Arguments of the environment, if an id is given.
-
-    Raises:
-        ValueError: A number is out of range.
 
     Example:
         >>> from viapoint.envs import Cylinder
@@ -116,12 +111,7 @@ class GeometrySearch:
         return f"{'search' if self.refinements else 'sobol'}{self.total_checks}"
 
     def decide(self, observation: Mapping[str, Any], scenes: Any = None) -> Float:
-        """Return the best action of each of B observations, shape (B, m).
-
-        Args:
-            observation: Parts of shape (B, .) each.
-            scenes: Unused; part of the protocol :class:`~viapoint.training.planning.baselines.Method`.
-        """
+        """Return the best action of each of B observations, shape (B, m); the scenes are not used."""
         return self.solve(Problem.of_observation(observation, self.task))
 
     def solve(self, problem: Problem, n_pieces: int = 1) -> Float:
@@ -165,15 +155,8 @@ class GeometrySearch:
     def plan(self, start: Any, goal: Any, obstacles: Any = ()) -> MotionPlan:
         """Return the best plan from rest at `start` to rest at `goal` among obstacles that stand still.
 
-        Where no candidate stays clear and in reach, the plan is the one with the least violation, and has no success.
-
-        Args:
-            start: Start, as `reset` takes it.
-            goal: Goal, as `reset` takes it.
-            obstacles: Shapes or dictionaries.
-
-        Raises:
-            ValueError: An argument is not allowed, an end is out of reach or touches an obstacle.
+        The arguments are as the options of `reset`. Where no candidate stays clear and in reach, the plan is the one
+        with the least violation, and has no success. ValueError: an end is out of reach or touches an obstacle.
         """
         given = {"start": start, "goal": goal, "obstacles": obstacles}
         return self.plan_scene(draw_given(given, self.task.sampler(), [np.random.default_rng(0)]))
@@ -223,7 +206,6 @@ def merits(
     The merit of a clear plan is its reward if the physics follows it, and that of others is near INFEASIBLE. It is a
     lower bound for plans that are certainly no better than another one. When replanning, a first action of zero, which
     keeps the plan, gains KEEP_BONUS. Actions that are barred, by a mask of shape (B, H), are not considered.
-    Where no setting is given, it is that of the obstacles.
     """
     moves = moves_of(task, problem, actions)
     worth = worth_of(task, problem, moves)
@@ -249,17 +231,16 @@ def refined_actions(task: Task, problem: Problem, actions: Numbers) -> Numbers:
     moves = moves_of(task, problem, actions)
     found = np.array(actions)
     number, at = task.n_via, task.n_via * task.action.dimension
+    room = np.inf if setting.of_hand else task.action.via_scale
     for b in range(len(found)):
         start = problem.start[b]
         line = problem.goal[b] - problem.start[b]
         seeds = moves.offsets[b, :, :number].copy()
         fixed = moves.offsets[b, 0, number:].copy()
-        bounds = np.full((2, number, len(start)), [[[-np.inf]], [[np.inf]]])
-        if not setting.of_hand:
-            middle = line * np.arange(1, number + 1)[:, None] / (number + 1)
-            bounds = np.stack((middle - task.action.via_scale, middle + task.action.via_scale))
+        middle = line * np.arange(1, number + 1)[:, None] / (number + 1)
+        bounds = np.stack((middle - room, middle + room))
         _, better = refine_seeds(
-            setting, table, fine, start, fixed, seeds, bounds, moves.duration[b, 0], problem.obstacles, b,
+            setting, table, fine, start, fixed, seeds, bounds, moves.duration[b, 0], problem.obstacles.take([b]),
             CLEARANCE_MARGIN, unit_of_jerk(line, setting.of_hand), SMOOTH, len(seeds), np.inf,
         )  # fmt: skip
         waypoints = np.zeros((len(seeds), number + 2, len(start)))
@@ -284,8 +265,7 @@ def plan_clearances(
     """Return the planned clearances of actions of shape (B, H, m), shape (B, H), [m].
 
     They are at most `most`, and below `least` the exact value does not matter, [m]. After the time `until`, [s],
-    nothing counts. With `exact`, movements are those that are executed, and looked at in many instants, which takes
-    longer.
+    nothing counts. With `exact`, movements are those that are executed, looked at in many instants.
     """
     moves = moves_of(task, problem, actions, exact=exact)
     setting = setting_of(task, problem.obstacles, exact=exact)
@@ -340,11 +320,7 @@ def _merits(
 
 
 def registered_task(env_id: str, **kwargs: Any) -> Task:
-    """Return the task of a registered environment made with `kwargs`.
-
-    Raises:
-        ValueError: There is no such environment, it is not of this package, or an argument is not allowed.
-    """
+    """Return the task of a registered environment made with `kwargs`; ValueError if it is not of this package."""
     check_registered(env_id)
     env: Any = gym.make_vec(env_id, num_envs=1, **kwargs)
     task = getattr(env.unwrapped, "task", None)
