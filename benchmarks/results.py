@@ -1,11 +1,11 @@
-"""Measure shipped agents and methods without learning in the frozen sets; write tables of two pages and a figure.
+"""Measure shipped agents and methods without learning in the frozen sets; write tables of three pages and a figure.
 
 python benchmarks/results.py                                  # all tasks; hours
 python benchmarks/results.py --env viapoint/PandaObstacles-v0 # others keep their numbers
 python benchmarks/results.py --only agents                    # only shipped agents, searches and planners
 python benchmarks/results.py --only runs                      # only the trainings of benchmarks/sb3.py
 python benchmarks/results.py --only looking                   # only searches and agents that look again on the way
-python benchmarks/results.py --only two                       # only sensed obstacles with two via-points
+python benchmarks/results.py --only one                       # only sensed obstacles with one via-point
 python benchmarks/results.py --only reaches                   # only obstacles on reaches of their own
 """
 
@@ -42,6 +42,7 @@ SENSED_BASELINES = (
     "thick:search512",
     "thick:plan_motion",
     "cautious512",
+    "cautious2048",
     "seen:search512",
     "known:search512",
     "known:plan_motion",
@@ -51,22 +52,28 @@ LOOKING: dict[str, dict[str, Any]] = {
     "one look": {"decide_at": "end"},
     "a look each 0.3 s": {"decide_at": ["horizon"]},
     "looks at what is new": {"decide_at": ["sight"]},
-    "two via-points, a look each 0.3 s": {"decide_at": ["horizon"], "n_via": 2},
 }
 """Decisions of PlanarSensed with rays around the hand, in which points that were seen are remembered."""
-LOOKS, TWO = "PlanarSensed, hand_rays", "PlanarSensed, two via-points"
-"""Names of this variant, and of one look with two via-points, in the file and on the page."""
-TWO_BASELINES = ("thick:search512", "thick:plan_motion", "cautious512", "seen:search512", "known:search512")
+LOOKS, ONE = "PlanarSensed, hand_rays", "PlanarSensed, one via-point"
+"""Names of this variant, and of one look with one via-point, in the file and on the page."""
+SEARCHES = (
+    "points:search512",
+    "fitted:search512",
+    "thick:search512",
+    "cautious512",
+    "seen:search512",
+    "known:search512",
+)
 PREDICTIONS = ("rest:search512", "search512", "reach:search512", "known:search512")
 """Searches with more and more that is known of the courses of obstacles."""
 INTERVALS = {"PlanarMovingObstacles": (0.3, 0.1), "PandaMovingObstacles": (0.5,)}
 """Greatest times from one decision to the next, [s], in tasks whose obstacles may be on reaches of their own."""
 REACHES = [f"{name}, reaches" for name in INTERVALS]
 """Names of these variants."""
-PAGES = Path("docs/results.md"), Path("docs/results-details.md")
+PAGES = Path("docs/results.md"), Path("docs/results-sensed.md"), Path("docs/results-details.md")
 PICTURE = Path("docs/images/results.png")
 DETAILS = ("points:", "fitted:", "agent, seed", "untrained, ")
-"""Beginnings of methods that are on the second page or in the file only."""
+"""Beginnings of methods that are on other pages or in the file only."""
 SHOWN: dict[str, dict[str, Any]] = {
     "plan_motion": METHOD_STYLES["plan_motion"],
     "known:plan_motion": METHOD_STYLES["plan_motion"],
@@ -96,18 +103,18 @@ class Config:
     """Ids of environments with a shipped agent."""
     n_scenes: int | None = None
     """Number of scenes of each set; default: all of them."""
-    only: Literal["everything", "agents", "runs", "looking", "two", "reaches"] = "everything"
-    """Part that is measured: shipped agents and their baselines, the trainings in `runs`, looking again on the way, two
-    via-points, or obstacles on reaches of their own; other numbers stay."""
+    only: Literal["everything", "agents", "runs", "looking", "one", "reaches"] = "everything"
+    """Part that is measured: shipped agents and their baselines, the trainings in `runs`, looking again on the way, one
+    via-point, or obstacles on reaches of their own; other numbers stay."""
     runs: Path = Path("runs/sb3")
-    """Folder of trainings, which get a row each: those of benchmarks/sb3.py, viaq with other seeds, viarank with other
-    beliefs."""
+    """Folder of trainings, which get a row each: those of benchmarks/sb3.py, viaq and viarank with other seeds, such as
+    `PlanarSensed-viarank-1`, and viarank with other beliefs, such as `PlanarSensed-fitted`."""
     reaches: Path = Path("runs/reaches")
     """Folder of trainings among obstacles on reaches of their own, such as `PlanarMovingObstacles-0` for seed 0."""
     looks: Path = Path("runs/looks")
     """Folder of trainings that look again each 0.3 s, such as `PlanarSensed-0` for seed 0."""
-    two: Path = Path("runs/two")
-    """Folder of trainings with one look and two via-points, such as `PlanarSensed-0` for seed 0."""
+    one: Path = Path("runs/one")
+    """Folder of trainings with one look and one via-point, named as those in `runs`."""
 
 
 def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
@@ -115,7 +122,8 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
     task = registered_task(env_id)
     settings: dict[str, Any] = {"checks": [0, 16], "refine": [4], "baselines": BASELINES}
     if task.sensor is not None:
-        settings = {"refine": [16], "baselines": SENSED_BASELINES}
+        refine = [] if task.space.of_hand else [16]  # in the plane, refined plans solve no other scenes
+        settings = {"refine": refine, "baselines": SENSED_BASELINES}
     elif task.replanning:
         settings = {"checks": [0, 16], "baselines": REPLANNING_BASELINES}
     common: dict[str, Any] = {"env": env_id, "scenes": name, "n_scenes": config.n_scenes}
@@ -130,29 +138,34 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
         for when, kwargs in LOOKING.items():
             settings = {**common, "env_kwargs": {"sensor": "hand_rays", **kwargs}}
             once = kwargs["decide_at"] == "end"
-            planner = ["thick:plan_motion"] if once else []
-            rows = evaluate(**settings, baselines=["thick:search512", *planner, "known:search512"]).rows
-            if not once and "n_via" not in kwargs:
+            stronger = "thick:plan_motion" if once else "thick:search4096"
+            rows = evaluate(**settings, baselines=["thick:search512", stronger, "known:search512"]).rows
+            if not once:
                 rows += seeds_of(config.looks, short, settings, untrained="horizon" in kwargs["decide_at"])
             for row in rows:
                 yield _numbers(LOOKS, name, f"{row['method']}, {when}", row)
-    if config.only in ("everything", "two") and task.sensor is not None and task.space.of_hand:
-        settings = {**common, "env_kwargs": {"n_via": 2}}
-        for row in evaluate(**settings, baselines=TWO_BASELINES).rows + seeds_of(config.two, short, settings):
-            yield _numbers(TWO, name, row["method"], row)
-    if config.only not in ("everything", "runs"):
-        return
-    for folder in sorted(config.runs.glob(f"{short}-*")):
-        run = Run(folder)
-        agent = load_agent(folder)  # the best by validation
+    if config.only in ("everything", "one") and task.sensor is not None and task.space.of_hand:
+        settings = {**common, "env_kwargs": {"n_via": 1}}
+        rows = evaluate(**settings, baselines=SEARCHES).rows
+        for row in rows + runs_of(config.one, short, settings):
+            yield _numbers(ONE, name, row["method"], row)
+    if config.only in ("everything", "runs"):
+        for row in runs_of(config.runs, short, common):
+            yield _numbers(env_id, name, row["method"], row)
+
+
+def runs_of(folder: Path, short: str, settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the numbers of the trainings of a task in a folder of several, each under the name of its method."""
+    rows = []
+    for path in sorted(folder.glob(f"{short}-*")):
+        run = Run(path)
+        agent = load_agent(path)  # the best by validation
         method = f"{run.config.algorithm.upper()}, {agent.num_timesteps:,} of {run.curve[-1]['decisions']:,}"
-        last = folder.name.rpartition("-")[2]
-        if run.config.algorithm == "viarank":  # with another belief
-            method = f"{last}:agent"
-        elif run.config.algorithm == "viaq":
-            method = f"agent, seed {last}"
-        row = evaluate(agent, **common, baselines=[]).rows[0]
-        yield _numbers(env_id, name, method, row)
+        last = path.name.rpartition("-")[2]
+        if run.config.algorithm in ("viaq", "viarank"):
+            method = f"agent, seed {last}" if last.isdigit() else f"{last}:agent"
+        rows.append({**evaluate(agent, **settings, baselines=[]).rows[0], "method": method})
+    return rows
 
 
 def reaches_of(config: Config, short: str, common: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -225,7 +238,7 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
     for env_id in dict.fromkeys(row["env"] for row in rows):
         mine = [row for row in rows if row["env"] == env_id]
         heading = env_id.removeprefix("viapoint/").removesuffix("-v0")
-        if env_id not in SHIPPED_IDS:  # tables of the second page
+        if env_id not in SHIPPED_IDS:  # tables of other pages
             found[heading] = table(mine)
             continue
         found[heading] = table([row for row in mine if not is_detail(row["method"])])
@@ -297,7 +310,7 @@ def draw_method(axes: Axes, name: str, row: dict[str, Any]) -> Any:
 
 def in_order(rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return rows by their tasks, and those of methods that were there before in the place that they had."""
-    tasks = [*SHIPPED_IDS, TWO, LOOKS, *REACHES]
+    tasks = [*SHIPPED_IDS, ONE, LOOKS, *REACHES]
     methods = list(dict.fromkeys((row["env"], row["method"]) for row in [*before, *rows]))
     return sorted(rows, key=lambda row: (tasks.index(row["env"]), methods.index((row["env"], row["method"]))))
 

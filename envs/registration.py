@@ -30,7 +30,7 @@ NAMED: dict[str, dict[str, Any]] = {
         "decide_at": EVENTS,
         "horizon": 0.5,
     },
-    "PlanarSensed": {"sensor": "rays"},
+    "PlanarSensed": {"sensor": "rays", "n_via": 2},
     "PandaSensed": {**PANDA_OBSTACLES, "sensor": "camera"},
 }
 TASKS: dict[str, dict[str, Any]] = {

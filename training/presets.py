@@ -52,7 +52,6 @@ _OFF_POLICY: dict[str, Any] = {
 _LITTLE_ENTROPY = {"ent_coef": "auto_0.02"}  # rewards are of order one, and the usual 1 outweighs them
 _NOISE = {"action_noise": {"kind": "normal", "sigma": 0.2}}
 _SELDOM: dict[str, Any] = {"eval_every": 10_000, "checkpoint_every": 50_000}
-_OWN: dict[str, Any] = {"n_timesteps": 40_000, "eval_every": 5_000, "checkpoint_every": 20_000}
 
 # Presets by the names of algorithms on the command line
 PRESETS: dict[str, Preset] = {
@@ -60,10 +59,16 @@ PRESETS: dict[str, Preset] = {
     "viaq": Preset(
         policy="ViaQPolicy",
         hyperparameters={"learning_starts": 4096, "learning_rate": _falling(3e-3, 3e-5)},
-        **_OWN,
+        n_timesteps=40_000,
+        eval_every=5_000,
+        checkpoint_every=20_000,
     ),
     "viarank": Preset(
-        policy="ViaRankPolicy", hyperparameters={"learning_rate": _falling(2e-3, 2e-5)}, **_OWN
+        policy="ViaRankPolicy",
+        n_timesteps=6_000,  # after more decisions, the predicted success of the best of many plans is worse
+        eval_every=2_000,
+        checkpoint_every=6_000,
+        hyperparameters={"learning_rate": _falling(2e-3, 2e-5)},
     ),
     "sac": Preset(n_timesteps=40_000, hyperparameters={**_OFF_POLICY, **_LITTLE_ENTROPY}),
     "td3": Preset(n_timesteps=40_000, hyperparameters={**_OFF_POLICY, **_NOISE}),
@@ -99,7 +104,7 @@ _REVISING = {"gradient_steps": 6, "next_candidates": 4}
 _LOOKING = {"gradient_steps": 12, "explore_candidates": 32, "labels": 16}
 REPLANNING_PRESETS = {
     "viaq": _changed(PRESETS["viaq"], _REVISING, n_timesteps=24_000),
-    "viarank": _changed(PRESETS["viarank"], _LOOKING, n_timesteps=20_000),
+    "viarank": _changed(PRESETS["viarank"], _LOOKING, n_timesteps=12_000, eval_every=4_000),
 }
 """Presets of replanning tasks."""
 JOINT_DECISIONS = 16_000  # Decisions in joint space, where one costs several times as much

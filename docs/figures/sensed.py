@@ -68,7 +68,8 @@ def draw_scene(axes: Axes, task: Task, scene: Scenes, agent: Any) -> None:
     path = Movements.of(plan).sample(plan.duration[:, None] * np.linspace(0.0, 1.0, 100)).position[0]
     axes.plot(*np.stack((start[0], goal[0])).T, color="0.4", linestyle=":", linewidth=1.0, zorder=3)
     axes.plot(*path.T, color=PALETTE.plan, linewidth=2.0, zorder=5)
-    axes.add_patch(Circle(plan.waypoints[0, 1], 0.018, color=PALETTE.via, zorder=6))
+    for via in plan.waypoints[0, 1:-1]:
+        axes.add_patch(Circle(via, 0.018, color=PALETTE.via, zorder=6))
     axes.add_patch(Circle(start[0], 0.018, fill=False, linewidth=1.2, color=PALETTE.start, zorder=6))
     axes.add_patch(Circle(goal[0], 0.020, color=PALETTE.goal, zorder=6))
     axes.add_patch(Circle(origin, 0.02, color=PALETTE.joint, zorder=6))

@@ -100,7 +100,7 @@ class ViaRankPolicy(PlanPolicy):
         width: int = 32,
         instants: int = 32,
         nearest: int = 16,
-        candidates: int = 256,
+        candidates: int = 1024,
         refinements: int = 2,
         per_refinement: int = 128,
         refine: int = 0,
