@@ -46,12 +46,12 @@ GOAL: dict[str, Any] = {**POINT, "color": PALETTE.goal, "marker": "D", "markersi
 
 
 def success_of_rows(
-    path: Path, table: Any, curves: Mapping[str, Sequence[Sequence[Sequence[float]]]]
+    path: Path, table: Any, curves: Mapping[str, Sequence[Sequence[Sequence[float]]]], sets: str = "scenes"
 ) -> Path:
     """Draw success with intervals of each method in each set of scenes, and success during trainings.
 
     `table` has lines of one environment with `method`, `set`, `success`, `low` and `high`; `curves` has pairs of
-    decisions and success in validation, for each run of each method.
+    decisions and success in validation, for each run of each method; `sets` says what the names of sets mean.
     """
     methods = list(dict.fromkeys(table["method"]))
     figure = Figure(figsize=(11.0, 1.6 + 0.32 * len(methods)), layout="constrained")
@@ -73,8 +73,8 @@ def success_of_rows(
         ax.set_xlabel("decisions")
         ax.set_ylabel("success in validation [%]")
         ax.set_ylim(-2.0, 102.0)
-    for ax in (axes, *others):
-        ax.legend(frameon=False, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    for ax, title in zip((axes, *others), (sets, None), strict=False):
+        ax.legend(frameon=False, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), title=title)
         style_axes(ax)
     return write_figure(path, figure, dpi=DOTS_PER_INCH)
 

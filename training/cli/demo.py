@@ -100,9 +100,9 @@ def _draw_success(path: Path, record: Mapping[str, Any], trained: Run) -> None:
     rows = []
     for method, summary in record["methods"].items():
         for band, found in summary["success_by_band"].items():
-            rows.append({"method": method, "set": f"share {band}", "success": found["rate"], **found})
+            rows.append({"method": method, "set": band, "success": found["rate"], **found})
     curve = [[each["decisions"], each["success"]["rate"]] for each in trained.curve]
-    success_of_rows(path, pd.DataFrame(rows), {"agent": [curve]})
+    success_of_rows(path, pd.DataFrame(rows), {"agent": [curve]}, "random plans that solve the scene")
 
 
 def _show_movements(folder: Path, agent: Agent, frozen: FrozenScenes) -> None:
