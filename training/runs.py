@@ -200,7 +200,7 @@ class Run:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock a run folder for this process, and files.tidy up what a crash left in it; in use, it raises BadFileError.
+    """Lock a run folder for this process, and tidy up what a crash left in it; in use, it raises BadFileError.
 
     The operating system unlocks it when the process ends.
     """

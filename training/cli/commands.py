@@ -70,7 +70,9 @@ def evaluate(config: EvaluateConfig) -> None:
             record["env_kwargs"] = config.env_kwargs
             changed = json.dumps(config.env_kwargs, sort_keys=True).encode()
             name += f"-{hashlib.sha256(changed).hexdigest()[:8]}"
-        kept = run.folder / "evaluations" / f"{name}{'.partial' * result.partial}.json"
+        if result.partial:
+            name += ".partial"
+        kept = run.folder / "evaluations" / f"{name}.json"
         write_json(kept, _with_earlier(record, kept))
         print(f"kept as {kept}", file=_notes(config))
     if config.json is not None:

@@ -27,13 +27,22 @@ def run(config: PlanConfig) -> None:
     if config.out is not None:
         _check_replaceable(config.out)
     arm = _arm_for(config)
+    _check_lengths(config, arm)
     scene = _scene(config.scene, arm)
     start = config.start or scene.get("start")
     if start is None:
         start = arm.hand(arm.home)[:2] if arm.space == "hand" else arm.home
-    problem = arm, start, _goal(config, scene), scene.get("obstacles", ())
-    settings = {name: getattr(config, name) for name in ("n_via", "margin", "duration", "time_limit")}
-    plan = plan_motion(*problem, rng=config.seed, **settings)
+    plan = plan_motion(
+        arm,
+        start,
+        _goal(config, scene),
+        scene.get("obstacles", ()),
+        n_via=config.n_via,
+        margin=config.margin,
+        duration=config.duration,
+        time_limit=config.time_limit,
+        rng=config.seed,
+    )
     print(plan)
     if not plan.success and not config.force:
         raise ValueError(f"no plan is safe: {plan.reason}; --force writes it nevertheless")
@@ -64,6 +73,16 @@ def _arm_for(config: PlanConfig) -> Arm:
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
         raise ValueError(f"{flags} is for an arm of a file, got --arm {config.arm}")
     return load_arm(config.arm, **given)
+
+
+def _check_lengths(config: PlanConfig, arm: Arm) -> None:
+    """Check how many numbers the ends of the movement have."""
+    ends = (2, "x y") if arm.space == "hand" else (len(arm.joint_names), "joint positions")
+    expected = {"start": ends, "goal": ends, "position": (3, "x y z"), "quaternion": (4, "w x y z")}
+    for name, (length, meaning) in expected.items():
+        given = len(getattr(config, name))
+        if given not in (0, length):
+            raise ValueError(f"--{name} needs {length} numbers for {arm.name}, {meaning}, got {given}")
 
 
 def _scene(path: Path | None, arm: Arm) -> dict[str, Any]:
