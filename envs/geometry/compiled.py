@@ -42,10 +42,17 @@ def kernel(function: Function) -> Function:
 def inner(function: Function) -> Function:
     """Compile a function that makes no arrays, and that compiled functions alone call; the code is cached on disk.
 
-    It has no entrance for calls from Python, which for packed obstacles takes half a second to compile. Python must
-    not call it: Numba would end the interpreter.
+    It has no entrance for calls from Python, which for packed obstacles takes half a second to compile.
     """
-    return cast("Function", njit(cache=True, **KERNEL, **INNER)(function))
+    made: Any = njit(cache=True, **KERNEL, **INNER)(function)
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise TypeError(f"{function.__name__} is for compiled functions; from Python, call its `py_func`")
+
+    # Numba itself would end the interpreter.
+    made._compile_for_args = refuse
+    made._insert = lambda *_, **__: None
+    return cast("Function", made)
 
 
 def inlined(function: Function) -> Function:
