@@ -22,8 +22,17 @@ from viapoint.envs.common.validation import is_number
 from viapoint.envs.registration import ENV_IDS
 from viapoint.envs.task import Task
 from viapoint.primitives.fitting import MOST_VIA_POINTS, USUAL_RANGE
-from viapoint.training import checks as valid
-from viapoint.training.checks import DEFAULT_ENV, SHIPPED_IDS, check_file, check_folder, named_path
+from viapoint.training.checks import (
+    DEFAULT_ENV,
+    RANGES,
+    SHIPPED_IDS,
+    check_env_kwargs,
+    check_file,
+    check_folder,
+    check_whole,
+    named_path,
+    unknown_name,
+)
 from viapoint.training.files import as_plain, parse_yaml
 from viapoint.training.planning.search import registered_task
 from viapoint.training.presets import STEP_PRESETS, Algorithm, Preset, preset_of, usual_algorithm
@@ -136,7 +145,7 @@ def task_with(env_id: str, env_kwargs: Mapping[str, Any]) -> Task:
         known = inspect.signature(Task.of).parameters
         for name in env_kwargs:
             if name not in (*known, "threads"):
-                raise ValueError(valid.unknown_name("env_kwargs", name, known)) from error
+                raise ValueError(unknown_name("env_kwargs", name, known)) from error
         raise ValueError(f"env_kwargs of {env_id}: {error}") from error
 
 
@@ -159,8 +168,8 @@ class Config:
                 value = named_path(name, value)
             elif str(each.type) == "NamedValues":
                 value = _plain(name, value)
-            elif name in valid.RANGES and value is not each.default and not isinstance(value, tuple | list):
-                value = valid.check_whole(name, value)
+            elif name in RANGES and value is not each.default and not isinstance(value, tuple | list):
+                value = check_whole(name, value)
             object.__setattr__(self, name, value)
         self._check()
 
@@ -207,7 +216,7 @@ class TrainConfig(Config):
             raise ValueError(f"env must be the id of an environment, got {self.env!r}")
         if self.algo is not None and self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
-        valid.check_env_kwargs(self.env_kwargs)
+        check_env_kwargs(self.env_kwargs)
         if self.arm is not None:
             env, argument = env_of_arm(self.arm, None if self.env == DEFAULT_ENV else self.env)
             object.__setattr__(self, "env", env)
@@ -303,7 +312,7 @@ class AgentConfig(Config):
     """Arguments of the environment, values in YAML: sensor=hand_rays decide_at=[sight]."""
 
     def _check(self) -> None:
-        valid.check_env_kwargs(self.env_kwargs)
+        check_env_kwargs(self.env_kwargs)
         if self.pretrained is not None:
             if self.agent not in (None, self.pretrained):
                 raise ValueError(f"the agent is named twice: {self.agent} and pretrained={self.pretrained}")

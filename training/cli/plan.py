@@ -111,6 +111,8 @@ def _goal(config: PlanConfig, scene: dict[str, Any]) -> Any:
     """Return the goal: coordinates, or a pose."""
     if config.position:
         return Pose(np.array(config.position), config.quaternion or None)
-    if not config.goal and "goal" not in scene:
-        raise ValueError("name a goal: --goal JOINTS, or --position X Y Z, or a scene file that has one")
-    return config.goal or scene["goal"]
+    if config.goal:
+        return config.goal
+    if "goal" in scene:
+        return scene["goal"]
+    raise ValueError("name a goal: --goal JOINTS, or --position X Y Z, or a scene file that has one")

@@ -29,13 +29,18 @@ from viapoint.envs.scenes.options import OPTIONS, options_to_json, scene_options
 from viapoint.primitives import passage_durations
 from viapoint.training.agents.agent import Agent
 from viapoint.training.paper.movements import TARGETS, rows_of_lights
-from viapoint.training.planning import search as searching
 from viapoint.training.planning.baselines import AgentMethod
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.plan_motion import SEEDS, checked_motion, ompl_motion, plan_motion
 from viapoint.training.planning.problem import Problem
-from viapoint.training.planning.search import CLEARANCE_MARGIN, GeometrySearch, registered_task
+from viapoint.training.planning.search import (
+    CLEARANCE_MARGIN,
+    GeometrySearch,
+    merits,
+    plan_clearances,
+    registered_task,
+)
 from viapoint.training.rollout import whole_task
 from viapoint.training.scene_sets import shipped_set
 
@@ -465,7 +470,7 @@ def _distinct(arena: Arena, state: State) -> list[Proposal]:
         rest, start, goal = np.zeros_like(scene.start)[None], scene.start[None], scene.goal[None]
         problem = Problem(start, rest, rest, goal, pack([scene.obstacles]))
         each_alone = problem.take(np.zeros(len(actions), np.int64))
-        values = searching.merits(task, each_alone, actions[:, None])[:, 0]
+        values = merits(task, each_alone, actions[:, None])[:, 0]
     order = np.argsort(-values, kind="stable")[:N_CANDIDATES]
     known = values[order] if by_agent else np.full(len(order), np.nan)
     ends = (np.tile(end, (len(order), 1)) for end in (scene.start, scene.goal))
@@ -536,7 +541,7 @@ def _plan_on(
     goal = task.space.coordinates(scenes.goals(time))[0]
     if task.replanning and env.last_plan is not None:
         keep = np.zeros((1, task.action.size))
-        clear = searching.plan_clearances(task, problem, keep[None], CLEARANCE_MARGIN, CLEARANCE_MARGIN)[0, 0]
+        clear = plan_clearances(task, problem, keep[None], CLEARANCE_MARGIN, CLEARANCE_MARGIN)[0, 0]
         same = np.abs(env.last_plan.waypoints[0, -1] - goal).max() < SAME_GOAL
         if same and clear >= CLEARANCE_MARGIN:
             return env.execute_actions(keep)

@@ -109,9 +109,8 @@ class PlannerMethod:
         outcomes: Outcomes = {}
         for count in np.unique(counts):
             rows = np.flatnonzero(counts == count)
-            _, durations, waypoints, _ = np.split(
-                decisions[rows], (1, 2 + count, 2 + count + (count + 2) * dimension), axis=1
-            )
+            durations = decisions[rows, 1 : 2 + count]
+            waypoints = decisions[rows, 2 + count : 2 + count + (count + 2) * dimension]
             plan = Plan.at_rest(waypoints.reshape(len(rows), count + 2, dimension), durations)
             result = self._simulation.execute_plan(scenes.take(rows), plan)
             for name, values in result.items():

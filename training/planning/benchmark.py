@@ -291,9 +291,10 @@ def measure_planner(
 def succeeding(plans: Sequence[MotionPlan]) -> list[int]:
     """Return the indices of the plans that succeed by geometry and in physics."""
     found = list[int]()
-    counts = np.array([plan.success * len(plan.durations) for plan in plans])
-    for count in np.unique(counts[counts > 0]):
-        rows = np.flatnonzero(counts == count)
+    success = np.array([plan.success for plan in plans], bool)
+    counts = np.array([len(plan.durations) for plan in plans])
+    for count in np.unique(counts[success]):
+        rows = np.flatnonzero(success & (counts == count))
         for some in np.split(rows, range(TOGETHER, len(rows), TOGETHER)):
             outcome, _ = execute_plans([plans[row] for row in some])
             found += some[outcome.is_success].tolist()
