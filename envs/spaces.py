@@ -5,12 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.inverse_kinematics import planar_joints, planar_motion, planar_solutions
+from viapoint.envs.arms.inverse_kinematics import (
+    RANGE_TOLERANCE,
+    planar_joints,
+    planar_motion,
+    planar_solutions,
+)
 from viapoint.envs.common.arrays import Bool, Float
 from viapoint.envs.plans import Motion, SpaceName
 
-# Greatest distance of the hand from a reference within reach, [m], and of a joint beyond its range, [rad]
-REACH_TOLERANCE = 1e-6
+REACH_TOLERANCE = 1e-6  # Greatest distance of the hand from a reference within reach, [m]
 
 
 class Space:
@@ -38,7 +42,7 @@ class Space:
     def inside(self, coordinates: Float) -> Bool:
         """Return True where all joints are within their ranges."""
         low, high = self.arm.joint_range.T
-        within = (coordinates >= low - REACH_TOLERANCE) & (coordinates <= high + REACH_TOLERANCE)
+        within = (coordinates >= low - RANGE_TOLERANCE) & (coordinates <= high + RANGE_TOLERANCE)
         return np.asarray(within.all(axis=-1))
 
 

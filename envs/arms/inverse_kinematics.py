@@ -22,6 +22,9 @@ STALLED = 1e-9  # Greatest step of the joints that ends the iterations, [rad]
 SAME = 1e-3  # Greatest difference of joints in solutions that count as the same, [rad]
 INSIDE = 1e-6  # Least distance from the limits of joints from which the nearest place is looked for, [rad]
 PATIENCE = 4  # Factor on the number of seeds where the first ones find nothing
+# Way of a joint beyond its range that counts as rounding, [rad] or [m]: limits in files may have five digits
+RANGE_TOLERANCE = 1e-5
+TURN = 2.0 * np.pi  # Full turn, [rad]
 REACHED = 1e-9  # Greatest distance of the hand from a target in the plane, [m]
 
 
@@ -247,12 +250,22 @@ def planar_motion(
     return joints.reshape(shape), rates.reshape(shape), changes.reshape(shape)
 
 
-def _solutions(arm: Arm, position: Float, axes: Float | None, begin: Float) -> list[Float]:
+def unwound(arm: Arm, joints: Float, near: Float) -> Float:
+    """Return joint positions, shape (..., J), with hinges at the equivalent within range that is nearest to `near`."""
+    low, high = arm.joint_range.T
+    least = np.ceil((joints - high - RANGE_TOLERANCE) / TURN)
+    most = np.floor((joints - low + RANGE_TOLERANCE) / TURN)
+    turns = np.clip(np.round((joints - near) / TURN), least, most)
+    return np.where(arm.chain.sliding, joints, joints - TURN * turns)
+
+
+def _solutions(arm: Arm, position: Float, axes: Float | None, begin: Float, near: Float) -> list[Float]:
     """Return different configurations with the tool at a target, found from those to begin with, (N, J)."""
     found: list[Float] = []
     target = np.eye(3) if axes is None else axes
     for joints in begin.copy():
         error = descend(arm.chain, arm.joint_range, position, target, axes is not None, joints)
+        joints = unwound(arm, joints, near)
         if error == 0.0 and all(np.abs(joints - other).max() > SAME for other in found):
             found.append(joints)
     return found
@@ -266,6 +279,8 @@ def inverse_kinematics(
     arm: Arm, position: Any, quaternion: Any = None, *, seed: Any = None, n_seeds: int = 64
 ) -> Float:
     """Return different joint positions that put the tool at a pose, the nearest to the first seed first, (S, J).
+
+    Hinges that may turn all around are at the equivalent that is nearest to the seed.
 
     Args:
         arm: Arm.
@@ -293,10 +308,10 @@ def inverse_kinematics(
     rng = np.random.default_rng(0)
     low, high = arm.joint_range.T
     begin = np.concatenate((first[None], rng.uniform(low, high, (number - 1, len(low)))))
-    found = _solutions(arm, position, axes, begin)
+    found = _solutions(arm, position, axes, begin, first)
     if not found:  # some poses near the joint limits are reached from few places
         begin = rng.uniform(low, high, (PATIENCE * number, len(low)))
-        found = _solutions(arm, position, axes, begin)
+        found = _solutions(arm, position, axes, begin, first)
     if not found:
         from scipy.optimize import least_squares  # here, because it is rarely needed
 

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.inverse_kinematics import RANGE_TOLERANCE
 from viapoint.envs.common.arrays import Bool, Float, norm
 from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import HALF_SPACE, Obstacles, no_obstacles
 from viapoint.envs.geometry.shapes import IN_TABLES
-from viapoint.envs.spaces import REACH_TOLERANCE
 
 MOST_JUMPS = 4  # Greatest number of jumps of the target in an episode
 ENDS = ("start", "goal")  # Names of the ends of a movement
@@ -257,7 +257,7 @@ def _check_end(
     """Check an end of the scenes that have it: inside the joint limits, and free of the arm itself and of obstacles."""
     for joint, (low, high) in enumerate(arm.joint_range):
         position = joints[:, joint]
-        outside = (position < low - REACH_TOLERANCE) | (position > high + REACH_TOLERANCE)
+        outside = (position < low - RANGE_TOLERANCE) | (position > high + RANGE_TOLERANCE)
         allowed = f"must be from {low:.4g} to {high:.4g}"
         _refuse(there & outside, f"{name}: joint {arm.joint_names[joint]!r} {allowed}", position)
     rows, own = row_clearances(arm.chain, arm.spheres, joints, obstacles, FAR)

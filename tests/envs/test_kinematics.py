@@ -5,6 +5,7 @@ import re
 import mujoco
 import numpy as np
 import pytest
+from helpers import UR5E
 
 from viapoint.envs.arms.arm import arm_from_xml
 from viapoint.envs.arms.inverse_kinematics import (
@@ -16,6 +17,7 @@ from viapoint.envs.arms.inverse_kinematics import (
     solve_planar,
 )
 from viapoint.envs.arms.kinematics import forward, link_poses, sphere_centres, tool_jacobian, torques
+from viapoint.envs.arms.load import load_arm
 from viapoint.envs.arms.registry import arm_of
 
 GANTRY = """
@@ -102,6 +104,20 @@ def test_inverse_kinematics_finds_what_forward_kinematics_gives(arm):
         mujoco.mju_mat2Quat(quaternion, frame.ravel())
         joints = inverse_kinematics(arm, place, quaternion)[0]
         np.testing.assert_allclose(forward(arm.chain, joints)[1], frame, atol=1e-4)
+
+
+def test_inverse_kinematics_makes_no_needless_turns():
+    """Each hinge is less than half a turn from the seed, where that is in range; no two solutions differ by turns."""
+    arm = load_arm(UR5E)
+    low, high = arm.joint_range.T
+    for seed in np.random.default_rng(1).uniform(-3.0, 3.0, (5, 6)):
+        found = inverse_kinematics(arm, (0.4, 0.3, 0.4), (0.0, 1.0, 0.0, 0.0), seed=seed)
+        assert len(found) > 2
+        for joints in found:
+            nearer = joints - 2.0 * np.pi * np.sign(joints - seed)
+            assert ((np.abs(joints - seed) <= np.pi + 1e-6) | (nearer < low) | (nearer > high)).all()
+        turned = np.sin(0.5 * (found[:, None] - found))
+        assert (np.abs(turned).max(axis=-1) + np.eye(len(found)) > 1e-4).all()
 
 
 def test_a_pose_out_of_reach_is_an_error_with_the_nearest_distance():

@@ -1,6 +1,7 @@
 """Laws of planning around known obstacles, also with the library OMPL."""
 
 import dataclasses
+import itertools
 import json
 import re
 import sys
@@ -25,6 +26,7 @@ from viapoint.envs import (
     obstacles_to_json,
 )
 from viapoint.envs.arms.kinematics import torques
+from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import pack, unpack
 from viapoint.envs.scenes.options import draw_given
 from viapoint.training import UnsafePlanError, plan_motion, plan_motions, read_motion, write_motion
@@ -43,6 +45,7 @@ from viapoint.training.planning.movements import (
     movement_table,
 )
 from viapoint.training.planning.ompl_paths import points_on
+from viapoint.training.planning.rrt_connect import clear_path
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import BANDS, load, scenes_for, shipped_path
@@ -121,7 +124,7 @@ ACROSS = {
     "goal": (0.2, 0.3),
     "obstacles": [Box((0.01, 0.5, 0.04), position=(0.0, 0.4, 0.0))],
     "ompl": False,
-    "time_limit": 20.0,
+    "time_limit": 2.0,
 }
 REASONS = [
     ({**ACROSS, "seeds": 0}, "from 1 seed"),
@@ -716,15 +719,62 @@ def test_plans_are_as_clear_as_they_are_said_to_be(env_id):
     assert sum(plan.success for plan in plans) > 6
 
 
-def test_where_no_seed_is_free_a_path_is_followed():
+def test_where_no_seed_is_free_a_path_is_followed(monkeypatch):
+    """That of compiled trees first, and that of OMPL where they find none."""
     pytest.importorskip("ompl")
     arm = benchmark_panda()
     problem = next(each for each in benchmark_problems() if each.name == "bookshelf_thin 20")
     given = {"start": problem.start, "goal": problem.goal, "obstacles": problem.obstacles}
-    given |= {"arm": arm, "seeds": 0, "n_via": 1}
-    plan = plan_motion(**given, time_limit=20.0)
+    given |= {"arm": arm, "seeds": 0, "n_via": 1, "time_limit": 20.0}
+    plan = plan_motion(**given, ompl=False)
+    assert (plan.success, plan.source) == (True, "path")
+    monkeypatch.setattr(module, "clear_path", lambda *_: np.empty((0, 7)))
+    plan = plan_motion(**given)
     assert (plan.success, plan.source) == (True, "ompl")
     assert not plan_motion(**given, ompl=False).success
+
+
+LIFT = """<mujoco><worldbody><body name="carriage"><joint name="lift" type="slide" axis="0 0 1" range="0 0.5"/>
+<geom size="0.02" mass="1"/><body name="arm"><joint name="turn" axis="0 0 1" range="-90 90"/>
+<geom type="capsule" fromto="0.05 0 0.1 0.4 0 0.1" size="0.02"/></body></body></worldbody></mujoco>"""
+LIFTED = load_arm(LIFT, name="lift", torque_limit=100.0, velocity_limit=1.0)
+"""Arm that turns and is lifted, 0.1 m above its base."""
+FENCE, CEILING = (Box((0.2, 0.02, 0.2), position=(0.3, 0.0, height)) for height in (0.1, 0.7))
+"""Obstacles below and above which the arm cannot pass; it can between them."""
+
+
+@pytest.mark.parametrize(
+    "arm", [benchmark_panda(), load_arm(LIFT, name="lift", torque_limit=100.0, velocity_limit=1.0)]
+)
+def test_a_path_of_trees_is_clear_between_its_ends(arm):
+    """The same seed gives the same path; where there is none, none is found."""
+    ends, shapes = np.array([[0.0, -0.8], [0.0, 0.8]]), [FENCE, CEILING]
+    if len(arm.joint_names) > 2:
+        problem = next(each for each in benchmark_problems() if each.name == "cage 1")
+        ends, shapes = np.stack((problem.start, problem.goal)), problem.obstacles
+    obstacles, setting = pack([shapes]), arm_setting(arm, False, pack([shapes]))
+    path, again = (clear_path(setting, ends, obstacles, 0.002, 5, 20.0) for _ in range(2))
+    np.testing.assert_array_equal(path, again)
+    np.testing.assert_array_equal(path[[0, -1]], ends)
+    low, high = arm.joint_range.T
+    assert ((path >= low) & (path <= high)).all()
+    shares = np.linspace(0.0, 1.0, 200)[:, None]
+    between = np.concatenate([one + shares * (other - one) for one, other in itertools.pairwise(path)])
+    rows, own = row_clearances(arm.chain, arm.spheres, between, obstacles.take([0] * len(between)), 1.0)
+    assert min(own.min(), rows.min()) > -0.002
+    wall = Box((0.01, 2.0, 2.0), position=(0.25, 0.0, 0.0), quaternion=(0.707, 0.0, 0.0, 0.707))
+    assert not len(clear_path(setting, ends, pack([[*shapes, wall]]), 0.002, 5, 0.1))
+
+
+def test_a_seed_that_is_free_is_not_lost(monkeypatch):
+    """Also where the refinement leaves the narrow passage that it leads through."""
+    monkeypatch.setattr(module, "ROUGH", 1e9)  # no more seeds follow a free one
+    arm = benchmark_panda()
+    problem = next(each for each in benchmark_problems() if each.name == "table_under_pick 18")
+    ends, obstacles = np.stack((problem.start, problem.goal)), pack([problem.obstacles])
+    path = clear_path(arm_setting(arm, False, obstacles, room=-1e-5), ends, obstacles, 0.001, 0, 20.0)
+    plan = plan_motion(arm, *ends, obstacles, n_via=3, seeds=points_on(path, 3)[None, 1:-1])
+    assert (plan.success, plan.source) == (True, "given")
 
 
 def test_points_lie_on_the_path_and_keep_its_corners():

@@ -22,7 +22,7 @@ from viapoint.envs.geometry.obstacles import Obstacles
 
 CHECK_SPACING = 0.05  # Spacing of collision checks along a line, [rad]
 FIRST = threading.Lock()  # of the import, which several threads may ask for
-VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12)  # Numbers of via-points, tried in this order
+VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # Numbers of via-points, tried in this order
 
 
 def import_ompl() -> Any:

@@ -17,10 +17,15 @@ import numpy as np
 
 from viapoint import primitives
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.inverse_kinematics import UnreachableError, inverse_kinematics
+from viapoint.envs.arms.inverse_kinematics import (
+    RANGE_TOLERANCE,
+    UnreachableError,
+    inverse_kinematics,
+    unwound,
+)
 from viapoint.envs.arms.kinematics import motion_torques, slowdowns, torques
 from viapoint.envs.arms.registry import arm_of
-from viapoint.envs.common.arrays import Float
+from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, whole_number
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack
@@ -51,6 +56,7 @@ from viapoint.training.planning.refine import (
     refine_seeds,
     unit_of_jerk,
 )
+from viapoint.training.planning.rrt_connect import clear_path
 
 # Once enough movements are free, more seeds are tried around the one with the least jerk: MORE for each doubling of its
 # relative jerk cost beyond ROUGH, and at most MOST_MORE.
@@ -59,10 +65,17 @@ ROUGH, MORE, MOST_MORE = 1.4, 8, 16
 SPREADS = 0.8, 1.0
 HAND_SPREADS = 0.15, 0.3  # Spreads of the same seeds in hand space, [m]
 NARROW = 8  # Number of seeds with the first spread
+# Number of seeds after which a path is looked for, where none became free, and of seeds along this path
+EARLY, ALONG = 8, 4
+TREE_TIME = 0.4  # Greatest share of the time that is left for a search of this path
+# Clearances that paths keep, as shares of those of the ends up to ROOM beyond what movements keep; smooth movements
+# need some of it
+PATH_ROOM, ROOM = (0.4, 0.1, 0.0, 0.4, 0.1), 0.02
+ALONG_TIME = 0.03  # Time limit of the refinement of a movement along a path, [s]
+MOST_REFINED = 12  # Greatest number of via-points that are refined, which takes longer the more there are
 SEEDS = 256  # Greatest number of random seeds
 CHUNKS = 1, 1, 2, 4  # Numbers of seeds between two looks at the clock; the last one repeats
 LONGEST_SEARCH = 1.0  # Default of the time limit, [s]
-RANGE_TOLERANCE = 1e-6  # Way beyond a joint limit that counts as rounding, [rad]
 SHORTEST = 0.25  # Shortest duration that is chosen, after which servos come to rest in time, [s]
 UNLIMITED = 0.85  # The same for arms without velocity limits, [s]
 # Instants of FINE_INSTANTS at which limits are looked at: every second one, and the last
@@ -75,7 +88,6 @@ ROUNDING = 1e-6  # Rounding error of clearances, [m]
 # Required clearances of a path of OMPL in each attempt, until one can be made smooth, [m]
 OMPL_MARGINS = (0.010, 0.004, 0.001, 0.001)
 OMPL_PATIENCE = 1.0  # Time limit for each path of OMPL as a baseline, [s]
-TURN = 2.0 * np.pi  # Full turn, [rad]
 GOALS = 8  # Greatest number of configurations that are tried for a pose
 
 
@@ -147,8 +159,9 @@ def plan_motion(
     The straight movement is taken if it is free. Otherwise via-points are refined by the gradient of clearance and jerk
     (see `viapoint.training.planning.refine`), from the straight line first, and then from random seeds, until
     `enough` free movements are found; if all are rough, from some more seeds around the best one. Each is checked at
-    256 instants and polished; the one with the least jerk is taken. Among moving obstacles, several durations are
-    tried, each 1.3 times as long as the one before.
+    256 instants and polished; the one with the least jerk is taken. Where the first seeds fail, RRT-Connect looks for
+    a path (see `viapoint.training.planning.rrt_connect`), which the movement follows through as many via-points as it
+    needs. Among moving obstacles, several durations are tried, each 1.3 times as long as the one before.
 
     Args:
         arm: Arm, or name of one.
@@ -156,7 +169,7 @@ def plan_motion(
         goal: The same; or several of them, shape (G, D), of which the cheapest to reach is taken; or one or several
             poses of the tool, :class:`~viapoint.envs.scenes.options.Pose`.
         obstacles: Shapes or dictionaries at time 0, with their velocities, or packed obstacles of one scene.
-        n_via: Number of via-points, 1 to 3.
+        n_via: Number of via-points, 1 to 3; movements along a path may have up to 32.
         seeds: Greatest number of random seeds, for all goals together; or via-points, shape (S, n_via, D), that are
             tried first, before up to 256 random ones.
         enough: Number of free movements among which the one with the least jerk is chosen.
@@ -167,7 +180,7 @@ def plan_motion(
         space: `joints` or `hand`; that of the arm by default.
         velocity: Initial velocity, shape (D,); 0 by default.
         acceleration: Initial acceleration, shape (D,); 0 by default.
-        ompl: True to follow a path of OMPL's RRT-Connect where no seed becomes free, if the extra `planning` is
+        ompl: True to follow a path of OMPL's RRT-Connect where nothing else is found, if the extra `planning` is
             installed.
         rng: Random generator of the seeds, or its seed; 0 by default.
 
@@ -228,21 +241,22 @@ def plan_motion(
     goals = _goals(problem, goal)
     number = -(-number // len(goals))  # rounded up
     until = time.perf_counter() + time_limit
-    # Straight movements are cheap, and the first goal that is reached bounds what others may cost.
+    # Straight movements are cheap, and the first goal that is reached bounds what others may cost. Paths are looked for
+    # where no goal is reached without.
     straight = []
     if len(goals) > 1:
-        straight = [_plan(problem._replace(goal=each), 0, 0.0, ompl) for each in goals]
+        straight = [_plan(problem._replace(goal=each), 0, 0.0) for each in goals]
     plans = list[MotionPlan]()
-    for rank, each in enumerate(goals):
-        least = min((plan.duration for plan in (*straight, *plans) if plan.success), default=np.inf)
-        if straight and straight[rank].duration >= least:
-            continue
-        # A goal that cannot be reached costs its share of the time, or a few seeds if another one is reached.
-        now = time.perf_counter()
-        share = now + (until - now) / (len(goals) - rank)
-        few = number if np.isinf(least) else min(number, NARROW)
-        tree = ompl and bool(np.isinf(least))
-        plans.append(_plan(problem._replace(goal=each), few, share, tree))
+    for paths in (False, True) if straight else (True,):
+        for rank, each in enumerate(goals):
+            least = min((plan.duration for plan in (*straight, *plans) if plan.success), default=np.inf)
+            if straight and (straight[rank].duration >= least or (paths and np.isfinite(least))):
+                continue
+            # A goal that cannot be reached costs its share of the time, or a few seeds if another one is reached.
+            now = time.perf_counter()
+            share = now + (until - now) / (len(goals) - rank)
+            few = number if np.isinf(least) else min(number, NARROW)
+            plans.append(_plan(problem._replace(goal=each), few, share, paths, ompl))
     plans += straight
     best = max(plans, key=lambda plan: (plan.success, -plan.duration if plan.success else plan.clearance))
     return dataclasses.replace(best, milliseconds=1e3 * (time.perf_counter() - began))
@@ -387,6 +401,7 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     _known(problem, straight, "straight", 0.0, _fault(problem)[0])
     tables = movement_table(n_via), fine_table(n_via)
     _refined(problem, problem.setting(), 0.0, tables, np.zeros((0, n_via, len(start))), 1.0, np.inf)
+    clear_path(problem.setting(), np.stack((arm.home, arm.home)), problem.obstacles, 0.0, 0, 0.0)
 
 
 def _goals(problem: _Problem, goal: Any) -> Float:
@@ -404,13 +419,9 @@ def _goals(problem: _Problem, goal: Any) -> Float:
         )
     several = values is not None and values.ndim > 1
     goals = finite_array("goal", goal if several else [goal], (None, len(problem.start)))
-    if problem.arm.continuous and not problem.space.of_hand:
-        # The equivalent position within the range that is nearest to the start.
+    if not problem.space.of_hand:
         endless = np.isin(problem.arm.joint_names, problem.arm.continuous)
-        low, high = problem.setting().joint_range.T
-        turns = np.round((goals - problem.start) / TURN)
-        turns = np.clip(turns, np.ceil((goals - high) / TURN), np.floor((goals - low) / TURN))
-        goals = goals - TURN * np.where(endless, turns, 0.0)
+        goals = np.where(endless, unwound(problem.arm, goals, problem.start), goals)
     away = np.abs(goals - problem.start).max(axis=-1)
     # Copies are contiguous and writable, which compiled functions depend on.
     return np.array(goals[np.argsort(away, kind="stable")])
@@ -488,10 +499,12 @@ def _fault(problem: _Problem) -> tuple[str, float]:
     return "", max(problem.margin, min(most, nearest - ROUNDING))
 
 
-def _plan(problem: _Problem, number: int, until: float, ompl: bool) -> MotionPlan:
+def _plan(
+    problem: _Problem, number: int, until: float, paths: bool = False, ompl: bool = False
+) -> MotionPlan:
     """Return the best movement to one goal, after a search with up to a number of random seeds until some time, [s].
 
-    With `ompl`, a path of OMPL is tried in the end, too.
+    With `paths`, those that are found by trees are followed where the first seeds fail, in the end also one of OMPL.
     """
     fault, kept = _fault(problem)
     straight = _straight(problem)
@@ -508,10 +521,13 @@ def _plan(problem: _Problem, number: int, until: float, ompl: bool) -> MotionPla
         duration *= 1.0 if problem.in_motion else LONGER  # the straight one in motion has it already
     tried, best = 0, None
     for _ in range(ROUNDS if several else 1):
-        found, more = _search(problem, kept, duration, number, until)
+        follows = paths and not problem.moves
+        found, more = _search(problem, kept, duration, number, until, early=EARLY if follows else math.inf)
         tried += more
-        if found is None and ompl and not problem.moves:
-            found = _along_path(problem, kept, duration, until)
+        if found is None and follows and time.perf_counter() < until:
+            problem = problem._replace(given=problem.given[:0])
+            found, more = _search_around(problem, kept, duration, number, until, ompl)
+            tried += more
         if found is not None:
             best = found
             if best.success or not several:
@@ -541,9 +557,21 @@ def _straight(problem: _Problem) -> Movement:
 
 
 def _search(
-    problem: _Problem, kept: float, duration: float, number: int, until: float
+    problem: _Problem,
+    kept: float,
+    duration: float,
+    number: int,
+    until: float,
+    *,
+    first: int = 0,
+    early: float = math.inf,
+    source: str = "given",
 ) -> tuple[MotionPlan | None, int]:
-    """Refine seeds until enough movements are free; return the one with the least jerk, and the number of seeds."""
+    """Refine seeds until enough movements are free; return the one with the least jerk, and the number of seeds.
+
+    Given seeds, from a `source`, come first, then the straight line and `number` random ones, without those before the
+    `first` of them. Beside the given ones, no more than `early` are tried if none becomes free.
+    """
     given, enough, n_via = problem.given, problem.enough, problem.given.shape[1]
     way = problem.goal - problem.start
     straight = np.arange(1, n_via + 1)[:, None] / (n_via + 1) * way
@@ -554,20 +582,22 @@ def _search(
     best, least = None, np.inf
     tight, widest = None, problem.margin  # the best of those that keep the margin and nothing more
     tried = free = since = 0
-    total = len(given) + 1 + number
+    total = len(given) + max(1 + number - first, 0)
     while time.perf_counter() < until:
         left = total - tried
         if free >= enough:  # rough movements are worth many more seeds
             more = int(MORE * math.log2(max(least / unit / ROUGH, 1.0)))
             left = min(left, since + min(more, MOST_MORE) - tried)
+        elif not free:
+            left = int(min(left, len(given) + early - tried))
         if left <= 0:
             break
         seeds = np.empty((min(CHUNKS[min(tried, len(CHUNKS) - 1)], left), *straight.shape))
         for k in range(len(seeds)):
-            rank = tried + k - len(given)
-            if rank < 0:
+            if tried + k < len(given):
                 seeds[k] = given[tried + k] - problem.start
                 continue
+            rank = tried + k - len(given) + first
             away = problem.generator.uniform(-1.0, 1.0, straight.shape)
             if best is not None and (free >= enough or rank % 2):  # what is free is seldom alone
                 seeds[k] = best[0].offsets[:n_via] + near * away
@@ -589,16 +619,60 @@ def _search(
             if free == enough:
                 since = tried + k + 1
             if found.cost[k] < least:
-                rank = tried + k - len(given)
                 least = float(found.cost[k])
-                source = "given" if rank < 0 else "random" if rank else "straight, refined"
-                best = movement, source, clearance
+                rank = tried + k - len(given) + first
+                name = source if tried + k < len(given) else "random" if rank else "straight, refined"
+                best = movement, name, clearance
         tried += done
     chosen = best or tight
     if chosen is None:
         return None, tried
-    movement, source, known = chosen
-    return _known(problem, movement, source, problem.least, clearance=known), tried
+    movement, name, known = chosen
+    return _known(problem, movement, name, problem.least, clearance=known), tried
+
+
+def _search_around(
+    problem: _Problem, kept: float, duration: float, number: int, until: float, ompl: bool
+) -> tuple[MotionPlan | None, int]:
+    """Return the best movement along a clear path, or else from random seeds, and the number of seeds.
+
+    Points of the path become seeds first, then as many via-points as the movement needs.
+    """
+    ends = np.ascontiguousarray(problem.space.joints(np.stack((problem.start, problem.goal))))
+    rows, own = row_clearances(
+        problem.arm.chain, problem.arm.spheres, ends, problem.obstacles.take([0, 0]), kept + ROOM
+    )
+    nearest = min(float(own.min()), float(rows.min(initial=kept + ROOM)))
+    tried = 0
+    for share in PATH_ROOM:
+        margin = kept + share * max(nearest - kept, 0.0)
+        patience = TREE_TIME * (until - time.perf_counter())
+        seed = int(problem.generator.integers(2**31))
+        path = clear_path(problem.setting(), ends, problem.obstacles, margin, seed, patience)
+        if not len(path):
+            continue
+        vias = problem.space.coordinates(points_on(path, problem.given.shape[1]))[1:-1]
+        near = HAND_SPREADS[0] if problem.space.of_hand else SPREADS[0]
+        away = problem.generator.uniform(-near, near, (ALONG, *vias.shape))
+        away[0] = 0.0
+        along = problem._replace(given=vias + away)
+        found, more = _search(along, kept, duration, number, until, early=0, source="path")
+        tried += more
+        found = found or _along(problem, kept, duration, until, path, "path")
+        if found is not None:
+            return found, tried
+    found, more = _search(problem, kept, duration, number, until, first=EARLY)
+    tried += more
+    patience = until - time.perf_counter()
+    if found is None and ompl and patience > 0.0:
+        try:
+            import_ompl()  # the time of the first import does not count
+        except ValueError:
+            return None, tried
+        other = path_around(problem.arm, ends, problem.obstacles, kept, patience)
+        if other is not None:
+            found = _along(problem, kept, duration, until, other, "ompl")
+    return found, tried
 
 
 def _refined(
@@ -623,30 +697,58 @@ def _refined(
     )  # fmt: skip
 
 
-def _along_path(problem: _Problem, kept: float, duration: float, until: float) -> MotionPlan | None:
-    """Return a movement along a path of OMPL, with as many via-points as it needs; None if there is none."""
-    patience = until - time.perf_counter()
-    if patience <= 0.0:
-        return None
-    try:
-        import_ompl()  # the time of the first import does not count
-    except ValueError:
-        return None
-    ends = np.ascontiguousarray(problem.space.joints(np.stack((problem.start, problem.goal))))
-    path = path_around(problem.arm, ends, problem.obstacles, kept, patience)
-    if path is None:
-        return None
-    for count in VIA_COUNTS:
-        points = problem.space.coordinates(points_on(path, count))
-        durations = np.asarray(primitives.passage_durations(points, 1.0))[None]
+def _along(
+    problem: _Problem, kept: float, duration: float, until: float, path: Float, source: str
+) -> MotionPlan | None:
+    """Return a movement along a path of joints, with as many via-points as it needs; None if there is none.
+
+    Fewer points of a free movement often make a smoother one.
+    """
+    for number in VIA_COUNTS:
+        points = problem.space.coordinates(points_on(path, number))
+        # Passage times of least jerk take longer to compute than all else, and leave narrow passages more often.
+        shares = np.sqrt(np.maximum(norm(np.diff(points, axis=0)), 1e-6))
+        durations = (shares / shares.sum())[None]
         tables = table_with(durations), table_with(durations, FINE_INSTANTS)
-        vias = points[None, 1:-1] - problem.start
-        _, found = _refined(problem, problem.setting(), kept, tables, vias, duration, until, smooth=0.0)
-        clearance = float(found.clearance[0])
-        if clearance >= kept:
-            movement = problem.movement(found.vias[0], tables[1], 0, duration)
-            return _known(problem, movement, "ompl", problem.least, clearance=clearance)
+        found = _moved(problem, kept, tables, points[1:-1], duration, until)
+        if found is None:
+            continue
+        for fewer in reversed(VIA_COUNTS[: VIA_COUNTS.index(number)]):
+            movement, _, cost = found
+            instants = np.linspace(0, FINE_INSTANTS - 1, fewer + 2).round().astype(np.int64)[1:-1]
+            points = movement.start + movement.table.basis[movement.times, instants] @ movement.offsets
+            tables = movement_table(fewer), fine_table(fewer)
+            other = _moved(problem, kept, tables, points, duration, until)
+            if other is not None and other[2] < cost:
+                found = other
+        movement, clearance, _ = found
+        return _known(problem, movement, source, problem.least, clearance=clearance)
     return None
+
+
+def _moved(
+    problem: _Problem,
+    kept: float,
+    tables: tuple[MovementTable, MovementTable],
+    vias: Float,
+    duration: float,
+    until: float,
+) -> tuple[Movement, float, float] | None:
+    """Return the movement through via-points, shape (K, D), after refinement, its clearance, [m], and its jerk cost.
+
+    None if it is not free. Many via-points are left where they are.
+    """
+    offsets = vias - problem.start
+    if len(vias) > MOST_REFINED:
+        movement = problem.movement(offsets, tables[1], 0, duration)
+        clearance = exact_clearance(problem.setting(), movement, problem.obstacles, kept)
+        cost = np.einsum("ij,id,jd->", tables[1].cost[0], movement.offsets, movement.offsets)
+        return (movement, clearance, float(cost)) if clearance >= kept else None
+    soon = min(until, time.perf_counter() + ALONG_TIME)
+    _, found = _refined(problem, problem.setting(), kept, tables, offsets[None], duration, soon, smooth=0.0)
+    clearance = float(found.clearance[0])
+    movement = problem.movement(found.vias[0], tables[1], int(found.times[0]), duration)
+    return (movement, clearance, float(found.cost[0])) if clearance >= kept else None
 
 
 def _timed(problem: _Problem, movement: Movement, least: float | None) -> tuple[float, Limits, str]:

@@ -504,6 +504,15 @@ def refine_seeds(
             apart = _clearance(setting, movement, obstacles, margin, NEARLY)
             if not NEARLY < apart < margin or clock() > end:
                 break
+        if apart < 0.0:
+            # The seed itself may have been free, in a passage that the refinement has left.
+            _copy(seeds[each], trial[:vias])
+            _copy(fixed, trial[vias:])
+            first, _ = best_times(table, trial, work.gram)
+            movement = Movement(table, first, start, trial, duration)
+            if is_free(setting, movement, obstacles, margin):
+                apart, times[0] = margin, first
+                _copy(trial, offsets[0])
         _copy(offsets[0, :vias], found.vias[each])
         found.times[each] = times[0]
         if apart < margin:
