@@ -114,7 +114,7 @@ def test_the_noise_is_not_that_which_the_fit_explains():
 )
 def test_samples_of_a_lost_marker_are_told_until_they_are_left_out(lost, value, jump):
     time = np.linspace(0.0, 1.0, 60)
-    good = through([[0.0, 0.0], [0.2, 0.1], [0.4, 0.0]], [0.4, 0.6])(time) + [0.2, 0.5]
+    good = through([[0.2, 0.5], [0.4, 0.6], [0.6, 0.5]], [0.4, 0.6])(time)
     bad = good.copy()
     bad[lost] = good[value] if value else 0.0  # held, or lost
     with pytest.warns(UserWarning, match=f"sample {jump} of movement 1, at "):
