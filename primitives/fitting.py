@@ -17,6 +17,7 @@ from itertools import combinations
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from .array_api import (
     Array,
@@ -42,9 +43,9 @@ _BEYOND = 0.25
 # Shortest segment, in durations of the movement: via-points closer in time cannot be told apart; least share of the
 # recording that the movement takes.
 _SHORTEST, _LEAST = 0.02, 1e-3
-# Distance of a sample from the middle of its neighbours that makes it an outlier, in their distance and in the extent
-# of nearly all samples.
-_APART = 2.0
+# Speed between samples that is a jump: in medians of the speeds around it, this number on either side, and in the speed
+# that crosses the extent once in the recording.
+_APART, _AROUND, _FAST = 8.0, 4, 10.0
 # Number of instants among which the first passage times are chosen.
 _GRID = 8
 # Numbers of the best starts that go on, and of their steps.
@@ -165,23 +166,25 @@ def fit_via_points(
         raise ValueError(f"free_ends must be True or False, got {free_ends!r}")
     movements, batch, kind = _recordings(time, position, 2 * counts[-1] + 5)
     fits = []
-    for times, positions in movements:
-        _warn_of_outliers(positions)
+    for i, (times, positions) in enumerate(movements):
+        _warn_of_jumps(times, positions, f" of movement {i}" if len(movements) > 1 else "")
         candidates = [_fit(times, positions, count, free_ends) for count in counts]
         fits.append(min(candidates, key=lambda fit: fit[-1]))  # the least BIC
     return _record(fits, batch, kind)
 
 
-def _warn_of_outliers(position: Floats) -> None:
-    """Warn of a sample that is far from both of its neighbours (N, D), which are near one another."""
-    away = np.abs(position[1:-1] - 0.5 * (position[2:] + position[:-2]))
-    low, high = np.quantile(position, (0.02, 0.98), axis=0)
-    wrong = np.argwhere(away > _APART * np.maximum(np.abs(position[2:] - position[:-2]), high - low))
-    if len(wrong):
-        sample, axis = wrong[0]
+def _warn_of_jumps(time: Floats, position: Floats, whose: str) -> None:
+    """Warn of a step between samples (N, D) that is much faster than those around it, as where a marker was lost."""
+    steps, gaps = np.linalg.norm(np.diff(position, axis=0), axis=-1), np.diff(time)
+    speeds = steps / np.maximum(gaps, np.median(gaps))  # clocks of recordings are not even
+    around = sliding_window_view(np.pad(speeds, _AROUND, mode="symmetric"), 2 * _AROUND + 1)
+    fast = _FAST * np.ptp(position, axis=0).max() / (time[-1] - time[0])
+    jumps = np.flatnonzero(speeds > np.maximum(_APART * np.median(around, axis=-1), fast))
+    if jumps.size:
+        first = jumps[0]
         warnings.warn(
-            f"sample {sample + 1} is {away[sample, axis]:.3g} m away from those beside it; leave out what was not "
-            "measured",
+            f"sample {first + 1}{whose}, at {time[first + 1]:g} s, is {steps[first]:.3g} m away from the one before; "
+            "leave out what was not measured",
             stacklevel=3,
         )
 

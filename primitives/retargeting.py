@@ -36,7 +36,8 @@ def retarget(
         time: (...,) present time on the trajectory's clock [s].
         goal: (..., D) new goal [m].
         arrival: (...,) new time of arrival on the trajectory's clock [s].
-        via: (..., D) via-point of the new movement, passed at its free passage time [m].
+        via: (..., D) the one via-point of the new movement, passed at its free passage time [m]; (K, D) makes a batch
+            of K movements.
         goal_velocity: (..., D) [m/s]; None = zero, FREE = the value of least cost.
         goal_acceleration: (..., D) [m/s^2]; likewise.
         freeze: remaining time to the old arrival [s] below which the old goal, arrival and final state are

@@ -113,7 +113,8 @@ def _ratio(xp: Namespace, numerator: Array, denominator: Array) -> Array:
 def dimensionless_jerk(trajectory: Trajectory) -> Array:
     """Return the dimensionless jerk (...,), integral |jerk|^2 dt duration^3 / peak speed^2; smaller is smoother.
 
-    The definition of Hogan & Sternad 2009, normalised by the peak speed. It is NaN where nothing moves.
+    The definition of Hogan & Sternad 2009, normalised by the peak speed. It is NaN where nothing moves. Jumps of the
+    acceleration do not count, such as those at the ends of a movement of order 2: compare movements of one order.
 
     Example:
         >>> from viapoint.primitives import dimensionless_jerk, point_to_point

@@ -28,6 +28,8 @@ from .array_api import (
 
 # Size of the basis of one block of trajectories, which stays in a core's second-level cache.
 _BLOCK_BYTES = 1_200_000
+# Roundings besides those of the sum of durations by which a time may lie outside the movement and count as inside.
+_ROUNDINGS = 4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -109,7 +111,8 @@ class Trajectory:
 
         Args:
             time: (T,) for all trajectories or (..., T) for each [s]; a single number gives (..., D). Before 0
-                and after the duration the end point is held at rest. A knot belongs to the segment that begins there.
+                and after the duration, but for rounding, the end point is held at rest. A knot belongs to the segment
+                that begins there.
             nu: order of the derivative, at least 0 (from 2 order on it is zero).
         """
         if isinstance(time, int | float):
@@ -151,6 +154,9 @@ class Trajectory:
         inside = (time >= 0) & (time <= end)
         if inside.all():
             return time, None
+        # The end is a sum of durations, so a total that was asked for may lie some roundings after it.
+        slack = (_ROUNDINGS + self.durations.shape[-1]) * float(xp.finfo(end.dtype).eps) * end
+        inside = (time >= -slack) & (time <= end + slack)
         return xp.minimum(xp.maximum(time, xp.zeros_like(time)), end), inside
 
     def floats(
@@ -259,7 +265,9 @@ class Trajectory:
 def require_trajectory(value: object) -> None:
     """Raise ValueError unless the value is a Trajectory."""
     if not isinstance(value, Trajectory):
-        raise ValueError(f"trajectory must be a viapoint.primitives.Trajectory, got {type(value).__name__}")
+        hint = "; give its attribute `trajectory`" if hasattr(value, "trajectory") else ""
+        name = type(value).__name__
+        raise ValueError(f"trajectory must be a viapoint.primitives.Trajectory, got {name}{hint}")
 
 
 def minimum_duration(

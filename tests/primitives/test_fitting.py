@@ -108,12 +108,18 @@ def test_the_noise_is_not_that_which_the_fit_explains():
     assert 0.0018 < math.sqrt(np.mean(squares)) < 0.0022
 
 
-def test_a_sample_far_from_its_neighbours_is_told():
+@pytest.mark.parametrize(
+    ("lost", "value", "jump"),
+    [(slice(0, 1), 0, 1), (slice(20, 21), 0, 20), (slice(20, 22), 0, 20), (slice(20, 32), 20, 32)],
+)
+def test_samples_of_a_lost_marker_are_told_until_they_are_left_out(lost, value, jump):
     time = np.linspace(0.0, 1.0, 60)
-    position = through([[0.0, 0.0], [0.2, 0.1], [0.4, 0.0]], [0.4, 0.6])(time)
-    position[20, 1] += 1.0
-    with pytest.warns(UserWarning, match="sample 20 "):
-        fit_via_points(time, position, 1)
+    good = through([[0.2, 0.5], [0.4, 0.6], [0.6, 0.5]], [0.4, 0.6])(time)
+    bad = good.copy()
+    bad[lost] = good[value] if value else 0.0  # held, or lost
+    with pytest.warns(UserWarning, match=f"sample {jump} of movement 1, at "):
+        fit_via_points(time, [good, bad], 1)
+    fit_via_points(np.delete(time, lost), np.delete(good, lost, axis=0), 1)
 
 
 @pytest.mark.parametrize("count", [5, 6, 7, 9, 10])

@@ -87,6 +87,16 @@ def test_limits_of_the_measures():
     assert vp.log_dimensionless_jerk(steady) == np.inf
 
 
+def test_a_recording_has_the_smoothness_of_its_movement():
+    movement, time = via_movement(0.3, 0.4), np.linspace(0.0, 1.0, 101)
+    recording = vp.through(movement(time), np.diff(time))
+    for measure in MEASURES:
+        np.testing.assert_allclose(measure(recording), measure(movement), rtol=1e-6)
+    np.testing.assert_allclose(vp.speed_peaks(recording).time, vp.speed_peaks(movement).time, atol=1e-6)
+    with pytest.raises(ValueError, match="its attribute `trajectory`"):
+        vp.log_dimensionless_jerk(vp.fit_via_points(time, movement(time), 1))
+
+
 @pytest.mark.parametrize("size", [1e-300, 1e-200, 1e-110, 1e110, 1e200, 1e300])
 def test_measures_hold_for_any_size(size):
     movement = via_movement(0.3, 0.5)

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.integrate import quad
 from scipy.interpolate import make_interp_spline
 
-from viapoint.primitives import minimum_duration, point_to_point, retarget, through
+from viapoint.primitives import minimum_duration, passage_durations, point_to_point, retarget, through
 
 
 def random_movement(rng, vias, order=3, batch=(), dimension=2):
@@ -113,6 +113,17 @@ def test_outside_the_movement_the_end_points_are_held_at_rest(rng):
     np.testing.assert_allclose(trajectory(outside), waypoints[[0, 0, -1, -1]], atol=1e-14)
     assert (trajectory(outside, 1) == 0).all()
     np.testing.assert_allclose(trajectory([end], 1)[0], ends["goal_velocity"], atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", [np, torch])
+def test_the_total_of_the_durations_is_not_after_the_end(kind, dtype, rng):
+    waypoints = kind.asarray(rng.normal(size=(300, 4, 2)).astype(dtype))
+    movement = through(waypoints, passage_durations(waypoints, 0.7))
+    assert (movement.duration != 0.7).any()
+    last, alone = movement([0.1, 0.7, 0.8], 3)[:, 1], movement(0.7, 3)
+    np.testing.assert_allclose(last, movement.sample(2, 3)[0][:, 1], rtol=1e4 * np.finfo(dtype).eps)
+    np.testing.assert_allclose(alone, last, rtol=1e4 * np.finfo(dtype).eps)
 
 
 @pytest.mark.parametrize("dimension", [1, 2, 3])

@@ -445,7 +445,9 @@ def test_a_file_gives_a_table_and_a_figure(tmp_path, capsys):
     np.testing.assert_allclose(around[["duration", "via1_time"]].astype(float), [1.0, 0.5], atol=0.02)
     assert table["via1_x"].isna().tolist() == [False, True]
     assert np.ptp(imread(folder / "fit.png")) > 0.5
+    assert "replaced" not in printed
     run("fit", file, "--out", folder, "--n-via", 0, 2)  # a folder of the command is written again
+    assert "fit.csv, replaced" in capsys.readouterr().out
     pd.testing.assert_frame_equal(pd.read_csv(folder / "fit.csv"), table)
 
 
@@ -457,8 +459,8 @@ def test_a_plane_movement_needs_no_other_columns_and_is_that_of_the_function(tmp
     written = pd.read_csv(tmp_path / "fit.csv").iloc[0]
     np.testing.assert_allclose(written[["via1_x", "via1_y"]].astype(float), fit.via_points[0], atol=1e-9)
     assert "via1_z" not in written
-    for format_ in ({"sep": ";", "decimal": ","}, {"sep": "\t"}):
-        table.assign(movement="1,5").to_csv(path, index=False, **format_)
+    for format_ in ({"sep": ";", "decimal": ","}, {"sep": "\t"}, {"sep": " "}):
+        table.assign(movement="1,5").rename(columns=str.title).to_csv(path, index=False, **format_)
         run("fit", path, "--out", tmp_path, "--n-via", 1, "--no-free-ends")
         again = pd.read_csv(tmp_path / "fit.csv", dtype={"movement": str}).iloc[0]
         assert again.pop("movement") == "1,5"
@@ -478,7 +480,25 @@ def test_other_units_than_seconds_and_metres_are_told(column, told, tmp_path, ca
 def test_the_most_via_points_are_told(most, told, tmp_path, capsys):
     recorded("time", "x", "y").to_csv(tmp_path / "one.csv", index=False)
     run("fit", tmp_path / "one.csv", "--out", tmp_path, "--n-via", 0, most)
-    assert ("the most allowed" in capsys.readouterr().err) == told
+    assert ("where samples were filtered" in capsys.readouterr().err) == told
+
+
+def test_movements_that_cannot_be_fitted_are_left_out_and_doubtful_ones_told(tmp_path, capsys):
+    good = recorded("time", "x", "y").assign(movement="good", trial=1)
+    xy, noise = ["x", "y"], np.random.default_rng(1).normal(0.0, 5e-4, (len(good), 2))
+    lost = good.assign(movement="lost")
+    lost.loc[40:43, xy] = 0.0
+    still = good.assign(movement="still", x=0.3, y=0.3)
+    noisy = good.assign(movement="noisy", x=noise[:, 0], y=noise[:, 1])
+    later = good.assign(time=good["time"] + 2.0)
+    parts = [still, good, lost, noisy, good.assign(movement="few")[:6], later]
+    pd.concat(parts).to_csv(tmp_path / "all.csv", index=False)
+    run("fit", tmp_path / "all.csv", "--out", tmp_path)
+    told = capsys.readouterr().err
+    assert list(pd.read_csv(tmp_path / "fit.csv")["movement"]) == ["good", "lost", "noisy"]
+    words = ["still is left out", "few is left out", "lost: sample 40,", "noisy: the fit explains"]
+    for each in (*words, f"good begins again in line {4 * len(good) + 8}", "not read: trial;"):
+        assert each in told
 
 
 TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
@@ -496,7 +516,8 @@ TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
             ["t;px;py", "0.0;0.1;0.2"],
             "must name the columns time, x, y, and optionally z and movement, got t, px, py",
         ),
-        ([TABLE[0], *(f"{-time},0.1,0.2" for time in range(12))], "goes back in time in line 3"),
+        ([TABLE[0], *(f"{-time},0.1,0.2" for time in range(12))], "equal time in line 3"),
+        ([*TABLE[:3], TABLE[2]], "equal time in line 4"),
         ([*TABLE, *TABLE[1:]], "add a column `movement`"),
         (["time,x,y", "s,m,m", *TABLE[1:]], "leave out lines of units"),
         (["# arm 1", *TABLE], "first line must name the columns"),

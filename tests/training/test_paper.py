@@ -22,11 +22,15 @@ FEWER = 9
 def made(tmp_path_factory):
     """The folder that the command wrote, with fewer scenes in row 12."""
     out = tmp_path_factory.mktemp("paper")
-    every = obstacles.light_scenes
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(obstacles, "light_scenes", lambda rows: every(rows).take(slice(None, None, FEWER)))
+        look_at_fewer_scenes(patch)
         cli.main(["paper", "--out", str(out)])
     return out
+
+
+def look_at_fewer_scenes(patch):
+    every = obstacles.light_scenes
+    patch.setattr(obstacles, "light_scenes", lambda rows: every(rows).take(slice(None, None, FEWER)))
 
 
 def claims_of(folder):
@@ -81,6 +85,12 @@ def test_a_failed_claim_ends_the_command_with_code_1(tmp_path, monkeypatch, caps
     assert end.value.code == 1
     assert "row 1, too much" in capsys.readouterr().err
     assert json.loads((tmp_path / "table.json").read_text())["holds"] is False
+
+
+def test_the_agent_for_static_obstacles_meets_the_claims_of_the_search(monkeypatch):
+    look_at_fewer_scenes(monkeypatch)
+    claims = obstacles.obstacle_claims(obstacles.light_movements("viapoint/PlanarObstacles-v0"))
+    assert [claim for claim in claims if not claim.holds] == []
 
 
 def test_the_construction_is_undone():

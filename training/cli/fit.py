@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ EXPECTED = "its first line must name the columns time, x, y, and optionally z an
 COORDINATES = ("x", "y", "z")  # Names of the coordinates; z may be left out
 # Distances of samples, [s], and extents of movements, [m], above which the units are probably others
 SLOW, WIDE = 0.5, 5.0
+POOR = 0.9  # R^2 below which the samples are hardly those of one movement
 DRAWN = 6  # Greatest number of movements in the figure
 
 Fits = dict[str, ViaPointFit]  # Fits by the names of the movements
@@ -36,19 +38,26 @@ def run(config: FitConfig) -> None:
     check_ours(figure)
     if table.exists() and not figure.exists():
         raise BadFileError(table, "exists and was not written by viapoint; name another folder")
+    again = table.exists()
     movements = read_movements(config.file)
     fits: Fits = {}
-    for name, (time, position) in movements.items():
+    for name, (time, position) in list(movements.items()):
         try:
-            fits[name] = fit_via_points(time, position, config.numbers, free_ends=config.free_ends)
+            with warnings.catch_warnings(record=True, action="always") as told:
+                fits[name] = fit_via_points(time, position, config.numbers, free_ends=config.free_ends)
         except ValueError as error:
-            raise BadFileError(config.file, f"movement {name}: {error}") from None
+            if len(movements) == 1:
+                raise BadFileError(config.file, f"movement {name}: {error}") from None
+            del movements[name]
+            print(f"movement {name} is left out: {error}", file=sys.stderr)
+        for each in told:
+            print(f"movement {name}: {each.message}", file=sys.stderr)
     _warn(movements, fits, config)
     print(_printed(fits))
     fitted_movements(figure, dict(itertools.islice(movements.items(), DRAWN)), fits)
     write_bytes(table, _written(fits).to_csv(index=False).encode())
     shown = "" if len(movements) <= DRAWN else f" of the first {DRAWN} movements"
-    print(f"\ntable: {table}\nfigure{shown}: {figure}")
+    print(f"\ntable: {table}{', replaced' if again else ''}\nfigure{shown}: {figure}")
 
 
 def read_movements(path: Path) -> Movements:
@@ -66,19 +75,27 @@ def read_movements(path: Path) -> Movements:
         entry = table[names].fillna("nothing").iloc[row, column]
         reason = f"has no number in line {table.index[row]}, column {names[column]}: {entry}"
         raise BadFileError(path, f"{reason}; leave out lines of units, and those that were not measured")
+    unread = [name for name in table.columns.dropna() if name not in (*REQUIRED, "z", "movement")]
+    if unread:
+        told = "the column `movement` names the movement of each line"
+        print(f"columns that are not read: {', '.join(unread)}; {told}", file=sys.stderr)
     labels = table["movement"].str.strip() if "movement" in table else pd.Series("1", index=table.index)
     if labels.isna().any():
         raise BadFileError(path, f"names no movement in line {labels.isna().idxmax()}")
+    begins = labels[labels != labels.shift()]
+    again = begins[begins.duplicated()]
+    if len(again):
+        told = "if it is another movement, give it another name"
+        print(f"movement {again.iloc[0]} begins again in line {again.index[0]}; {told}", file=sys.stderr)
     movements: Movements = {}
     for label, rows in numbers.groupby(labels, sort=False):
         values = rows.to_numpy(dtype=float)
-        back = np.flatnonzero(np.diff(values[:, 0]) < 0.0)
+        back = np.flatnonzero(np.diff(values[:, 0]) <= 0.0)
         if back.size:
-            reason = f"goes back in time in line {rows.index[back[0] + 1]}; if another movement begins there"
-            advice = (
-                "add a column `movement` with the name of the movement of each line, otherwise sort the lines"
-            )
-            raise BadFileError(path, f"{reason}, {advice}")
+            reason = f"has an earlier or equal time in line {rows.index[back[0] + 1]}; if another movement begins there"
+            advice = "add a column `movement` with the name of the movement of each line"
+            otherwise = "otherwise sort the lines, and keep one of equal times"
+            raise BadFileError(path, f"{reason}, {advice}, {otherwise}")
         movements[str(label)] = values[:, 0], values[:, 1:]
     if not movements:
         raise BadFileError(path, "holds no samples")
@@ -95,9 +112,14 @@ def _warn(movements: Movements, fits: Fits, config: FitConfig) -> None:
             print(f"movement {name}: samples are {gap:g} s apart; `time` is in seconds", file=sys.stderr)
         if extent > WIDE:
             print(f"movement {name}: the hand moves {extent:g} m; positions are in metres", file=sys.stderr)
+        if fits[name].r_squared < POOR:
+            share = f"{float(fits[name].r_squared):.0%} of the variance"
+            print(f"movement {name}: the fit explains only {share}; is it one movement?", file=sys.stderr)
         if fewest < most == fits[name].n_via:
-            told = "see whether more fit better (--n-via), and cut a recording of several movements"
-            print(f"movement {name}: {most} via-points, the most allowed, fit best; {told}", file=sys.stderr)
+            found = f"movement {name}: {most} via-points, the most allowed, fit best"
+            told = "too many where samples were filtered: fit unfiltered ones, or give the number (--n-via 1)"
+            otherwise = "otherwise cut a recording of several movements, and allow more"
+            print(f"{found}; {told}; {otherwise}", file=sys.stderr)
 
 
 def _read_table(path: Path) -> pd.DataFrame:
@@ -109,16 +131,16 @@ def _read_table(path: Path) -> pd.DataFrame:
         text = content.decode("utf-8-sig")
         begun = text.lstrip()
         file = io.StringIO(begun)
-        separator = next((each for each in ";\t" if each in begun.partition("\n")[0]), ",")
+        separator = next((each for each in ";\t, " if each in begun.partition("\n")[0]), ",")
         table = pd.read_csv(
             file, sep=separator, header=None, dtype=str, skipinitialspace=True, skip_blank_lines=False
         )
     except ValueError as error:
-        reason = f"cannot be read as CSV in UTF-8 ({str(error).strip()})"
-        raise BadFileError(path, f"{reason}; {EXPECTED}, separated by commas or semicolons") from None
+        reason = str(error).rpartition("C error: ")[2].strip()  # of pandas, without its own words
+        raise BadFileError(path, f"cannot be read as a table: {reason}; {EXPECTED}") from None
     blank_lines = text[: len(text) - len(begun)].count("\n")
     table.index += 1 + blank_lines
-    head = table.iloc[0].str.strip()
+    head = table.iloc[0].str.strip().str.lower()
     twice = [name for name in ("time", *COORDINATES, "movement") if (head == name).sum() > 1]
     if twice:
         raise BadFileError(path, f"has several columns {twice[0]}")

@@ -132,7 +132,7 @@ def obstacle_claims(avoidance: ObstacleMovements) -> list[Claim]:
               lambda f: f.residual.mean(), near(0.0, 0.02)),
         claim("The same: standard deviation", ".02", lambda f: f.residual.std(ddof=0), at_most(0.04)),
         claim("The same: slope over d1/(d1+d2); it has a trend, in the model as on the arm", "no trend",
-              lambda f: f.along.cov(f.residual) / f.along.var(), near(0.035, 0.015)),
+              lambda f: f.along.cov(f.residual) / f.along.var(), at_least(0.005)),
         claim("Distance from the model through the point of greatest curvature / distance of the targets: median",
               "close match", lambda f: 100 * f.apart.median(), at_most(5.0), "%"),
         Claim(12, f"Time scaling: every movement again in 1.1 s and .85 s: greatest distance of the paths ({who})",

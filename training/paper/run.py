@@ -68,7 +68,7 @@ DRAWINGS: dict[str, tuple[str, Callable[..., Figure]]] = {
     "fig11_scaling": ("The same three points in 1.1 s and 0.85 s (Fig. 11).",
         partial(figures.pair, (*ENDS, *THREE_POINTS, SLOW), (*ENDS, *THREE_POINTS, FAST),
             (f"{SLOW} s", f"{FAST} s"))),
-    "valleys": ("Where there is a speed valley at all (A), and how much later the curvature has its peak (B).",
+    "valleys": ("Where there is a speed valley at all (A), and how much later the curvature has its peak (B; d1 < d2).",
         figures.valleys),
     "alternatives": ("Least acceleration, jerk and snap (A, B); least jerk of the hand (C) and of the joints "
         "(D).", figures.orders_and_spaces),
