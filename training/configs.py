@@ -335,8 +335,8 @@ class EvaluateConfig(AgentConfig):
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
     refine: tuple[int, ...] = ()  # Numbers of proposals that the planner refines, one further row each.
     scenes: str = "test"
-    """Scene set: validation, test, hard, uniform, or a scene file; motionbenchmaker for the problems of that benchmark,
-    on which planners are measured: straight, plan_motion, plan_motion+ompl, ompl, search512."""
+    """Scene set: validation, test, hard, uniform, or an .npz file of scenes; motionbenchmaker for the problems of that
+    benchmark, on which planners are measured: straight, plan_motion, plan_motion+ompl, ompl, search512."""
     problems: Path | None = None
     """Folder of MotionBenchMaker's own files, in place of the problems that are shipped; with --arm, for the joints of
     that arm, by their names."""
@@ -376,7 +376,7 @@ class PlayConfig(AgentConfig):
     """
 
     video: Path = Path("movements.mp4")  # MP4 file to write.
-    scenes: str = "test"  # Scene set: validation, test, hard, uniform, or a scene file.
+    scenes: str = "test"  # Scene set: validation, test, hard, uniform, or an .npz file.
     n_scenes: int = 8  # Number of scenes, evenly spread over the set.
     checks: int = 0  # Number of proposals that the agent checks with exact geometry; 0 for none.
 
@@ -411,6 +411,8 @@ class RecordConfig(AgentConfig):
 class PlanConfig(Config):
     """Plan a smooth movement of an arm around known obstacles.
 
+    With --arm alone, the joints, limits, tool and home of the arm are printed.
+
     Example: viapoint plan --arm panda --position 0.5 0.3 0.4 --out plan.csv
     """
 
@@ -428,7 +430,7 @@ class PlanConfig(Config):
     """Names of its joints from the base to the tool; by default all of the chain."""
     base: str = ""  # Body that the chain begins at, where a file has two arms.
     packages: tuple[Path, ...] = ()  # Folders for package:// in a URDF.
-    velocity_limit: float | None = None  # Velocity limit of its joints, [rad/s]; by default that of the file.
+    velocity_limit: float | None = None  # Velocity limit of joints, [rad/s], slides [m/s]; else the file's.
     n_via: int = 2  # Number of via-points, 1 to 3.
     margin: float = 0.0  # Least clearance, [m].
     duration: float | None = None  # Duration, [s]; by default the shortest that the limits allow.

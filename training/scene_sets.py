@@ -215,7 +215,7 @@ def _read(path: Path, name: str) -> dict[str, NDArray[Any]]:
         content["kind"] = content["kind"].astype(np.int64)
         _check_content(content)
     except Exception as error:  # an archive can be broken in any of its layers
-        raise ValueError(f"{path} is not a file of scenes: {error or type(error).__name__}") from None
+        raise ValueError(f"{path} is not an .npz file of scenes: {error or type(error).__name__}") from None
     return content
 
 

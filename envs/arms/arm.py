@@ -187,7 +187,7 @@ def arm_from_xml(
             reason = f"in contact in none of {COMPARED:,} configurations"
             left_out.append(LeftOut(names[first], names[second], reason))
     spheres = spheres._replace(pairs=spheres.pairs[kept])
-    inertia = _greatest_inertia(data, joints, ranges)
+    inertia = greatest_inertia(data, joints, ranges)
     # Much damping makes a joint as slow to return as much inertia does.
     inertia = np.maximum(inertia, 0.5 * chain.damping / bandwidth)
     stiffness = inertia * bandwidth**2
@@ -375,7 +375,7 @@ def _add_actuators(spec: mujoco.MjSpec, arm: Arm) -> None:
             servo.forcerange = -arm.torque_limit[j], arm.torque_limit[j]
 
 
-def _greatest_inertia(data: mujoco.MjData, joints: Sequence[str], ranges: Float) -> Float:
+def greatest_inertia(data: mujoco.MjData, joints: Sequence[str], ranges: Float) -> Float:
     """Return the greatest inertia that each joint sees in some configurations, shape (J,), [kg m^2] or [kg]."""
     model = data.model
     low, high = ranges.T

@@ -83,9 +83,9 @@ def choose_tool(model: mujoco.MjModel, given: Any, base: str | None, notes: list
         tool = _named(name, bodies)
         tool = tool._replace(position=finite_array("tool", point, (3,)), name=f"a point of {name!r}")
     else:
-        tool = _usual_tool(model, sites, bodies, root, notes) or _tip(model, bodies, root)
+        tool = _usual_tool(model, sites, bodies, root, notes) or _tip(model, sites, bodies, root)
     if root not in (tool.body, *ancestors(model, tool.body)):
-        raise ValueError(f"the tool {tool.name!r} is not carried by base={base!r}; name one of both")
+        raise ValueError(f"the tool {tool.name!r} is not carried by the base {base!r}; name one of both")
     return tool
 
 
@@ -143,10 +143,10 @@ def _usual_tool(
     rivals += [part.name for part in apart if part.name not in inner]
     if rivals:
         listed = ", ".join(dict.fromkeys([tool.name, *rivals]))
-        raise ValueError(f"there are several tools: {listed}; name one with tool=, or a side with base=")
+        raise ValueError(f"there are several tools: {listed}; name one with tool=")
     if inner:
         notes.append(
-            f"{WARNING}the tool is {tool.name!r}, but could be {', '.join(inner)}: name it with tool="
+            f"{WARNING}the tool is {tool.name!r}, but could be {', '.join(inner)}; name it with tool="
         )
     return tool
 
@@ -188,9 +188,9 @@ def arm_joints(model: mujoco.MjModel, chain: list[str], notes: list[str]) -> lis
             moving, arms = _branches(model, body)
             if len(moving) > 1 and not arms:
                 fingers.add(name)
-    for some, what in ((mobile, "which seem to move a mobile base"), (fingers, "which seem to move fingers")):
+    for some, what in ((mobile, "a mobile base"), (fingers, "fingers")):
         if some:
-            notes.append(f"fixed: {', '.join(sorted(some))}, {what}")
+            notes.append(f"fixed: {', '.join(sorted(some))}, taken for {what}")
     return [name for name in chain if name not in mobile | fingers]
 
 
@@ -208,12 +208,12 @@ def ancestors(model: mujoco.MjModel, body: int) -> list[int]:
     return found
 
 
-def _tip(model: mujoco.MjModel, bodies: list[Tool], root: int) -> Tool:
+def _tip(model: mujoco.MjModel, sites: list[Tool], bodies: list[Tool], root: int) -> Tool:
     """Return the tip of the last link of the longest chain of joints, before it branches into fingers.
 
-    It is the only frame without geoms on the link, its flange. Elsewhere it is on an axis of the link's frame, as far
-    away as geoms of the link reach: on the axis, and to the side, where their bounding box has its centre farthest off.
-    Where this box is centred, it is the frame itself.
+    It is the only site on the link, or else the only frame without geoms, its flange. Elsewhere it is on an axis of the
+    link's frame, as far away as geoms of the link reach: on the axis, and to the side, where their bounding box has its
+    centre farthest off. Where this box is centred, it is the frame itself.
 
     Raises:
         ValueError: There are several arms, or no chain.
@@ -233,6 +233,9 @@ def _tip(model: mujoco.MjModel, bodies: list[Tool], root: int) -> Tool:
             break
     if len(chain_joints(model, body, root)) < 2:
         raise ValueError("no chain of two or more hinges and slides leads to a tool; name one with tool=")
+    own = [site for site in sites if model.body_weldid[site.body] == model.body_weldid[body]]
+    if len(own) == 1:
+        return own[0]._replace(name=f"the site {own[0].name!r} of {bodies[body - 1].name!r}")
     flange = body
     while not moving:
         frames = [each for each in _children(model, flange) if not model.body_geomnum[each]]

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.arm import HIDDEN_GROUP, Arm, arm_from_xml, asset, move
+from viapoint.envs.arms.arm import HIDDEN_GROUP, Arm, arm_from_xml, asset, greatest_inertia, move
 from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
 from viapoint.envs.arms.choices import (
     GROUNDS,
@@ -32,7 +32,7 @@ from viapoint.envs.arms.choices import (
     known_limits,
 )
 from viapoint.envs.arms.kinematics import torques
-from viapoint.envs.arms.stored import cached_arm
+from viapoint.envs.arms.stored import cached_arm, read_arm
 from viapoint.envs.arms.urdf import WARNING, Packages, Urdf, read_urdf
 from viapoint.envs.common.arrays import Float, frame_matrices
 from viapoint.envs.common.validation import finite_array, number_of_at_least
@@ -42,8 +42,8 @@ HOMES = 64  # Number of random configurations among which a home is looked for
 INSET = 0.1  # Least distance of home from the joint limits, as a share of the ranges
 LEAST_GAP = 0.002  # Distance of bodies at home below which another home is looked for, [m]
 DEFAULT_VELOCITY_LIMIT = 2.0  # Velocity limit of joints without one, [rad/s] or [m/s]
-WEIGHTS, LEAST_TORQUE = 3.0, 1.0
-"""Torque limit of joints without one, as a multiple of the torque that gravity needs, and at least, [N m] or [N]."""
+WEIGHTS, ACCELERATION, LEAST_TORQUE = 3.0, 5.0, 1.0
+"""Torque limit of joints without one: multiple of what gravity needs, acceleration [rad/s^2], and least one, [N m]."""
 WEIGHED = 200  # Number of configurations in which the arm is weighed
 # Numbers of configurations in which bodies that are always near are looked for, and contacts of these
 LOOKED_AT, NEAR_LOOKED_AT = 16, 1000
@@ -111,7 +111,8 @@ def load_arm(
     The arm keeps the file's joints, inertias, damping and limits, and the spheres and capsules of its bodies. Capsules
     cover the other geoms: nothing sticks out of them. Other joints are fixed as in the file's first keyframe. The base
     is what is fixed to the world and carries the arm; everything else is left out. `arm.notes` tells what was chosen
-    where no argument was given. The arm is stored in a cache folder, so that it loads faster the next time.
+    where no argument was given. The arm is stored in a cache folder, so that it loads faster the next time. A file of
+    :func:`write_arm` is the arm that was written; of the choices, only limits and name may be given anew.
 
     Args:
         file: MJCF or URDF file, the text of an MJCF file, or a specification.
@@ -127,9 +128,9 @@ def load_arm(
         joint_range: Lowest and highest position of each joint, shape (J, 2); by default those of the file, and +-pi for
             continuous joints.
         torque_limit: Torque limit of each joint or of all; by default those of the file's joints or actuators, those of
-            a well-known arm, or several times the arm's weight with a warning.
+            a well-known arm, or what the arm's weight and inertia need with a warning.
         velocity_limit: Velocity limit of each joint or of all; by default that of the URDF, the file's custom number of
-            that name, that of a well-known arm, or 2 with a warning.
+            that name, that of a well-known arm, or 2 with a warning. Limits above those of the file are warned of, too.
         tolerance: Greatest distance by which the capsules that cover a geom reach beyond it, 0.005 or more, [m]; where
             that takes too many, and for large geoms of the base, they reach farther. `arm.excess` tells how far.
 
@@ -144,8 +145,10 @@ def load_arm(
         (('shoulder_pan', 'shoulder_lift', 'elbow'), "tool: 'hand'")
     """
     folders = (packages,) if isinstance(packages, str | Path) else tuple(packages)
+    written = read_arm(file)
     spec, own_name, urdf = _read(file, folders)
-    name = own_name if name is None else name
+    usual = own_name if written is None else written.name
+    name = usual if name is None else name
     if not isinstance(name, str) or not name:
         raise ValueError(f"name must be a string of one or more characters, got {name!r}")
     given = {
@@ -163,11 +166,32 @@ def load_arm(
     whole = _compiled(spec, notes)
     arguments = {**given, "name": name, "notes": notes, "urdf": urdf[3:]}
     known_as = f"{name} {spec.modelname}"
-    arm = cached_arm(whole, arguments, lambda: _load(whole, name, known_as, urdf, notes, given))
+    if written is None:
+        arm = cached_arm(whole, arguments, lambda: _load(whole, name, known_as, urdf, notes, given))
+    else:
+        arm = _with_limits(replace(written, name=name), given)
+    weak = np.abs(torques(arm.chain, arm.home, np.zeros(1), np.zeros(1))) > arm.torque_limit
+    if given["torque_limit"] is not None and weak.any():
+        some = ", ".join(itertools.compress(arm.joint_names, weak))
+        raise ValueError(f"torque limits of {some} do not hold the arm's weight at home; raise torque_limit")
     for note in arm.notes:
-        if note.startswith(WARNING):
+        if note.startswith(WARNING) and (written is None or note not in written.notes):
             warnings.warn(note.removeprefix(WARNING), stacklevel=2)
     return arm
+
+
+def _with_limits(arm: Arm, given: Mapping[str, Any]) -> Arm:
+    """Return an arm that :func:`write_arm` wrote, with given limits; other choices raise ValueError."""
+    for name in ("tool", "joints", "base", "home", "origin", "joint_range"):
+        if given[name] is not None:
+            raise ValueError(f"leave out {name}=, write_arm wrote this file: it is a whole arm")
+    limits: dict[str, Any] = {}
+    notes = list(arm.notes)
+    for name, own in (("torque_limit", arm.torque_limit), ("velocity_limit", arm.velocity_limit)):
+        if given[name] is not None:
+            notes = [note for note in notes if name.replace("_", " ") not in note]
+            limits[name] = _given_limits(name, given[name], own, arm.joint_names, notes)
+    return replace(arm, notes=tuple(notes), **limits)
 
 
 def _load(
@@ -189,10 +213,7 @@ def _load(
         raise ValueError(f"joints: {error.args[0]}") from None
     ranges = _ranges(whole, names, given["joint_range"], notes)
     velocity = _velocities(whole, names, given["velocity_limit"], urdf.velocity_limits, known_as, notes)
-    torque = _torques(whole, names, given["torque_limit"], known_as, notes)
-    for what, limit in (("torque_limit", torque), ("velocity_limit", velocity)):
-        if not (limit > 0.0).all():
-            raise ValueError(f"{what} must be positive, got {limit}")
+    torque = _torques(whole, names, ranges, given["torque_limit"], known_as, notes)
     dofs = whole.jnt_dofadr[numbers]
     # Models that are moved by other means than motors have such damping.
     stuck = whole.dof_damping[dofs].reshape(len(names), -1)[:, 0] * velocity > STUCK * torque
@@ -243,12 +264,8 @@ def _load(
     )
     weight = np.abs(torques(arm.chain, home, np.zeros(1), np.zeros(1)))
     weak = weight > torque
-    if weak.any():  # a spring or a counterweight may bear it, which the file does not have
+    if weak.any() and given["torque_limit"] is None:  # a spring that the file lacks may bear it
         some = ", ".join(itertools.compress(names, weak))
-        if given["torque_limit"] is not None:
-            raise ValueError(
-                f"torque limits of {some} do not hold the arm's weight at home; raise torque_limit"
-            )
         notes.append(
             f"{WARNING}torque limits of {some}: {WEIGHTS:g} times the weight at home, which those of the file do not "
             "hold; give torque_limit"
@@ -393,10 +410,22 @@ def _ranges(model: mujoco.MjModel, joints: Names, given: Any, notes: list[str]) 
     return np.where(endless[:, None], (-np.pi, np.pi), model.jnt_range[numbers])
 
 
-def _torques(model: mujoco.MjModel, joints: Names, given: Any, arm: str, notes: list[str]) -> Float:
+def _given_limits(name: str, given: Any, own: Float, joints: Names, notes: list[str]) -> Float:
+    """Return given limits of joints, shape (J,); a note tells those above the file's own, which are 0 for none."""
+    limits = _per_joint(name, given, joints)
+    if not (limits > 0.0).all():
+        raise ValueError(f"{name} must be positive, got {limits}")
+    above = (own > 0.0) & (limits > own)
+    if above.any():
+        some = ", ".join(itertools.compress(joints, above))
+        notes.append(f"{WARNING}{name} is greater than that in the file, {own[above]}, of {some}")
+    return limits
+
+
+def _torques(
+    model: mujoco.MjModel, joints: Names, ranges: Float, given: Any, arm: str, notes: list[str]
+) -> Float:
     """Return the torque limit of each joint, its own, or the greatest of the actuators that drive it."""
-    if given is not None:
-        return _per_joint("torque_limit", given, joints)
     found = np.zeros(len(joints))
     for i, name in enumerate(joints):
         joint = model.joint(name).id
@@ -406,12 +435,15 @@ def _torques(model: mujoco.MjModel, joints: Names, given: Any, arm: str, notes: 
         drives = np.isin(model.actuator_trntype, JOINT_TRANSMISSIONS) & (model.actuator_trnid[:, 0] == joint)
         for index in np.flatnonzero(drives):
             found[i] = max(found[i], _actuator_torque(model, int(index)))
+    if given is not None:
+        return _given_limits("torque_limit", given, found, joints, notes)
     known = known_limits(KNOWN_TORQUES, arm, len(joints))
-    weight: Any = 0.0
+    needed: Any = 0.0
     if known is None and (found <= 0.0).any():
-        weight = np.maximum(WEIGHTS * _greatest_weight(model, joints), LEAST_TORQUE)
-    how = f"{WEIGHTS:g} times what the arm's weight needs"
-    return _completed("torque", joints, found, known, weight, how, notes)
+        needed = ACCELERATION * greatest_inertia(mujoco.MjData(model), joints, ranges)
+        needed = np.maximum(needed, WEIGHTS * _greatest_weight(model, joints)).clip(LEAST_TORQUE)
+    how = f"{WEIGHTS:g} times what the arm's weight needs, at least enough for {ACCELERATION:g} rad/s^2 (slides m/s^2)"
+    return _completed("torque", joints, found, known, needed, f"{how}; give torque_limit", notes)
 
 
 def _completed(
@@ -423,7 +455,7 @@ def _completed(
     if some and known is not None:
         notes.append(f"{what} limits: those of the arm of this name")
     elif some:
-        notes.append(f"{WARNING}the file has no {what} limits of {some}; they get {how}; give {what}_limit")
+        notes.append(f"{WARNING}the file has no {what} limits of {some}; they get {how}")
     return np.where(missing, default if known is None else known, limits)
 
 
@@ -460,12 +492,14 @@ def _velocities(
     model: mujoco.MjModel, joints: Names, given: Any, in_urdf: dict[str, float], arm: str, notes: list[str]
 ) -> Float:
     """Return the velocity limit of each joint, shape (J,)."""
-    if given is None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
-        given = model.numeric("velocity_limit").data
-    if given is not None:
-        return _per_joint("velocity_limit", given, joints)
     found = np.array([in_urdf.get(name, 0.0) for name in joints])
-    how = f"{DEFAULT_VELOCITY_LIMIT:g} rad/s (slides {DEFAULT_VELOCITY_LIMIT:g} m/s)"
+    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
+        own = model.numeric("velocity_limit").data
+        if given is None or len(own) in (1, len(joints)):
+            found = _per_joint("velocity_limit", own, joints)
+    if given is not None:
+        return _given_limits("velocity_limit", given, found, joints, notes)
+    how = f"{DEFAULT_VELOCITY_LIMIT:g} rad/s (slides m/s); give velocity_limit="
     known = known_limits(KNOWN_VELOCITIES, arm, len(joints))
     return _completed("velocity", joints, found, known, DEFAULT_VELOCITY_LIMIT, how, notes)
 

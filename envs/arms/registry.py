@@ -12,7 +12,6 @@ import numpy as np
 
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
 from viapoint.envs.arms.load import load_arm
-from viapoint.envs.arms.stored import read_arm
 
 ARM_FILES = (".xml", ".mjcf", ".urdf")  # Suffixes of files of arms
 
@@ -116,7 +115,7 @@ def arm_of(arm: Any) -> Arm:
 def _of_file(path: Path, changed: int) -> Arm:
     """Return the arm of a file, which was last changed at some time."""
     try:
-        arm = read_arm(path) or load_arm(path)
+        arm = load_arm(path)
     except ValueError as error:
         raise ValueError(f"{error}; give arguments to load_arm, and keep its arm with write_arm") from None
     return dataclasses.replace(arm, file=str(path))

@@ -48,17 +48,17 @@ def with_kept_arm(env_kwargs: Mapping[str, Any], folder: Path) -> dict[str, Any]
 
 
 def write_arm(path: str | Path, arm: Arm) -> None:
-    """Write an arm as a self-contained MJCF file, which is the same arm for :func:`arm_of`, `arm=` and `--arm`.
+    """Write an arm as a self-contained MJCF file, the same arm for :func:`load_arm`, `arm=` and `--arm`.
 
     Its geoms are the capsules that collide; visual meshes are left out.
 
     Example:
         >>> import tempfile
         >>> from pathlib import Path
-        >>> from viapoint.envs import arm_of, write_arm
+        >>> from viapoint.envs import arm_of, load_arm, write_arm
         >>> file = Path(tempfile.mkdtemp()) / "arm.xml"
         >>> write_arm(file, arm_of("planar"))  # or an arm of load_arm, which may have needed arguments
-        >>> arm_of(file).joint_names
+        >>> load_arm(file).joint_names
         ('shoulder', 'elbow')
     """
     choices: dict[str, Any] = {"name": arm.name, "joints": arm.joint_names}
@@ -74,9 +74,12 @@ def _element(choices: str) -> str:
     return f"<custom><text name={quoteattr(MARK)} data={quoteattr(choices)}/></custom>"
 
 
-def read_arm(path: Path) -> Arm | None:
-    """Return the arm of a file of :func:`write_arm`; None for all other files."""
-    text = path.read_text(encoding="utf-8", errors="replace")
+def read_arm(file: Any) -> Arm | None:
+    """Return the arm of a file of :func:`write_arm`, or of its text; None for everything else."""
+    text = str(file)
+    if not text.lstrip().startswith("<"):
+        path = Path(text).expanduser()
+        text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     if MARK not in text:
         return None
     mark = ET.fromstring(text).find(f"custom/text[@name='{MARK}']")

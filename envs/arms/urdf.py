@@ -66,16 +66,20 @@ def read_urdf(path: Path, packages: Packages, visual: bool = False) -> Urdf:
             root.remove(element)
     velocity = {}
     unseen: list[str] = []
+    left_out: dict[str, list[str]] = {}  # Names of links by the faults of their collision geoms
     find = functools.partial(_find, path, packages)
     for element in (*root.findall("link"), *root.findall("joint")):
         name = element.get("name", "")
         try:
             if element.tag == "link":
-                unseen += _prepare_link(element, find, assets, visual, notes)
+                _mend_inertia(element, notes)
+                unseen += _prepare_link(element, find, assets, visual, left_out)
             else:
                 velocity[name] = _prepare_joint(element, notes)
         except ValueError as error:
             raise ValueError(f"{path.name}, {element.tag} {name!r}: {error}") from None
+    for fault, links in left_out.items():
+        notes.append(f"{WARNING}collision geoms are left out, of {', '.join(dict.fromkeys(links))}: {fault}")
     extension = root.find("mujoco")
     if extension is None:
         extension = ET.SubElement(root, "mujoco")
@@ -131,10 +135,9 @@ def _prepare_joint(joint: ET.Element, notes: list[str]) -> float:
 
 
 def _prepare_link(
-    link: ET.Element, find: Find, assets: dict[str, bytes], visual: bool, notes: list[str]
+    link: ET.Element, find: Find, assets: dict[str, bytes], visual: bool, left_out: dict[str, list[str]]
 ) -> list[str]:
-    """Mend the inertia of a link, leave out geoms that cannot be used, and return the faults of visual ones."""
-    _mend_inertia(link, notes)
+    """Leave out geoms of a link that cannot be used, and return the faults of visual ones."""
     faults = []
     for part in (*link.findall("visual"), *link.findall("collision")):
         collides = part.tag == "collision"
@@ -145,7 +148,7 @@ def _prepare_link(
                 raise
             fault = str(error)
         if fault and collides:
-            notes.append(f"{WARNING}a collision geom of {link.get('name')} is left out: {fault}")
+            left_out.setdefault(fault, []).append(link.get("name", ""))
         elif fault:
             faults.append(fault)
         if fault or not (collides or visual):
@@ -188,8 +191,8 @@ def _prepared(geometry: ET.Element | None, find: Find, assets: dict[str, bytes] 
         file = element.get("filename", "")
         if not file.lower().endswith(READ_MESHES):
             return (
-                f"MuJoCo reads {', '.join(READ_MESHES)}, not {Path(file).name}: convert it, for example with "
-                "trimesh: trimesh.load(FILE, force='mesh').export('x.stl')"
+                f"MuJoCo reads {', '.join(READ_MESHES)}, not {Path(file).suffix!r}: convert it, for example "
+                "with trimesh: trimesh.load(FILE, force='mesh').export('x.stl')"
             )
         found = find(file)
         element.set("filename", str(found.resolve()))
@@ -243,7 +246,7 @@ def _find(path: Path, packages: Packages, file: str) -> Path:
     for place in places:
         if place.is_file():
             return place
-    raise ValueError(f"there is no file {file!r}; packages= names folders to look in")
+    raise ValueError(f"there is no file {file!r}; name folders to look in with packages=")
 
 
 def _srdf(path: Path, urdf: ET.Element, notes: list[str]) -> tuple[tuple[str, str], ...]:

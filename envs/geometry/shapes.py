@@ -542,7 +542,7 @@ def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
         0.18
         >>> as_obstacle({"shape": "box", "sizes": (0.1, 0.2, 0.02)})
         Traceback (most recent call last):
-        ValueError: box: parameters are size, position, quaternion, velocity, name; unknown is sizes, missing is size
+        ValueError: box: parameters are size, position, quaternion, velocity, name; unknown: sizes; missing: size
     """
     if isinstance(value, Shape):
         return value
@@ -560,10 +560,8 @@ def as_obstacle(value: Shape | Mapping[str, Any]) -> Shape:
     unknown = ", ".join(str(each) for each in values if each not in allowed)
     missing = ", ".join(each for each in needed if each not in values)
     if unknown or missing:
-        raise ValueError(
-            f"{kind}: parameters are {', '.join(allowed)}; unknown is {unknown or 'none'}, "
-            f"missing is {missing or 'none'}"
-        )
+        faults = (unknown and f"; unknown: {unknown}") + (missing and f"; missing: {missing}")
+        raise ValueError(f"{kind}: parameters are {', '.join(allowed)}{faults}")
     return shape(**values)
 
 

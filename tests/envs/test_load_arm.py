@@ -15,6 +15,7 @@ from viapoint.envs.arms.choices import KNOWN_VELOCITIES, known_limits
 from viapoint.envs.arms.kinematics import forward, sphere_centres, torques
 from viapoint.envs.arms.load import load_arm, read_model
 from viapoint.envs.arms.registry import arm_of
+from viapoint.envs.arms.stored import write_arm
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import pack
 
@@ -312,6 +313,8 @@ def test_a_frame_alone_on_the_last_link_is_the_tool():
     plate = '<body name="plate" pos="0 0 0.1"/><body><geom size="0.01"/></body>'
     arm = three(('<site name="tool" pos="0 0 0.2"/>', plate), tool=None)
     assert arm.notes[0] == "tool: \"the frame of 'plate'\""
+    sited = three(('<site name="tool"', '<body name="plate"/><site name="tip"'), tool=None)
+    assert sited.notes[0] == "tool: \"the site 'tip' of 'c'\""
 
 
 ONLY_SEEN = 'contype="0" conaffinity="0"'
@@ -458,9 +461,20 @@ def test_urdf_files_are_arms(crane):
     np.testing.assert_allclose(arm.joint_range, [(0.0, 0.4), (-np.pi, np.pi), (-1.0, 2.0)], atol=1e-5)
     assert "wrist" in arm.group_names
     assert "lift: 0 to 0.4 m, at most 0.3 m/s and 900 N" in arm.report()
+    with pytest.warns(
+        UserWarning, match=r"velocity_limit is greater than that in the file, \[0.3\], of lift"
+    ):
+        load_arm(written(crane), velocity_limit=1.0)
     joints = (0.2, np.pi / 2, 0.0)
     np.testing.assert_allclose(arm.hand(joints), (0.1, 0.65, 0.52), atol=1e-5)
     np.testing.assert_allclose(arm.hand((0.0, 0.0, np.pi / 2)), (0.52, 0.0, 0.05), atol=1e-5)
+
+
+def test_joints_that_carry_no_weight_get_torques_that_move_the_arm(crane):
+    path = written(crane, *((f' effort="{limit}"', "") for limit in (900, 80, 50)))
+    with pytest.warns(UserWarning, match="at least enough for 5 rad/s"):
+        arm = load_arm(path)
+    np.testing.assert_allclose(arm.torque_limit[1], 5.0 * arm.stiffness[1] / 50.0**2, rtol=1e-3)
 
 
 LIMIT = '<limit lower="-1" upper="2" effort'
@@ -539,7 +553,7 @@ def test_visual_geoms_of_a_urdf_are_drawn_and_count_for_nothing_else(crane):
     assert arm.xml == plain.xml
     (told,) = (note for note in arm.notes if "not drawn" in note)
     assert "1, the first because" in told
-    assert "boom.dae" in told
+    assert "not '.dae'" in told
     model = read_model(path)
     shown = np.flatnonzero(model.geom_group < 3)
     bodies = [model.body(model.geom_bodyid[geom]).name for geom in shown]
@@ -597,6 +611,22 @@ def test_the_second_time_an_arm_comes_from_the_cache(cache, monkeypatch):
             ur5e(text, **other)
     with pytest.raises(TypeError):
         ur5e(text.replace("0.1625", "0.1626"), **changes)
+
+
+def test_a_written_arm_is_the_same_arm_and_takes_other_limits(tmp_path):
+    slow, path = ur5e(velocity_limit=1.0), tmp_path / "slow.xml"
+    write_arm(path, slow)
+    for same in (load_arm(path), load_arm(path.read_text()), arm_of(path)):
+        np.testing.assert_equal(parts_of(dataclasses.replace(same, file="")), parts_of(slow))
+    with pytest.warns(UserWarning, match="velocity_limit is greater"):
+        fast = load_arm(path, velocity_limit=2.0, name="fast")
+    assert (fast.name, fast.xml, fast.left_out) == ("fast", slow.xml, slow.left_out)
+    np.testing.assert_array_equal(
+        (fast.velocity_limit, fast.torque_limit), (np.full(6, 2.0), slow.torque_limit)
+    )
+    for given in ({"tool": "hand"}, {"home": HOME}, {"torque_limit": 1e-3}):
+        with pytest.raises(ValueError):
+            load_arm(path, **given)
 
 
 def test_a_capsule_of_hardly_any_length_is_covered():
@@ -683,6 +713,7 @@ FLOATING = '<joint name="base_joint" type="floating"><parent link="odom"/><child
 ODD = [
     (MESH, "package://renamed_description/meshes/wrist.stl"),
     ('<geometry><box size="0.4 0.06 0.06"/>', '<geometry><mesh filename="../meshes/boom.dae"/>'),
+    ('<geometry><cylinder radius="0.04" length="0.2"/>', '<geometry><mesh filename="post.dae"/>'),
     ("</robot>", "<xacro:thing a:b='1'/></robot>"),
     ('<mass value="2"/>\n    <inertia ixx="0.1"', '<mass value="2"/><inertia ixx="-0.1"'),
     ('<mass value="1"/>\n    <inertia ixx="0.1"', '<mass value="1"/><inertia ixx="nan"'),
@@ -706,13 +737,13 @@ def test_urdf_files_with_odd_parts_load(crane):
     trimesh.creation.box((0.1, 0.1, 0.1)).export(stl, file_type="stl_ascii")
     stl.write_bytes(stl.read_bytes().upper().replace(b"SOLID ", b"solid"))
     (crane / "meshes" / "boom.dae").write_text("<COLLADA/>")
-    with pytest.warns(UserWarning, match=r"boom\.dae|no size"):
+    with pytest.warns(UserWarning, match=r"post, boom: MuJoCo|no size"):
         arm = load_arm(written(crane, *ODD))
     assert arm.joint_names == ("lift", "turn", "tilt")
     assert "wrist" in arm.group_names
     assert "boom" not in arm.group_names
     notes = "\n".join(arm.notes)
-    for told in ("fixed: base_joint", "mass of base", "its box has no size", "boom.dae"):
+    for told in ("fixed: base_joint", "mass of base", "its box has no size", "of post, boom: MuJoCo"):
         assert told in notes
     for link in ("post", "boom", "wrist"):
         assert f"inertia of {link}" in notes

@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import warnings
 from importlib.metadata import version
 from pathlib import Path
 
@@ -106,6 +107,15 @@ def test_an_end_in_the_middle_is_one_line_and_a_code(error, code, failed, monkey
     if code == 2:
         with pytest.raises(ZeroDivisionError):
             run("doctor", "--debug")
+
+
+def test_warnings_are_lines_that_name_flags(capsys, monkeypatch):
+    message = UserWarning("name one with tool=, or a base with base=")
+    monkeypatch.setattr(
+        cli, "run_command", lambda _: print(warnings.formatwarning(message, UserWarning, "a.py", 1))
+    )
+    run("plan")
+    assert capsys.readouterr().out == "warning: name one with --tool, or a base with --base\n\n"
 
 
 @pytest.fixture(scope="module")

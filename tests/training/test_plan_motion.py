@@ -35,7 +35,7 @@ from viapoint.training.evaluation import evaluate_methods
 from viapoint.training.planning import ompl_paths, refine
 from viapoint.training.planning import plan_motion as module
 from viapoint.training.planning.baselines import make_method
-from viapoint.training.planning.benchmark import benchmark_panda, benchmark_problems, read_problems
+from viapoint.training.planning.benchmark import DATA, benchmark_panda, benchmark_problems, read_problems
 from viapoint.training.planning.motion_plan import execute_plans
 from viapoint.training.planning.movements import (
     OUTSIDE,
@@ -523,15 +523,20 @@ def test_files_hold_the_movement(tmp_path, file) -> None:
     for one, other in zip(written, again, strict=True):
         assert np.allclose(one, other, rtol=1e-9, atol=1e-8)
     assert np.allclose(again.torque, torques(PANDA.chain, again.position, again.velocity, again.acceleration))
+    plan = plan_motion(PANDA, PANDA.home, GOAL, duration=3.0 + 1e-11)
+    write_motion(plan, tmp_path / file)  # the last two instants would be the same in the file
+    assert len(read_motion(tmp_path / file)[1].time) == 301
 
 
 def test_files_of_other_forms_are_refused(tmp_path) -> None:
     plan = plan_motion(PANDA, PANDA.home, GOAL, [POST])
     with pytest.raises(ValueError):
         write_motion(plan, tmp_path / "plan.txt")
-    for name, text in (("a.csv", "time,x\n1,2\n"), ("b.yaml", "points: 3\n"), ("c.csv", "")):
+    twice = "time,position:a,velocity:a,acceleration:a,torque:a\n" + 2 * "0,0,0,0,0\n"
+    texts = {"a.csv": "time,x\n1,2\n", "b.yaml": "points: 3\n", "c.csv": "", "d.csv": twice}
+    for name, text in texts.items():
         (tmp_path / name).write_text(text)
-        with pytest.raises(ValueError):
+        with pytest.raises(ValueError, match=r"time, position:NAME|joint_names, positions"):
             read_motion(tmp_path / name)
     unsafe = plan_motion(PANDA, PANDA.home, GOAL, WALL, time_limit=0.0)
     with pytest.raises(UnsafePlanError):
@@ -561,6 +566,10 @@ def test_command_line_plans_and_measures(tmp_path, capsys, failed) -> None:
     assert "has reaches" in failed(*words)
     scene.write_text('{"format": "viapoint-scene", "env": "viapoint/PlanarReach-v0", "start": [0.1, 0.4]}')
     assert "of the arm planar" in failed(*words)
+    assert ".npz" in failed("evaluate", "--env", PLANE, "--scenes", scene)
+    main(["plan", "--arm", str(UR5E)])
+    assert "shoulder_pan: -6.283 to 6.283 rad, at most 3.14 rad/s" in capsys.readouterr().out
+    assert "leave out --tool" in failed("plan", "--arm", DATA / "panda_spheres.xml", "--tool", "hand")
     results = tmp_path / "results.json"
     for _ in range(2):  # the second time, the file of the first is replaced
         main(["evaluate", "--scenes", "motionbenchmaker", "--n-scenes", "3", "--json", str(results)])
@@ -626,8 +635,8 @@ def test_problems_are_read_from_the_original_files(tmp_path) -> None:
     with pytest.raises(ValueError, match=r"shelf.*meshes"):  # not left out without a word
         read_problems(tmp_path)
     (folder / "request0007.yaml").write_text("start_state: {}\n")
-    for bad in (tmp_path, tmp_path / "nothing"):
-        with pytest.raises(ValueError):
+    for bad, told in ((tmp_path, "request0007.*'joint_state'"), (tmp_path / "nothing", "folder")):
+        with pytest.raises(ValueError, match=told):
             read_problems(bad)
 
 

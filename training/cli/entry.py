@@ -9,6 +9,7 @@ import io
 import os
 import re
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -45,10 +46,13 @@ viapoint COMMAND --help shows the options of a command and an example;
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a subcommand; errors print one line to the standard error output and exit with code 2."""
+    """Run a subcommand; warnings and errors are lines on the standard error output, errors exit with code 2."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
+    usual = warnings.formatwarning
+    if not debug:
+        warnings.formatwarning = lambda message, *_: f"warning: {_with_flags(str(message), words)}\n"
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names that a terminal without UTF-8 cannot show
     try:
@@ -58,6 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 _check_resumed(config, words)
             run_command(config)
         finally:
+            warnings.formatwarning = usual
             sys.stdout.flush()  # at Python's exit, a closed pipe would print a message
     except KeyboardInterrupt:
         _leave("stopped", 130)
@@ -72,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             doctor.run(None)
         if debug:
             raise
-        _leave(_one_line(error), getattr(error, "exit_code", 2))
+        _leave(_with_flags(_one_line(error), words), getattr(error, "exit_code", 2))
 
 
 def run_command(config: Any) -> None:
@@ -162,6 +167,12 @@ def _one_line(error: Exception) -> str:
     if isinstance(error, ValueError | OSError) or kind.__module__.startswith(("viapoint", "gymnasium")):
         return text
     return f"{kind.__name__}: {text} (--debug shows where)"
+
+
+def _with_flags(text: str, words: Sequence[str]) -> str:
+    """Return a message to `plan` with flags in place of arguments of load_arm, as in `name one with tool=`."""
+    flags = re.sub(r"\b([a-z_]+)=(?=[\s,;]|$)", lambda name: f"--{name[1].replace('_', '-')}", text)
+    return flags if words[:1] == ["plan"] else text
 
 
 def _was_interrupted(error: BaseException | None) -> bool:

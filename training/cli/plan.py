@@ -27,6 +27,9 @@ def run(config: PlanConfig) -> None:
     if config.out is not None:
         _check_replaceable(config.out)
     arm = _arm_for(config)
+    if not any((config.start, config.goal, config.position, config.scene, config.out, config.video)):
+        print(arm.report())
+        return
     _check_lengths(config, arm)
     scene = _scene(config.scene, arm)
     start = config.start or scene.get("start")
@@ -67,7 +70,7 @@ def _check_replaceable(path: Path) -> None:
 def _arm_for(config: PlanConfig) -> Arm:
     """Return the arm of a name or of a file."""
     given = {name: getattr(config, name) for name in LOADING if getattr(config, name)}
-    if not given:
+    if not given and (config.arm in arm_names() or not Path(config.arm).expanduser().is_file()):
         return arm_of(config.arm)
     if config.arm in arm_names():
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)

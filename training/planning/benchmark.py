@@ -21,7 +21,7 @@ import pandas as pd
 import yaml
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.stored import read_arm
+from viapoint.envs.arms.load import load_arm
 from viapoint.envs.common.arrays import Float, frame_matrices
 from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.obstacles import pack, quaternions_of
@@ -76,9 +76,7 @@ class BenchmarkProblem(NamedTuple):
 def benchmark_panda() -> Arm:
     """Return the Panda of the benchmark: 59 spheres, the fingers open by 6.5 cm each, dynamics of the built-in one."""
     with as_file(DATA / "panda_spheres.xml") as path:
-        arm = read_arm(path)
-    assert arm is not None
-    return arm
+        return load_arm(path)
 
 
 def benchmark_problems() -> list[BenchmarkProblem]:
@@ -130,6 +128,7 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
     request = scene.with_name(scene.name.replace("scene", "request"))
     if not request.is_file():
         raise ValueError(f"{request}: there is no such file beside {scene.name}")
+    both = f"{scene} and {request.name}"
     try:
         read = yaml.load(scene.read_text(encoding="utf-8"), yaml.CSafeLoader)
         asked = yaml.load(request.read_text(encoding="utf-8"), yaml.CSafeLoader)
@@ -152,11 +151,14 @@ def _read(scene: Path, joints: Sequence[str]) -> BenchmarkProblem:
                 f"plans are executed among at most {MOST_OBSTACLES} obstacles, got {len(obstacles)}"
             )
     except yaml.YAMLError as error:
-        raise ValueError(f"{scene} or {request.name} is no YAML: {' '.join(str(error).split())}") from None
+        raise ValueError(f"{both}: no YAML: {' '.join(str(error).split())}") from None
     except (KeyError, TypeError, IndexError, AttributeError, OSError) as error:
-        raise ValueError(f"{scene}: no problem of MotionBenchMaker ({error!r:.80})") from None
+        raise ValueError(
+            f"{both}: no problem of MotionBenchMaker, which has start_state/joint_state and goal_constraints/0/"
+            f"joint_constraints in requests, world/collision_objects in scenes ({error!r:.80})"
+        ) from None
     except ValueError as error:
-        raise ValueError(f"{scene}: {error}") from None
+        raise ValueError(f"{both}: {error}") from None
     number = int(scene.stem.removeprefix("scene"))
     return BenchmarkProblem(scene.parent.name.removesuffix("_panda"), number, begin, end, obstacles)
 

@@ -70,12 +70,14 @@ def read_motion(path: str | Path) -> tuple[tuple[str, ...], JointMotion]:
     try:
         text = path.read_text(encoding="utf-8")
         names, time, parts = _read_table(text) if form == "csv" else _read_message(text)
+        if not (np.diff(finite_array("time", time, (len(time),))) > 0.0).all():
+            raise ValueError("its times do not increase")
         shape = (len(time), len(names))
         return names, JointMotion(time, *(finite_array("motion", part, shape) for part in parts))
-    except (KeyError, IndexError, StopIteration, TypeError, ValueError, yaml.YAMLError) as error:
-        raise ValueError(
-            f"{path} is no movement of joints ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
-        ) from None
+    except (KeyError, IndexError, TypeError, ValueError, yaml.YAMLError) as error:
+        wanted = _columns(("NAME",)) if form == "csv" else ("joint_names", *ROS_PARTS, "time_from_start")
+        fault = f"{type(error).__name__}: {' '.join(str(error).split())[:80]}"
+        raise ValueError(f"{path} is no movement of joints, with {', '.join(wanted)} ({fault})") from None
 
 
 def _form(path: Path) -> str:
@@ -102,7 +104,7 @@ def _table(names: tuple[str, ...], motion: JointMotion) -> str:
 def _read_table(text: str) -> tuple[tuple[str, ...], Float, list[Float]]:
     """Return joints, times and quantities of a table."""
     rows = csv.reader(io.StringIO(text))
-    head = next(rows)
+    head = next(rows, [])
     names = tuple(column.removeprefix("position:") for column in head if column.startswith("position:"))
     if head != _columns(names):
         raise ValueError("its columns are others")

@@ -158,7 +158,7 @@ class MotionPlan:
         """
         self.refuse_unsafe(force)
         number_of_at_least("rate", rate, 1e-3, HIGHEST_RATE)
-        last = int(np.floor(self.duration * rate * (1.0 - 1e-12)))
+        last = int((self.duration - 2e-9) * rate)  # times of files are whole nanoseconds, and increase
         time = np.append(np.arange(last + 1) / rate, self.duration)
         motion = joint_motion(space_of(self.arm, self.space), *self.trajectory().sample(time))
         return JointMotion(time, *motion, torques(self.arm.chain, *motion))
