@@ -130,9 +130,14 @@ REASONS = [
     ({**ACROSS, "seeds": 0}, "from 1 seed"),
     ({**ACROSS, "seeds": 1}, "from 2 seeds"),
     ({"obstacles": [POST, Sphere(0.1, position=PANDA.hand(GOAL))]}, "goal is in contact with obstacle 1"),
+    (
+        {"margin": 0.1, "obstacles": [POST, Sphere(0.1, position=PANDA.hand(PANDA.home), name="ball")]},
+        "obstacle 1 'ball'",
+    ),
     ({"goal": GOAL + 9.0 * np.eye(7)[2]}, "joint 'joint3' must be from -2.897 to 2.897"),
     ({"arm": "planar", "start": (0.0, 0.3), "goal": (0.0, 0.9)}, "out of reach"),
     ({"obstacles": [POST], "duration": 0.3}, "limit"),
+    ({"obstacles": [POST], "time_limit": 0.0}, "no time for another one"),
     ({"arm": WEAK, "time_limit": 0.0}, "weight of the arm"),
     ({"margin": 0.1}, "nearer to itself than the margin at the start"),
     ({"velocity": 300.0 * np.eye(7)[0]}, "velocity limit of joint 'joint1'"),
@@ -145,6 +150,13 @@ def test_the_reason_of_a_plan_without_success_is_told(arguments, reason) -> None
     plan = plan_motion(**{"arm": PANDA, "start": PANDA.home, "goal": GOAL, **arguments})
     assert not plan.success
     assert reason in plan.reason
+
+
+def test_the_shortest_duration_of_a_pose_is_that_of_its_best_configuration() -> None:
+    given = PANDA, PANDA.home, Pose((0.5, 0.3, 0.4))
+    best = plan_motion(*given).duration
+    told = re.search(r"shortest duration is ([0-9.]+) s", plan_motion(*given, duration=0.5 * best).reason)
+    assert float(told[1]) <= best + 0.01
 
 
 def test_a_given_duration_and_a_margin_are_kept() -> None:

@@ -29,7 +29,7 @@ from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, whole_number
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack
-from viapoint.envs.geometry.shapes import Shape
+from viapoint.envs.geometry.shapes import Shape, as_obstacles
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
 from viapoint.envs.plans import Plan, SpaceName
 from viapoint.envs.scenes.options import Pose, as_pose
@@ -106,6 +106,7 @@ class _Problem(NamedTuple):
     given: Any = ()  # Via-points that are tried first, shape (S, K, D)
     enough: int = 1  # Number of free movements
     generator: Any = None  # Random generator of the seeds
+    names: Sequence[str] = ()  # Names of the obstacles, empty for those without
 
     def setting(self, near: float = np.inf) -> Setting:
         """Return arm and space; in the plane without spheres that are farther than `near` from all obstacles, [m]."""
@@ -211,7 +212,8 @@ def plan_motion(
     where = space_of(arm, arm.space if space is None else space)
     _warm_up(arm, where.of_hand, n_via)
     began = time.perf_counter()
-    packed = obstacles if isinstance(obstacles, Obstacles) else pack([obstacles])
+    shapes = [] if isinstance(obstacles, Obstacles) else as_obstacles(obstacles)
+    packed = obstacles if isinstance(obstacles, Obstacles) else pack([shapes])
     if len(packed.kind) != 1:
         raise ValueError(f"obstacles must be those of one scene, got {len(packed.kind)} scenes")
     number, given = SEEDS, np.zeros((0, n_via, where.dimension))
@@ -237,6 +239,7 @@ def plan_motion(
         given=given,
         enough=enough,
         generator=rng,
+        names=[shape.name for shape in shapes],
     )
     goals = _goals(problem, goal)
     number = -(-number // len(goals))  # rounded up
@@ -258,8 +261,14 @@ def plan_motion(
             few = number if np.isinf(least) else min(number, NARROW)
             plans.append(_plan(problem._replace(goal=each), few, share, paths, ompl))
     plans += straight
-    best = max(plans, key=lambda plan: (plan.success, -plan.duration if plan.success else plan.clearance))
+    best = max(plans, key=_merit)
     return dataclasses.replace(best, milliseconds=1e3 * (time.perf_counter() - began))
+
+
+def _merit(plan: MotionPlan) -> tuple[bool, float]:
+    """Return by what the best plan has the greatest: a short one that succeeds, then clearance, and small loads."""
+    worst = min(plan.clearance, 0.0) - max(*plan.limits, 1.0)
+    return plan.success, -plan.duration if plan.success else worst
 
 
 def plan_motions(
@@ -477,14 +486,19 @@ def _fault(problem: _Problem) -> tuple[str, float]:
             low, high = arm.joint_range[worst]
             allowed = f"must be from {low:.4g} to {high:.4g}, got {joints[end, worst]:.4g}"
             return f"the {name} is outside the limits: joint {arm.joint_names[worst]!r} {allowed}", most
-        if own[end] < problem.margin:
-            touches = "touches itself" if own[end] < 0.0 else "is nearer to itself than the margin"
-            return f"the arm {touches} at the {name}, clearance {1e3 * own[end]:.1f} mm", most
-        near = both.present[end] & (rows[end] < problem.margin) & (resting | (end == 0))
-        if near.any():
-            row = int(near.argmax())
-            where = "in contact with" if rows[end, row] < 0.0 else "nearer than the margin to"
-            return f"the {name} is {where} obstacle {row}, clearance {1e3 * rows[end, row]:.1f} mm", most
+        counts = both.present[end] & (resting | (end == 0))
+        row = int(np.where(counts, rows[end], np.inf).argmin()) if counts.any() else -1
+        apart = min(rows[end, row], own[end]) if row >= 0 else own[end]
+        if apart >= problem.margin:
+            continue
+        if apart == own[end]:
+            touches = "touches itself" if apart < 0.0 else "is nearer to itself than the margin"
+            which = f"the arm {touches} at the {name}"
+        else:
+            called = f" {problem.names[row]!r}" if problem.names and problem.names[row] else ""
+            touches = "in contact with" if apart < 0.0 else "nearer than the margin to"
+            which = f"the {name} is {touches} obstacle {row}{called}"
+        return f"{which}, clearance {1e3 * apart:.1f} mm", most
     if problem.in_motion:
         moving = joint_motion(space, ends[:1], problem.velocity[None], problem.acceleration[None])
         torque = motion_torques(arm.chain, *moving)[0]
@@ -537,7 +551,7 @@ def _plan(
     plan = best or _known(problem, straight, "straight", problem.least)
     ended = "the time limit was reached" if time.perf_counter() >= until else "no free one was found"
     seeds = "1 seed" if tried == 1 else f"{tried} seeds"
-    reason = f"{plan.reason}; {ended} from {seeds}"
+    reason = f"{plan.reason}; {ended} from {seeds}" if tried else f"{plan.reason}; no time for another one"
     return dataclasses.replace(plan, success=False, seeds=tried, reason=reason)
 
 
