@@ -70,7 +70,7 @@ EARLY, ALONG = 8, 4
 TREE_TIME = 0.4  # Greatest share of the time that is left for a search of this path
 # Clearances that paths keep, as shares of those of the ends up to ROOM beyond what movements keep; smooth movements
 # need some of it
-PATH_ROOM, ROOM = (0.4, 0.1, 0.0, 0.4, 0.1), 0.02
+PATH_ROOM, ROOM = 4 * (0.4, 0.1, 0.0), 0.02
 ALONG_TIME = 0.03  # Time limit of the refinement of a movement along a path, [s]
 MOST_REFINED = 12  # Greatest number of via-points that are refined, which takes longer the more there are
 SEEDS = 256  # Greatest number of random seeds
@@ -87,6 +87,7 @@ SPARE = 1e-3  # Clearance that movements keep beyond the margin where their ends
 ROUNDING = 1e-6  # Rounding error of clearances, [m]
 # Required clearances of a path of OMPL in each attempt, until one can be made smooth, [m]
 OMPL_MARGINS = (0.010, 0.004, 0.001, 0.001)
+OMPL_ROOM = 0.7  # Greatest of these clearances, as a share of that of the ends
 OMPL_PATIENCE = 1.0  # Time limit for each path of OMPL as a baseline, [s]
 GOALS = 8  # Greatest number of configurations that are tried for a pose
 
@@ -385,7 +386,9 @@ def ompl_motion(
 
     ends = np.ascontiguousarray(where.joints(np.stack((start, goal))))
     best = smooth(ends)
-    for margin in OMPL_MARGINS:
+    nearest = _clearance_of(arm, ends, obstacles, OMPL_MARGINS[0])
+    for most in OMPL_MARGINS:
+        margin = min(most, OMPL_ROOM * nearest)
         path = path_around(arm, ends, obstacles, margin, OMPL_PATIENCE)
         if path is None:
             continue
@@ -645,6 +648,12 @@ def _search(
     return _known(problem, movement, name, problem.least, clearance=known), tried
 
 
+def _clearance_of(arm: Arm, joints: Float, obstacles: Obstacles, most: float) -> float:
+    """Return the least clearance of configurations, shape (N, J), among obstacles of one scene, at most `most`, [m]."""
+    rows, own = row_clearances(arm.chain, arm.spheres, joints, obstacles.take([0] * len(joints)), most)
+    return min(float(own.min()), float(rows.min(initial=most)))
+
+
 def _search_around(
     problem: _Problem, kept: float, duration: float, number: int, until: float, ompl: bool
 ) -> tuple[MotionPlan | None, int]:
@@ -653,13 +662,10 @@ def _search_around(
     Points of the path become seeds first, then as many via-points as the movement needs.
     """
     ends = np.ascontiguousarray(problem.space.joints(np.stack((problem.start, problem.goal))))
-    rows, own = row_clearances(
-        problem.arm.chain, problem.arm.spheres, ends, problem.obstacles.take([0, 0]), kept + ROOM
-    )
-    nearest = min(float(own.min()), float(rows.min(initial=kept + ROOM)))
+    room = max(_clearance_of(problem.arm, ends, problem.obstacles, kept + ROOM) - kept, 0.0)
     tried = 0
     for share in PATH_ROOM:
-        margin = kept + share * max(nearest - kept, 0.0)
+        margin = kept + share * room
         patience = TREE_TIME * (until - time.perf_counter())
         seed = int(problem.generator.integers(2**31))
         path = clear_path(problem.setting(), ends, problem.obstacles, margin, seed, patience)
