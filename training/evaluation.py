@@ -120,8 +120,8 @@ class EvaluationResult:
     def rows(self) -> list[dict[str, Any]]:
         """Metrics of each method by name, the name of the method as `method`.
 
-        Rates are dictionaries of `rate`, `low`, `high` (95 % Wilson interval), `count` and `of`; lengths are in [m] and
-        times in [s].
+        Rates are dictionaries of `rate`, `low`, `high` (95 % Wilson interval), `count` and `of`; lengths are in [m],
+        errors in joint space in [rad], and times in [s].
         """
         return [{"method": result.name, **result.summary()} for result in self.results]
 

@@ -33,7 +33,7 @@ Callbacks = BaseCallback | Sequence[BaseCallback] | None
 PROGRESS = "{desc}{percentage:.0f}%|{bar}| {elapsed}<{remaining}, {n_fmt}/{total_fmt} decisions"
 LOG_EVERY = 1_000  # Decisions between two entries of the log
 RATES = ("collision", "reachable")  # Metrics that are true or false
-# Metrics of a validation in the log and in the learning curve; medians in [m] and [s]
+# Metrics of a validation in the log and in the learning curve; medians in [m], [s], and [rad] for errors of joints
 VALIDATED = ("success", "collision", "min_clearance", "goal_error", "jerk_ratio", "duration")
 
 
