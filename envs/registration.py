@@ -60,8 +60,8 @@ def register_all() -> None:
             )
 
 
-def registered_id(env_id: str) -> str:
-    """Return a registered id without the module in front, as in `my_module:my/Task-v0`, which is imported first.
+def check_registered(env_id: str) -> str:
+    """Return an id that Gymnasium knows, without the module in front of it (`my_module:my/Task-v0`), which is imported.
 
     Raises:
         ValueError: There is no such module or environment; the message names the closest id.

@@ -18,7 +18,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.registry import ARM_FILES, arm_of
 from viapoint.envs.common.validation import is_number
-from viapoint.envs.registration import ENV_IDS, registered_id
+from viapoint.envs.registration import ENV_IDS, check_registered
 from viapoint.envs.task import Task
 from viapoint.primitives.fitting import MOST_VIA_POINTS, USUAL_RANGE
 from viapoint.training.checks import (
@@ -163,7 +163,7 @@ class Config:
             if isinstance(value, str) and "Path" in str(each.type):
                 value = named_path(name, value)
             elif name == "env" and isinstance(value, str):
-                value = registered_id(value)
+                value = check_registered(value)
             elif str(each.type) == "NamedValues":
                 value = _plain(name, value)
             elif name in RANGES and value is not each.default and not isinstance(value, tuple | list):

@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from viapoint.envs.common.arrays import Float, Observation
 from viapoint.envs.common.validation import finite_array
 from viapoint.envs.outcome import Outcome
-from viapoint.envs.registration import registered_id
+from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import NEVER, Scenes
 from viapoint.training import report
 from viapoint.training.agents.agent import load_agent
@@ -239,9 +239,9 @@ def _environment_of(agent: Any, env: str | None, env_kwargs: Any) -> tuple[str, 
     if not isinstance(agent, BaseAlgorithm):
         if env is None:
             raise ValueError("env must be the id of an environment where no trained agent is given")
-        return registered_id(env), whole_task(env, env_kwargs or {})
+        return check_registered(env), whole_task(env, env_kwargs or {})
     mine, kwargs = env_arguments(agent.get_env())
-    if env is not None and registered_id(env) != mine:
+    if env is not None and check_registered(env) != mine:
         raise ValueError(f"env must be {mine}, on which the agent was trained, or be left out, got {env!r}")
     if env_kwargs is not None:
         trained = agent.get_env().get_attr("task", [0])[0]  # type: ignore[union-attr]

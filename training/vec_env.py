@@ -15,7 +15,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 import viapoint.envs
-from viapoint.envs.registration import registered_id
+from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import TERMS as TERMS
 from viapoint.training.files import as_plain
 
@@ -114,7 +114,7 @@ class ViaVecEnv(VecEnv):
     """
 
     def __init__(self, env_id: str, num_envs: int, seed: int | None = None, **kwargs: Any) -> None:
-        env_id = registered_id(env_id)
+        env_id = check_registered(env_id)
         extra: dict[str, Any] = {}
         if gym.spec(env_id).vector_entry_point is None:  # copies of the single environment
             extra["vector_kwargs"] = {"autoreset_mode": AutoresetMode.SAME_STEP}

@@ -10,7 +10,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from viapoint.envs import obstacles_to_json, scene_from_json, scene_to_json
 from viapoint.envs.geometry.obstacles import POSE_SIZE
-from viapoint.envs.registration import registered_id
+from viapoint.envs.registration import check_registered
 from viapoint.training import Run, SceneExtractor, Study, TrainConfig, ViaVecEnv, evaluate, load_agent, train
 from viapoint.training.agents.agent import find_model
 from viapoint.training.cli import commands
@@ -101,7 +101,7 @@ def test_an_id_may_name_the_module_that_registers_it(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     named = "own_ids:me/Named-v0"
     assert TrainConfig(env=named).env == EvaluateConfig(env=named).env == "me/Named-v0"
-    assert ViaVecEnv(named, 1).env_id == registered_id(named) == "me/Named-v0"
+    assert ViaVecEnv(named, 1).env_id == check_registered(named) == "me/Named-v0"
     assert (
         evaluate(env=named, baselines=["straight"], scenes="validation", n_scenes=2).env_id == "me/Named-v0"
     )
@@ -110,7 +110,7 @@ def test_an_id_may_name_the_module_that_registers_it(tmp_path, monkeypatch):
     assert find_model(f"viapoint.envs:{PLANE}") == find_model(PLANE)
     for wrong in ("own_idz:me/Named-v0", "own_ids:me/Named-v1", "me Named"):
         with pytest.raises(ValueError):
-            registered_id(wrong)
+            check_registered(wrong)
 
 
 def test_an_own_id_needs_a_vector_environment():

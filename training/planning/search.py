@@ -14,7 +14,7 @@ from viapoint.envs.env import ReachEnv
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import Plan
-from viapoint.envs.registration import registered_id
+from viapoint.envs.registration import check_registered
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.scenes.scene import Scenes
@@ -321,7 +321,7 @@ def _merits(
 
 def registered_task(env_id: str, **kwargs: Any) -> Task:
     """Return the task of a registered environment made with `kwargs`; ValueError if it is not of this package."""
-    env_id = registered_id(env_id)
+    check_registered(env_id)
     env: Any = gym.make_vec(env_id, num_envs=1, **kwargs)
     task = getattr(env.unwrapped, "task", None)
     single = [each.unwrapped for each in getattr(env.unwrapped, "envs", ())]
