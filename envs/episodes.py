@@ -328,7 +328,7 @@ class Episodes:
         steering, first = task.steering, state.steps == 0
         before = self._outcome(np.zeros(len(first), bool))
         begin = state.steps.copy()
-        velocity = steering.decode(wanted, self._start, self.goals(self.time))
+        velocity = wanted * np.array(steering.top_speed)
         number = steering.physics_steps
         ahead = steering.follow(self._motion, velocity, number)
         state.reachable[:] = task.space.inside(ahead.position).all(axis=-1)
@@ -365,7 +365,6 @@ class Episodes:
             final = final & (event == Event.ARRIVAL)
         after = self._outcome(final)
         ended = final | (event >= Event.CONTACT)  # events of the highest ranks end an episode
-        truncated = (event == Event.TIME_LIMIT) & ~final & task.stepwise
         length = norm(task.space.coordinates(self.scenes.goal) - self._start)
         terms = reward_terms(
             before, after, first, ended, length, self._zero_duration, task.tolerance.unit, task.weights
@@ -375,7 +374,8 @@ class Episodes:
         self._look(np.arange(len(event)))
         info = {**after._asdict(), **terms, **times}
         reward = np.asarray(sum(terms.values()))
-        return Decision(self.observe(), reward, ended & ~truncated, truncated, info)
+        # The time limit terminates, too: the time left is observed, and the end is judged as any other.
+        return Decision(self.observe(), reward, ended, np.zeros_like(ended), info)
 
     def _outcome(self, final: Bool) -> Outcome:
         """Return the metrics so far, where `final` is True for arms that have arrived at their last goal."""

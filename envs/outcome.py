@@ -48,9 +48,10 @@ class Outcome(NamedTuple):
     """Least clearance of the plan from obstacles and of the arm from itself, [m]; negative for a depth; at most 1."""
     goal_error: Float
     """Distance from the goal after the settling time: of the hand [m], in joint space the greatest of a joint [rad]."""
-    duration: Float  # Duration of the plan, [s]
+    duration: Float  # Duration of the plan, until a contact, [s]
     path_length: Float  # Length of the hand's path, [m]
-    jerk_cost: Float  # Jerk cost of the plan: half the integral of its squared jerk, [m^2/s^5] or [rad^2/s^5]
+    jerk_cost: Float
+    """Jerk cost of the plan until a contact: half the integral of its squared jerk, [m^2/s^5] or [rad^2/s^5]."""
     jerk_ratio: Float  # Jerk cost relative to the straight movement's of the same duration
     peak_speed: Float  # Greatest speed of the hand, [m/s]
     tracking_error: Float  # Root mean square distance from the plan, [m], in joint space [rad]

@@ -304,16 +304,15 @@ def turned(offset: Float, line: Float) -> Float:
 class Steering:
     """Layout of the actions of control steps, and the filter that turns them into references.
 
-    An action is the wanted velocity as a fraction of `top_speed`: of the hand along and across the line from start to
-    goal, or of the joints. The zero action brings the arm to rest. A critically damped filter of the second order makes
-    a smooth reference of the velocity u, so that its jerk is finite:
+    An action is the wanted velocity as a fraction of `top_speed`: of the hand along x and y of the world, or of the
+    joints. The zero action brings the arm to rest. A critically damped filter of the second order makes a smooth
+    reference of the velocity u, so that its jerk is finite:
 
         v'' = w^2 (u - v) - 2 w v'
 
     With u held over a control step the solution is known: one step of N references is a few multiplications.
     """
 
-    space: SpaceName
     names: tuple[str, ...]  # Names of the components, in order
     top_speed: tuple[float, ...]  # Velocity that an action of 1 stands for, [m/s] or [rad/s]
     bandwidth: float  # Bandwidth w of the filter, [rad/s]
@@ -328,11 +327,6 @@ class Steering:
         rate is up to w / e twice.
         """
         return float(2.0 * np.sqrt(2.0) * max(self.top_speed) * self.bandwidth / np.e)
-
-    def decode(self, action: Float, start: Float, goal: Float) -> Float:
-        """Return the velocity of an action, shape (N, D), [m/s] or [rad/s]."""
-        wanted = action * np.array(self.top_speed)
-        return turned(wanted, goal - start) if self.space == "hand" else wanted
 
     def follow(self, motion: Motion, wanted: Float, number: int) -> Motion:
         """Return references now and after each of T physics steps, shape (N, T + 1, D) each."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 import gymnasium as gym
@@ -59,15 +60,21 @@ def register_all() -> None:
             )
 
 
-def check_registered(env_id: str) -> None:
-    """Check that Gymnasium knows an id.
+def check_registered(env_id: str) -> str:
+    """Return an id that Gymnasium knows, without the module in front of it (`my_module:my/Task-v0`), which is imported.
 
     Raises:
-        ValueError: No such environment is registered; the message names the closest id.
+        ValueError: There is no such module or environment; the message names the closest id.
     """
+    module, _, name = env_id.rpartition(":")
     try:
-        gym.spec(env_id)
-    except gym.error.UnregisteredEnv:
+        if module:
+            importlib.import_module(module)
+        gym.spec(name)
+    except ImportError as error:
+        raise ValueError(f"the module of {env_id!r} cannot be imported: {error}") from error
+    except gym.error.Error:
         ours = [each for each in gym.registry if each.startswith("viapoint/")]
-        hint = did_you_mean(env_id, ours) or "; viapoint.envs.ENV_IDS lists those of viapoint"
-        raise ValueError(f"there is no environment {env_id!r}{hint}") from None
+        hint = did_you_mean(name, ours) or f"; name the module that registers it, as in my_module:{name}"
+        raise ValueError(f"there is no environment {name!r}{hint}") from None
+    return name

@@ -68,9 +68,11 @@ def reward_terms(
         w_success 1[success] - w_collision 1[contact] + w_clearance clip(c, -5 cm, 1 cm) / 5 cm
         - w_goal min(e / u, 1) - w_smoothness log(1 + J / J_0) - w_duration T / T_0 + w_progress (1 - e / length)
 
-    with the clearance c, jerk cost J and duration T of all that was commanded, the distance e from the goal at the end,
-    and the jerk cost J_0 and the duration T_0 of the straight movement of the zero action. With the default weights any
-    success is worth more than any failure, and the duration T_0 is the best one of a straight movement.
+    with the clearance c of all that was commanded, its jerk cost J and duration T until a contact, the distance e from
+    the goal at the end, and the jerk cost J_0 and the duration T_0 of the straight movement of the zero action. With
+    the default weights a success is worth more than a failure unless its plan is very slow or rough: the term of the
+    duration is -1 where T is 4 T_0, that of smoothness where J is 22,000 J_0. The duration T_0 is the best one of a
+    straight movement.
 
     Metrics are those before and after the decision, which is the `first` of an episode or not, and `ended` it or not.
     The length is that from start to goal, [m] or [rad], and u, `goal_unit`, the distance at which the term of the goal

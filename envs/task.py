@@ -223,8 +223,7 @@ class Task:
             raise ValueError(f"control_step must be 1 to 500 times {timestep} s, got {self.control_step!r}")
         speeds = JOINT_SPEED_SHARE * np.minimum(self.arm.velocity_limit, 10.0)
         return Steering(
-            space=self.space_name,
-            names=self.action.names_of_axes,
+            names=("x", "y") if in_hand else self.arm.joint_names,
             top_speed=(HAND_SPEED,) * 2 if in_hand else tuple(float(speed) for speed in speeds),
             bandwidth=HAND_BANDWIDTH if in_hand else JOINT_BANDWIDTH,
             physics_steps=number,

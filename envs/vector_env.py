@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict
-from viapoint.envs.common.validation import finite_array, masked_rows, seeds_of, whole_number
+from viapoint.envs.common.validation import did_you_mean, finite_array, masked_rows, seeds_of, whole_number
 from viapoint.envs.episodes import Decision, Episodes, History
 from viapoint.envs.geometry.obstacles import geom_meshes
 from viapoint.envs.outcome import Rollout
@@ -102,6 +103,11 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         pictures = {"render_mode": render_mode, "width": width, "height": height}
         ends = {"autoreset_mode": autoreset_mode, "max_episode_steps": max_episode_steps}
         EzPickle.__init__(self, num_envs, threads=threads, **pictures, **ends, **task)
+        known = inspect.signature(Task.of).parameters
+        for name in task:
+            if name not in known:
+                told = f"{name!r}; arguments are {', '.join(known)}{did_you_mean(name, known)}"
+                raise TypeError(f"{type(self).__name__} got an unexpected keyword argument {told}")
         self.task = Task.of(**task)
         """Task of an episode: what an agent may compute with before it moves."""
         self.num_envs = whole_number("num_envs", num_envs, 1)

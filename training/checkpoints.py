@@ -23,7 +23,7 @@ from stable_baselines3.common.save_util import recursive_getattr, recursive_seta
 from viapoint.envs.arms.registry import ARM_FILES
 from viapoint.envs.arms.stored import COPY
 from viapoint.training.agents.model_io import describe
-from viapoint.training.files import BadFileError, read_bytes, write_bytes
+from viapoint.training.files import BadFileError, read_bytes, write_bytes, written_by
 from viapoint.training.vec_env import ViaVecEnv
 
 FORMAT = 3
@@ -81,18 +81,18 @@ def read_checkpoint(model: BaseAlgorithm, path: Path) -> float:
     A checkpoint that is torn, foreign, or of another model raises BadFileError.
     """
     state = read_state(path)
-    written_by = f"was written by viapoint {state['model'].get('viapoint')} and"
+    written = written_by(state["model"].get("viapoint"))
     mine = _with_any_file(describe(model))
     theirs = _with_any_file(state["model"])
     others = [name for name in mine if name not in MAY_DIFFER and mine[name] != theirs.get(name)]
     if others:
-        raise BadFileError(path, f"{written_by} is of another model: {', '.join(others)}")
+        raise BadFileError(path, f"is of another model: {', '.join(others)}{written}")
     try:
         _restore(model, state, _mapped(state["arrays"], torch.Tensor, torch.Tensor.numpy))
         return float(state["extra"]["seconds"])
     except Exception as error:  # of a library, for content that does not fit the model
-        reason = f"{written_by} does not fit the model ({type(error).__name__}: {error})"
-        raise BadFileError(path, reason) from None
+        reason = f"does not fit the model ({type(error).__name__}: {error})"
+        raise BadFileError(path, reason + written) from None
 
 
 def _with_any_file(record: Any) -> Any:

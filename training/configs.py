@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import inspect
 import json
 import shlex
 from collections.abc import Iterable, Mapping
@@ -19,7 +18,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.registry import ARM_FILES, arm_of
 from viapoint.envs.common.validation import is_number
-from viapoint.envs.registration import ENV_IDS
+from viapoint.envs.registration import ENV_IDS, check_registered
 from viapoint.envs.task import Task
 from viapoint.primitives.fitting import MOST_VIA_POINTS, USUAL_RANGE
 from viapoint.training.checks import (
@@ -31,7 +30,6 @@ from viapoint.training.checks import (
     check_folder,
     check_whole,
     named_path,
-    unknown_name,
 )
 from viapoint.training.files import as_plain, parse_yaml
 from viapoint.training.planning.search import registered_task
@@ -103,7 +101,9 @@ def _listed(ids: Iterable[str]) -> str:
     return f"viapoint/NAME-v0, where NAME is one of {names}"
 
 
-ENV = tyro.conf.arg(metavar="ID", help=f"Id of a registered environment, such as {_listed(ENV_IDS)}.")
+ENV = tyro.conf.arg(
+    metavar="ID", help=f"Id of a registered environment: {_listed(ENV_IDS)}; or my_module:my/Task-v0."
+)
 AGENT = tyro.conf.arg(metavar="AGENT", help="Run folder, model folder, or id of a shipped agent.")
 PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent: {_listed(SHIPPED_IDS)}.")
 ARM = tyro.conf.arg(metavar="ARM", help="Arm: panda, planar, or an MJCF or URDF file.")
@@ -142,10 +142,6 @@ def task_with(env_id: str, env_kwargs: Mapping[str, Any]) -> Task:
     try:
         return registered_task(env_id, **env_kwargs)
     except TypeError as error:
-        known = inspect.signature(Task.of).parameters
-        for name in env_kwargs:
-            if name not in (*known, "threads"):
-                raise ValueError(unknown_name("env_kwargs", name, known)) from error
         raise ValueError(f"env_kwargs of {env_id}: {error}") from error
 
 
@@ -166,6 +162,8 @@ class Config:
             name, value = each.name, getattr(self, each.name)
             if isinstance(value, str) and "Path" in str(each.type):
                 value = named_path(name, value)
+            elif name == "env" and isinstance(value, str):
+                value = check_registered(value)
             elif str(each.type) == "NamedValues":
                 value = _plain(name, value)
             elif name in RANGES and value is not each.default and not isinstance(value, tuple | list):

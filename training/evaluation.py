@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from viapoint.envs.common.arrays import Float, Observation
 from viapoint.envs.common.validation import finite_array
 from viapoint.envs.outcome import Outcome
+from viapoint.envs.registration import check_registered
 from viapoint.envs.scenes.scene import NEVER, Scenes
 from viapoint.training import report
 from viapoint.training.agents.agent import load_agent
@@ -119,8 +120,8 @@ class EvaluationResult:
     def rows(self) -> list[dict[str, Any]]:
         """Metrics of each method by name, the name of the method as `method`.
 
-        Rates are dictionaries of `rate`, `low`, `high` (95 % Wilson interval), `count` and `of`; lengths are in [m] and
-        times in [s].
+        Rates are dictionaries of `rate`, `low`, `high` (95 % Wilson interval), `count` and `of`; lengths are in [m],
+        errors in joint space in [rad], and times in [s].
         """
         return [{"method": result.name, **result.summary()} for result in self.results]
 
@@ -228,7 +229,9 @@ def evaluate(
     if n_scenes is not None and n_scenes > len(chosen.share):
         print(f"{chosen.name} has {len(chosen.share)} scenes, not {n_scenes}: all are used", file=sys.stderr)
     options: dict[str, Any] = {"time_decisions": time_decisions, "progress": progress}
-    return evaluate_methods(methods, chosen, env_id, env_kwargs=kwargs, **options)
+    result = evaluate_methods(methods, chosen, env_id, env_kwargs=kwargs, **options)
+    own = agent.get_env().unwrapped if isinstance(agent, BaseAlgorithm) else None  # type: ignore[union-attr]
+    return replace(result, env_id=getattr(own, "recorded_id", env_id))
 
 
 def _environment_of(agent: Any, env: str | None, env_kwargs: Any) -> tuple[str, dict[str, Any]]:
@@ -236,9 +239,9 @@ def _environment_of(agent: Any, env: str | None, env_kwargs: Any) -> tuple[str, 
     if not isinstance(agent, BaseAlgorithm):
         if env is None:
             raise ValueError("env must be the id of an environment where no trained agent is given")
-        return env, whole_task(env, env_kwargs or {})
+        return check_registered(env), whole_task(env, env_kwargs or {})
     mine, kwargs = env_arguments(agent.get_env())
-    if env not in (None, mine):
+    if env is not None and check_registered(env) != mine:
         raise ValueError(f"env must be {mine}, on which the agent was trained, or be left out, got {env!r}")
     if env_kwargs is not None:
         trained = agent.get_env().get_attr("task", [0])[0]  # type: ignore[union-attr]

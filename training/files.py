@@ -43,6 +43,12 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **packages}
 
 
+def written_by(version: Any) -> str:
+    """Return the end of a message about a file that another version of viapoint wrote; empty if unknown or this."""
+    mine = importlib.metadata.version("viapoint")
+    return "" if version in (None, mine) else f"; it was written by viapoint {version}, and this is {mine}"
+
+
 class BadFileError(ValueError):
     """Error of a file or folder; the message names it and the reason."""
 

@@ -22,7 +22,7 @@ Record = Mapping[str, Any]  # Result of `EvaluationResult.to_dict`, or the conte
 # Metric, scale and number of digits of the columns of numbers, by heading
 NUMBERS = {
     "clearance [mm]": ("min_clearance", 1e3, 1),
-    "goal error [mm]": ("goal_error", 1e3, 2),
+    "goal error [mm, mrad]": ("goal_error", 1e3, 2),
     "jerk ratio": ("jerk_ratio", 1.0, 2),
     "SPL": ("spl", 1.0, 3),
     "duration [s]": ("duration", 1.0, 2),
@@ -30,12 +30,13 @@ NUMBERS = {
     "98 % of them [ms]": ("decision_time_98", 1e3, 2),
 }
 NOTES = (
-    "Success: arrived at rest within 1 cm, no contact at any physics step, joint limits kept; with its 95 % "
-    "Wilson interval. Share: success among scenes of that solution share, the fraction of random actions "
-    "whose plan is clear; in hard sets also among scenes of each family. Clearance and goal error are medians "
-    "of all scenes, jerk ratio (to the straight movement) and duration of the successes. SPL: success weighted "
-    "by straight distance over path length. Decision: median wall time of single decisions, and their 98th "
-    "percentile; where that is missing, the mean in a batch."
+    "Success: arrived at rest within 1 cm, or in joint space 0.02 rad of every joint, no contact at any "
+    "physics step, joint limits kept; with its 95 % Wilson interval. Share: success among scenes of that "
+    "solution share, the fraction of random actions whose plan is clear; in hard sets also among scenes of "
+    "each family. Clearance and goal error are medians of all scenes, jerk ratio (to the straight movement) "
+    "and duration of the successes. SPL: success weighted by straight distance over path length. Decision: "
+    "median wall time of single decisions, and their 98th percentile; where that is missing, the mean in a "
+    "batch."
 )
 HEADINGS, COLUMN = 18, 14  # Widths in a terminal, [characters]
 

@@ -72,11 +72,12 @@ class Run:
                 raise ValueError(f"without {', '.join(sorted(missing))}")
             if isinstance(record.get("env_kwargs"), dict):
                 record["env_kwargs"] = with_kept_arm(record["env_kwargs"], folder)
+            record["env"] = str(record["env"]).rpartition(":")[2]  # a file names no module to import
             self.config: TrainConfig = TrainConfig(**record)
         except (TypeError, ValueError) as error:
-            writer = self.versions.get("viapoint", "of an unknown version")
-            reason = f"was written by viapoint {writer}, and is no configuration of a training here ({error})"
-            raise BadFileError(folder / "config.json", reason) from None
+            reason = f"is no configuration of a training here: {error}"
+            written = files.written_by(self.versions.get("viapoint"))
+            raise BadFileError(folder / "config.json", reason + written) from None
 
     def __repr__(self) -> str:
         config = self.config

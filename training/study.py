@@ -46,7 +46,7 @@ from viapoint.training.trainer import train_or_resume
 Values = Mapping[str, Any]
 Record = dict[str, Any]
 # Types of the fields of a file
-Entries = list[str] | dict[str, dict[str, Any] | None]  # Names, or options by name
+Entries = list[Any] | dict[str, dict[str, Any] | None]  # Names, or options by name
 Names = list[str] | tuple[str, ...]
 Numbers = list[int] | tuple[int, ...]
 # Fields of a training that an agent may set
@@ -234,6 +234,10 @@ def _study(
 
 def _entries(given: Entries) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield name and fields of each entry of a list or mapping, one for each point of its grid."""
+    if not all(isinstance(name, str) for name in given):
+        raise ValueError(
+            f"a list is one of names; options are by name, NAME: {{id: ..., ...}}, got {given!r}"
+        )
     entries = given if isinstance(given, dict) else dict.fromkeys(given)
     for name, fields in entries.items():
         if not name.strip("/. ") or ".." in name or name.startswith("/"):

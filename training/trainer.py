@@ -33,7 +33,7 @@ Callbacks = BaseCallback | Sequence[BaseCallback] | None
 PROGRESS = "{desc}{percentage:.0f}%|{bar}| {elapsed}<{remaining}, {n_fmt}/{total_fmt} decisions"
 LOG_EVERY = 1_000  # Decisions between two entries of the log
 RATES = ("collision", "reachable")  # Metrics that are true or false
-# Metrics of a validation in the log and in the learning curve; medians in [m] and [s]
+# Metrics of a validation in the log and in the learning curve; medians in [m], [s], and [rad] for errors of joints
 VALIDATED = ("success", "collision", "min_clearance", "goal_error", "jerk_ratio", "duration")
 
 
@@ -294,8 +294,6 @@ class RunCallback(CallbackList):
         if self._validation is None or (self.curve and self.curve[-1]["decisions"] == self.num_timesteps):
             return
         began = time.monotonic()
-        if hasattr(self.model, "calibrate"):  # of agents that predict their success
-            self.model.calibrate()
         (result,) = evaluate(self.model, scenes=self._validation, time_decisions=False).results
         if result.partial:  # Ctrl-C has ended it: some scenes say nothing of all
             return
@@ -310,6 +308,9 @@ class RunCallback(CallbackList):
         # A validation is better with more success, then with less jerk.
         best = max(self.curve, key=lambda each: (each["success"]["rate"], -(each["jerk_ratio"] or 0.0)))
         if record is best:
+            # Agents that predict their success are calibrated for a file alone: no plan depends on it.
+            if self.num_timesteps and hasattr(self.model, "calibrate"):
+                self.model.calibrate()
             self.run.save("best", self.model)
         self._show_progress()
         self._began += time.monotonic() - began  # the time of a validation does not count

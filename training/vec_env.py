@@ -92,7 +92,7 @@ class ViaVecEnv(VecEnv):
     not apply: the reward of another goal depends on contact and jerk of a movement that was not made.
 
     Args:
-        env_id: Id of a registered environment.
+        env_id: Id of a registered environment, also with the module that registers it, `my_module:my/Task-v0`.
         num_envs: Number of copies N.
         seed: Copy i is seeded with `seed + i` at the next reset; None seeds from the system.
         **kwargs: Keyword arguments of the environment.
@@ -114,7 +114,7 @@ class ViaVecEnv(VecEnv):
     """
 
     def __init__(self, env_id: str, num_envs: int, seed: int | None = None, **kwargs: Any) -> None:
-        check_registered(env_id)
+        env_id = check_registered(env_id)
         extra: dict[str, Any] = {}
         if gym.spec(env_id).vector_entry_point is None:  # copies of the single environment
             extra["vector_kwargs"] = {"autoreset_mode": AutoresetMode.SAME_STEP}
@@ -123,6 +123,7 @@ class ViaVecEnv(VecEnv):
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(f"{env_id} must have autoreset mode SAME_STEP, not {mode}")
         self.env_id, self.env_kwargs = env_id, dict(kwargs)
+        self.recorded_id = env_id  # of an agent's file, which need not be registered here; tables name it
         spaces = self.venv.single_observation_space, self.venv.single_action_space
         VecEnv.__init__(self, num_envs, *spaces)
         self._actions: NDArray[Any] | None = None

@@ -97,7 +97,7 @@ def masked_rows(mask: Any, num_envs: int, running: bool) -> Int:
     mask = np.asarray(mask)
     if mask.shape != (num_envs,) or mask.dtype != np.bool_ or not mask.any():
         raise ValueError(
-            f"options['reset_mask'] must be {num_envs} bools, of which one is True, got {mask!r}"
+            f"options['reset_mask'] must be {num_envs} bools, one or more of them True, got {mask!r}"
         )
     if not running and not mask.all():
         raise ValueError("options['reset_mask'] must be True for every environment at the first reset")

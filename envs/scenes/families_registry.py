@@ -76,7 +76,8 @@ def check_families(families: Sequence[str], plane: bool, kinds: Iterable[str], m
     known = scene_families(plane)
     for name in families:
         if name not in known:
-            raise ValueError(f"families must be some of {', '.join(known)}, got {name!r}")
+            others = "others need register_scene_family in this process"
+            raise ValueError(f"families must be some of {', '.join(known)}, got {name!r}; {others}")
         lack = known[name].lack(kinds, most)
         if lack:
             raise ValueError(f"the family {name!r} {lack}")
@@ -99,10 +100,10 @@ def register_scene_family(
 
     Args:
         name: Name that is not taken among families of the same place.
-        build: Function `build(rng, room)` of a random generator and a
-            :class:`~viapoint.envs.scenes.layout.Room`. It returns a list of shapes and a list of
-            :class:`~viapoint.envs.scenes.layout.Place`, [m], where goals are; without places, goals are free
-            configurations. In the plane it returns a third list of one place, the start. Or it returns the layout of a
+        build: Function `build(rng, room)` of a random generator and a :class:`~viapoint.envs.scenes.layout.Room`. It
+            returns a list of shapes and a list of :class:`~viapoint.envs.scenes.layout.Place`, [m], where goals are,
+            and starts where both are exchanged; without places, goals are free configurations. In the plane it returns
+            a third list of one place, the start. Or it returns the layout of a
             :class:`~viapoint.envs.scenes.layout.Furniture`. It must depend on nothing but its arguments.
         plane: True for arms in the plane, False for arms in space.
         kinds: Kinds of obstacles that the family needs; others appear only if `room.kinds` has them.
@@ -148,6 +149,8 @@ def _checked(name: str, build: Build) -> Build:
     def checked(rng: np.random.Generator, room: Room) -> Layout:
         built = build(rng, room)  # errors of the function itself are its own
         try:
+            if not isinstance(built, Layout | tuple | list):
+                raise TypeError(f"build must return shapes and places, or a layout, got {built!r}")
             layout = built if isinstance(built, Layout) else _as_layout(*built)
             numbers = np.array([*layout.rows, *layout.goals, *layout.starts])
             if len(layout.rows) % ROW or (len(layout.goals) + len(layout.starts)) % PLACE:

@@ -192,7 +192,7 @@ def check_scenes(
         _check_end(arm, name, getattr(scenes, name), scenes.obstacles, everywhere, names)
     if len(ends) == len(ENDS):
         apart = np.abs(scenes.goal - scenes.start).max(axis=-1)
-        allowed = f"start and goal must differ by {LEAST_APART} or more in a joint"
+        allowed = f"start and goal must be apart, by {LEAST_APART} rad or more in a joint"
         _refuse(apart < LEAST_APART, allowed, apart)
         check_jumps(scenes, arm, names)
 

@@ -17,7 +17,7 @@ from safetensors.numpy import load_file, save, save_file
 
 from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES
-from viapoint.training import load_agent
+from viapoint.training import Run, load_agent
 from viapoint.training.agents.model_io import build, load_model, save_model
 from viapoint.training.checkpoints import read_checkpoint, read_state, write_checkpoint
 from viapoint.training.files import BadFileError
@@ -97,6 +97,9 @@ def test_no_module_is_imported_by_name(model, monkeypatch):
     monkeypatch.syspath_prepend(model)
     edit(model, env={"id": "evil_module:viapoint/PlanarReach-v0", "kwargs": {}})
     check_refused(model, RECORD)
+    settings = {"env": "evil_module:viapoint/PlanarReach-v0", "algo": "sac", "seed": 0, "n_timesteps": 8}
+    (model / "config.json").write_text(json.dumps(settings))
+    assert Run(model).config.env == "viapoint/PlanarReach-v0"
     assert "evil_module" not in sys.modules
 
 

@@ -222,6 +222,7 @@ def test_the_document_holds_every_method_and_metric(record, tmp_path):
     search = dict(zip(cells[0], cells[3], strict=True))
     assert search["success"] == f"{100 * summary['success']['rate']:.1f} %"
     assert search["clearance [mm]"] == f"{1e3 * summary['min_clearance']:.1f}"
+    assert search["goal error [mm, mrad]"] == f"{1e3 * summary['goal_error']:.2f}"  # as the space has it
     assert json.loads(data.read_text()) == record
     assert record["sha256"][:12] in document.read_text()
     rate = summary["success"]["rate"]

@@ -14,6 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from viapoint.envs import RewardWeights, Sensor, arm_of, register_arm
 from viapoint.envs.arms import registry
+from viapoint.envs.scenes.families_registry import FAMILIES
 from viapoint.training import Run, TrainConfig, ViaVecEnv, files, load_agent, runs, train
 from viapoint.training.agents.agent import find_model
 from viapoint.training.agents.model_io import build, describe, load_model, save_model, weights
@@ -84,6 +85,15 @@ def test_an_agent_of_ones_own_arm_is_loaded_by_whoever_makes_the_arm_known(tmp_p
     registry._OWN.clear()
     with pytest.raises(BadFileError, match=r"'mine'.*register_arm"):
         load_model(tmp_path)
+
+
+def test_an_agent_of_a_family_of_ones_own_asks_for_the_family(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setitem(FAMILIES, (True, "mine"), FAMILIES[True, "clutter"])
+        save_model(new("viaq", ViaVecEnv(PLANE, 1, families="mine", threads=1)), tmp_path)
+    with pytest.raises(BadFileError, match=r"'mine'.*register_scene_family") as raised:
+        load_model(tmp_path)
+    assert "written by" not in str(raised.value)  # the version is not to blame
 
 
 def test_an_error_of_a_file_reaches_other_processes():

@@ -10,7 +10,11 @@ from stable_baselines3.common.monitor import Monitor
 
 from viapoint.envs import obstacles_to_json, scene_from_json, scene_to_json
 from viapoint.envs.geometry.obstacles import POSE_SIZE
-from viapoint.training import SceneExtractor, TrainConfig, ViaVecEnv, evaluate, load_agent, train
+from viapoint.envs.registration import check_registered
+from viapoint.training import Run, SceneExtractor, Study, TrainConfig, ViaVecEnv, evaluate, load_agent, train
+from viapoint.training.agents.agent import find_model
+from viapoint.training.cli import commands
+from viapoint.training.configs import EvaluateConfig
 from viapoint.training.files import BadFileError
 
 
@@ -76,11 +80,37 @@ def test_an_own_id_has_the_limit_of_decisions_of_gymnasium(tmp_path, monkeypatch
     with monkeypatch.context() as patch:
         patch.delitem(gym.registry, env_id)  # where the model is loaded, the id need not be known
         again = evaluate(run.best, scenes="validation", n_scenes=4)
+        commands.evaluate(
+            EvaluateConfig(agent=str(run.folder), scenes="validation", n_scenes=4, baselines=())
+        )
+        with pytest.raises(BadFileError, match=f"'{env_id}'; name the module") as raised:
+            Run(run.folder)  # but it must be to go on
+    assert "written by" not in str(raised.value)
+    assert len(list((run.folder / "evaluations").iterdir())) == 1
     for each in (result, again):
+        assert each.env_id == env_id
         assert (each.results[0].outcomes["decisions"] == 3).all()
     register(vector_entry_point=vector, control_step=0.08)  # nor another task by this id
     with pytest.raises(BadFileError):
         load_agent(run.folder)
+
+
+def test_an_id_may_name_the_module_that_registers_it(tmp_path, monkeypatch):
+    spec = "'viapoint.envs.env:ReachEnv', vector_entry_point='viapoint.envs.vector_env:ReachVectorEnv'"
+    (tmp_path / "own_ids.py").write_text(f"import gymnasium\ngymnasium.register('me/Named-v0', {spec})\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    named = "own_ids:me/Named-v0"
+    assert TrainConfig(env=named).env == EvaluateConfig(env=named).env == "me/Named-v0"
+    assert ViaVecEnv(named, 1).env_id == check_registered(named) == "me/Named-v0"
+    assert (
+        evaluate(env=named, baselines=["straight"], scenes="validation", n_scenes=2).env_id == "me/Named-v0"
+    )
+    study = Study.from_dict({"environments": [named], "baselines": ["straight"], "scenes": ["validation"]})
+    assert study.trials[0].env_id == named  # workers import it
+    assert find_model(f"viapoint.envs:{PLANE}") == find_model(PLANE)
+    for wrong in ("own_idz:me/Named-v0", "own_ids:me/Named-v1", "me Named"):
+        with pytest.raises(ValueError):
+            check_registered(wrong)
 
 
 def test_an_own_id_needs_a_vector_environment():

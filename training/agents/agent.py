@@ -194,12 +194,13 @@ def find_model(source: str | Path) -> Path:
     Raises:
         ValueError: It is none of them.
     """
+    source = str(source).removeprefix("viapoint.envs:")
     folder = Path(source).expanduser()
     known = ", ".join(SHIPPED_IDS)
-    if str(source) in SHIPPED_IDS:
+    if source in SHIPPED_IDS:
         return SHIPPED / folder.name
-    if str(source) in gym.registry:
-        raise ValueError(f"no agent is shipped for {str(source)!r}; agents are shipped for {known}")
+    if source in gym.registry:
+        raise ValueError(f"no agent is shipped for {source!r}; agents are shipped for {known}")
     if folder.suffix == ".zip" and not folder.exists():
         folder = folder.with_suffix("")
     if (folder / "model.json").is_file():

@@ -43,6 +43,7 @@ from viapoint.training.files import (
     read_json,
     write_arrays,
     write_json,
+    written_by,
 )
 from viapoint.training.planning.candidates import MOST_CANDIDATES, MOST_ROUNDS
 from viapoint.training.planning.movements import INSTANTS
@@ -123,11 +124,9 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
     path = folder / "model.json"
     tensors = folder / "weights.safetensors"
     record = read_json(path, LARGEST_MODEL_JSON)
-    writer = f"was written by viapoint {record.get('viapoint')}"
+    written = written_by(record.get("viapoint"))
     if record.get("format") != FORMAT:
-        mine = importlib.metadata.version("viapoint")
-        found = f"must have format {FORMAT}, got {record.get('format')!r}"
-        raise BadFileError(path, f"{found}; it {writer} and this is {mine}")
+        raise BadFileError(path, f"must have format {FORMAT}, got {record.get('format')!r}{written}")
     arrays = read_arrays(tensors, LARGEST_WEIGHTS)
     try:
         # An arm file that is gone is replaced by its copy; ViaQ's networks know the task, too.
@@ -150,8 +149,8 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
         if env is not None:
             load_model(folder)  # raises the error of the file if that is to blame
             raise ValueError(f"env does not fit the agent in {folder}: {error}") from None
-        reason = f"does not describe a model of this version of viapoint ({type(error).__name__}: {error})"
-        raise BadFileError(path, f"{writer} and {reason}") from None
+        reason = f"does not describe a model that can be built here ({type(error).__name__}: {error})"
+        raise BadFileError(path, reason + written) from None
     _put_weights(model, arrays, tensors)
     if record.get("weights_sha256", "") not in ("", _digest(tensors)):
         raise BadFileError(tensors, "is damaged: its hash is not the one that model.json states")
@@ -365,6 +364,7 @@ def _own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
         if value > most:
             raise ValueError(f"{name} may be at most {most} in a file, got {value}")
     env = ViaVecEnv(env_id, 1, **kwargs)
+    env.recorded_id = record["id"]
     if "task" in record:
         try:
             check_same_task(Task.from_dict(record["task"]), _task_of(env))

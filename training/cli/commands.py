@@ -16,7 +16,7 @@ import pandas as pd
 from viapoint.envs.arms.registry import arm_of
 from viapoint.training import configs, report
 from viapoint.training import trainer as training
-from viapoint.training.agents.agent import Agent, load_agent
+from viapoint.training.agents.agent import Agent, best_model, load_agent
 from viapoint.training.checks import SHIPPED_IDS
 from viapoint.training.configs import AgentConfig, EvaluateConfig, PlayConfig, RecordConfig, TrainConfig
 from viapoint.training.datasets import dataset_folder, record_dataset
@@ -26,7 +26,6 @@ from viapoint.training.planning import benchmark
 from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.report import scene_progress
-from viapoint.training.runs import Run
 from viapoint.training.scene_sets import evenly_spread, scenes_for
 
 MOST_FAULTS = 10  # Greatest number of problems that are named with what is wrong
@@ -62,9 +61,11 @@ def evaluate(config: EvaluateConfig) -> None:
         result = measure(agent, env=env, env_kwargs=env_kwargs, progress=progress, **settings)
     record = result.to_dict()
     print(report.formatted(record, config.format))
-    if config.agent is not None and (Path(config.agent).expanduser() / "config.json").is_file():
-        run = Run(config.agent)
-        record["weights_sha256"] = read_json(run.best / "model.json").get("weights_sha256")
+    folder = Path(config.agent or "").expanduser()
+    if (
+        config.agent is not None and (folder / "config.json").is_file()
+    ):  # also of an id that is not known here
+        record["weights_sha256"] = read_json(best_model(folder) / "model.json").get("weights_sha256")
         name = f"{Path(config.scenes).stem}-{result.sha256[:8]}"  # the hash is that of the scenes
         if config.env_kwargs:
             record["env_kwargs"] = config.env_kwargs
@@ -72,7 +73,7 @@ def evaluate(config: EvaluateConfig) -> None:
             name += f"-{hashlib.sha256(changed).hexdigest()[:8]}"
         if result.partial:
             name += ".partial"
-        kept = run.folder / "evaluations" / f"{name}.json"
+        kept = folder / "evaluations" / f"{name}.json"
         write_json(kept, _with_earlier(record, kept))
         print(f"kept as {kept}", file=_notes(config))
     if config.json is not None:
