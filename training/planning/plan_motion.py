@@ -67,10 +67,11 @@ HAND_SPREADS = 0.15, 0.3  # Spreads of the same seeds in hand space, [m]
 NARROW = 8  # Number of seeds with the first spread
 # Number of seeds after which a path is looked for, where none became free, and of seeds along this path
 EARLY, ALONG = 8, 4
-TREE_TIME = 0.4  # Greatest share of the time that is left for a search of this path
-# Clearances that paths keep, as shares of those of the ends up to ROOM beyond what movements keep; smooth movements
-# need some of it
-PATH_ROOM, ROOM = 4 * (0.4, 0.1, 0.0), 0.02
+# Paths that are looked for in turn: clearances beyond what movements keep, as shares of those of the ends up to ROOM,
+# [m], of which smooth movements need some; and greatest shares of the time that is left. Random seeds follow the first
+# turn.
+PATHS, ROOM = ((0.4, 0.15), (0.1, 0.2), (0.0, 0.4)), 0.02
+PATH_ATTEMPTS = 12
 ALONG_TIME = 0.03  # Time limit of the refinement of a movement along a path, [s]
 MOST_REFINED = 12  # Greatest number of via-points that are refined, which takes longer the more there are
 SEEDS = 256  # Greatest number of random seeds
@@ -657,42 +658,44 @@ def _clearance_of(arm: Arm, joints: Float, obstacles: Obstacles, most: float) ->
 def _search_around(
     problem: _Problem, kept: float, duration: float, number: int, until: float, ompl: bool
 ) -> tuple[MotionPlan | None, int]:
-    """Return the best movement along a clear path, or else from random seeds, and the number of seeds.
+    """Return the best movement along a clear path or from random seeds, and the number of seeds.
 
-    Points of the path become seeds first, then as many via-points as the movement needs.
+    Points of a path become seeds first, then as many via-points as the movement needs.
     """
     ends = np.ascontiguousarray(problem.space.joints(np.stack((problem.start, problem.goal))))
     room = max(_clearance_of(problem.arm, ends, problem.obstacles, kept + ROOM) - kept, 0.0)
-    tried = 0
-    for share in PATH_ROOM:
-        margin = kept + share * room
-        patience = TREE_TIME * (until - time.perf_counter())
+    tried, best = 0, None
+    for attempt in range(PATH_ATTEMPTS):
+        share, time_share = PATHS[attempt % len(PATHS)]
+        patience = time_share * (until - time.perf_counter())
         seed = int(problem.generator.integers(2**31))
-        path = clear_path(problem.setting(), ends, problem.obstacles, margin, seed, patience)
-        if not len(path):
-            continue
-        vias = problem.space.coordinates(points_on(path, problem.given.shape[1]))[1:-1]
-        near = HAND_SPREADS[0] if problem.space.of_hand else SPREADS[0]
-        away = problem.generator.uniform(-near, near, (ALONG, *vias.shape))
-        away[0] = 0.0
-        along = problem._replace(given=vias + away)
-        found, more = _search(along, kept, duration, number, until, early=0, source="path")
-        tried += more
-        found = found or _along(problem, kept, duration, until, path, "path")
-        if found is not None:
+        path = clear_path(problem.setting(), ends, problem.obstacles, kept + share * room, seed, patience)
+        found = None
+        if len(path):
+            vias = problem.space.coordinates(points_on(path, problem.given.shape[1]))[1:-1]
+            near = HAND_SPREADS[0] if problem.space.of_hand else SPREADS[0]
+            away = problem.generator.uniform(-near, near, (ALONG, *vias.shape))
+            away[0] = 0.0
+            along = problem._replace(given=vias + away)
+            found, more = _search(along, kept, duration, number, until, early=0, source="path")
+            tried += more
+            found = found or _along(problem, kept, duration, until, path, "path")
+        if found is None and attempt == len(PATHS) - 1:
+            found, more = _search(problem, kept, duration, number, until, first=EARLY)
+            tried += more
+        if found is not None and found.success:
             return found, tried
-    found, more = _search(problem, kept, duration, number, until, first=EARLY)
-    tried += more
+        best = best or found  # free, but beyond the limits
     patience = until - time.perf_counter()
-    if found is None and ompl and patience > 0.0:
+    if best is None and ompl and patience > 0.0:
         try:
             import_ompl()  # the time of the first import does not count
         except ValueError:
             return None, tried
         other = path_around(problem.arm, ends, problem.obstacles, kept, patience)
         if other is not None:
-            found = _along(problem, kept, duration, until, other, "ompl")
-    return found, tried
+            best = _along(problem, kept, duration, until, other, "ompl")
+    return best, tried
 
 
 def _refined(
