@@ -20,9 +20,7 @@ Timing = Literal["optimal", "learned"]
 SpaceName = Literal["hand", "joints"]
 
 LOG_SPLIT = float(np.log(4.0))  # Log ratio of neighbouring durations for an action of 1: a factor of four
-MOST_VIAS = (
-    32  # Greatest number of via-points of an action; narrow passages of arms in space may need some twenty
-)
+MOST_VIAS = 32  # Greatest number of via-points; movements through narrow passages may need some twenty
 # Bounds of the duration range, [s] in hand space, factors in joint space
 SHORTEST_DURATION, LONGEST_DURATION = 0.05, 60.0
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)  # Nodes and weights of Gauss-Legendre quadrature

@@ -33,7 +33,7 @@ from viapoint.envs.arms.choices import (
 )
 from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.arms.stored import cached_arm, read_arm
-from viapoint.envs.arms.urdf import WARNING, Packages, Urdf, read_urdf
+from viapoint.envs.arms.urdf import MASSES_GUESSED, WARNING, Packages, Urdf, read_urdf
 from viapoint.envs.common.arrays import Float, frame_matrices
 from viapoint.envs.common.validation import finite_array, number_of_at_least
 from viapoint.envs.geometry.obstacles import quaternions_of
@@ -262,13 +262,16 @@ def _load(
         exclude={parsed.named(pair): reason for pair, reason in exclude.items()},
         touch=touch,
     )
-    weight = np.abs(torques(arm.chain, home, np.zeros(1), np.zeros(1)))
+    # Where masses are guesses, limits that do not hold them are no property of the arm, wherever it is.
+    guessed = any(MASSES_GUESSED in note for note in notes)
+    weighed = np.concatenate((home[None], drawn[: WEIGHED if guessed else 0]))
+    weight = np.abs(torques(arm.chain, weighed, np.zeros(1), np.zeros(1))).max(axis=0)
     weak = weight > torque
     if weak.any() and given["torque_limit"] is None:  # a spring that the file lacks may bear it
         some = ", ".join(itertools.compress(names, weak))
         notes.append(
-            f"{WARNING}torque limits of {some}: {WEIGHTS:g} times the weight at home, which those of the file do not "
-            "hold; give torque_limit"
+            f"{WARNING}torque limits of {some}: {WEIGHTS:g} times the weight{'' if guessed else ' at home'}, which "
+            "those of the file do not hold; give torque_limit"
         )
         torque = np.where(weak, WEIGHTS * weight, torque)
     endless = itertools.compress(names, (whole.jnt_limited[numbers] == 0) & ~arm.chain.sliding)

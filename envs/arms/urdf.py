@@ -28,6 +28,7 @@ LIMITED = ("revolute", "prismatic")  # Types of joints that have limits
 MOVING = (*LIMITED, "continuous")  # Types of joints that an arm may have
 SEVERAL_WAYS = ("floating", "planar")  # Types of joints that move in several ways at once; they are fixed
 WARNING = "warning: "  # Beginning of notes that are told as warnings, too
+MASSES_GUESSED = "that of its geoms, as if of water"  # End of notes on masses that the file lacks
 OBJECT = re.compile(rb"(?m)^[og]\b.*$")  # Line of an OBJ file that begins an object or a group
 LEFT_OUT = ("transmission", "gazebo")  # Elements that MuJoCo does not need
 
@@ -161,7 +162,7 @@ def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
     name, mass = link.get("name"), link.find("inertial/mass")
     if mass is None:
         if link.find("collision") is not None:
-            notes.append(f"mass of {name}, which the file lacks: that of its geoms, as if of water")
+            notes.append(f"mass of {name}, which the file lacks: {MASSES_GUESSED}")
         return
     value = float(mass.get("value", 0.0))
     if value <= 0.0:

@@ -477,6 +477,17 @@ def test_joints_that_carry_no_weight_get_torques_that_move_the_arm(crane):
     np.testing.assert_allclose(arm.torque_limit[1], 5.0 * arm.stiffness[1] / 50.0**2, rtol=1e-3)
 
 
+def test_limits_hold_masses_that_the_file_lacks(crane):
+    """Also in other configurations than home, in which the joint bears nothing."""
+    path = written(crane, ('effort="50"', 'effort="0.01"'))
+    path.write_text(re.sub(r"<inertial>.*?</inertial>", "", path.read_text(), flags=re.DOTALL))
+    with pytest.warns(UserWarning, match="tilt"):
+        arm = load_arm(path, home=(0.0, 0.0, 0.5 * np.pi))
+    weighed = np.random.default_rng(0).uniform((0.0, -3.0, -1.0), (0.4, 3.0, 2.0), (300, 3))
+    weight = np.abs(torques(arm.chain, weighed, np.zeros(1), np.zeros(1))).max(axis=0)
+    assert (weight <= arm.torque_limit).all()
+
+
 LIMIT = '<limit lower="-1" upper="2" effort'
 MESH = "package://crane_description/meshes/wrist.obj"
 

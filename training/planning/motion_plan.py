@@ -114,7 +114,7 @@ class MotionPlan:
     jerk: float
     """Jerk cost relative to that of the straight movement of the same duration; NaN where that does not move."""
     source: str
-    """Origin of the via-points: `straight`, `straight, refined`, `given`, `random`, `ompl`, or another planner;
+    """Origin of the via-points: `straight`, `straight, refined`, `given`, `random`, `path`, `ompl`, or another planner;
     `refused` where there is no movement."""
     reason: str = ""
     """Reason why there is no success; empty for success."""

@@ -666,6 +666,8 @@ def _search_around(
     room = max(_clearance_of(problem.arm, ends, problem.obstacles, kept + ROOM) - kept, 0.0)
     tried, best = 0, None
     for attempt in range(PATH_ATTEMPTS):
+        if time.perf_counter() >= until:
+            break
         share, time_share = PATHS[attempt % len(PATHS)]
         patience = time_share * (until - time.perf_counter())
         seed = int(problem.generator.integers(2**31))
@@ -728,6 +730,8 @@ def _along(
     Fewer points of a free movement often make a smoother one.
     """
     for number in VIA_COUNTS:
+        if time.perf_counter() >= until:
+            break
         points = problem.space.coordinates(points_on(path, number))
         # Passage times of least jerk take longer to compute than all else, and leave narrow passages more often.
         shares = np.sqrt(np.maximum(norm(np.diff(points, axis=0)), 1e-6))
@@ -737,6 +741,8 @@ def _along(
         if found is None:
             continue
         for fewer in reversed(VIA_COUNTS[: VIA_COUNTS.index(number)]):
+            if time.perf_counter() >= until:
+                break
             movement, _, cost = found
             instants = np.linspace(0, FINE_INSTANTS - 1, fewer + 2).round().astype(np.int64)[1:-1]
             points = movement.start + movement.table.basis[movement.times, instants] @ movement.offsets
