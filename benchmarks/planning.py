@@ -36,9 +36,11 @@ PUBLISHED = (
 CURVES, FIGURE = DOCS / "planning_curves.csv", DOCS / "images" / "planning.png"
 DEVELOPED_ON = 20
 """Greatest number of the problems that were looked at during development."""
+UNSOLVABLE = "table_pick 41"
+"""Problem with a goal in contact, which tables leave out, too."""
 EVERY, PATIENCE = 4, 0.5
 """Step between the problems of the curves, and of the comparison with the least jerk in a longer time, [s]."""
-PLANNERS = ("straight", "plan_motion", "plan_motion+ompl", "search512", "ompl")
+PLANNERS = ("straight", "plan_motion", "paths", "plan_motion+ompl", "search512", "ompl")
 LIMITS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 """Time limits of plan_motion, [ms]."""
 CHECKS = (16, 64, 256, 1024, 4096, 16384)
@@ -62,7 +64,8 @@ def main() -> None:
     if asked.what == "table":
         write_table(problems)
     else:
-        measure_curves(problems[::EVERY]).to_csv(
+        solvable = [each for each in problems[::EVERY] if each.name != UNSOLVABLE]
+        measure_curves(solvable).to_csv(
             CURVES, index=False, float_format="%.4g", lineterminator="\n"
         )
         draw_curves()

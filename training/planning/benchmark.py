@@ -214,7 +214,9 @@ Progress = Callable[[str, int, int], None]
 
 
 def benchmark_planner(name: str) -> Planner:
-    """Return a planner by its name: straight, plan_motion, plan_motion+ompl, ompl, or search512 or another number.
+    """Return a planner by its name: straight, plan_motion, paths, plan_motion+ompl, ompl, or searchN.
+
+    `paths` is plan_motion without random seeds.
 
     Raises:
         ValueError: There is no such planner, or its library is not installed.
@@ -222,6 +224,7 @@ def benchmark_planner(name: str) -> Planner:
     settings: dict[str, dict[str, Any]] = {
         "straight": {"time_limit": 0.0},
         "plan_motion": {"ompl": False},
+        "paths": {"ompl": False, "seeds": 0},
         "plan_motion+ompl": {"time_limit": 10.0},
     }
     if "ompl" in name:
