@@ -65,9 +65,7 @@ def main() -> None:
         write_table(problems)
     else:
         solvable = [each for each in problems[::EVERY] if each.name != UNSOLVABLE]
-        measure_curves(solvable).to_csv(
-            CURVES, index=False, float_format="%.4g", lineterminator="\n"
-        )
+        measure_curves(solvable).to_csv(CURVES, index=False, float_format="%.4g", lineterminator="\n")
         draw_curves()
 
 
