@@ -414,7 +414,8 @@ def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     _known(problem, straight, "straight", 0.0, _fault(problem)[0])
     tables = movement_table(n_via), fine_table(n_via)
     _refined(problem, problem.setting(), 0.0, tables, np.zeros((0, n_via, len(start))), 1.0, np.inf)
-    clear_path(problem.setting(), np.stack((arm.home, arm.home)), problem.obstacles, 0.0, 0, 0.0)
+    rng = np.random.default_rng(0)
+    clear_path(problem.setting(), np.stack((arm.home, arm.home)), problem.obstacles, 0.0, rng, 0.0)
 
 
 def _goals(problem: _Problem, goal: Any) -> Float:
@@ -670,8 +671,8 @@ def _search_around(
             break
         share, time_share = PATHS[attempt % len(PATHS)]
         patience = time_share * (until - time.perf_counter())
-        seed = int(problem.generator.integers(2**31))
-        path = clear_path(problem.setting(), ends, problem.obstacles, kept + share * room, seed, patience)
+        margin = kept + share * room
+        path = clear_path(problem.setting(), ends, problem.obstacles, margin, problem.generator, patience)
         found = None
         if len(path):
             vias = problem.space.coordinates(points_on(path, problem.given.shape[1]))[1:-1]

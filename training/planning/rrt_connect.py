@@ -26,7 +26,12 @@ LESS = 0.95  # Length of a shortcut that is worth a check, as a share of the way
 
 @compiled
 def clear_path(
-    setting: Setting, ends: Float, obstacles: Obstacles, margin: float, seed: int, patience: float
+    setting: Setting,
+    ends: Float,
+    obstacles: Obstacles,
+    margin: float,
+    rng: np.random.Generator,
+    patience: float,
 ) -> Float:
     """Return the corners of a clear path with start and goal, shape (P, J); none, shape (0, J), if none is found.
 
@@ -35,15 +40,15 @@ def clear_path(
         ends: Start and goal, both clear, shape (2, J).
         obstacles: Obstacles of one scene, at rest.
         margin: Least clearance of the path, [m].
-        seed: Seed of the random numbers.
+        rng: Random generator.
         patience: Time limit, [s].
     """
     until = clock() + patience
-    np.random.seed(seed)  # noqa: NPY002 - compiled functions have generators of their own, one for each thread
     low, high = setting.joint_range[:, 0], setting.joint_range[:, 1]
     placed = memory(setting.chain, setting.spheres)
     joints = len(low)
-    here, target = np.empty(joints), np.empty(joints)
+    here = np.empty(joints)
+    target = np.empty(joints)
     # Both trees: their nodes, the node from which each was reached, and how many there are.
     node = np.empty((2, MOST_NODES, joints))
     parent = np.empty((2, MOST_NODES), np.int64)
@@ -54,7 +59,7 @@ def clear_path(
         if count.max() == MOST_NODES or clock() > until:
             break
         for j in range(joints):
-            target[j] = np.random.uniform(low[j], high[j])  # noqa: NPY002
+            target[j] = rng.uniform(low[j], high[j])
         one = int(count[0] > count[1])  # the smaller tree grows
         other = 1 - one
         if _grow(setting, node[one], parent[one], count, one, target, obstacles, margin, here, placed) < 0.0:
@@ -68,7 +73,9 @@ def clear_path(
         if left == 0.0:
             path = np.empty((count[0] + count[1] + SHORTCUTS, joints))
             length = _join(node, parent, count, path)
-            length = _shorten(setting, path, length, obstacles, margin, here, placed, np.empty((2, joints)))
+            length = _shorten(
+                setting, path, length, obstacles, margin, rng, here, placed, np.empty((2, joints))
+            )
             return path[:length]
     return np.empty((0, joints))
 
@@ -129,7 +136,8 @@ def line_is_clear(
     count = 1
     while count * SPACING < way:
         count *= 2
-    begin, stride = count, count
+    begin = count
+    stride = count
     while begin:
         for k in range(begin, count + 1, stride):
             for j in range(len(here)):
@@ -187,6 +195,7 @@ def _shorten(
     length: int,
     obstacles: Obstacles,
     margin: float,
+    rng: np.random.Generator,
     here: Float,
     placed: Placed,
     points: Float,
@@ -198,8 +207,8 @@ def _shorten(
     """
     for _ in range(SHORTCUTS):
         # Points of the path, as numbers of a corner and shares of the way to the next.
-        one = np.random.random() * (length - 1)  # noqa: NPY002
-        other = np.random.random() * (length - 1)  # noqa: NPY002
+        one = rng.uniform(0.0, length - 1.0)
+        other = rng.uniform(0.0, length - 1.0)
         first, last = int(min(one, other)), int(max(one, other))
         if first == last:
             continue
