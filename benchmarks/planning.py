@@ -112,7 +112,7 @@ def quality(problems: list[BenchmarkProblem], lines: pd.DataFrame) -> str:
         ratios.append(jerk / min(best.jerk, jerk))
     found = pd.Series(ratios)
     return (
-        f"Jerk of plan_motion relative to the least that it finds in {1e3 * PATIENCE:.0f} ms, each {EVERY}th problem: "
+        f"Jerk of plan_motion relative to the least that it finds in {1e3 * PATIENCE:.0f} ms, every {EVERY}th problem: "
         f"median {found.median():.2f}, mean {found.mean():.2f}, 95 % {found.quantile(0.95):.2f}; at most 1.15 in "
         f"{100 * (found <= 1.15).mean():.0f} %."
     )
