@@ -62,9 +62,8 @@ def evaluate(config: EvaluateConfig) -> None:
     record = result.to_dict()
     print(report.formatted(record, config.format))
     folder = Path(config.agent or "").expanduser()
-    if (
-        config.agent is not None and (folder / "config.json").is_file()
-    ):  # also of an id that is not known here
+    # Also of a run whose id is not registered here.
+    if config.agent is not None and (folder / "config.json").is_file():
         record["weights_sha256"] = read_json(best_model(folder) / "model.json").get("weights_sha256")
         name = f"{Path(config.scenes).stem}-{result.sha256[:8]}"  # the hash is that of the scenes
         if config.env_kwargs:
