@@ -672,7 +672,9 @@ def test_narrow_passages_that_a_search_finds_are_planned() -> None:
     hard = frozen.take(frozen.band == len(BANDS) - 1).scenes
     start, goal = task.space.coordinates(hard.start), task.space.coordinates(hard.goal)
     solved = [
-        plan_motion(task.arm, start[i], goal[i], hard.obstacles.take([i]), space="hand").success
+        plan_motion(
+            task.arm, start[i], goal[i], hard.obstacles.take([i]), space="hand", time_limit=10.0
+        ).success
         for i in range(len(start))
     ]
     assert sum(solved) >= len(solved) - 2
