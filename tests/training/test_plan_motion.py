@@ -44,8 +44,7 @@ from viapoint.training.planning.movements import (
     fine_table,
     movement_table,
 )
-from viapoint.training.planning.ompl_paths import points_on
-from viapoint.training.planning.rrt_connect import clear_path
+from viapoint.training.planning.rrt_connect import clear_path, points_on
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import BANDS, load, scenes_for, shipped_path
@@ -118,17 +117,18 @@ def test_plans_never_lie(obstacles, arguments) -> None:
 
 
 WEAK = dataclasses.replace(PANDA, torque_limit=0.1 * PANDA.torque_limit)
-ACROSS = {
+SIDES = [(0.08, 0.01, 0.2, 0.22), (0.08, 0.01, 0.2, 0.38), (0.01, 0.08, 0.12, 0.3), (0.01, 0.08, 0.28, 0.3)]
+ENCLOSED = {
     "arm": "planar",
     "start": (-0.2, 0.3),
     "goal": (0.2, 0.3),
-    "obstacles": [Box((0.01, 0.5, 0.04), position=(0.0, 0.4, 0.0))],
+    "obstacles": [Box((a, b, 0.04), position=(x, y, 0.0)) for a, b, x, y in SIDES],
     "ompl": False,
     "time_limit": 2.0,
 }
 REASONS = [
-    ({**ACROSS, "seeds": 0}, "from 1 seed"),
-    ({**ACROSS, "seeds": 1}, "from 2 seeds"),
+    ({**ENCLOSED, "seeds": 0}, "from 1 seed"),
+    ({**ENCLOSED, "seeds": 1}, "from 2 seeds"),
     ({"obstacles": [POST, Sphere(0.1, position=PANDA.hand(GOAL))]}, "goal is in contact with obstacle 1"),
     (
         {"margin": 0.1, "obstacles": [POST, Sphere(0.1, position=PANDA.hand(PANDA.home), name="ball")]},

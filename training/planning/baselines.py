@@ -24,9 +24,10 @@ from viapoint.training.planning.cautious import (
     CautiousSearch,
 )
 from viapoint.training.planning.motion_plan import MotionPlan
-from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl
+from viapoint.training.planning.ompl_paths import import_ompl
 from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
 from viapoint.training.planning.predictions import PREDICTIONS, PredictedSearch
+from viapoint.training.planning.rrt_connect import VIA_COUNTS
 from viapoint.training.planning.search import GeometrySearch, registered_task
 from viapoint.training.rollout import Outcomes, SceneSimulation
 from viapoint.training.vec_env import env_arguments, predicted_actions

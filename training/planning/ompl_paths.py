@@ -15,14 +15,14 @@ import numpy as np
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.kinematics import Chain, Spheres
-from viapoint.envs.common.arrays import Float, norm
-from viapoint.envs.geometry.clearance import memory, obstacle_clearance, place, self_clearance
+from viapoint.envs.common.arrays import Float
+from viapoint.envs.geometry.clearance import memory
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
+from viapoint.training.planning.rrt_connect import keeps_margin
 
 CHECK_SPACING = 0.05  # Spacing of collision checks along a line, [rad]
 FIRST = threading.Lock()  # of the import, which several threads may ask for
-VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # Numbers of via-points, tried in this order
 
 
 def import_ompl() -> Any:
@@ -98,27 +98,7 @@ def path_around(arm: Arm, ends: Float, obstacles: Obstacles, margin: float, pati
 def _line_is_clear(chain: Chain, spheres: Spheres, line: Float, obstacles: Obstacles, margin: float) -> bool:
     """Return True if all configurations of shape (T, J) have more than a margin in scene 0."""
     placed = memory(chain, spheres)
-    for k in range(len(line)):
-        place(chain, spheres, line[k], placed)
-        if obstacle_clearance(spheres, placed, obstacles, 0, 0.0, margin, margin) < margin:
-            return False
-        if self_clearance(spheres, placed, margin, margin) < margin:
-            return False
-    return True
-
-
-def points_on(path: Float, count: int) -> Float:
-    """Return start, `count` points and goal of a path of straight pieces.
-
-    The points are the corners if there are as many, otherwise they are evenly spaced along the path. If there are more
-    points than corners, each corner replaces the nearest point.
-    """
-    if count == len(path) - 2:
-        return path
-    along = np.concatenate(([0.0], np.cumsum(norm(np.diff(path, axis=0)))))
-    places = along[-1] * np.arange(1, count + 1) / (count + 1)
-    if count > len(path) - 2:
-        for corner in along[1:-1]:
-            places[np.abs(places - corner).argmin()] = corner
-    places = np.concatenate(([0.0], np.sort(places), along[-1:]))
-    return np.stack([np.interp(places, along, path[:, i]) for i in range(path.shape[1])], axis=-1)
+    clear = 0
+    while clear < len(line) and keeps_margin(chain, spheres, line[clear], obstacles, margin, placed):
+        clear += 1
+    return clear == len(line)

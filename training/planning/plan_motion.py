@@ -47,7 +47,7 @@ from viapoint.training.planning.movements import (
     movement_table,
     table_with,
 )
-from viapoint.training.planning.ompl_paths import VIA_COUNTS, import_ompl, path_around, points_on
+from viapoint.training.planning.ompl_paths import import_ompl, path_around
 from viapoint.training.planning.refine import (
     SMOOTH,
     Found,
@@ -56,7 +56,7 @@ from viapoint.training.planning.refine import (
     refine_seeds,
     unit_of_jerk,
 )
-from viapoint.training.planning.rrt_connect import clear_path
+from viapoint.training.planning.rrt_connect import VIA_COUNTS, clear_path, points_on
 
 # Once enough movements are free, more seeds are tried around the one with the least jerk: MORE for each doubling of its
 # relative jerk cost beyond ROUGH, and at most MOST_MORE.

@@ -479,7 +479,8 @@ def refine_seeds(
         unit: Unit of jerk costs in unit time.
         smooth: Jerk cost in this unit with which a movement that was polished once is smooth enough.
         enough: Number of free movements after which to stop.
-        patience: Time after which no further refinement begins, [s]; each takes less than a millisecond.
+        patience: Time after which no further refinement begins, [s]; with up to three via-points each takes less than a
+            millisecond.
     """
     end = clock() + patience
     number, vias, dimension = seeds.shape

@@ -10,7 +10,8 @@ import math
 
 import numpy as np
 
-from viapoint.envs.common.arrays import Float, Int
+from viapoint.envs.arms.kinematics import Chain, Spheres
+from viapoint.envs.common.arrays import Float, Int, norm
 from viapoint.envs.geometry.clearance import Placed, memory, obstacle_clearance, place, self_clearance
 from viapoint.envs.geometry.compiled import clock, compiled, inlined, inner, kernel
 from viapoint.envs.geometry.obstacles import Obstacles
@@ -22,6 +23,7 @@ METRE = 4.0  # Angle that counts as much as a metre of a sliding joint, [rad]
 MOST_NODES, MOST_SAMPLES = 20_000, 300_000  # Greatest numbers of nodes of a tree and of its targets
 SHORTCUTS = 200  # Number of shortcuts that are tried
 LESS = 0.95  # Length of a shortcut that is worth a check, as a share of the way that it replaces
+VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # Numbers of points of a path that are tried as via-points
 
 
 @compiled
@@ -117,6 +119,17 @@ def _grow(
 
 
 @inner
+def keeps_margin(
+    chain: Chain, spheres: Spheres, joints: Float, obstacles: Obstacles, margin: float, placed: Placed
+) -> bool:
+    """Return True if a configuration keeps a margin from the obstacles of scene 0, and from itself."""
+    place(chain, spheres, joints, placed)
+    if obstacle_clearance(spheres, placed, obstacles, 0, 0.0, margin, margin) < margin:
+        return False
+    return self_clearance(spheres, placed, margin, margin) >= margin
+
+
+@inner
 def line_is_clear(
     setting: Setting,
     first: Float,
@@ -142,10 +155,7 @@ def line_is_clear(
         for k in range(begin, count + 1, stride):
             for j in range(len(here)):
                 here[j] = first[j] + k / count * (last[j] - first[j])
-            place(setting.chain, setting.spheres, here, placed)
-            if obstacle_clearance(setting.spheres, placed, obstacles, 0, 0.0, margin, margin) < margin:
-                return False
-            if self_clearance(setting.spheres, placed, margin, margin) < margin:
+            if not keeps_margin(setting.chain, setting.spheres, here, obstacles, margin, placed):
                 return False
         stride = begin
         begin //= 2
@@ -248,3 +258,20 @@ def _move(path: Float, length: int, begin: int, target: int) -> int:
         corner = length - 1 - i if way > 0 else begin + i
         _copy(path[corner], path[corner + way])
     return length + way
+
+
+def points_on(path: Float, count: int) -> Float:
+    """Return start, `count` points and goal of a path of straight pieces.
+
+    The points are the corners if there are as many, otherwise they are evenly spaced along the path. If there are more
+    points than corners, each corner replaces the nearest point.
+    """
+    if count == len(path) - 2:
+        return path
+    along = np.concatenate(([0.0], np.cumsum(norm(np.diff(path, axis=0)))))
+    places = along[-1] * np.arange(1, count + 1) / (count + 1)
+    if count > len(path) - 2:
+        for corner in along[1:-1]:
+            places[np.abs(places - corner).argmin()] = corner
+    places = np.concatenate(([0.0], np.sort(places), along[-1:]))
+    return np.stack([np.interp(places, along, path[:, i]) for i in range(path.shape[1])], axis=-1)
