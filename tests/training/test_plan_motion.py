@@ -126,6 +126,7 @@ ENCLOSED = {
     "ompl": False,
     "time_limit": 2.0,
 }
+FOLDED = np.array([0.0, -1.7, 0.0, -3.0, 0.0, 0.0, 0.8])
 REASONS = [
     ({**ENCLOSED, "seeds": 0}, "from 1 seed"),
     ({**ENCLOSED, "seeds": 1}, "from 2 seeds"),
@@ -139,7 +140,7 @@ REASONS = [
     ({"obstacles": [POST], "duration": 0.3}, "limit"),
     ({"obstacles": [POST], "time_limit": 0.0}, "no time for another one"),
     ({"arm": WEAK, "time_limit": 0.0}, "weight of the arm"),
-    ({"margin": 0.1}, "nearer to itself than the margin at the start"),
+    ({"goal": FOLDED}, "the arm touches itself at the goal"),
     ({"velocity": 300.0 * np.eye(7)[0]}, "velocity limit of joint 'joint1'"),
     ({"acceleration": 300.0 * np.eye(7)[0]}, "torque limit of joint 'joint1'"),
 ]
@@ -164,6 +165,20 @@ def test_a_given_duration_and_a_margin_are_kept() -> None:
     assert plan.success
     assert plan.duration == pytest.approx(4.0)
     assert plan.clearance >= 0.03
+
+
+def test_a_margin_holds_for_obstacles_and_not_for_the_arm_itself() -> None:
+    """At home the arm has 36 mm from itself. A seed, random ones and a path keep the margin from a ball alone."""
+    middle = PANDA.hand(PANDA.home + 0.5 * (GOAL - PANDA.home))
+    ball = Sphere(0.03, position=middle + np.array([0.0, 0.0, 0.03]))
+    for arguments in ({}, {"seeds": np.zeros((1, 2, 7)), "enough": 3}, {"seeds": 0, "n_via": 1}):
+        plan = plan_motion(PANDA, PANDA.home, GOAL, [ball], margin=0.045, **arguments)
+        assert plan.success
+        joints = plan.trajectory()(np.linspace(0.0, plan.duration, 500))
+        many = pack([[ball]]).take([0] * 500)
+        apart, own = row_clearances(PANDA.chain, PANDA.spheres, joints, many, 1.0)
+        assert apart.min() >= 0.045 > own.min() > 0.0
+        assert plan.clearance == pytest.approx(own.min(), abs=1e-3)
 
 
 @pytest.mark.parametrize("name", ["panda", "planar"])

@@ -108,7 +108,7 @@ class MotionPlan:
     """True if the movement touches nothing and keeps all limits."""
     clearance: float
     """Least clearance from obstacles and of the arm from itself, [m]; at most 1, negative in contact, and -2 for a
-    movement that leaves the joint limits or the reach."""
+    movement that leaves the joint limits or the reach. A margin holds for obstacles alone."""
     limits: Limits
     """Shares of the velocity and torque limits."""
     jerk: float

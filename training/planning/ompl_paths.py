@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.kinematics import Chain, Spheres
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.geometry.clearance import memory
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
+from viapoint.training.planning.movements import Setting
 from viapoint.training.planning.rrt_connect import keeps_margin
 
 CHECK_SPACING = 0.05  # Spacing of collision checks along a line, [rad]
@@ -48,7 +48,9 @@ def _ompl() -> Any:
     return ompl
 
 
-def path_around(arm: Arm, ends: Float, obstacles: Obstacles, margin: float, patience: float) -> Float | None:
+def path_around(
+    setting: Setting, ends: Float, obstacles: Obstacles, margin: float, patience: float
+) -> Float | None:
     """Return corners of a clear path with start and goal, shape (P, J), [rad]; None if none is found in time.
 
     `ends` are the joint positions of start and goal, shape (2, J). The path keeps a margin, [m], to obstacles at rest,
@@ -65,11 +67,11 @@ def path_around(arm: Arm, ends: Float, obstacles: Obstacles, margin: float, pati
             one, other = joints(first), joints(second)
             count = max(2, int(np.ceil(np.abs(other - one).max() / CHECK_SPACING)) + 1)
             line = np.ascontiguousarray(np.linspace(one, other, count))
-            return bool(_line_is_clear(arm.chain, arm.spheres, line, obstacles, margin))
+            return bool(_line_is_clear(setting.chain, setting.spheres, line, obstacles, margin))
 
     space = base.RealVectorStateSpace(number)
     bounds = base.RealVectorBounds(number)
-    for i, (low, high) in enumerate(arm.joint_range):
+    for i, (low, high) in enumerate(setting.joint_range):
         bounds.setLow(i, float(low))
         bounds.setHigh(i, float(high))
     space.setBounds(bounds)

@@ -23,7 +23,7 @@ from viapoint.envs.arms.inverse_kinematics import (
     inverse_kinematics,
     unwound,
 )
-from viapoint.envs.arms.kinematics import motion_torques, slowdowns, torques
+from viapoint.envs.arms.kinematics import Spheres, motion_torques, slowdowns, torques
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, whole_number
@@ -112,7 +112,13 @@ class _Problem(NamedTuple):
 
     def setting(self, near: float = np.inf) -> Setting:
         """Return arm and space; in the plane without spheres that are farther than `near` from all obstacles, [m]."""
-        return arm_setting(self.arm, self.space.of_hand, self.obstacles, room=-RANGE_TOLERANCE, near=near)
+        found = arm_setting(self.arm, self.space.of_hand, self.obstacles, room=-RANGE_TOLERANCE, near=near)
+        return found._replace(spheres=found.spheres._replace(room=self.margin))
+
+    @property
+    def spheres(self) -> Spheres:
+        """Spheres of the arm. Only obstacles are kept at the margin: parts of some arms are always nearer."""
+        return self.arm.spheres._replace(room=self.margin)
 
     @property
     def in_motion(self) -> bool:
@@ -178,7 +184,7 @@ def plan_motion(
         enough: Number of free movements among which the one with the least jerk is chosen.
         time_limit: Time after which no further seed is tried, [s]; with 0, only the straight movement is looked at.
             Inverse kinematics of poses, some 20 ms, comes before.
-        margin: Least clearance of the movement from obstacles, and of the arm from itself, [m].
+        margin: Least clearance of the movement from obstacles, [m]; from itself, the arm keeps 0.
         duration: Duration, [s]; None for the shortest that keeps 97 % of the limits, 0.25 s or more.
         space: `joints` or `hand`; that of the arm by default.
         velocity: Initial velocity, shape (D,); 0 by default.
@@ -387,10 +393,11 @@ def ompl_motion(
 
     ends = np.ascontiguousarray(where.joints(np.stack((start, goal))))
     best = smooth(ends)
-    nearest = _clearance_of(arm, ends, obstacles, OMPL_MARGINS[0])
+    setting = arm_setting(arm, where.of_hand, obstacles)
+    nearest = _clearance_of(setting, ends, obstacles, OMPL_MARGINS[0])
     for most in OMPL_MARGINS:
         margin = min(most, OMPL_ROOM * nearest)
-        path = path_around(arm, ends, obstacles, margin, OMPL_PATIENCE)
+        path = path_around(setting, ends, obstacles, margin, OMPL_PATIENCE)
         if path is None:
             continue
         for count in VIA_COUNTS:
@@ -457,7 +464,7 @@ def _goals_of_poses(problem: _Problem, poses: list[Pose]) -> Float:
             fault = error
             continue
         many = problem.obstacles.take(np.zeros(len(joints), np.int64))
-        rows, own = row_clearances(arm.chain, arm.spheres, joints, many, problem.margin + SPARE)
+        rows, own = row_clearances(arm.chain, problem.spheres, joints, many, problem.margin + SPARE)
         apart = np.minimum(own, rows[:, resting].min(axis=1, initial=np.inf))
         free = apart >= problem.margin
         if free.any():
@@ -481,7 +488,7 @@ def _fault(problem: _Problem) -> tuple[str, float]:
     resting = ~problem.obstacles.velocity[0].any(axis=-1)
     both = problem.obstacles.take([0, 0])
     most = problem.margin + SPARE
-    rows, own = row_clearances(arm.chain, arm.spheres, joints, both, most)
+    rows, own = row_clearances(arm.chain, problem.spheres, joints, both, most)
     for end, name in enumerate(("start", "goal")):
         beyond = np.maximum(arm.joint_range[:, 0] - joints[end], joints[end] - arm.joint_range[:, 1])
         worst = int(beyond.argmax())
@@ -497,8 +504,8 @@ def _fault(problem: _Problem) -> tuple[str, float]:
         if apart >= problem.margin:
             continue
         if apart == own[end]:
-            touches = "touches itself" if apart < 0.0 else "is nearer to itself than the margin"
-            which = f"the arm {touches} at the {name}"
+            apart -= problem.margin
+            which = f"the arm touches itself at the {name}"
         else:
             called = f" {problem.names[row]!r}" if problem.names and problem.names[row] else ""
             touches = "in contact with" if apart < 0.0 else "nearer than the margin to"
@@ -650,9 +657,10 @@ def _search(
     return _known(problem, movement, name, problem.least, clearance=known), tried
 
 
-def _clearance_of(arm: Arm, joints: Float, obstacles: Obstacles, most: float) -> float:
+def _clearance_of(setting: Setting, joints: Float, obstacles: Obstacles, most: float) -> float:
     """Return the least clearance of configurations, shape (N, J), among obstacles of one scene, at most `most`, [m]."""
-    rows, own = row_clearances(arm.chain, arm.spheres, joints, obstacles.take([0] * len(joints)), most)
+    many = obstacles.take([0] * len(joints))
+    rows, own = row_clearances(setting.chain, setting.spheres, joints, many, most)
     return min(float(own.min()), float(rows.min(initial=most)))
 
 
@@ -664,7 +672,8 @@ def _search_around(
     Points of a path become seeds first, then as many via-points as the movement needs.
     """
     ends = np.ascontiguousarray(problem.space.joints(np.stack((problem.start, problem.goal))))
-    room = max(_clearance_of(problem.arm, ends, problem.obstacles, kept + ROOM) - kept, 0.0)
+    setting = problem.setting()
+    room = max(_clearance_of(setting, ends, problem.obstacles, kept + ROOM) - kept, 0.0)
     tried, best = 0, None
     for attempt in range(PATH_ATTEMPTS):
         if time.perf_counter() >= until:
@@ -672,7 +681,7 @@ def _search_around(
         share, time_share = PATHS[attempt % len(PATHS)]
         patience = time_share * (until - time.perf_counter())
         margin = kept + share * room
-        path = clear_path(problem.setting(), ends, problem.obstacles, margin, problem.generator, patience)
+        path = clear_path(setting, ends, problem.obstacles, margin, problem.generator, patience)
         found = None
         if len(path):
             vias = problem.space.coordinates(points_on(path, problem.given.shape[1]))[1:-1]
@@ -695,7 +704,7 @@ def _search_around(
             import_ompl()  # the time of the first import does not count
         except ValueError:
             return None, tried
-        other = path_around(problem.arm, ends, problem.obstacles, kept, patience)
+        other = path_around(setting, ends, problem.obstacles, kept, patience)
         if other is not None:
             best = _along(problem, kept, duration, until, other, "ompl")
     return best, tried
@@ -818,6 +827,17 @@ def _timed(problem: _Problem, movement: Movement, least: float | None) -> tuple[
     return factor * duration, limits, beyond
 
 
+def _exact(problem: _Problem, movement: Movement) -> float:
+    """Return the clearance of a movement, also while the arm comes to rest at the goal, [m]; OUTSIDE out of reach."""
+    setting, obstacles, margin = problem.setting(), problem.obstacles, problem.margin
+    clearance = exact_clearance(setting, movement, obstacles, margin)
+    if obstacles.velocity[0].any():
+        later = obstacles._replace(centre=obstacles.centre + movement.duration * obstacles.velocity)
+        rest = Movement(fine_table(0), 0, problem.goal, np.zeros((3, len(problem.goal))), SETTLING)
+        clearance = min(clearance, exact_clearance(setting, rest, later, margin))
+    return clearance
+
+
 def _known(
     problem: _Problem,
     movement: Movement,
@@ -831,21 +851,20 @@ def _known(
     table, times, start, offsets, _ = movement
     vias = offsets[:-3]
     movement = problem.movement(vias, table, times, duration)
-    if clearance is None or clearance >= NEAR:
-        clearance = exact_clearance(problem.setting(), movement, problem.obstacles, problem.margin)
-    if problem.obstacles.velocity[0].any():  # also while the arm comes to rest at the goal
-        obstacles = problem.obstacles
-        later = obstacles._replace(centre=obstacles.centre + duration * obstacles.velocity)
-        rest = Movement(fine_table(0), 0, problem.goal, np.zeros((3, len(problem.goal))), SETTLING)
-        clearance = min(clearance, exact_clearance(problem.setting(), rest, later, problem.margin))
+    if clearance is None or clearance >= NEAR or problem.moves:
+        clearance = _exact(problem, movement)
+    kept = clearance
+    if problem.margin > 0.0 and clearance != OUTSIDE:  # of which own clearances have more
+        clearance = min(clearance, _exact(problem._replace(margin=0.0), movement))
     cost = np.einsum("ij,id,jd->", table.cost[times], movement.offsets, movement.offsets)
     straight_cost = float(straight_jerk_cost(float(np.linalg.norm(problem.goal - problem.start)), 1.0))
     jerk = 1.0 if cost == 0.0 else max(float(cost) / straight_cost, 1.0) if straight_cost else np.nan
     reason = fault
     if not reason and clearance == OUTSIDE:
         reason = "it leaves the joint limits or the reach"
-    elif not reason and clearance < problem.margin:
-        reason = f"its clearance is {1e3 * clearance:.1f} mm, less than {1e3 * problem.margin:g} mm"
+    elif not reason and kept < problem.margin:
+        nearest = clearance if clearance < 0.0 else kept
+        reason = f"its clearance is {1e3 * nearest:.1f} mm, less than {1e3 * problem.margin:g} mm"
     elif not reason and max(limits) > 1.0:
         reason = beyond
     return MotionPlan(
