@@ -72,7 +72,8 @@ EARLY, ALONG = 8, 4
 # turn.
 PATHS, ROOM = ((0.4, 0.15), (0.1, 0.2), (0.0, 0.4)), 0.02
 PATH_ATTEMPTS = 12
-ALONG_TIME = 0.03  # Time limit of the refinement of a movement along a path, [s]
+JAGGED = 20.0  # Relative jerk cost of a movement along a path beyond which one more path is tried
+ALONG_TIME = 0.1  # Time limit of the refinement of a movement along a path, [s]
 MOST_REFINED = 12  # Greatest number of via-points that are refined, which takes longer the more there are
 SEEDS = 256  # Greatest number of random seeds
 CHUNKS = 1, 1, 2, 4  # Numbers of seeds between two looks at the clock; the last one repeats
@@ -669,12 +670,14 @@ def _search_around(
 ) -> tuple[MotionPlan | None, int]:
     """Return the best movement along a clear path or from random seeds, and the number of seeds.
 
-    Points of a path become seeds first, then as many via-points as the movement needs.
+    Points of a path become seeds first, then as many via-points as the movement needs. As many paths are followed as
+    free movements are wanted, and one more if the movement is jagged.
     """
     ends = np.ascontiguousarray(problem.space.joints(np.stack((problem.start, problem.goal))))
     setting = problem.setting()
     room = max(_clearance_of(setting, ends, problem.obstacles, kept + ROOM) - kept, 0.0)
-    tried, best = 0, None
+    tried = free = 0
+    best = None
     for attempt in range(PATH_ATTEMPTS):
         if time.perf_counter() >= until:
             break
@@ -695,9 +698,13 @@ def _search_around(
         if found is None and attempt == len(PATHS) - 1:
             found, more = _search(problem, kept, duration, number, until, first=EARLY)
             tried += more
-        if found is not None and found.success:
-            return found, tried
-        best = best or found  # free, but beyond the limits
+        if found is None:
+            continue
+        free += found.success
+        if best is None or (found.success, best.jerk) > (best.success, found.jerk):
+            best = found
+        if free >= problem.enough + (best.jerk > JAGGED):
+            return best, tried
     patience = until - time.perf_counter()
     if best is None and ompl and patience > 0.0:
         try:
@@ -746,8 +753,8 @@ def _along(
         # Passage times of least jerk take longer to compute than all else, and leave narrow passages more often.
         shares = np.sqrt(np.maximum(norm(np.diff(points, axis=0)), 1e-6))
         durations = (shares / shares.sum())[None]
-        tables = table_with(durations), table_with(durations, FINE_INSTANTS)
-        found = _moved(problem, kept, tables, points[1:-1], duration, until)
+        table = table_with(durations, FINE_INSTANTS)
+        found = _moved(problem, kept, table, points[1:-1], duration, until)
         if found is None:
             continue
         for fewer in reversed(VIA_COUNTS[: VIA_COUNTS.index(number)]):
@@ -756,8 +763,7 @@ def _along(
             movement, _, cost = found
             instants = np.linspace(0, FINE_INSTANTS - 1, fewer + 2).round().astype(np.int64)[1:-1]
             points = movement.start + movement.table.basis[movement.times, instants] @ movement.offsets
-            tables = movement_table(fewer), fine_table(fewer)
-            other = _moved(problem, kept, tables, points, duration, until)
+            other = _moved(problem, kept, fine_table(fewer), points, duration, until)
             if other is not None and other[2] < cost:
                 found = other
         movement, clearance, _ = found
@@ -768,25 +774,27 @@ def _along(
 def _moved(
     problem: _Problem,
     kept: float,
-    tables: tuple[MovementTable, MovementTable],
+    table: MovementTable,
     vias: Float,
     duration: float,
     until: float,
 ) -> tuple[Movement, float, float] | None:
     """Return the movement through via-points, shape (K, D), after refinement, its clearance, [m], and its jerk cost.
 
-    None if it is not free. Many via-points are left where they are.
+    None if it is not free. Many via-points are left where they are. Movements along paths are long: with fewer instants
+    than those of a fine table, the refinement would not see what is between two of them.
     """
     offsets = vias - problem.start
     if len(vias) > MOST_REFINED:
-        movement = problem.movement(offsets, tables[1], 0, duration)
+        movement = problem.movement(offsets, table, 0, duration)
         clearance = exact_clearance(problem.setting(), movement, problem.obstacles, kept)
-        cost = np.einsum("ij,id,jd->", tables[1].cost[0], movement.offsets, movement.offsets)
+        cost = np.einsum("ij,id,jd->", table.cost[0], movement.offsets, movement.offsets)
         return (movement, clearance, float(cost)) if clearance >= kept else None
     soon = min(until, time.perf_counter() + ALONG_TIME)
+    tables = table, table
     _, found = _refined(problem, problem.setting(), kept, tables, offsets[None], duration, soon, smooth=0.0)
     clearance = float(found.clearance[0])
-    movement = problem.movement(found.vias[0], tables[1], int(found.times[0]), duration)
+    movement = problem.movement(found.vias[0], table, int(found.times[0]), duration)
     return (movement, clearance, float(found.cost[0])) if clearance >= kept else None
 
 
