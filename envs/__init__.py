@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from viapoint.envs.arms.load import load_arm
     from viapoint.envs.arms.registry import arm_of, register_arm
     from viapoint.envs.arms.stored import write_arm
-    from viapoint.envs.env import ReachEnv, RecordMovements
+    from viapoint.envs.env import ReachEnv
     from viapoint.envs.geometry.distance import signed_distances
     from viapoint.envs.geometry.obstacles import Obstacles, observation_rows, obstacles_from_rows
     from viapoint.envs.geometry.shapes import (
@@ -67,7 +67,6 @@ __all__ = [
     "Pose",
     "ReachEnv",
     "ReachVectorEnv",
-    "RecordMovements",
     "RewardWeights",
     "Room",
     "Scenes",
