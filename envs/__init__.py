@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from viapoint.envs.arms.registry import arm_of, register_arm
     from viapoint.envs.arms.stored import write_arm
     from viapoint.envs.env import ReachEnv
-    from viapoint.envs.geometry.distance import signed_distances
+    from viapoint.envs.geometry.clearance import signed_distances
     from viapoint.envs.geometry.obstacles import Obstacles, observation_rows, obstacles_from_rows
     from viapoint.envs.geometry.shapes import (
         SHAPES,

@@ -25,8 +25,8 @@ from viapoint.envs.common.validation import (
     unit_quaternion,
     whole_number,
 )
+from viapoint.envs.geometry.clearance import point_distance_and_normal
 from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.distance import point_distance_and_normal
 from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, POINT_CLOUD, Obstacles, bounding_boxes
 
 Mount = Literal["world", "hand"]
