@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -21,7 +20,6 @@ from viapoint.envs.common.arrays import Bool, Float, Int, frame_matrices
 from viapoint.envs.common.validation import (
     finite_array,
     number_of_at_least,
-    record_of,
     unit_quaternion,
     whole_number,
 )
@@ -130,15 +128,6 @@ class Sensor:
             checked[name] = number_of_at_least(f"{name} of the sensor", getattr(self, name), least, below)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
-
-    @classmethod
-    def of(cls, sensor: Sensor | Mapping[str, Any] | None) -> Sensor | None:
-        """Return a sensor from itself, or from a mapping of its fields; None for none.
-
-        Raises:
-            ValueError: The argument is something else, or a number is out of range.
-        """
-        return None if sensor is None else record_of("sensor", cls, sensor)
 
     @property
     def n_rays(self) -> int:

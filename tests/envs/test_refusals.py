@@ -168,7 +168,7 @@ POINT, BALL = np.ones(3), ve.Sphere(0.1)
 
 
 def record(**change):
-    return ve.Task.from_dict({**ve.Task.of().as_dict(), **change})
+    return ve.Task.of(**{**ve.Task.of().as_dict(), **change})
 
 
 def nothing(rng, room):
