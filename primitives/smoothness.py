@@ -16,9 +16,9 @@ from ._polynomial import differentiate, multiply, root_candidates, unit_size
 from .array_api import Array, Namespace, as_number, like, to_numpy, unit_factors
 from .trajectory import Trajectory, require_trajectory
 
-# Number of speed samples for the spectral arc length, for any duration: far beyond a movement's bandwidth; and with
-# the zeros behind them.
-_SPECTRUM_SAMPLES, _PADDED = 1000, 16 * 1024
+# Number of speed samples for the spectral arc length, for any duration: far beyond a movement's bandwidth.
+_SPECTRUM_SAMPLES = 1000
+_PADDED = 16 * 1024  # Number of samples with the zeros behind them
 # Least rate of the squared speed, relative to its greatest, that is more than rounding in double precision.
 _LEAST_TREND = 1e-12
 # Least rate in lower precisions, in units of machine epsilon: their coefficients are rounded more.
