@@ -245,7 +245,6 @@ CALLS = [
     (geom_meshes, [(pack([[ve.ConvexMesh(CUBE)]]),), (pack([[ve.PointCloud(CUBE)]]),)]),
     (ve.observation_rows, [(pack([[BALL]]), ("box",)), (pack([[ve.ConvexMesh(CUBE)]]), ("box",))]),
     (from_rows, [(ve.PointCloud(CUBE),), (ve.ConvexMesh(CUBE),)]),
-    (lambda rows: pack([[BALL] * 6], rows=rows), [(5,)]),
 ]  # fmt: skip
 OF_ANOTHER_TYPE = [
     (lambda change: record(**change), [({"speed": 1},), ({"shapes": 1},)]),
