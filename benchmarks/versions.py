@@ -29,7 +29,6 @@ TOOLS = [
     "pytest-xdist",
     "hypothesis",
     "mpmath",
-    "moviepy",
     "setuptools",
     "build",
     "ruff",

@@ -6,89 +6,52 @@ long.
 
 from typing import TYPE_CHECKING
 
-from viapoint.envs.common import mujoco_check as mujoco_check
-from viapoint.envs.registration import ENV_IDS, TASKS, register_all
+import viapoint.envs.common.mujoco_check  # noqa: F401 - explains what is wrong with MuJoCo before others import it
+from viapoint.envs.registration import register_all
 from viapoint.primitives._lazy import lazy_imports
 
 if TYPE_CHECKING:
-    from viapoint.envs.arms.arm import Arm
-    from viapoint.envs.arms.inverse_kinematics import inverse_kinematics
-    from viapoint.envs.arms.load import load_arm
-    from viapoint.envs.arms.registry import arm_of, register_arm
-    from viapoint.envs.arms.stored import write_arm
-    from viapoint.envs.env import ReachEnv, RecordMovements
-    from viapoint.envs.geometry.distance import signed_distances
-    from viapoint.envs.geometry.obstacles import Obstacles, observation_rows, obstacles_from_rows
-    from viapoint.envs.geometry.shapes import (
-        SHAPES,
-        Box,
-        Capsule,
-        ConvexMesh,
-        Cylinder,
-        HalfSpace,
-        PointCloud,
-        Shape,
-        Sphere,
-        as_obstacle,
-        as_obstacles,
-        obstacles_from_json,
-        obstacles_to_json,
-        register_mesh,
-    )
-    from viapoint.envs.plans import Plan
-    from viapoint.envs.rewards import RewardWeights
-    from viapoint.envs.scenes.families_registry import register_scene_family
-    from viapoint.envs.scenes.layout import Furniture, Place, Room
-    from viapoint.envs.scenes.options import Pose, scene_from_json, scene_to_json
-    from viapoint.envs.scenes.scene import Scenes
-    from viapoint.envs.sensors import Sensor
-    from viapoint.envs.task import Task
-    from viapoint.envs.vector_env import ReachVectorEnv
+    from viapoint.envs.arms.arm import Arm as Arm
+    from viapoint.envs.arms.inverse_kinematics import inverse_kinematics as inverse_kinematics
+    from viapoint.envs.arms.load import load_arm as load_arm
+    from viapoint.envs.arms.registry import arm_of as arm_of
+    from viapoint.envs.arms.registry import register_arm as register_arm
+    from viapoint.envs.arms.stored import write_arm as write_arm
+    from viapoint.envs.env import ReachEnv as ReachEnv
+    from viapoint.envs.geometry.clearance import signed_distances as signed_distances
+    from viapoint.envs.geometry.obstacles import Obstacles as Obstacles
+    from viapoint.envs.geometry.obstacles import observation_rows as observation_rows
+    from viapoint.envs.geometry.obstacles import obstacles_from_rows as obstacles_from_rows
+    from viapoint.envs.geometry.shapes import SHAPES as SHAPES
+    from viapoint.envs.geometry.shapes import Box as Box
+    from viapoint.envs.geometry.shapes import Capsule as Capsule
+    from viapoint.envs.geometry.shapes import ConvexMesh as ConvexMesh
+    from viapoint.envs.geometry.shapes import Cylinder as Cylinder
+    from viapoint.envs.geometry.shapes import HalfSpace as HalfSpace
+    from viapoint.envs.geometry.shapes import PointCloud as PointCloud
+    from viapoint.envs.geometry.shapes import Shape as Shape
+    from viapoint.envs.geometry.shapes import Sphere as Sphere
+    from viapoint.envs.geometry.shapes import as_obstacle as as_obstacle
+    from viapoint.envs.geometry.shapes import as_obstacles as as_obstacles
+    from viapoint.envs.geometry.shapes import obstacles_from_json as obstacles_from_json
+    from viapoint.envs.geometry.shapes import obstacles_to_json as obstacles_to_json
+    from viapoint.envs.geometry.shapes import register_mesh as register_mesh
+    from viapoint.envs.plans import Plan as Plan
+    from viapoint.envs.registration import ENV_IDS as ENV_IDS
+    from viapoint.envs.registration import TASKS as TASKS
+    from viapoint.envs.rewards import RewardWeights as RewardWeights
+    from viapoint.envs.scenes.families_registry import register_scene_family as register_scene_family
+    from viapoint.envs.scenes.layout import Furniture as Furniture
+    from viapoint.envs.scenes.layout import Place as Place
+    from viapoint.envs.scenes.layout import Room as Room
+    from viapoint.envs.scenes.options import Pose as Pose
+    from viapoint.envs.scenes.options import scene_from_json as scene_from_json
+    from viapoint.envs.scenes.options import scene_to_json as scene_to_json
+    from viapoint.envs.scenes.scene import Scenes as Scenes
+    from viapoint.envs.sensors import Sensor as Sensor
+    from viapoint.envs.task import Task as Task
+    from viapoint.envs.vector_env import ReachVectorEnv as ReachVectorEnv
 else:
-    __getattr__, __dir__ = lazy_imports(__name__)
+    __getattr__, __dir__, __all__ = lazy_imports(__name__)
 
 register_all()
-
-__all__ = [
-    "ENV_IDS",
-    "SHAPES",
-    "TASKS",
-    "Arm",
-    "Box",
-    "Capsule",
-    "ConvexMesh",
-    "Cylinder",
-    "Furniture",
-    "HalfSpace",
-    "Obstacles",
-    "Place",
-    "Plan",
-    "PointCloud",
-    "Pose",
-    "ReachEnv",
-    "ReachVectorEnv",
-    "RecordMovements",
-    "RewardWeights",
-    "Room",
-    "Scenes",
-    "Sensor",
-    "Shape",
-    "Sphere",
-    "Task",
-    "arm_of",
-    "as_obstacle",
-    "as_obstacles",
-    "inverse_kinematics",
-    "load_arm",
-    "observation_rows",
-    "obstacles_from_json",
-    "obstacles_from_rows",
-    "obstacles_to_json",
-    "register_arm",
-    "register_mesh",
-    "register_scene_family",
-    "scene_from_json",
-    "scene_to_json",
-    "signed_distances",
-    "write_arm",
-]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -21,12 +20,11 @@ from viapoint.envs.common.arrays import Bool, Float, Int, frame_matrices
 from viapoint.envs.common.validation import (
     finite_array,
     number_of_at_least,
-    record_of,
     unit_quaternion,
     whole_number,
 )
+from viapoint.envs.geometry.clearance import point_distance_and_normal
 from viapoint.envs.geometry.compiled import compiled
-from viapoint.envs.geometry.distance import point_distance_and_normal
 from viapoint.envs.geometry.obstacles import ABSENT, HALF_SPACE, POINT_CLOUD, Obstacles, bounding_boxes
 
 Mount = Literal["world", "hand"]
@@ -130,15 +128,6 @@ class Sensor:
             checked[name] = number_of_at_least(f"{name} of the sensor", getattr(self, name), least, below)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
-
-    @classmethod
-    def of(cls, sensor: Sensor | Mapping[str, Any] | None) -> Sensor | None:
-        """Return a sensor from itself, or from a mapping of its fields; None for none.
-
-        Raises:
-            ValueError: The argument is something else, or a number is out of range.
-        """
-        return None if sensor is None else record_of("sensor", cls, sensor)
 
     @property
     def n_rays(self) -> int:

@@ -138,11 +138,12 @@ class Task:
             sensor = named_sensor(sensor, arm, room.foot, room.scale)
             if decide_at == END:  # only one look at the beginning
                 sensor = dataclasses.replace(sensor, looks=1)
-        sensor = Sensor.of(sensor)
-        if sensor is not None and not n_obstacles[1]:
-            raise ValueError("sensor needs n_obstacles of 1 or more: there is nothing to see")
-        if sensor is not None and not sensor.sees(arm.chain.origin[0], farthest_reach(arm)):
-            raise ValueError(f"sensor sees nothing of what the arm {arm.name!r} reaches: {sensor}")
+        if sensor is not None:
+            sensor = record_of("sensor", Sensor, sensor)
+            if not n_obstacles[1]:
+                raise ValueError("sensor needs n_obstacles of 1 or more: there is nothing to see")
+            if not sensor.sees(arm.chain.origin[0], farthest_reach(arm)):
+                raise ValueError(f"sensor sees nothing of what the arm {arm.name!r} reaches: {sensor}")
         task = cls(
             arm=arm,
             space_name=space,
@@ -269,7 +270,7 @@ class Task:
         return SceneSampler(self)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the task as plain values for JSON; the arm by its name, or the path of its file."""
+        """Return the task as plain values for JSON, which :meth:`of` takes again; the arm by its name, or its file."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         values["arm"] = self.arm.file or self.arm.name
         values["space"] = values.pop("space_name")
@@ -281,15 +282,6 @@ class Task:
             del values["courses"]
         plain: dict[str, Any] = json.loads(json.dumps(values))  # lists in place of tuples
         return plain
-
-    @classmethod
-    def from_dict(cls, record: Mapping[str, Any]) -> Task:
-        """Return the task of a record of :meth:`as_dict`; its arm must be registered, or its file be there.
-
-        Raises:
-            ValueError: There is no such arm, or a value is not allowed.
-        """
-        return cls.of(**record)
 
 
 def _checked_durations(space: SpaceName, given: Any) -> tuple[float, float]:

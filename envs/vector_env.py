@@ -17,7 +17,6 @@ from gymnasium.utils import EzPickle, seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from viapoint.envs.arms.arm import Arm
 from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict
 from viapoint.envs.common.validation import did_you_mean, finite_array, masked_rows, seeds_of, whole_number
 from viapoint.envs.episodes import Decision, Episodes, History
@@ -26,7 +25,7 @@ from viapoint.envs.outcome import Rollout
 from viapoint.envs.plans import Plan
 from viapoint.envs.renderer import RENDER_MODES, EpisodeRenderer
 from viapoint.envs.scenes.options import draw_given
-from viapoint.envs.scenes.scene import Scenes, check_jumps
+from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 
 SINGLE_METADATA: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
@@ -147,11 +146,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
     # What happened
-
-    @property
-    def arm(self) -> Arm:
-        """Arm that moves."""
-        return self.task.arm
 
     @property
     def model(self) -> Any:
@@ -333,8 +327,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             row = int(inside.argmin())
             raise ValueError(f"goals must be within the arm's reach, got {goals[row].tolist()} in row {row}")
         joints = space.joints(goals)
-        scenes = Scenes.together([each.scenes for each in self._episodes])
-        check_jumps(scenes._replace(goal=joints), self.arm)
         for episodes, share in zip(self._episodes, self._shares, strict=True):
             episodes.scenes.goal[:] = joints[share]
             episodes.scenes.jumps[:] = 0.0

@@ -4,7 +4,6 @@ Every function takes NumPy arrays or torch tensors with any leading (batch) dime
 kind. Units are metres and seconds.
 """
 
-from ._polynomial import Extrema
 from .array_api import FREE
 from .fitting import ViaPointFit, fit_via_points
 from .minimum_jerk import minimum_jerk_coefficients, point_to_point, through
@@ -20,7 +19,7 @@ from .smoothness import (
     speed_peaks,
     speed_valleys,
 )
-from .trajectory import CostGradient, Trajectory, cost_gradient, minimum_duration
+from .trajectory import CostGradient, Extrema, Trajectory, cost_gradient, minimum_duration
 
 __all__ = [
     "FREE",

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from typing import Any
 
 
-def lazy_imports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a package that imports some names on first use.
+def lazy_imports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Return `__getattr__`, `__dir__` and `__all__` of a package that imports its names on first use.
 
-    The names are those that its `__init__.py` imports under `if TYPE_CHECKING:`, where type checkers see them, too. So
-    there is one list of them.
+    The names are those that its `__init__.py` imports under `if TYPE_CHECKING:`, in the form `NAME as NAME`, by which
+    type checkers know that they are exported. So there is one list of them.
     """
     module: Any = sys.modules[package]
     places: dict[str, str] = {}
@@ -31,4 +31,4 @@ def lazy_imports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
     def names() -> list[str]:
         return sorted({*vars(module), *places})
 
-    return get, names
+    return get, names, sorted(places)

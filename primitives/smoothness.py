@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 
 from ._polynomial import differentiate, multiply, root_candidates, unit_size
-from .array_api import Array, Namespace, as_number, is_whole, like, to_numpy, unit_factors
+from .array_api import Array, Namespace, as_number, like, to_numpy, unit_factors
 from .trajectory import Trajectory, require_trajectory
 
 # Number of speed samples for the spectral arc length, for any duration: far beyond a movement's bandwidth.
 _SPECTRUM_SAMPLES = 1000
-# Greatest padding; beyond it the spectrum of a single movement takes gigabytes of memory.
-_MOST_PADDING = 16
+_PADDED = 16 * 1024  # Number of samples with the zeros behind them
 # Least rate of the squared speed, relative to its greatest, that is more than rounding in double precision.
 _LEAST_TREND = 1e-12
 # Least rate in lower precisions, in units of machine epsilon: their coefficients are rounded more.
@@ -147,20 +146,17 @@ def log_dimensionless_jerk(trajectory: Trajectory) -> Array:
     return xp.where(without_jerk, np.inf, -logarithm)[()]
 
 
-def spectral_arc_length(
-    trajectory: Trajectory, *, cutoff: float = 10.0, threshold: float = 0.05, padding: int = 4
-) -> Array:
+def spectral_arc_length(trajectory: Trajectory, *, cutoff: float = 10.0, threshold: float = 0.05) -> Array:
     """Return the spectral arc length of the speed (SPARC, Balasubramanian et al. 2015); greater is smoother.
 
     It is minus the arc length of the normalised amplitude spectrum up to the last frequency below `cutoff` at
-    which the amplitude reaches `threshold`. The speed is sampled at 1000 instants and padded with zeros to
-    2^padding times the next power of two.
+    which the amplitude reaches `threshold`. The speed is sampled at 1000 instants and padded with zeros to 16
+    times the next power of two.
 
     Args:
         trajectory: the movements.
         cutoff: highest frequency [Hz].
         threshold: amplitude below which the tail of the spectrum is left out, 0 to 1.
-        padding: powers of two of zero padding, 0 to 16.
 
     Returns:
         (...,); -1.4024 for a straight reach of 1 s, NaN where nothing moves.
@@ -175,22 +171,19 @@ def spectral_arc_length(
         raise ValueError(f"cutoff must be a number above 0, got {cutoff!r}")
     if not 0 <= as_number(threshold) < 1:
         raise ValueError(f"threshold must be a number of at least 0 and below 1, got {threshold!r}")
-    if not is_whole(padding) or padding > _MOST_PADDING:
-        raise ValueError(f"padding must be a whole number from 0 to {_MOST_PADDING}, got {padding!r}")
     xp, dtype = trajectory.namespace, trajectory.coefficients.dtype
     if 0 in trajectory.batch_shape:  # not all libraries transform empty batches
         return 0.0 * trajectory.duration
-    length = 2 ** (int(np.ceil(np.log2(_SPECTRUM_SAMPLES))) + int(padding))
     velocity = trajectory.sample(_SPECTRUM_SAMPLES + 1, 1)[0][..., :-1, :]
     speeds = _length(xp, velocity)
     if xp is not np and dtype.itemsize < 4:  # torch has no Fourier transform of half precision
         speeds = xp.astype(speeds, xp.float32)
-    spectrum = xp.abs(xp.fft.rfft(speeds, n=length, axis=-1))
+    spectrum = xp.abs(xp.fft.rfft(speeds, n=_PADDED, axis=-1))
     spectrum = _ratio(xp, spectrum, spectrum[..., :1])
     numbers = to_numpy(spectrum)
     index = np.arange(numbers.shape[-1])
     with np.errstate(divide="ignore", invalid="ignore"):  # a movement that stands still may last no time
-        step = _SPECTRUM_SAMPLES / (length * to_numpy(trajectory.duration)[..., None])  # [Hz]
+        step = _SPECTRUM_SAMPLES / (_PADDED * to_numpy(trajectory.duration)[..., None])  # [Hz]
         counts = (numbers >= threshold) & (index * step <= cutoff)
     last = np.max(np.where(counts, index, 0), axis=-1, keepdims=True)
     used = like(xp, (index[:-1] < last).astype(float), spectrum)

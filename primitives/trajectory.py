@@ -1,4 +1,8 @@
-"""Trajectories: positions as piecewise polynomials of time, their scaling to limits, and derivatives of their cost."""
+"""Trajectories: positions as piecewise polynomials of time, their scaling to limits, and derivatives of their cost.
+
+Extrema are at roots of a derivative and at ends of segments. Their values are evaluated in the caller's array library,
+with gradients that are right: the slope vanishes at an extremum (envelope theorem), or the time is a knot.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +15,19 @@ import numpy as np
 
 from ._hermite_tables import derivative_factors, energy_table
 from ._knot_solver import States, least_cost_coefficients
-from ._polynomial import Extrema, axis_extrema, largest_norm
+from ._polynomial import differentiate, evaluate, multiply, root_candidates, unit_size
 from .array_api import (
     Array,
+    Floats,
     Namespace,
     as_floats,
     broadcast_batch,
     broadcast_to,
+    largest_exponent,
     leading_shape,
     like,
     namespace_of,
+    ordered_sum,
     require,
     to_numpy,
     whole_orders,
@@ -30,6 +37,29 @@ from .array_api import (
 _BLOCK_BYTES = 1_200_000
 # Roundings besides those of the sum of durations by which a time may lie outside the movement and count as inside.
 _ROUNDINGS = 4
+
+
+@dataclass(frozen=True)
+class Extrema:
+    """Least and greatest value along each axis, with the first time of each.
+
+    Attributes:
+        minimum: (..., D) [m/s^nu].
+        minimum_time: (..., D) [s].
+        maximum: (..., D) [m/s^nu].
+        maximum_time: (..., D) [s].
+
+    Example:
+        >>> from viapoint.primitives import point_to_point
+        >>> extrema = point_to_point([0.0], [1.0], 2.0).extrema(1)  # of the velocity
+        >>> extrema.maximum.round(9).tolist(), extrema.maximum_time.round(9).tolist()
+        ([0.9375], [1.0])
+    """
+
+    minimum: Array
+    minimum_time: Array
+    maximum: Array
+    maximum_time: Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -196,11 +226,27 @@ class Trajectory:
 
     def extrema(self, nu: int = 0) -> Extrema:
         """Return the least and greatest nu-th derivative per axis, with their times; at a jump, both sides count."""
-        return axis_extrema(self, self._finite_derivative(nu))
+        coefficients = self._finite_derivative(nu)
+        polynomials, _ = _polynomials(coefficients)
+        u = _with_ends(root_candidates(differentiate(polynomials)))
+        values = evaluate(polynomials[..., None, :], u)
+        low = _read(self, coefficients, _best(self, u, -values))
+        high = _read(self, coefficients, _best(self, u, values))
+        return Extrema(*low, *high)
 
     def peak(self, nu: int = 0) -> Array:
         """Return (...,) the largest Euclidean norm of the nu-th derivative [m/s^nu]; ValueError if it overflows."""
-        return largest_norm(self, self._finite_derivative(nu))
+        xp, coefficients = self.namespace, self._finite_derivative(nu)
+        polynomials, exponent = _polynomials(coefficients)
+        square = ordered_sum(multiply(polynomials, polynomials), -2)
+        change = ordered_sum(multiply(polynomials, differentiate(polynomials)), -2)
+        u = _with_ends(root_candidates(change))  # the roots of x . dx/du
+        score = evaluate(square[..., None, :], u)
+        values, _ = _read(self, coefficients, _best(self, u[..., None, :], score[..., None, :]))
+        limit = largest_exponent(xp, values.dtype)
+        exponent = np.clip(exponent, -limit, limit)
+        down, up = (like(xp, np.ldexp(1.0, sign * exponent), values) for sign in (-1, 1))
+        return xp.linalg.vector_norm(values * down, axis=-1) * up[..., 0]
 
     def _finite_derivative(self, nu: int) -> Array:
         """Return the coefficients of the nu-th derivative, or raise ValueError if it overflows."""
@@ -260,6 +306,46 @@ class Trajectory:
             first = moved[..., :1, :, :] + translation[..., None, None, :]
             moved = xp.concat([first, moved[..., 1:, :, :]], axis=-3)
         return Trajectory(moved, self.durations, self.order, self.starts, self.rates, self.end)
+
+
+def _polynomials(coefficients: Array) -> tuple[Floats, Any]:
+    """Return the coefficients as (..., S, D, n) NumPy float64, of unit size, and the exponent (..., 1)."""
+    numbers, exponent = unit_size(to_numpy(coefficients).astype(np.float64), (-3, -2, -1))
+    return np.ascontiguousarray(np.moveaxis(numbers, -3, -1)), exponent[..., 0, 0]
+
+
+def _with_ends(u: Floats) -> Floats:
+    """Return the points with 0 before and 1 after them."""
+    edge = np.zeros((*u.shape[:-1], 1))
+    return np.concatenate([edge, u, edge + 1.0], axis=-1)
+
+
+def _best(trajectory: Trajectory, u: Floats, score: Floats) -> tuple[Any, Floats]:
+    """Return segment and unit time, (..., D) each, of the best of candidates (..., S, D, P): the earliest of equals."""
+    empty = to_numpy(trajectory.rates) <= 0
+    score = np.where(empty[..., None, None], -np.inf, score)
+    u, score = np.swapaxes(u, -3, -2), np.swapaxes(score, -3, -2)  # (..., D, S, P)
+    count = u.shape[-1]
+    u, score = (np.reshape(a, (*a.shape[:-2], a.shape[-2] * count)) for a in (u, score))
+    chosen = np.argmax(score, axis=-1)
+    return chosen // count, np.take_along_axis(u, chosen[..., None], axis=-1)[..., 0]
+
+
+def _read(trajectory: Trajectory, coefficients: Array, place: tuple[Any, Floats]) -> tuple[Array, Array]:
+    """Return the value (..., D) of axis d at place d (or of all axes at the one place), and the time."""
+    segment, u = place
+    xp, (powers, segments, _) = trajectory.namespace, coefficients.shape[-3:]
+    chosen = segment[..., None, None, :] == np.arange(segments)[:, None]  # (..., 1, S, D or 1)
+    basis = chosen * u[..., None, None, :] ** np.arange(powers)[:, None, None]
+    values = xp.sum(xp.sum(like(xp, basis, coefficients) * coefficients, axis=-2), axis=-2)
+    starts = to_numpy(trajectory.starts)
+    rates = to_numpy(trajectory.rates)
+    spans = np.where(rates > 0, 1.0 / np.where(rates > 0, rates, 1.0), 0.0)
+    shape = (*segment.shape[:-1], segments)
+    start = np.take_along_axis(np.broadcast_to(starts, shape), segment, axis=-1)
+    span = np.take_along_axis(np.broadcast_to(spans, shape), segment, axis=-1)
+    time = np.minimum(start + u * span, to_numpy(trajectory.end))  # no rounding past the end
+    return values, like(xp, time, coefficients)
 
 
 def require_trajectory(value: object) -> None:

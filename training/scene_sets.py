@@ -59,7 +59,7 @@ class FrozenScenes:
     @property
     def hidden(self) -> Float:
         """Share of obstacles that the sensor does not see at all in each scene, shape (N,); NaN without a sensor."""
-        task = Task.from_dict(self.task)
+        task = Task.of(**self.task)
         if task.sensor is None:
             return np.full(self.share.shape, np.nan)
         rotation, origin = task.sensor.pose(task.arm, self.scenes.start)
@@ -143,7 +143,8 @@ def shipped_set(name: str, task: Task) -> FrozenScenes | None:
         if text is None:
             continue
         frozen = json.loads(str(text))
-        same_eye = _eyes_agree(Sensor.of(frozen.get("sensor")), task.sensor)
+        eye = Sensor(**frozen["sensor"]) if "sensor" in frozen else None
+        same_eye = _eyes_agree(eye, task.sensor)
         if same_eye and _scene_key(frozen) == _scene_key(task.as_dict()):
             return load(path, name)
     return None

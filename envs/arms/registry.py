@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,43 +15,29 @@ from viapoint.envs.arms.load import load_arm
 ARM_FILES = (".xml", ".mjcf", ".urdf")  # Suffixes of files of arms
 
 
-@functools.cache
-def planar() -> Arm:
-    """Return the right arm of an adult in the horizontal plane, its shoulder at the origin."""
-    return arm_from_xml(
-        "planar",
-        asset("planar.xml"),
-        joints=("shoulder", "elbow"),
-        tool="hand",
-        home=(0.6, 1.5),
-        velocity_limit=(np.inf, np.inf),
-        torque_limit=(60.0, 45.0),
-        space="hand",
-        bandwidth=40.0,
-    )
-
-
-@functools.cache
-def panda() -> Arm:
-    """Return the Franka Emika Panda with its hand, its base at the origin."""
-    return arm_from_xml(
-        "panda",
-        asset("panda.xml"),
-        joints=tuple(f"joint{number}" for number in range(1, 8)),
-        tool="hand",
-        home=(0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785),  # Franka's ready pose
-        velocity_limit=(2.175,) * 4 + (2.61,) * 3,
-        torque_limit=(87.0,) * 4 + (12.0,) * 3,
+# Arguments of :func:`arm_from_xml` for the built-in arms, whose files are in the assets
+_BUILT_IN: dict[str, dict[str, Any]] = {
+    "planar": {  # the right arm of an adult in the horizontal plane, its shoulder at the origin
+        "joints": ("shoulder", "elbow"),
+        "home": (0.6, 1.5),
+        "velocity_limit": (np.inf, np.inf),
+        "torque_limit": (60.0, 45.0),
+        "space": "hand",
+        "bandwidth": 40.0,
+    },
+    "panda": {  # the Franka Emika Panda with its hand, its base at the origin
+        "joints": tuple(f"joint{number}" for number in range(1, 8)),
+        "home": (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785),  # Franka's ready pose
+        "velocity_limit": (2.175,) * 4 + (2.61,) * 3,
+        "torque_limit": (87.0,) * 4 + (12.0,) * 3,
         # Capsules of wrist and flange are always within 2 cm, though the links never touch: the 59 spheres of VAMP's
         # model (panda_spherized.urdf) leave them at least 7 mm apart, whatever the joint positions.
-        exclude={
+        "exclude": {
             frozenset(("link0", "link1")): "consecutive links",
             frozenset(("link5", "link7")): "never in contact",
         },
-    )
-
-
-_BUILT_IN: dict[str, Callable[[], Arm]] = {"planar": planar, "panda": panda}
+    },
+}
 _OWN: dict[str, Arm] = {}
 
 
@@ -97,7 +82,7 @@ def arm_of(arm: Any) -> Arm:
         return arm
     name = str(arm) if isinstance(arm, str | Path) else ""
     if name in _BUILT_IN:
-        return _BUILT_IN[name]()
+        return _built_in(name)
     if name in _OWN:
         return _OWN[name]
     if name.endswith(ARM_FILES):
@@ -109,6 +94,12 @@ def arm_of(arm: Any) -> Arm:
         f"arm must be an Arm, a file that ends in {' or '.join(ARM_FILES)}, or one of {', '.join(arm_names())}, got "
         f"{arm!r:.60}; register_arm adds an arm of your own"
     )
+
+
+@functools.cache
+def _built_in(name: str) -> Arm:
+    """Return a built-in arm."""
+    return arm_from_xml(name, asset(f"{name}.xml"), tool="hand", **_BUILT_IN[name])
 
 
 @functools.lru_cache(maxsize=16)

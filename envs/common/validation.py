@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.arrays import Float, Int
+from viapoint.primitives.array_api import is_whole
 
 Record = TypeVar("Record")
 UNIT_TOLERANCE = 1e-3  # Greatest error of a quaternion's length; smaller ones are corrected
@@ -31,11 +32,6 @@ def did_you_mean(value: Any, allowed: Iterable[str]) -> str:
     """Return the end of a message about an unknown name: the closest allowed one, or nothing if none is close."""
     close = difflib.get_close_matches(str(value), list(allowed), n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
-
-
-def is_whole(value: Any) -> bool:
-    """Return True for a whole number, also NumPy's; a bool is none."""
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def is_number(value: Any) -> bool:

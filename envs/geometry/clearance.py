@@ -1,4 +1,4 @@
-"""Clearance of configurations and movements: least signed distances of an arm from obstacles and from itself.
+"""Signed distances of points from packed obstacles, and clearance of configurations and movements of an arm.
 
 The arm is a set of spheres, see :class:`~viapoint.envs.arms.kinematics.Spheres`. Its clearance from an obstacle is the
 least signed distance of a sphere's centre, minus the radius of the sphere. Broad phase: a bounding ball of each group
@@ -8,15 +8,17 @@ of spheres comes first, and the spheres of a group are only placed where its bal
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from viapoint.envs.arms.kinematics import PART, Chain, Spheres, link_frames, transform
 from viapoint.envs.common.arrays import Bool, Float
-from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel
-from viapoint.envs.geometry.distance import point_distance
+from viapoint.envs.common.validation import finite_array
+from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel, rotated, rotated_back
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
+from viapoint.envs.geometry.shapes import Distance, Shape, as_obstacles, local_distance
 
 FAR = 1.0  # Greatest clearance that is reported, [m]; farther obstacles do not matter
 # Way beyond the least clearance so far up to which a movement looks for more, to skip configurations, [m]
@@ -51,6 +53,63 @@ class Bounds(NamedTuple):
     rotation: Float  # Axes of the links' frames in the configuration before, shape (J + 1, 3, 3)
     ball: Float  # Centres of the bounding balls in the configuration before, shape (G, 3), [m]
     between: Float  # Joints between two configurations, shape (J,); empty if nothing counts there
+
+
+@inlined
+def point_distance_and_normal(
+    obstacles: Obstacles, scene: int, row: int, x: float, y: float, z: float, time: float, limit: float
+) -> Distance:
+    """Return the signed distance of a point from an obstacle, [m], and its gradient, the outward normal.
+
+    The obstacle has moved for `time` since it was at its centre; absent ones are far away. Beyond `limit`, [m], any
+    number between it and the distance may be returned. The compiler leaves out a gradient that nothing uses.
+    """
+    centre, velocity, size = obstacles.centre, obstacles.velocity, obstacles.size
+    dx = x - centre[scene, row, 0] - time * velocity[scene, row, 0]
+    dy = y - centre[scene, row, 1] - time * velocity[scene, row, 1]
+    dz = z - centre[scene, row, 2] - time * velocity[scene, row, 2]
+    axes = obstacles.rotation[scene, row]
+    here = rotated_back(axes, (dx, dy, dz))
+    sizes = size[scene, row, 0], size[scene, row, 1], size[scene, row, 2]
+    kind, meshes, clouds = obstacles.kind[scene, row], obstacles.meshes, obstacles.clouds
+    distance, nx, ny, nz = local_distance(kind, sizes, meshes, clouds, here, limit)
+    nx, ny, nz = rotated(axes, (nx, ny, nz))
+    return distance, nx, ny, nz
+
+
+@compiled
+def point_clearances(obstacles: Obstacles, point: tuple[float, float, float]) -> Float:
+    """Return the signed distance of a point from the nearest obstacle of each of N scenes, shape (N,), at most 1 m."""
+    x, y, z = point
+    found = np.ones(len(obstacles.kind))
+    for scene in range(len(found)):
+        for row in range(obstacles.kind.shape[1]):
+            if obstacles.kind[scene, row] != ABSENT:
+                apart = point_distance_and_normal(obstacles, scene, row, x, y, z, 0.0, 1.0)[0]
+                found[scene] = min(found[scene], apart)
+    return found
+
+
+def signed_distances(obstacles: Iterable[Shape | Mapping[str, Any]], points: Any, radius: Any = 0.0) -> Float:
+    """Return the signed distances of points, or spheres, from n obstacles at time 0, shape (..., n), [m].
+
+    Args:
+        obstacles: n shapes or dictionaries.
+        points: Shape (..., 3), [m].
+        radius: Radius of the spheres, which broadcasts with the leading axes, [m].
+
+    Example:
+        >>> from viapoint.envs.geometry.clearance import signed_distances
+        >>> from viapoint.envs.geometry.shapes import Box, Sphere
+        >>> scene = [Box((0.4, 0.6, 0.02), position=(0.5, 0.0, 0.2)), Sphere(0.05, position=(0.5, 0.2, 0.27))]
+        >>> signed_distances(scene, [0.5, 0.0, 0.27], radius=0.03).round(3).tolist()
+        [0.02, 0.12]
+    """
+    points = finite_array("points", points, (..., 3))
+    shapes = as_obstacles(obstacles)
+    if not shapes:
+        return np.zeros((*points.shape[:-1], 0))
+    return np.stack([shape.distance(points, radius) for shape in shapes], axis=-1)
 
 
 @compiled
@@ -139,7 +198,8 @@ def group_clearance(
             x = placed.centre[sphere, 0]
             y = placed.centre[sphere, 1]
             z = placed.centre[sphere, 2]
-        distance = point_distance(obstacles, scene, row, x, y, z, time, least + radius) - radius
+        limit = least + radius
+        distance = point_distance_and_normal(obstacles, scene, row, x, y, z, time, limit)[0] - radius
         if sphere == ball:
             if distance >= least:
                 break

@@ -114,13 +114,7 @@ def _box_square(boxes: Float, node: int, x: float, y: float, z: float) -> float:
 
 
 def build_cloud(points: Float, radius: float) -> Clouds:
-    """Return a cloud with its tree from points, shape (K, 3), [m]."""
-    points, boxes = _tree(points)
-    return Clouds(points, np.array([radius]), np.array([0, len(points)]), np.array([0, len(boxes)]), boxes)
-
-
-def _tree(points: Float) -> tuple[Float, Float]:
-    """Return points, shape (K, 3), in the order of a tree, and the boxes of its nodes, shape (2 L, 6), [m].
+    """Return a cloud with its tree from points, shape (K, 3), [m].
 
     Level by level, each node is split along the longest side of its box (J. L. Bentley, Multidimensional binary search
     trees used for associative searching, 1975).
@@ -136,7 +130,7 @@ def _tree(points: Float) -> tuple[Float, Float]:
         high = np.maximum.reduceat(points, first)
         boxes[level : 2 * level] = np.concatenate((low, high), axis=1)
         if level == leaves:
-            return points, boxes
+            break
         node = np.repeat(np.arange(level), np.diff(first, append=len(points)))
         side = (high - low).argmax(axis=1)
         width = np.take_along_axis(high - low, side[:, None], axis=1)[:, 0].clip(TINY)
@@ -144,6 +138,7 @@ def _tree(points: Float) -> tuple[Float, Float]:
         begin = np.take_along_axis(low, side[:, None], axis=1)[:, 0]
         points = points[np.argsort(node + 0.5 * (place - begin[node]) / width[node])]
         level *= 2
+    return Clouds(points, np.array([radius]), np.array([0, len(points)]), np.array([0, len(boxes)]), boxes)
 
 
 def join_clouds(clouds: Iterable[Clouds]) -> Clouds:

@@ -147,16 +147,14 @@ def pack(scenes: Sequence[Iterable[Shape | Mapping[str, Any]]], rows: int | None
 
     Args:
         scenes: Shapes or dictionaries of each scene.
-        rows: Number of rows for obstacles; by default, the greatest number of obstacles of a scene.
+        rows: Number of rows for obstacles, enough for each scene; by default, the greatest number of obstacles of one.
 
     Raises:
-        ValueError: A scene has more obstacles than rows, or an obstacle is not allowed.
+        ValueError: An obstacle is not allowed.
     """
     shapes = [as_obstacles(scene) for scene in scenes]
-    most = max(map(len, shapes), default=0)
-    rows = most if rows is None else rows
-    if most > rows:
-        raise ValueError(f"there must be at most {rows} obstacles, got {most}")
+    if rows is None:
+        rows = max(map(len, shapes), default=0)
     found = no_obstacles(len(shapes), rows)
     meshes: list[Meshes] = []
     clouds: list[Clouds] = []

@@ -13,8 +13,7 @@ from viapoint.envs.arms.inverse_kinematics import inverse_kinematics, planar_joi
 from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.clearance import FAR, row_clearances
-from viapoint.envs.geometry.distance import point_clearances
+from viapoint.envs.geometry.clearance import FAR, point_clearances, row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, pack, unpack
 from viapoint.envs.geometry.shapes import (
     ConvexMesh,

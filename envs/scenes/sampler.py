@@ -16,8 +16,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import planar_joints
 from viapoint.envs.arms.kinematics import link_poses, sphere_centres
 from viapoint.envs.common.arrays import Bool, Float, Int, norm
-from viapoint.envs.geometry.clearance import memory, row_clearances
-from viapoint.envs.geometry.distance import point_clearances
+from viapoint.envs.geometry.clearance import memory, point_clearances, row_clearances
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.plans import SHORTEST_DURATION
 from viapoint.envs.scenes.ends import (

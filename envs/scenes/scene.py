@@ -194,15 +194,11 @@ def check_scenes(
         apart = np.abs(scenes.goal - scenes.start).max(axis=-1)
         allowed = f"start and goal must be apart, by {LEAST_APART} rad or more in a joint"
         _refuse(apart < LEAST_APART, allowed, apart)
-        check_jumps(scenes, arm, names)
+        _check_jumps(scenes, arm, names)
 
 
-def check_jumps(scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]] = ()) -> None:
-    """Check the jumps of the target; the arguments are those of :func:`check_scenes`.
-
-    Raises:
-        ValueError: A jump is not later than the one before it, or its target is impossible.
-    """
+def _check_jumps(scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]]) -> None:
+    """Check that each jump is later than the one before it, and its target is possible."""
     before = np.zeros(len(scenes.start))
     for jump in range(MOST_JUMPS):
         time = scenes.jump_times[:, jump]

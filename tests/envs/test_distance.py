@@ -11,8 +11,8 @@ from helpers import random_shape
 from scipy.spatial.transform import Rotation
 
 import viapoint.envs as ve
+from viapoint.envs.geometry.clearance import point_distance_and_normal
 from viapoint.envs.geometry.compiled import compiled, inner, kernel
-from viapoint.envs.geometry.distance import point_distance, point_distance_and_normal
 from viapoint.envs.geometry.obstacles import KINDS, add_to_model, no_obstacles, pack
 
 ALL = pytest.mark.parametrize("kind", KINDS)
@@ -27,25 +27,23 @@ def places(rng, number):
 
 
 @compiled
-def both(obstacles, points, time, limit, found, normals):
-    """Distances without and with gradients, shapes (N, n, M, 2) and (N, n, M, 3)."""
+def measure(obstacles, points, time, limit, found, normals):
+    """Fill in distances and gradients, shapes (N, n, M) and (N, n, M, 3)."""
     for scene in range(found.shape[0]):
         for row in range(found.shape[1]):
             for i in range(len(points)):
                 x, y, z = points[i]
-                found[scene, row, i, 0] = point_distance(obstacles, scene, row, x, y, z, time, limit)
                 distance, nx, ny, nz = point_distance_and_normal(obstacles, scene, row, x, y, z, time, limit)
-                found[scene, row, i, 1] = distance
+                found[scene, row, i] = distance
                 normals[scene, row, i] = nx, ny, nz
 
 
 def measured(obstacles, points, time=0.0, limit=FAR):
-    """Distances, shape (N, n, M), which are the same with and without gradients, and gradients."""
-    found = np.empty((*obstacles.kind.shape, len(points), 2))
-    normals = np.empty((*obstacles.kind.shape, len(points), 3))
-    both(obstacles, points, time, limit, found, normals)
-    np.testing.assert_allclose(found[..., 0], found[..., 1], atol=1e-15)
-    return found[..., 0], normals
+    """Distances, shape (N, n, M), and gradients."""
+    found = np.empty((*obstacles.kind.shape, len(points)))
+    normals = np.empty((*found.shape, 3))
+    measure(obstacles, points, time, limit, found, normals)
+    return found, normals
 
 
 def coal_bodies(shape):

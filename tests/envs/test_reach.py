@@ -109,13 +109,13 @@ def test_contact_implies_negative_clearance_and_clearance_implies_no_contact(arm
 
 def scenes_with(env, kind, rng):
     """Return free configurations and a random shape of a kind within reach in each scene."""
-    task = Task.of(arm=env.arm, space="joints", n_obstacles=0)
+    task = Task.of(arm=env.task.arm, space="joints", n_obstacles=0)
     scenes = task.sampler()([np.random.default_rng(seed) for seed in rng.integers(2**31, size=env.num_envs)])
     shapes = []
     for start in scenes.start:
         away = rng.normal(size=3) * (1.0, 1.0, 0.3)
         away *= rng.uniform(0.15, 0.5) / np.linalg.norm(away)
-        place = env.arm.hand(start) + away
+        place = env.task.arm.hand(start) + away
         wall = HalfSpace.facing(-away, position=place)
         shape = wall if kind == "half_space" else random_shape(kind, rng)
         shapes.append([{**shape.to_dict(), "position": place}])

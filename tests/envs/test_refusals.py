@@ -168,13 +168,7 @@ POINT, BALL = np.ones(3), ve.Sphere(0.1)
 
 
 def record(**change):
-    return ve.Task.from_dict({**ve.Task.of().as_dict(), **change})
-
-
-def recorder(mode):
-    env = gym.Wrapper(gym.Env())
-    env.env.render_mode = mode
-    return ve.RecordMovements(env, "nowhere")
+    return ve.Task.of(**{**ve.Task.of().as_dict(), **change})
 
 
 def nothing(rng, room):
@@ -203,7 +197,6 @@ CALLS = [
     (lambda weights: ve.RewardWeights(**weights), [
         ({"success": np.nan},), ({"success": "much"},), ({"duration": -0.1},), ({"progress": True},),
     ]),
-    (recorder, [(None,), ("human",), ("rgb_array",)]),
     (lambda sensor: ve.Task.of(sensor=sensor), [
         ("eyes",), (3,), ({"lens": 1},), ({"columns": 0},), ({"columns": 1.5},), ({"rows": 2, "columns": 40_000},),
         ({"field_of_view": 7.0},), ({"rows": 4, "field_of_view": 3.1},), ({"range": 0.0},), ({"noise": -1.0},),
@@ -252,7 +245,6 @@ CALLS = [
     (geom_meshes, [(pack([[ve.ConvexMesh(CUBE)]]),), (pack([[ve.PointCloud(CUBE)]]),)]),
     (ve.observation_rows, [(pack([[BALL]]), ("box",)), (pack([[ve.ConvexMesh(CUBE)]]), ("box",))]),
     (from_rows, [(ve.PointCloud(CUBE),), (ve.ConvexMesh(CUBE),)]),
-    (lambda rows: pack([[BALL] * 6], rows=rows), [(5,)]),
 ]  # fmt: skip
 OF_ANOTHER_TYPE = [
     (lambda change: record(**change), [({"speed": 1},), ({"shapes": 1},)]),

@@ -182,7 +182,7 @@ def test_plans_that_are_revised_in_motion_keep_to_the_limits():
     env = gym.make_vec(PANDA_MOVING, num_envs=24, threads=1, n_obstacles=0).unwrapped
     env.reset(seed=0)
     rng, moving = np.random.default_rng(0), 0
-    arm = env.arm
+    arm = env.task.arm
     for _ in range(4):
         env.execute_actions(rng.uniform(-1.0, 1.0, env.action_space.shape))
         for history in env.last_plans:
@@ -199,7 +199,7 @@ def test_limits_hold_between_samples_and_no_movement_is_slower_than_they_need():
     env.reset(seed=5)
     actions = np.random.default_rng(5).uniform(-1.0, 1.0, env.action_space.shape)
     info = env.execute_actions(actions).info
-    arm, ran = env.arm, info["reachable"]
+    arm, ran = env.task.arm, info["reachable"]
     assert ran.mean() > 0.1
     assert (info["stretch"][ran] > 1.0).all()
     plan = env.last_plan.take(ran)

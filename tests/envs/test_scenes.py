@@ -64,7 +64,7 @@ def several():
 def test_ends_are_free_and_the_straight_movement_is_not(env_id, kwargs):
     env = gym.make_vec(env_id, num_envs=12, threads=1, **kwargs).unwrapped
     env.reset(seed=0)
-    check_scenes(env.scenes, env.arm)
+    check_scenes(env.scenes, env.task.arm)
     counts = env.scenes.obstacles.present.sum(axis=-1)
     fewest, most = env.task.n_obstacles
     assert (counts <= most).all()
@@ -129,17 +129,17 @@ def test_ends_may_be_poses_in_joint_space(several):
     down = (0.0, 1.0, 0.0, 0.0)
     poses = [ve.Pose((0.5, y, 0.4), down) for y in (-0.2, 0.0, 0.3)]
     several.reset(seed=0, options={"start": HOME, "goal": poses, "obstacles": []})
-    hands, axes = forward(several.arm.chain, several.scenes.goal)
+    hands, axes = forward(several.task.arm.chain, several.scenes.goal)
     np.testing.assert_allclose(hands, [pose.position for pose in poses], atol=1e-5)
     np.testing.assert_allclose(axes[:, 2, 2], -1.0, atol=1e-4)
     several.reset(seed=0, options={"goal": {"position": (0.5, 0.1, 0.3)}})
-    np.testing.assert_allclose(several.arm.hand(several.scenes.goal), [(0.5, 0.1, 0.3)] * 3, atol=1e-5)
+    np.testing.assert_allclose(several.task.arm.hand(several.scenes.goal), [(0.5, 0.1, 0.3)] * 3, atol=1e-5)
 
 
 def test_the_parts_that_are_not_given_are_drawn_to_fit(several):
     several.reset(seed=0, options={"obstacles": [CRATE]})
     assert several.scenes.obstacles.present.sum() == 3
-    check_scenes(several.scenes, several.arm)
+    check_scenes(several.scenes, several.task.arm)
     several.reset(seed=0, options={"start": HOME})
     np.testing.assert_array_equal(several.scenes.start, [HOME] * 3)
     assert several.scenes.obstacles.present.any(axis=1).all()
@@ -175,7 +175,9 @@ def test_a_jump_and_a_turn_can_be_given_to_all_scenes_or_to_each():
     together = env.scenes
     env.reset(seed=0, options={**options, "jumps": [[row]] * 2, "turns": [[turn]] * 2})
     same_scenes(env.scenes, together)
-    np.testing.assert_allclose(env.arm.hand(together.goals(np.full(2, 0.3)))[:, :2], [OTHER] * 2, atol=1e-9)
+    np.testing.assert_allclose(
+        env.task.arm.hand(together.goals(np.full(2, 0.3)))[:, :2], [OTHER] * 2, atol=1e-9
+    )
 
 
 def test_a_mesh_survives_json_and_one_without_a_name_changes_nothing():

@@ -91,7 +91,6 @@ VALUES = [  # call, then bad values
     (lambda bad: vp.curvature(bad, [0.5]), [vp.point_to_point([0.0], [1.0], 1.0)]),
     (lambda bad: vp.spectral_arc_length(REACH, cutoff=bad), [0, -1.0, np.nan, None, "10", [10.0], FREE]),
     (lambda bad: vp.spectral_arc_length(REACH, threshold=bad), [-0.1, 1.0, np.nan, None, "0", np.ones(2)]),
-    (lambda bad: vp.spectral_arc_length(REACH, padding=bad), [1.5, -1, None, "4", True, 4.0, [4], 10**9]),
     (lambda bad: vp.point_to_point([0.0], [1.0], bad).extrema(2), [1e-300]),
     (lambda bad: vp.point_to_point(torch.zeros(2), torch.ones(2), bad).peak(2), [1e-30]),
     (lambda bad: vp.fit_via_points(bad, SEEN), [TIME * np.nan, TIME[:10], TIME[::-1], TWICE]),

@@ -27,7 +27,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 import viapoint.envs.geometry.clearance
-import viapoint.envs.geometry.distance
 import viapoint.training.planning.movements
 import viapoint.training.planning.search
 from viapoint.envs.geometry.obstacles import BOX, bounding_boxes, no_obstacles, unpack
@@ -371,7 +370,6 @@ def test_plans_out_of_reach_are_not_taken(env_id):
 
 KNOW_OBSTACLES = (
     viapoint.envs.geometry.clearance,
-    viapoint.envs.geometry.distance,
     viapoint.training.planning.search,
 )
 EVERY = np.arange(INSTANTS)

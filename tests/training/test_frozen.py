@@ -43,7 +43,7 @@ def some():
 
 @pytest.mark.parametrize("frozen", SHIPPED.values(), ids=SHIPPED)
 def test_shipped_sets_are_whole_possible_and_of_the_kind_that_they_promise(frozen):
-    check_scenes(frozen.scenes, Task.from_dict(frozen.task).arm)
+    check_scenes(frozen.scenes, Task.of(**frozen.task).arm)
     name = frozen.name
     changing = frozen.task["moving_obstacles"] or not frozen.task["n_obstacles"][1]
     wanted = (make.FEWER if changing else make.NUMBERS)[name]

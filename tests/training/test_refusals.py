@@ -254,7 +254,7 @@ CALLS = [
     lambda: ViaVecEnv("CartPole-v1", 2),
     lambda: SceneSimulation("Nothing-v3"),
     lambda: load_agent("viapoint/Reach-v0"),
-    lambda: Task.from_dict({**agent().get_env().get_attr("task")[0].as_dict(), "arm": "octopus"}),
+    lambda: Task.of(**{**agent().get_env().get_attr("task")[0].as_dict(), "arm": "octopus"}),
     *(lambda env_id=env_id: ViaQ("ViaQPolicy", ViaVecEnv(env_id, 2)) for env_id in (STEP, SENSED)),
     lambda: ViaQ("ViaQPolicy", make_vec_env("Pendulum-v1")),
     *(lambda wrapper=wrapper: ViaQ("ViaQPolicy", make_vec_env(PLANE, 2, wrapper_class=wrapper))

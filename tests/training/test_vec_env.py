@@ -129,7 +129,7 @@ def test_seeds_options_and_attributes(env):
     assert all((first[name] == part).all() for name, part in again.items())
     native = env.venv.unwrapped
     scenes = [
-        scene_from_json(scene_to_json(native.scenes, native.arm, native.task.space_name, scene=row))
+        scene_from_json(scene_to_json(native.scenes, native.task.arm, native.task.space_name, scene=row))
         for row in range(6)
     ]
     env.set_options(scenes[0])

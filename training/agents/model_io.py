@@ -367,7 +367,7 @@ def _own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
     env.recorded_id = record["id"]
     if "task" in record:
         try:
-            check_same_task(Task.from_dict(record["task"]), _task_of(env))
+            check_same_task(Task.of(**record["task"]), _task_of(env))
         except ValueError as error:
             raise BadFileError(
                 folder, f"holds an agent for another {env_id} than is registered: {error}"

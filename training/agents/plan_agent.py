@@ -65,7 +65,7 @@ class PlanPolicy(BasePolicy):
             if name not in inspect.signature(BaseModel).parameters:
                 raise ValueError(unknown_name("policy_kwargs", name, self.OWN))
         super().__init__(observation_space, action_space, **kwargs)
-        self.task = Task.from_dict(task)
+        self.task = Task.of(**task)
         self.replanning = self.task.replanning
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -284,7 +284,7 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
                 f"{type(self).__name__} computes with metres: VecNormalize must be made with norm_obs=False"
             )
         check_unwrapped(env)
-        check_same_task(Task.from_dict(self.policy_kwargs["task"]), self._task_of(env))
+        check_same_task(Task.of(**self.policy_kwargs["task"]), self._task_of(env))
 
     def _setup_model(self) -> None:
         if self.env is not None:

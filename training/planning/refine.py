@@ -26,9 +26,9 @@ from viapoint.envs.geometry.clearance import (
     movement_clearance,
     nearest_spheres,
     place,
+    point_distance_and_normal,
 )
 from viapoint.envs.geometry.compiled import clock, compiled, inlined, inner, kernel
-from viapoint.envs.geometry.distance import point_distance, point_distance_and_normal
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.envs.outcome import straight_jerk_cost
 from viapoint.training.planning.movements import (
@@ -209,7 +209,8 @@ def _add_obstacles(time: float, wanted: float, work: _Work) -> tuple[float, floa
         for row in range(obstacles.kind.shape[1]):
             if obstacles.kind[0, row] == ABSENT:
                 continue
-            apart = point_distance(obstacles, 0, row, u, v, w, time, far + size) - size
+            limit = far + size
+            apart = point_distance_and_normal(obstacles, 0, row, u, v, w, time, limit)[0] - size
             seen[3] = min(seen[3], apart)
             if apart >= wanted:
                 continue
