@@ -29,6 +29,7 @@ TOOLS = [
     "pytest-xdist",
     "hypothesis",
     "mpmath",
+    "moviepy",
     "setuptools",
     "build",
     "ruff",

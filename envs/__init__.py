@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from viapoint.envs.arms.registry import register_arm as register_arm
     from viapoint.envs.arms.stored import write_arm as write_arm
     from viapoint.envs.env import ReachEnv as ReachEnv
+    from viapoint.envs.env import RecordMovements as RecordMovements
     from viapoint.envs.geometry.clearance import signed_distances as signed_distances
     from viapoint.envs.geometry.obstacles import Obstacles as Obstacles
     from viapoint.envs.geometry.obstacles import observation_rows as observation_rows

@@ -1,11 +1,14 @@
-"""One environment, a batch of one."""
+"""One environment, a batch of one, and the recording of its movements."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
+from types import FrameType
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.wrappers import RecordVideo
 
 from viapoint.envs.common.arrays import Observation
 from viapoint.envs.common.validation import finite_array
@@ -38,6 +41,7 @@ class ReachEnv(gym.Env[Any, Any]):
         self.action_space = self.batch.single_action_space
         self.render_mode = self.batch.render_mode
         self._over = True
+        self._warned = False
 
     @property
     def task(self) -> Task:
@@ -106,9 +110,65 @@ class ReachEnv(gym.Env[Any, Any]):
 
     def render(self) -> Any:
         """Render the last movement in the render mode; after a reset, the scene."""
+        if not self._warned and not self.task.stepwise and _is_recorded():
+            self._warned = True
+            gym.logger.warn(
+                "RecordVideo keeps one frame of each step, and here a step is a movement: "
+                "viapoint.envs.RecordMovements with render_mode='rgb_array_list' keeps all frames"
+            )
         frames = self.batch.render()
         return None if frames is None else frames[0]
 
     def close(self) -> None:
         """Stop worker threads and close the render window."""
         self.batch.close()
+
+
+def _is_recorded() -> bool:
+    """Return True if Gymnasium's RecordVideo, which does not say so, has asked for a picture."""
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None:
+        if frame.f_code is RecordVideo._capture_frame.__code__:
+            return True
+        frame = frame.f_back
+    return False
+
+
+class RecordMovements(RecordVideo[Any, Any]):
+    """Version of Gymnasium's `RecordVideo` that keeps every frame of a movement.
+
+    `RecordVideo` takes one frame per step, so with `render_mode="rgb_array_list"` it keeps only the last frame of the
+    list. This wrapper keeps all frames, whether a movement is one step or several. The arguments are those of
+    `RecordVideo`; moviepy must be installed.
+
+    Raises:
+        ValueError: The environment's `render_mode` is not `rgb_array_list`.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> env = gym.make("viapoint.envs:viapoint/PlanarReach-v0", render_mode="rgb_array_list")
+        >>> env = RecordMovements(env, "videos")  # doctest: +SKIP
+    """
+
+    recorded_frames: list[Any] = []  # noqa: RUF012 - Gymnasium reads it in `__del__`, also after an error in `__init__`
+
+    def __init__(self, env: gym.Env[Any, Any], *args: Any, **kwargs: Any) -> None:
+        if env.render_mode != "rgb_array_list":
+            raise ValueError(
+                "RecordMovements records every frame of a movement and needs render_mode='rgb_array_list', "
+                f"got {env.render_mode!r}; Gymnasium's RecordVideo records one frame per step"
+            )
+        super().__init__(env, *args, **kwargs)
+        self._shown = 0
+        """Number of frames of the episode that are in the video."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        """Reset the environment, and start a video if the episode is to be recorded."""
+        self._shown = 0
+        return super().reset(**kwargs)
+
+    def _capture_frame(self) -> None:
+        frames: Any = self.env.render()
+        self.recorded_frames.extend(frames[self._shown :])
+        # Each step returns the frames from the beginning of the episode.
+        self._shown = len(frames)

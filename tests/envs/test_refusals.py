@@ -171,6 +171,12 @@ def record(**change):
     return ve.Task.of(**{**ve.Task.of().as_dict(), **change})
 
 
+def recorder(mode):
+    env = gym.Wrapper(gym.Env())
+    env.env.render_mode = mode
+    return ve.RecordMovements(env, "nowhere")
+
+
 def nothing(rng, room):
     """Build nothing."""
 
@@ -197,6 +203,7 @@ CALLS = [
     (lambda weights: ve.RewardWeights(**weights), [
         ({"success": np.nan},), ({"success": "much"},), ({"duration": -0.1},), ({"progress": True},),
     ]),
+    (recorder, [(None,), ("human",), ("rgb_array",)]),
     (lambda sensor: ve.Task.of(sensor=sensor), [
         ("eyes",), (3,), ({"lens": 1},), ({"columns": 0},), ({"columns": 1.5},), ({"rows": 2, "columns": 40_000},),
         ({"field_of_view": 7.0},), ({"rows": 4, "field_of_view": 3.1},), ({"range": 0.0},), ({"noise": -1.0},),

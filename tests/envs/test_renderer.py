@@ -9,12 +9,13 @@ import weakref
 from types import SimpleNamespace
 
 import gymnasium as gym
+import imageio_ffmpeg
 import mujoco
 import numpy as np
 import pytest
-from helpers import PANDA, PLANE, SENSED, WHOLE, post
+from helpers import JUMPS, PANDA, PLANE, SENSED, WHOLE, play, post
 
-from viapoint.envs import Box, HalfSpace, Sphere, arm_of, gl, renderer
+from viapoint.envs import Box, HalfSpace, RecordMovements, Sphere, arm_of, gl, renderer
 from viapoint.envs.gl import GLUnavailableError
 
 pytestmark = pytest.mark.usefixtures("quick_pictures")
@@ -172,6 +173,35 @@ def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
     assert len(shown) == 5
     env.close()
     assert shown[-1] == "closed"
+
+
+def frames_of(path):
+    """Number of frames of a video."""
+    reader = imageio_ffmpeg.read_frames(str(path))
+    next(reader)
+    return sum(1 for _ in reader)
+
+
+@pytest.mark.parametrize("env_id", [PLANE, JUMPS])
+def test_each_frame_of_a_movement_of_one_or_several_steps_is_recorded_once(env_id, make, tmp_path):
+    pytest.importorskip("moviepy")
+    made = make(env_id, "rgb_array_list", side=64, duration_range=(0.4, 0.6))
+    env = RecordMovements(made, str(tmp_path / "videos"), episode_trigger=lambda _: True)
+    env.reset(seed=0)
+    steps = len(play(env, 0.3))
+    expected = 1 + round(env.unwrapped.last_rollout.time[-1] * env.metadata["render_fps"])
+    env.close()
+    assert (steps > 1) == (env_id == JUMPS)
+    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == pytest.approx(expected, abs=1)
+
+
+def test_gymnasium_records_two_frames_of_a_movement_and_a_warning_says_so(make, tmp_path):
+    pytest.importorskip("moviepy")
+    env = gym.wrappers.RecordVideo(make(side=64), str(tmp_path / "videos"), episode_trigger=lambda _: True)
+    with pytest.warns(UserWarning, match="RecordMovements"):
+        moved(env, AROUND)
+    env.close()
+    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == 2
 
 
 def in_a_thread(function):
