@@ -10,7 +10,7 @@ from helpers import random_shape
 from scipy.spatial.transform import Rotation
 
 import viapoint.envs as ve
-from viapoint.envs.geometry.compiled import compiled, inner, kernel
+from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.distance import point_distance, point_distance_and_normal
 from viapoint.envs.geometry.obstacles import KINDS, add_to_model, no_obstacles, pack
 
@@ -224,25 +224,6 @@ def doubled(length):
     return 2.0 * length.metres
 """
 USE = "from caller import Length, doubled; print(doubled(Length(1.5)))"
-
-
-@inner
-def twice(number):
-    return 2.0 * number
-
-
-@kernel
-def fourfold(number):
-    return twice(twice(number))
-
-
-def test_functions_for_compiled_ones_alone_refuse_calls_from_python():
-    with pytest.raises(TypeError):
-        twice(1.5)
-    assert fourfold(1.5) == 6.0
-    with pytest.raises(TypeError):
-        twice(1.5)  # though it is compiled now
-    assert twice.py_func(1.5) == 3.0
 
 
 def test_records_may_move_to_another_module(tmp_path):
