@@ -766,9 +766,7 @@ FENCE, CEILING = (Box((0.2, 0.02, 0.2), position=(0.3, 0.0, height)) for height 
 """Obstacles below and above which the arm cannot pass; it can between them."""
 
 
-@pytest.mark.parametrize(
-    "arm", [benchmark_panda(), load_arm(LIFT, name="lift", torque_limit=100.0, velocity_limit=1.0)]
-)
+@pytest.mark.parametrize("arm", [benchmark_panda(), LIFTED])
 def test_a_path_of_trees_is_clear_between_its_ends(arm):
     """The same seed gives the same path; where there is none, none is found."""
     ends, shapes = np.array([[0.0, -0.8], [0.0, 0.8]]), [FENCE, CEILING]
