@@ -255,19 +255,6 @@ def test_an_interrupted_demo_goes_on_and_what_is_done_is_not_done_again(quick, c
     assert written == {name: (quick.out / name).stat().st_mtime_ns for name in demo.FILES}
 
 
-def not_filmed(monkeypatch) -> list[str]:
-    """Let `play` decide without rendering; the arms of its videos are listed."""
-    filmed: list[str] = []
-
-    def record(path, env, scenes, decide, **_) -> None:
-        observation, _ = env.reset(seed=0)
-        decide({name: value[None] for name, value in observation.items()}, scenes)
-        filmed.append(env.unwrapped.task.arm.file)
-
-    monkeypatch.setattr("viapoint.training.video.record_video", record)
-    return filmed
-
-
 def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     shutil.copy(UR5E, tmp_path / "my_arm.xml")
     monkeypatch.chdir(tmp_path)
@@ -290,9 +277,6 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     assert Run(folder).config.env_kwargs["arm"] == str(folder / "arm.xml")
     np.testing.assert_array_equal(kept.predict(seen, deterministic=True)[0], action)
     run("evaluate", folder, "--baselines", "straight", "--n-scenes", 4, "--scenes", "validation")
-    filmed = not_filmed(monkeypatch)
-    run("play", folder, "--n-scenes", 1, "--scenes", "validation", "--video", tmp_path / "a.mp4")
-    assert filmed == [kept.env_kwargs["arm"]]
 
 
 def test_a_run_goes_on_with_its_copy_of_an_arm(tmp_path, capsys) -> None:
@@ -314,14 +298,11 @@ def test_a_run_goes_on_with_its_copy_of_an_arm(tmp_path, capsys) -> None:
     assert first.read_bytes() == second.read_bytes()
 
 
-def test_methods_are_measured_on_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
-    arm = ["--arm", UR5E, "--scenes", "validation"]
+def test_methods_are_measured_on_an_arm_of_a_file(tmp_path) -> None:
     out = tmp_path / "results.json"
-    run("evaluate", *arm, "--baselines", "straight", "plan_motion", "--n-scenes", 4, "--json", out)
+    words = ["--baselines", "straight", "plan_motion", "--scenes", "validation", "--n-scenes", 4]
+    run("evaluate", "--arm", UR5E, *words, "--json", out)
     assert out.is_file()
-    filmed = not_filmed(monkeypatch)
-    run("play", *arm, "--n-scenes", 1, "--video", tmp_path / "b.mp4")
-    assert filmed == [str(UR5E)]
 
 
 GOOD, GONE = "print('fine')", "import no_such_module"
