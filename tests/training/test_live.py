@@ -315,12 +315,10 @@ def test_obstacles_of_every_shape_are_added_resized_drawn_and_kept_in_files(env_
 @pytest.mark.parametrize("asset", ["", '<asset><mesh name="gone" file="gone.obj"/></asset>'])
 def test_an_arm_of_ones_own_is_drawn_from_its_file(asset, tmp_path):
     """The drawn hand is where the arm's hand is, wherever the file puts the arm."""
-    names = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-    home = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
     text = UR5E.read_text()
     file = tmp_path / "ur5e.xml"
     file.write_text(text.replace("<worldbody>", f"{asset}<worldbody>"))
-    arm = ve.load_arm(file, tool="hand", joints=names, home=home, velocity_limit=np.pi)
+    arm = ve.load_arm(file)
     parts = drawing.ArmDrawing(arm, file)
     away = []
     for joints in arm.home + np.random.default_rng(0).uniform(-0.4, 0.4, (8, 6)):
