@@ -4,7 +4,6 @@ import io
 import json
 import os
 import pty
-import re
 import shlex
 import shutil
 import subprocess
@@ -39,15 +38,6 @@ FEW = "gradient_steps=1", 'policy_kwargs={"candidates":32,"refinements":1,"per_r
 
 def run(*words):
     cli.main([str(word) for word in words])
-
-
-@pytest.mark.parametrize("command", cli.COMMANDS)
-def test_every_command_has_help(command, capsys):
-    with pytest.raises(SystemExit) as end:
-        run(command, "--help")
-    assert not end.value.code
-    shown = capsys.readouterr().out
-    assert f"viapoint {command}" in re.search("Example: (.+)", shown).group(1)
 
 
 def test_errors_of_options_are_the_same_on_a_terminal(capsys):
