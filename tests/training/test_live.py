@@ -201,9 +201,10 @@ def test_every_method_keeps_a_duration_that_the_limits_allow(method, arenas):
     assert "the shortest time" not in describe_plan(state.proposals[0], state.plan.duration)
 
 
-def test_a_dragged_goal_is_reached_without_a_jump(arenas):
-    """A goal that is dragged after the arrival is reached by a second movement."""
-    arena = arenas(MOVING)
+@pytest.mark.parametrize("env_id", [MOVING, JUMPS])
+def test_a_dragged_goal_is_reached_without_a_jump(env_id, arenas):
+    """A goal that is dragged jumps no more; after the arrival, it is reached by a second movement."""
+    arena = arenas(env_id)
     scene = drawn(arena)
     aside = scene.goal + (0.02, 0.04) * np.sign(0.3 - scene.goal)
     for late in (False, True):
@@ -258,18 +259,6 @@ def test_the_motion_planner_plans_on_where_plans_are_revised(env_id, arenas, mon
         followed += in_motion and np.allclose(movement.plan.duration, last.duration)
     assert reached >= 7
     assert followed >= 2
-
-
-def test_a_dragged_goal_jumps_no_more(arenas):
-    """Neither in the movement nor in the simulations of its proposals."""
-    arena = arenas(JUMPS)
-    scene = drawn(arena)
-    assert len(scene.jumps)
-    state = with_proposals(arena, decided(arena, scene._replace(jumps=())))
-    assert state.plan.success
-    assert np.isfinite(state.proposals[0].reward)
-    *_, movement = execute(arena, state)
-    assert not movement.scenes.jumps.any()
 
 
 @pytest.mark.parametrize("env_id", [PLANE, PANDA])
