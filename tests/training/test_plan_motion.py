@@ -502,17 +502,10 @@ def test_first_problems_of_the_benchmark() -> None:
     assert outcome.is_success.all()
 
 
-def test_more_free_movements_are_hardly_smoother() -> None:
-    arm = benchmark_panda()
-    ratios = []
-    for problem in benchmark_problems():
-        if problem.number == 12:  # one of each set
-            given = arm, problem.start, problem.goal, problem.obstacles
-            one, best = (
-                plan_motion(*given, enough=enough, ompl=False, time_limit=30.0) for enough in (1, 30)
-            )
-            ratios.append(one.jerk / best.jerk)
-    assert np.mean(ratios) < 1.2
+def test_the_smoothest_of_enough_free_movements_is_taken() -> None:
+    one, best = (plan_motion(PANDA, PANDA.home, GOAL, [POST], enough=enough) for enough in (1, 30))
+    assert best.seeds > one.seeds
+    assert best.jerk <= one.jerk
 
 
 def test_limits_are_those_of_a_dense_movement() -> None:
