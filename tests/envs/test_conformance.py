@@ -202,21 +202,12 @@ def test_broken_physics_ends_its_episode_alone(env_id, broken, tmp_path, monkeyp
     assert not after["unstable"].any()  # the next episode is sound
 
 
-def zeros(env):
-    return np.zeros(env.action_space.shape, np.float32)
-
-
-def native(env_id=PLANE, mode="NextStep", number=3, **kwargs):
-    env = gym.make_vec(env_id, num_envs=number, autoreset_mode=mode, **kwargs)
-    assert env.metadata["autoreset_mode"] is AutoresetMode(mode)
-    return env
-
-
 @pytest.mark.parametrize("env_id", [PLANE, STEP, MOVING])
 @pytest.mark.parametrize("mode", MODES)
 def test_the_native_batch_is_gymnasiums_in_each_mode(env_id, mode):
     """Observations, rewards, ends and infos are those of Gymnasium's own vector environment, step by step."""
-    mine = native(env_id, mode)
+    mine = gym.make_vec(env_id, num_envs=3, autoreset_mode=mode)
+    assert mine.metadata["autoreset_mode"] is AutoresetMode(mode)
     theirs = gym.vector.SyncVectorEnv([lambda: gym.make(env_id)] * 3, autoreset_mode=AutoresetMode(mode))
     first, second = mine.reset(seed=1)[0], theirs.reset(seed=1)[0]
     same(first, second)
@@ -259,14 +250,15 @@ def same_infos(mine, theirs):
 @pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
 def test_wrappers_of_observations_take_the_native_batch(mode):
     """In the modes for which Gymnasium defines them."""
-    env = wrappers.FlattenObservation(wrappers.RecordEpisodeStatistics(native(mode=mode)))
+    native = gym.make_vec(PLANE, num_envs=3, autoreset_mode=mode)
+    env = wrappers.FlattenObservation(wrappers.RecordEpisodeStatistics(native))
     if mode == "NextStep":
         env = wrappers.NormalizeObservation(env)
     seen, _ = env.reset(seed=0)
     assert seen.shape == env.observation_space.shape
     returns = 0
     for _ in range(4):
-        seen, _, terminated, truncated, info = env.step(zeros(env))
+        seen, _, terminated, truncated, info = env.step(np.zeros(env.action_space.shape, np.float32))
         assert np.isfinite(seen).all()
         returns += "episode" in info
         if mode == "Disabled" and (terminated | truncated).any():
