@@ -707,15 +707,12 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
 
 
 def test_where_there_is_no_way_it_gives_up(monkeypatch):
-    """A ring of bars around the start."""
+    """Bars are all around the goal."""
     pytest.importorskip("ompl")
     monkeypatch.setattr(module, "OMPL_MARGINS", module.OMPL_MARGINS[:1])
     monkeypatch.setattr(module, "OMPL_PATIENCE", 0.05)
-    x, y = -0.25, 0.35
-    across = [Box((0.01, 0.08, 0.04), position=(x + side, y, 0.0)) for side in (-0.07, 0.07)]
-    along = [Box((0.08, 0.01, 0.04), position=(x, y + side, 0.0)) for side in (-0.07, 0.07)]
     simulation = SceneSimulation(PLANE, 1)
-    given = {"start": (x, y), "goal": (0.15, 0.35), "obstacles": [*across, *along]}
+    given = {name: ENCLOSED[name] for name in ("start", "goal", "obstacles")}
     scenes = draw_given(given, simulation.task.sampler(), [np.random.default_rng(0)])
     method = make_method("ompl", PLANE)
     assert not method.plan(scenes).success
