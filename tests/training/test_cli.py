@@ -489,14 +489,10 @@ TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
     ("lines", "told"),
     [
         ([TABLE[0], *(f"{line},0.3" for line in TABLE[1:])], "Expected 3 fields in line 2, saw 4"),
-        ([TABLE[0], *(f"{line}," for line in TABLE[1:])], "Expected 3 fields in line 2, saw 4"),
         ([*TABLE[:3], "", "  ", "0.2,0.1"], "line 6, column y: nothing"),
         ([*TABLE[:2], "", "0.1,far,0.2"], "line 4, column x: far"),
         (["y", "0.1"], "no column time"),
-        (
-            ["t;px;py", "0.0;0.1;0.2"],
-            "must name the columns time, x, y, and optionally z and movement, got t, px, py",
-        ),
+        (["t;px;py", "0.0;0.1;0.2"], "optionally z and movement, got t, px, py"),
         ([TABLE[0], *(f"{-time},0.1,0.2" for time in range(12))], "equal time in line 3"),
         ([*TABLE[:3], TABLE[2]], "equal time in line 4"),
         ([*TABLE, *TABLE[1:]], "add a column `movement`"),
