@@ -144,8 +144,9 @@ class Tab:
             time.sleep(0.06)
         self.mouse("Released", last)
 
-    def key(self, name):
-        pressed = {"key": name, "code": name, "windowsVirtualKeyCode": KEYS[name]}
+    def press_right(self):
+        """Press the right arrow key."""
+        pressed = {"key": "ArrowRight", "code": "ArrowRight", "windowsVirtualKeyCode": 39}
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, **pressed)
 
@@ -162,6 +163,3 @@ class Tab:
             self.call("Page.close")
             self._socket.close()
             shutil.rmtree(self.downloads, ignore_errors=True)
-
-
-KEYS = {"ArrowRight": 39}

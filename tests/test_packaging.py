@@ -150,18 +150,6 @@ def test_modules_models_scenes_agents_and_the_command_are_inside_and_nothing_els
     assert "viapoint = viapoint.training.cli.entry:main" in wheel.read(name).decode()
 
 
-def test_dependencies_have_a_lower_bound_that_the_tried_versions_fulfil():
-    pins = dict(
-        re.findall(
-            r"(?m)^([\w.-]+)==([\d.]+)", (ROOT / "constraints.txt").read_text().lower().replace("_", "-")
-        )
-    )
-    for line in PROJECT["dependencies"] + PROJECT["optional-dependencies"]["training"]:
-        name, bound = re.fullmatch(r"([\w.-]+)>=([\d.]+)", line).groups()
-        tried = pins[name]
-        assert [int(n) for n in bound.split(".")] <= [int(n) for n in tried.split(".")], line
-
-
 IMPORT = re.compile(r"^\s*(?:from (\w[\w.]*) import |import (\w[\w.]*)(?: as \w+)?$)", re.MULTILINE)
 OF_OTHER_NAMES = {"yaml", "pil", "mpl_toolkits", "glfw"}
 """PyYAML, and what Matplotlib and MuJoCo bring."""

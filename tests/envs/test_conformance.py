@@ -11,7 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector as wrappers
-from helpers import JUMPS, MOVING, PLANE, SENSED, STEP, play, same
+from helpers import MOVING, PLANE, SENSED, STEP, play, same
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
 from viapoint.envs import ENV_IDS
@@ -202,21 +202,12 @@ def test_broken_physics_ends_its_episode_alone(env_id, broken, tmp_path, monkeyp
     assert not after["unstable"].any()  # the next episode is sound
 
 
-def zeros(env):
-    return np.zeros(env.action_space.shape, np.float32)
-
-
-def native(env_id=PLANE, mode="NextStep", number=3, **kwargs):
-    env = gym.make_vec(env_id, num_envs=number, autoreset_mode=mode, **kwargs)
-    assert env.metadata["autoreset_mode"] is AutoresetMode(mode)
-    return env
-
-
 @pytest.mark.parametrize("env_id", [PLANE, STEP, MOVING])
 @pytest.mark.parametrize("mode", MODES)
 def test_the_native_batch_is_gymnasiums_in_each_mode(env_id, mode):
     """Observations, rewards, ends and infos are those of Gymnasium's own vector environment, step by step."""
-    mine = native(env_id, mode)
+    mine = gym.make_vec(env_id, num_envs=3, autoreset_mode=mode)
+    assert mine.metadata["autoreset_mode"] is AutoresetMode(mode)
     theirs = gym.vector.SyncVectorEnv([lambda: gym.make(env_id)] * 3, autoreset_mode=AutoresetMode(mode))
     first, second = mine.reset(seed=1)[0], theirs.reset(seed=1)[0]
     same(first, second)
@@ -232,6 +223,8 @@ def test_the_native_batch_is_gymnasiums_in_each_mode(env_id, mode):
         ends += over.sum()
         same_infos(one[4], other[4])
         if mode == "Disabled" and over.any():
+            with pytest.raises(gym.error.ResetNeeded):
+                mine.step(actions)
             options = {"reset_mask": over}
             same(mine.reset(options=dict(options))[0], theirs.reset(options=dict(options))[0])
     assert ends >= 2
@@ -254,104 +247,23 @@ def same_infos(mine, theirs):
             np.testing.assert_array_equal(one[mask], other[mask], err_msg=name)
 
 
-@pytest.mark.parametrize("env_id", [PLANE, JUMPS])
-def test_without_autoreset_an_episode_that_is_over_needs_a_reset(env_id):
-    env = native(env_id, "Disabled")
-    env.reset(seed=0)
-    over = np.zeros(3, bool)
-    while not over.any():
-        _, _, terminated, truncated, _ = env.step(zeros(env))
-        over = terminated | truncated
-    with pytest.raises(gym.error.ResetNeeded):
-        env.step(zeros(env))
-    env.reset(options={"reset_mask": over})
-    env.step(zeros(env))
-
-
 @pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
 def test_wrappers_of_observations_take_the_native_batch(mode):
     """In the modes for which Gymnasium defines them."""
-    env = wrappers.FlattenObservation(wrappers.RecordEpisodeStatistics(native(mode=mode)))
+    native = gym.make_vec(PLANE, num_envs=3, autoreset_mode=mode)
+    env = wrappers.FlattenObservation(wrappers.RecordEpisodeStatistics(native))
     if mode == "NextStep":
         env = wrappers.NormalizeObservation(env)
     seen, _ = env.reset(seed=0)
     assert seen.shape == env.observation_space.shape
     returns = 0
     for _ in range(4):
-        seen, _, terminated, truncated, info = env.step(zeros(env))
+        seen, _, terminated, truncated, info = env.step(np.zeros(env.action_space.shape, np.float32))
         assert np.isfinite(seen).all()
         returns += "episode" in info
         if mode == "Disabled" and (terminated | truncated).any():
             env.reset(options={"reset_mask": terminated | truncated})
     assert returns >= 2
-
-
-def test_a_loop_as_in_cleanrl_learns():
-    """PPO's loop in one file: a batch, a flat observation, a buffer and a few updates."""
-    torch = pytest.importorskip("torch")
-    torch.manual_seed(0)
-    number, steps = 32, 4
-    envs = wrappers.FlattenObservation(native("viapoint/PlanarReach-v0", number=number))
-    envs = wrappers.RecordEpisodeStatistics(envs)
-    size, actions = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
-    actor = torch.nn.Sequential(torch.nn.Linear(size, 32), torch.nn.Tanh(), torch.nn.Linear(32, actions))
-    critic = torch.nn.Sequential(torch.nn.Linear(size, 32), torch.nn.Tanh(), torch.nn.Linear(32, 1))
-    spread = torch.nn.Parameter(torch.full((actions,), -1.0))
-    optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters(), spread], lr=1e-2)
-    seen, _ = envs.reset(seed=1)
-    means = []
-    over = np.zeros(number, bool)
-    for _ in range(8):
-        batch = []
-        for _ in range(steps):
-            x = torch.as_tensor(seen, dtype=torch.float32)
-            with torch.no_grad():
-                chosen = torch.distributions.Normal(actor(x), spread.exp()).sample()
-            seen, reward, terminated, truncated, _ = envs.step(chosen.numpy())
-            # With next-step autoreset, the step after the end of an episode only resets it.
-            valid = torch.as_tensor(~over)
-            batch.append((x[valid], chosen[valid], torch.as_tensor(reward, dtype=torch.float32)[valid]))
-            over = terminated | truncated
-        x, chosen, reward = (torch.cat(parts) for parts in zip(*batch, strict=True))
-        means.append(float(reward.mean()))
-        before = torch.distributions.Normal(actor(x), spread.exp()).log_prob(chosen).sum(-1).detach()
-        for _ in range(4):
-            value = critic(x).squeeze(-1)
-            now = torch.distributions.Normal(actor(x), spread.exp()).log_prob(chosen).sum(-1)
-            ratio = (now - before).exp()
-            gain = reward - value.detach()
-            policy = torch.min(ratio * gain, ratio.clamp(0.8, 1.2) * gain).mean()
-            loss = ((reward - value) ** 2).mean() - policy
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-    assert np.mean(means[-3:]) > np.mean(means[:3]) + 0.02
-
-
-def test_torchrl():
-    envs = pytest.importorskip("torchrl.envs")
-    for env_id in ENV_IDS:
-        for env in (envs.GymEnv(env_id), envs.GymWrapper(gym.make(env_id))):
-            assert env.rollout(2).batch_size[0] >= 1
-
-
-def test_rllib():
-    pytest.importorskip("ray.rllib")
-    from ray.rllib.algorithms.ppo import PPOConfig
-    from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
-    from ray.tune.registry import register_env
-
-    register_env("reach", lambda config: gym.wrappers.FlattenObservation(gym.make(PLANE, **config)))
-    config = PPOConfig().environment("reach", env_config={"n_obstacles": 2}).env_runners(num_env_runners=0)
-    episodes = SingleAgentEnvRunner(config=config).sample(num_episodes=3)
-    assert [len(episode) for episode in episodes] == [1, 1, 1]
-
-
-def test_tianshou():
-    tianshou = pytest.importorskip("tianshou.env")
-    envs = tianshou.DummyVectorEnv([lambda: gym.make(PLANE)] * 2)
-    envs.reset()
-    envs.step(np.zeros((2, 3), np.float32))
 
 
 FORKED = """

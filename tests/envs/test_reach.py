@@ -1,7 +1,5 @@
 """Outcomes of whole movements."""
 
-import os
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -14,8 +12,6 @@ from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import resting
 
 SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")
-MOVEMENTS = int(os.environ.get("VIAPOINT_TEST_MOVEMENTS", "100"))
-"""Random movements for each arm and shape."""
 
 
 def through(env, via, duration=0.85):
@@ -79,12 +75,11 @@ def test_thin_walls_are_not_tunnelled_at_the_highest_speed():
 def test_contact_implies_negative_clearance_and_clearance_implies_no_contact(arm, kind):
     """In MuJoCo at every physics step of random movements past a random shape."""
     rng = np.random.default_rng(7)
-    number = min(MOVEMENTS, 50)
     # Not all kinds have default families in the plane.
     kinds = (kind, "box", "cylinder")
     env = gym.make_vec(
         PANDA if arm == "panda" else PLANE,
-        num_envs=number,
+        num_envs=50,
         n_obstacles=1,
         shapes=tuple(dict.fromkeys(kinds)),
         families="clutter",
@@ -94,7 +89,7 @@ def test_contact_implies_negative_clearance_and_clearance_implies_no_contact(arm
     ).unwrapped
     env.reset(seed=0)
     touched = clear = 0
-    for _ in range(max(MOVEMENTS // number, 1)):
+    for _ in range(2):
         scenes = scenes_with(env, kind, rng)
         env.begin(scenes)
         decision = env.execute_actions(rng.uniform(-1.0, 1.0, env.action_space.shape))
@@ -104,7 +99,7 @@ def test_contact_implies_negative_clearance_and_clearance_implies_no_contact(arm
         assert not info["collision"][clearance >= 0.0].any()
         touched += info["collision"].sum()
         clear += (clearance >= 0.0).sum()
-    assert min(touched, clear) > 0.02 * MOVEMENTS
+    assert min(touched, clear) > 2
 
 
 def scenes_with(env, kind, rng):

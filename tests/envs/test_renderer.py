@@ -18,8 +18,6 @@ from helpers import JUMPS, PANDA, PLANE, SENSED, WHOLE, play, post
 from viapoint.envs import Box, HalfSpace, RecordMovements, Sphere, arm_of, gl, renderer
 from viapoint.envs.gl import GLUnavailableError
 
-pytestmark = pytest.mark.usefixtures("quick_pictures")
-
 DRAWN = {
     "start": [-0.1, 0.25],
     "goal": [-0.1, 0.55],
@@ -27,6 +25,39 @@ DRAWN = {
 }
 """Scene of the tests of pictures."""
 STRAIGHT, AROUND = np.zeros(3, np.float32), np.array([0.0, -0.5, 0.5], np.float32)
+
+
+@pytest.fixture(autouse=True)
+def quick_pictures(monkeypatch):
+    """Pictures without supersampling: what is tested here does not need to look good."""
+    monkeypatch.setattr(renderer, "STILL_SUPERSAMPLING", 1)
+
+
+@pytest.fixture(scope="module")
+def opengl():
+    """OpenGL, or the test is skipped."""
+    env = gym.make(PLANE, render_mode="rgb_array", width=16, height=16)
+    env.reset(seed=0)
+    try:
+        env.render()
+    except GLUnavailableError as error:
+        pytest.skip(f"no picture can be rendered here: {error}")
+    finally:
+        env.close()
+
+
+@pytest.fixture
+def make(opengl):
+    """Function that makes environments with small pictures, which are closed after the test."""
+    opened = []
+
+    def made(name=PLANE, mode="rgb_array", *, side=96, **kwargs):
+        opened.append(gym.make(name, render_mode=mode, **{"width": side, "height": side, **kwargs}))
+        return opened[-1]
+
+    yield made
+    for env in opened:
+        env.close()
 
 
 def moved(env, action):

@@ -44,18 +44,6 @@ def test_one_via_point_is_passed_where_eq_c16_changes_sign(family, rng):
     assert (residual(np.where(t == 0.5, 0.5, high), start, via, goal) <= 0).all()
 
 
-def test_limits_of_one_via_point():
-    points = {
-        "on the start": ([[0, 0], [0, 0], [1, 0]], [0, 1]),
-        "on the goal": ([[0, 0], [1, 0], [1, 0]], [1, 0]),
-        "out and back": ([[0, 0], [1, 2], [0, 0]], [0.5, 0.5]),
-        "nowhere to go": ([[1, 1], [1, 1], [1, 1]], [0, 1]),
-        "halfway": ([[0, 0], [0.5, 0], [1, 0]], [0.5, 0.5]),
-    }
-    for name, (waypoints, expected) in points.items():
-        np.testing.assert_array_equal(passage_durations(waypoints, 1.0), expected, err_msg=name)
-
-
 @pytest.mark.parametrize("vias", [1, 2, 3, 5])
 @pytest.mark.parametrize("ends", ["at rest", "moving and free"])
 def test_no_shift_of_a_passage_time_lowers_the_cost(vias, ends, rng):

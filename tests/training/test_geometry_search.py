@@ -35,19 +35,14 @@ def random_actions(task, *shape, seed=0):
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (*shape, task.action.size))
 
 
-def decoded(task, problem, actions):
-    """The plans that environments make of actions of shape (N, H, m), at rest."""
-    start, goal = (np.repeat(end[:, None], actions.shape[1], axis=1) for end in (problem.start, problem.goal))
-    return task.action.decode(actions, start, goal)
-
-
 @pytest.mark.parametrize("timing", ["optimal", "learned"])
 @pytest.mark.parametrize("n_via", [0, 1, 2, 3])
 @pytest.mark.parametrize("env_id", [PLANE, PANDA])
 def test_planned_movements_are_nearly_those_of_the_environment(env_id, n_via, timing):
     env, _, problem = drawn(env_id, 6, n_via=n_via, timing=timing)
     actions = random_actions(env.task, 6, 20)
-    plan = decoded(env.task, problem, actions)
+    start, goal = (np.repeat(end[:, None], 20, axis=1) for end in (problem.start, problem.goal))
+    plan = env.task.action.decode(actions, start, goal)
     moves = moves_of(env.task, problem, actions)
     basis = moves.table.basis[moves.times]
     path = problem.start[:, None, None] + np.einsum("bhti,bhid->bhtd", basis, moves.offsets)

@@ -201,9 +201,10 @@ def test_every_method_keeps_a_duration_that_the_limits_allow(method, arenas):
     assert "the shortest time" not in describe_plan(state.proposals[0], state.plan.duration)
 
 
-def test_a_dragged_goal_is_reached_without_a_jump(arenas):
-    """A goal that is dragged after the arrival is reached by a second movement."""
-    arena = arenas(MOVING)
+@pytest.mark.parametrize("env_id", [MOVING, JUMPS])
+def test_a_dragged_goal_is_reached_without_a_jump(env_id, arenas):
+    """A goal that is dragged jumps no more; after the arrival, it is reached by a second movement."""
+    arena = arenas(env_id)
     scene = drawn(arena)
     aside = scene.goal + (0.02, 0.04) * np.sign(0.3 - scene.goal)
     for late in (False, True):
@@ -260,18 +261,6 @@ def test_the_motion_planner_plans_on_where_plans_are_revised(env_id, arenas, mon
     assert followed >= 2
 
 
-def test_a_dragged_goal_jumps_no_more(arenas):
-    """Neither in the movement nor in the simulations of its proposals."""
-    arena = arenas(JUMPS)
-    scene = drawn(arena)
-    assert len(scene.jumps)
-    state = with_proposals(arena, decided(arena, scene._replace(jumps=())))
-    assert state.plan.success
-    assert np.isfinite(state.proposals[0].reward)
-    *_, movement = execute(arena, state)
-    assert not movement.scenes.jumps.any()
-
-
 @pytest.mark.parametrize("env_id", [PLANE, PANDA])
 def test_a_dragged_end_is_where_it_was_dragged_to(env_id, arenas):
     arena = arenas(env_id)
@@ -315,12 +304,10 @@ def test_obstacles_of_every_shape_are_added_resized_drawn_and_kept_in_files(env_
 @pytest.mark.parametrize("asset", ["", '<asset><mesh name="gone" file="gone.obj"/></asset>'])
 def test_an_arm_of_ones_own_is_drawn_from_its_file(asset, tmp_path):
     """The drawn hand is where the arm's hand is, wherever the file puts the arm."""
-    names = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-    home = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
     text = UR5E.read_text()
     file = tmp_path / "ur5e.xml"
     file.write_text(text.replace("<worldbody>", f"{asset}<worldbody>"))
-    arm = ve.load_arm(file, tool="hand", joints=names, home=home, velocity_limit=np.pi)
+    arm = ve.load_arm(file)
     parts = drawing.ArmDrawing(arm, file)
     away = []
     for joints in arm.home + np.random.default_rng(0).uniform(-0.4, 0.4, (8, 6)):

@@ -106,7 +106,7 @@ def test_what_a_user_does_changes_the_plan(page, open_tab):
     before = session.state.plan.duration
     tab.run("document.querySelector('[role=slider]').focus()")
     for _ in range(4):
-        tab.key("ArrowRight")
+        tab.press_right()
     settled(session)
     assert session.state.plan.duration == pytest.approx(before + 0.04, abs=0.02)
     tab.press("button", "Decide anew")

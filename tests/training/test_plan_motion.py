@@ -517,17 +517,10 @@ def test_first_problems_of_the_benchmark() -> None:
     assert outcome.is_success.all()
 
 
-def test_more_free_movements_are_hardly_smoother() -> None:
-    arm = benchmark_panda()
-    ratios = []
-    for problem in benchmark_problems():
-        if problem.number == 12:  # one of each set
-            given = arm, problem.start, problem.goal, problem.obstacles
-            one, best = (
-                plan_motion(*given, enough=enough, ompl=False, time_limit=30.0) for enough in (1, 30)
-            )
-            ratios.append(one.jerk / best.jerk)
-    assert np.mean(ratios) < 1.2
+def test_the_smoothest_of_enough_free_movements_is_taken() -> None:
+    one, best = (plan_motion(PANDA, PANDA.home, GOAL, [POST], enough=enough) for enough in (1, 30))
+    assert best.seeds > one.seeds
+    assert best.jerk <= one.jerk
 
 
 def test_limits_are_those_of_a_dense_movement() -> None:
@@ -729,15 +722,12 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
 
 
 def test_where_there_is_no_way_it_gives_up(monkeypatch):
-    """A ring of bars around the start."""
+    """Bars are all around the goal."""
     pytest.importorskip("ompl")
     monkeypatch.setattr(module, "OMPL_MARGINS", module.OMPL_MARGINS[:1])
     monkeypatch.setattr(module, "OMPL_PATIENCE", 0.05)
-    x, y = -0.25, 0.35
-    across = [Box((0.01, 0.08, 0.04), position=(x + side, y, 0.0)) for side in (-0.07, 0.07)]
-    along = [Box((0.08, 0.01, 0.04), position=(x, y + side, 0.0)) for side in (-0.07, 0.07)]
     simulation = SceneSimulation(PLANE, 1)
-    given = {"start": (x, y), "goal": (0.15, 0.35), "obstacles": [*across, *along]}
+    given = {name: ENCLOSED[name] for name in ("start", "goal", "obstacles")}
     scenes = draw_given(given, simulation.task.sampler(), [np.random.default_rng(0)])
     method = make_method("ompl", PLANE)
     assert not method.plan(scenes).success
@@ -781,9 +771,7 @@ FENCE, CEILING = (Box((0.2, 0.02, 0.2), position=(0.3, 0.0, height)) for height 
 """Obstacles below and above which the arm cannot pass; it can between them."""
 
 
-@pytest.mark.parametrize(
-    "arm", [benchmark_panda(), load_arm(LIFT, name="lift", torque_limit=100.0, velocity_limit=1.0)]
-)
+@pytest.mark.parametrize("arm", [benchmark_panda(), LIFTED])
 def test_a_path_of_trees_is_clear_between_its_ends(arm):
     """The same seed gives the same path; where there is none, none is found."""
     ends, shapes = np.array([[0.0, -0.8], [0.0, 0.8]]), [FENCE, CEILING]

@@ -49,11 +49,6 @@ def results_in(folder):
     return found
 
 
-def of_viaq(results):
-    """Return the part of results that belongs to viaq."""
-    return {name: result for name, result in results.items() if "/viaq/" in name}
-
-
 @pytest.fixture(scope="module")
 def ray():
     """One Ray for all studies of this process, as each start takes seconds."""
@@ -121,7 +116,7 @@ def test_a_killed_study_goes_on_to_the_same_results(whole, tmp_path):
     lines = []
     run_study(Study.from_dict(ONE_AGENT), out=folder, told=lines.append)
     assert len(lines) == 3 - complete
-    assert results_in(folder) == of_viaq(whole[3])
+    assert results_in(folder) == {name: each for name, each in whole[3].items() if "/viaq/" in name}
 
 
 def test_a_search_writes_its_best_settings_and_a_command_for_them(ray, tmp_path):
