@@ -266,6 +266,74 @@ def test_wrappers_of_observations_take_the_native_batch(mode):
     assert returns >= 2
 
 
+def test_a_loop_as_in_cleanrl_learns():
+    """PPO's loop in one file: a batch, a flat observation, a buffer and a few updates."""
+    torch = pytest.importorskip("torch")
+    torch.manual_seed(0)
+    number, steps = 32, 4
+    envs = wrappers.FlattenObservation(native("viapoint/PlanarReach-v0", number=number))
+    envs = wrappers.RecordEpisodeStatistics(envs)
+    size, actions = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+    actor = torch.nn.Sequential(torch.nn.Linear(size, 32), torch.nn.Tanh(), torch.nn.Linear(32, actions))
+    critic = torch.nn.Sequential(torch.nn.Linear(size, 32), torch.nn.Tanh(), torch.nn.Linear(32, 1))
+    spread = torch.nn.Parameter(torch.full((actions,), -1.0))
+    optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters(), spread], lr=1e-2)
+    seen, _ = envs.reset(seed=1)
+    means = []
+    over = np.zeros(number, bool)
+    for _ in range(8):
+        batch = []
+        for _ in range(steps):
+            x = torch.as_tensor(seen, dtype=torch.float32)
+            with torch.no_grad():
+                chosen = torch.distributions.Normal(actor(x), spread.exp()).sample()
+            seen, reward, terminated, truncated, _ = envs.step(chosen.numpy())
+            # With next-step autoreset, the step after the end of an episode only resets it.
+            valid = torch.as_tensor(~over)
+            batch.append((x[valid], chosen[valid], torch.as_tensor(reward, dtype=torch.float32)[valid]))
+            over = terminated | truncated
+        x, chosen, reward = (torch.cat(parts) for parts in zip(*batch, strict=True))
+        means.append(float(reward.mean()))
+        before = torch.distributions.Normal(actor(x), spread.exp()).log_prob(chosen).sum(-1).detach()
+        for _ in range(4):
+            value = critic(x).squeeze(-1)
+            now = torch.distributions.Normal(actor(x), spread.exp()).log_prob(chosen).sum(-1)
+            ratio = (now - before).exp()
+            gain = reward - value.detach()
+            policy = torch.min(ratio * gain, ratio.clamp(0.8, 1.2) * gain).mean()
+            loss = ((reward - value) ** 2).mean() - policy
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    assert np.mean(means[-3:]) > np.mean(means[:3]) + 0.02
+
+
+def test_torchrl():
+    envs = pytest.importorskip("torchrl.envs")
+    for env_id in ENV_IDS:
+        for env in (envs.GymEnv(env_id), envs.GymWrapper(gym.make(env_id))):
+            assert env.rollout(2).batch_size[0] >= 1
+
+
+def test_rllib():
+    pytest.importorskip("ray.rllib")
+    from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+    from ray.tune.registry import register_env
+
+    register_env("reach", lambda config: gym.wrappers.FlattenObservation(gym.make(PLANE, **config)))
+    config = PPOConfig().environment("reach", env_config={"n_obstacles": 2}).env_runners(num_env_runners=0)
+    episodes = SingleAgentEnvRunner(config=config).sample(num_episodes=3)
+    assert [len(episode) for episode in episodes] == [1, 1, 1]
+
+
+def test_tianshou():
+    tianshou = pytest.importorskip("tianshou.env")
+    envs = tianshou.DummyVectorEnv([lambda: gym.make(PLANE)] * 2)
+    envs.reset()
+    envs.step(np.zeros((2, 3), np.float32))
+
+
 FORKED = """
 import os, signal
 import gymnasium as gym
