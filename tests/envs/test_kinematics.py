@@ -16,7 +16,7 @@ from viapoint.envs.arms.inverse_kinematics import (
     planar_motion,
     solve_planar,
 )
-from viapoint.envs.arms.kinematics import forward, link_poses, tool_jacobian, torques
+from viapoint.envs.arms.kinematics import forward, link_poses, sphere_centres, tool_jacobian, torques
 from viapoint.envs.arms.load import load_arm
 from viapoint.envs.arms.registry import arm_of
 
@@ -155,3 +155,31 @@ def test_reach_in_the_plane_without_angles(limits):
     known, joints = planar_limits(arm.chain, limits), np.empty(2)
     for x, y in np.random.default_rng(0).uniform(-0.8, 0.8, (2000, 2)):
         assert in_planar_reach(arm.chain, known, x, y) == solve_planar(arm.chain, limits, x, y, joints)
+
+
+def test_spheres_contain_the_geoms_and_stick_out_little(arm):
+    """Points on the surface of every collision geom are inside a sphere; no sphere is farther out than the excess."""
+    model = arm.compile(0)
+    data = mujoco.MjData(model)
+    position, _, _ = states(arm, 3)
+    rng = np.random.default_rng(2)
+    for joints in position:
+        data.qpos[:] = joints
+        mujoco.mj_kinematics(model, data)
+        centres, radii = sphere_centres(arm.chain, arm.spheres, joints), arm.spheres.radius
+        outside = np.full(len(radii), np.inf)
+        for geom in range(model.ngeom):
+            if not model.geom_contype[geom]:
+                continue
+            axis = data.geom_xmat[geom].reshape(3, 3)[:, 2] * model.geom_size[geom, 1]
+            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE.value:
+                axis = 0.0 * axis
+            away = rng.normal(size=(500, 3))
+            away /= np.linalg.norm(away, axis=1, keepdims=True)
+            centre, radius = data.geom_xpos[geom], model.geom_size[geom, 0]
+            surface = centre + rng.uniform(-1, 1, (500, 1)) * axis + radius * away
+            assert ((np.linalg.norm(surface[:, None] - centres, axis=-1) - radii).min(axis=1) < 1e-9).all()
+            share = np.clip((centres - centre) @ axis / max(axis @ axis, 1e-12), -1.0, 1.0)
+            from_axis = np.linalg.norm(centres - centre - share[:, None] * axis, axis=1)
+            outside = np.minimum(outside, from_axis + radii - radius)
+        assert outside.max() <= arm.excess + 1e-9 <= 0.005 + 2e-9
