@@ -11,6 +11,7 @@ from helpers import MOVING, PLANE, REACH
 from viapoint.envs import ENV_IDS, Task
 from viapoint.envs.scenes.scene import check_scenes
 from viapoint.training import scene_sets
+from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import (
@@ -26,6 +27,13 @@ from viapoint.training.scene_sets import (
 
 FILES = sorted(shipped_path(PLANE).parent.glob("*.npz"))
 SHIPPED = {f"{path.stem} {name}": frozen for path in FILES for name, frozen in shipped_sets(path).items()}
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    simulation = SceneSimulation(PLANE, 250, threads=1)
+    yield simulation
+    simulation.close()
 
 
 @pytest.fixture
@@ -65,15 +73,28 @@ def test_sets_made_again_are_the_same():
     assert made.sha256 == load(shipped_path(REACH), "validation").sha256
 
 
-def test_the_stated_share_is_what_one_measures():
+def test_scenes_are_of_the_kind_asked_for_and_can_be_solved(simulation, monkeypatch):
+    monkeypatch.setattr(make, "NUMBERS", {"test": 4, "hard": 6, "uniform": 4})
+    monkeypatch.setattr(make, "TOGETHER", 25)
+    maker = make.Maker(PLANE)
+    test, hard, uniform = (maker.make(name) for name in ("test", "hard", "uniform"))
+    np.testing.assert_array_equal(np.bincount(test.band), [1, 1, 1, 1])
+    assert sorted(hard.family) == sorted(set(hard.family))
+    assert (hard.share < 0.05).all()
+    method = make_method("search4096", PLANE)
+    for each in (test, hard, uniform):
+        assert len(each.share) == len(each.scenes.start) == make.NUMBERS[each.name]
+        done = simulation(each.scenes, method.decide(simulation.observe(each.scenes), each.scenes))
+        assert done["is_success"].mean() > 0.7
+
+
+def test_the_stated_share_is_what_one_measures(simulation):
     """Other random actions give the same shares in physics, within what chance and the least clearance allow."""
     frozen = load(shipped_path(PLANE), "validation")
     few = frozen.take(np.flatnonzero(frozen.share > 0.1)[:12])
     draws = np.random.default_rng(123).uniform(-1.0, 1.0, (100, 3))
     rows = np.repeat(np.arange(12), 100)
-    simulation = SceneSimulation(PLANE, 250, threads=1)
     success = simulation(few.scenes.take(rows), np.tile(draws, (12, 1)))["is_success"]
-    simulation.close()
     measured = success.reshape(12, 100).mean(axis=-1)
     spread = np.sqrt(few.share * (1.0 - few.share) * (1.0 / 100 + 1.0 / 512))
     assert (np.abs(measured - few.share) < 4.0 * spread + 0.03).all()
