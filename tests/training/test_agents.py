@@ -32,12 +32,17 @@ import viapoint.training.planning.movements
 import viapoint.training.planning.search
 from viapoint.envs.geometry.obstacles import BOX, bounding_boxes, no_obstacles, unpack
 from viapoint.training import GeometrySearch, ViaQ, ViaRank, ViaVecEnv, evaluate, load_agent
-from viapoint.training.agents import viaq_policy
+from viapoint.training.agents import viaq
 from viapoint.training.agents.agent import SAC
 from viapoint.training.agents.pairs import CLEAR, LENGTHS, NO_OBSTACLE, pairs_of
-from viapoint.training.agents.viaq import OutcomeReplayBuffer, Outcomes, outcome_of
-from viapoint.training.agents.viaq_critic import Values, _Saturated
-from viapoint.training.agents.viaq_policy import ViaQPolicy
+from viapoint.training.agents.viaq import (
+    OutcomeReplayBuffer,
+    Outcomes,
+    Values,
+    ViaQPolicy,
+    _Saturated,
+    outcome_of,
+)
 from viapoint.training.planning.baselines import agent_method
 from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.candidates import best_duration, candidate_actions, sobol_actions
@@ -340,14 +345,14 @@ def test_refined_candidates_are_apart_from_each_other(monkeypatch):
         refined.append(actions)
         return actions
 
-    monkeypatch.setattr(viaq_policy, "refined_actions", refine)
+    monkeypatch.setattr(viaq, "refined_actions", refine)
     agent = load_agent(PLANE)
     agent.policy.refine = 4
     problem = problem_of(agent.policy.task, 16)
     agent.policy._chosen(problem)
     vias = refined[0][..., :2]
     distance = np.linalg.norm(vias[:, :, None] - vias[:, None], axis=-1)
-    assert distance[:, ~np.eye(4, dtype=bool)].min() >= viaq_policy.APART
+    assert distance[:, ~np.eye(4, dtype=bool)].min() >= viaq.APART
     actions, values = agent.policy.propose(problem)
     best = actions[np.arange(16), values.argmax(axis=1)]
     np.testing.assert_array_equal(refined[0][:, 0], best)
@@ -406,7 +411,7 @@ def refuse_geometry(monkeypatch):
         for name, function in inspect.getmembers(module, callable):
             if getattr(function, "__module__", "") == module.__name__ and not inspect.isclass(function):
                 monkeypatch.setattr(module, name, refuse)
-                for user in (viaq_policy, viapoint.training.planning.movements):
+                for user in (viaq, viapoint.training.planning.movements):
                     if getattr(user, name, None) is function:
                         monkeypatch.setattr(user, name, refuse)
 
@@ -496,7 +501,7 @@ def test_as_many_plans_are_checked_as_one_says_and_the_best_of_them_is_taken(
     small, env_id, checks, monkeypatch
 ):
     model, env = small(env_id)
-    observation, checked, exact = env.reset(), {}, viaq_policy.merits
+    observation, checked, exact = env.reset(), {}, viaq.merits
     model.policy.checks = 0
     unchecked = model.policy.decide(observation)
 
@@ -506,7 +511,7 @@ def test_as_many_plans_are_checked_as_one_says_and_the_best_of_them_is_taken(
             checked.setdefault(goal.tobytes(), []).append((some, worth))
         return found
 
-    monkeypatch.setattr(viaq_policy, "merits", counted)
+    monkeypatch.setattr(viaq, "merits", counted)
     model.policy.checks = checks
     decided = model.policy.decide(observation)
     most = min(checks, 48)  # there are 48 candidates

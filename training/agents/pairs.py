@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from stable_baselines3.common.torch_layers import create_mlp
 from torch import Tensor, nn
 
 from viapoint.envs.common.arrays import Bool, Float, Int
@@ -319,13 +320,7 @@ class PairNetwork(nn.Module):
 
     def __init__(self, shapes: Sequence[str], width: int) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(LENGTHS + len(shapes), width),
-            nn.ReLU(),
-            nn.Linear(width, width),
-            nn.ReLU(),
-            nn.Linear(width, 1),
-        )
+        self.layers = nn.Sequential(*create_mlp(LENGTHS + len(shapes), 1, [width, width]))
         self.nearness = nn.Parameter(torch.tensor([1.0, -2.0]))
         """Slope and offset of a skip connection from the distance of the bounding box. It makes the nearest pair the
         minimum at the start of training."""
