@@ -221,9 +221,8 @@ def test_refinement_solves_more_than_as_many_checks(made):
         observation = env.reset()
     assert solved[1] > solved[0] + 0.3
     replanning = model_on(made(MOVING))
-    replanning.policy.refine = 4
     with pytest.raises(ValueError, match="refine"):
-        replanning.predict(replanning.env.reset())
+        replanning.policy.refine = 4
 
 
 def policy_of(task, **kwargs):

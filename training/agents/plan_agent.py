@@ -77,6 +77,8 @@ class PlanPolicy(BasePolicy):
     def _check_setting(self, name: str, value: Any) -> None:
         """Check a setting; a wrong type, or a number out of range, raises ValueError."""
         check_arguments(type(self), {name: value})
+        if name == "refine" and value and not self.can_refine:
+            raise ValueError(f"refine must be 0 where plans are revised or have no via-points, got {value}")
 
     @property
     def all_candidates(self) -> int:
@@ -92,15 +94,6 @@ class PlanPolicy(BasePolicy):
         """True for tasks whose movements begin at rest and have via-points, which can be refined."""
         return not self.replanning and self.task.n_via > 0
 
-    def _check_refine(self) -> None:
-        if self.refine and not self.can_refine:
-            raise ValueError(
-                f"refine must be 0 where plans are revised or have no via-points, got {self.refine}"
-            )
-
-    def _own(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.OWN}
-
     def _make_optimizer(self, network: torch.nn.Module, lr_schedule: Any) -> None:
         """Create the optimizer of the network."""
         self.optimizer = self.optimizer_class(
@@ -110,8 +103,9 @@ class PlanPolicy(BasePolicy):
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {name: getattr(self, name) for name in self.OWN}
         always = {"task": self.task.as_dict(), "lr_schedule": self._dummy_schedule}
-        return {**super()._get_constructor_parameters(), **self._own(), **always}
+        return {**super()._get_constructor_parameters(), **own, **always}
 
     def proposals(self, number: int, values: Callable[[Numbers], Numbers]) -> tuple[Numbers, Numbers]:
         """Return candidates of some problems, shape (B, N, m), and their values, shape (B, N); the first is zero.
@@ -172,10 +166,6 @@ class PlanPolicy(BasePolicy):
     def decide(self, observation: Observation) -> Numbers:
         """Return the chosen actions, shape (B, m), for parts of B observations."""
 
-    def forward(self, observation: Any, deterministic: bool = True) -> Tensor:
-        """Return the chosen actions, shape (B, m)."""
-        return self._predict(observation, deterministic)
-
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         arrays = {name: each.cpu().numpy() for name, each in observation.items()}
         return torch.as_tensor(self.decide(arrays), dtype=torch.float32, device=self.device)
@@ -187,8 +177,6 @@ class PlanPolicy(BasePolicy):
             ValueError: The observation has other parts or sizes than the observation space, or is not finite; in tasks
                 with whole movements, start and goal are the same; with a sensor, points are not on its rays.
         """
-        if isinstance(observation, tuple):  # the base class explains the mistake
-            return super().predict(cast(Any, observation), state, *args, **kwargs)
         parts: Any = self.observation_space
         wanted = ", ".join(parts.spaces)
         if not isinstance(observation, Mapping):
@@ -239,7 +227,7 @@ def task_in(env: VecEnv) -> Task | None:
 class PlanAlgorithm(Agent, OffPolicyAlgorithm):
     """Off-policy algorithm that trains a policy that ranks plans.
 
-    `own` names the attributes of the subclass that are hyperparameters.
+    Subclasses set their own hyperparameters as attributes, and then call the constructor.
     """
 
     LARGEST_GRADIENT: float  # Norm to which gradients are clipped
@@ -251,14 +239,12 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         env: Any,
         learning_rate: Any,
         *,
-        own: tuple[str, ...],
         policy_kwargs: dict[str, Any] | None,
         _init_setup_model: bool,
         **kwargs: Any,
     ) -> None:
-        checked = {name: getattr(self, name) for name in own}
-        checked.update((name, value) for name, value in kwargs.items() if name in LIMITS)
-        check_arguments(type(self), checked)
+        check_arguments(type(self), vars(self))
+        check_arguments(type(self), {name: value for name, value in kwargs.items() if name in LIMITS})
         super().__init__(
             policy,
             env,
@@ -290,7 +276,6 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         if self.env is not None:
             self._check_env(self.env)
         super()._setup_model()
-        self.actor = self.policy
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         total, callback = super()._setup_learn(*args, **kwargs)
@@ -340,9 +325,6 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
 
     def _after_update(self) -> None:
         """Follow an update of the network."""
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []

@@ -113,7 +113,6 @@ class ViaQPolicy(PlanPolicy):
         self.checks = checks
         self.refine = refine
         self._check_candidates()
-        self._check_refine()
         self.critic = ViaQCritic(self.task, width=self.width)
         self.critic_target: ViaQCritic | None = None
         if self.replanning:  # values of later decisions are learned from a critic that changes slowly
@@ -166,7 +165,6 @@ class ViaQPolicy(PlanPolicy):
 
     def decide(self, observation: Observation) -> Numbers:
         """Return the chosen actions, shape (B, m), for B observations, arrays by name."""
-        self._check_refine()  # it may have been set after construction
         number = len(observation["joints"])
         pieces = []
         for first in range(0, number, BLOCK):
@@ -324,7 +322,6 @@ class ViaQ(PlanAlgorithm):
             policy,
             env,
             learning_rate,
-            own=("explore_uniformly", "temperature", "explore_candidates", "next_candidates"),
             buffer_size=buffer_size,
             learning_starts=learning_starts,
             batch_size=batch_size,

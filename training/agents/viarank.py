@@ -117,7 +117,6 @@ class ViaRankPolicy(PlanPolicy):
         self.refine = refine
         self.belief = belief
         self._check_candidates()
-        self._check_refine()
         sensor = _check_task(self.task).sensor
         assert sensor is not None
         self.network = SightNetwork(sensor, width=width)
@@ -170,7 +169,6 @@ class ViaRankPolicy(PlanPolicy):
 
     def best(self, problem: Problem, sight: Sight) -> tuple[Float, Float]:
         """Return the best actions of B problems, shape (B, m), and probabilities that are too high, shape (B,)."""
-        self._check_refine()  # it may have been set after construction
         chosen, success = [], []
         for first in range(0, len(problem.start), BLOCK):
             rows = slice(first, first + BLOCK)
@@ -298,7 +296,6 @@ class ViaRank(PlanAlgorithm):
             policy,
             env,
             learning_rate,
-            own=("explore_candidates", "labels"),
             buffer_size=1,
             learning_starts=learning_starts,
             batch_size=batch_size,
@@ -429,9 +426,6 @@ class ViaRank(PlanAlgorithm):
     def _sampler(self) -> SceneSampler:
         """Sampler of the scenes that are learned from."""
         return self.policy.task.sampler()
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_sampler"]
 
 
 ALGORITHMS["viarank"] = ViaRank
