@@ -104,8 +104,9 @@ def _listed(ids: Iterable[str]) -> str:
 ENV = tyro.conf.arg(
     metavar="ID", help=f"Id of a registered environment: {_listed(ENV_IDS)}; or my_module:my/Task-v0."
 )
-AGENT = tyro.conf.arg(metavar="AGENT", help="Run folder, model folder, or id of a shipped agent.")
-PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent: {_listed(SHIPPED_IDS)}.")
+AGENT = tyro.conf.arg(
+    metavar="AGENT", help=f"Run folder, model folder, or id of a shipped agent: {_listed(SHIPPED_IDS)}."
+)
 ARM = tyro.conf.arg(metavar="ARM", help="Arm: panda, planar, or an MJCF or URDF file.")
 # Environments of the built-in arms; that of other arms is viapoint/Obstacles-v0
 ARM_ENVS = {"planar": DEFAULT_ENV, "panda": "viapoint/PandaObstacles-v0"}
@@ -303,7 +304,6 @@ class AgentConfig(Config):
     """Configuration of a command for an agent, an environment or an arm."""
 
     agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
-    pretrained: Annotated[str | None, PRETRAINED] = None  # as if the id were given as agent
     env: Annotated[str | None, ENV] = None  # default: that of the agent
     arm: Annotated[str | None, ARM] = None  # in place of that of the agent, if any
     env_kwargs: NamedValues = field(default_factory=dict)
@@ -311,10 +311,6 @@ class AgentConfig(Config):
 
     def _check(self) -> None:
         check_env_kwargs(self.env_kwargs)
-        if self.pretrained is not None:
-            if self.agent not in (None, self.pretrained):
-                raise ValueError(f"the agent is named twice: {self.agent} and pretrained={self.pretrained}")
-            object.__setattr__(self, "agent", self.pretrained)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -70,7 +70,6 @@ CONFIGURATIONS = [
     (TrainConfig, STALLING),  # the preset has no more decisions than it must make
     (TrainConfig, {**STALLING, "n_timesteps": 10**5, "eval_every": 0}),
     *((EvaluateConfig, {"env": PLANE, "checks": checks}) for checks in ((8,), ())),
-    (EvaluateConfig, {"agent": "runs/x", "pretrained": PLANE}),
     (PlayConfig, {"agent": "a", "video": "film.gif"}),
     (LiveConfig, {"port": 70_000}),
     (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}),
@@ -364,7 +363,6 @@ COMMANDS = [
     ("play", "--env"),
     ("live --env nothing", "nothing"),
     ("evaluate nowhere", "nowhere"),
-    ("evaluate --pretrained nobody", "nobody"),
     ("plan --position 0.4 0.3", "--position needs 3 numbers for panda, x y z, got 2"),
     ("plan --goal 0.4 0.3", "--goal needs 7 numbers"),
     ("evaluate --baselines straight --agent", "--agent needs a name"),
