@@ -120,13 +120,6 @@ class Work(NamedTuple):
 
 
 @inner
-def _place(given: Given, b: int, h: int, instant: int, work: Work) -> bool:
-    """Place the arm at an instant of a movement, and return True within reach and joint ranges."""
-    position, joints, placed = work.position, work.joints, work.placed
-    return bool(place_at(given.setting, given.moves, b, h, instant, position, joints, placed))
-
-
-@inner
 def _local(given: Given, b: int, row: int, point: Float, time: float, local: Float) -> None:
     """Fill in a point in the frame of an obstacle at a time, shape (3,), [m]."""
     obstacles = given.obstacles
@@ -156,7 +149,7 @@ def _place_sphere(
 ) -> bool:
     """Fill in a sphere's centre in the frame of an obstacle at an instant, and return True within reach."""
     moves, placed = given.moves, work.placed
-    if not _place(given, b, h, instant, work):
+    if not place_at(given.setting, moves, b, h, instant, work.position, work.joints, placed):
         return False
     place_group(given.setting.spheres, group, placed)
     _local(given, b, row, placed.centre[sphere], moves.duration[b, h] * instant / (INSTANTS - 1), local)
@@ -257,7 +250,7 @@ def _gather(
                 time = moves.duration[b, h] * instant / (INSTANTS - 1)
                 if k > 0 and time > until[b, h]:
                     break
-                if not _place(given, b, h, instant, work):
+                if not place_at(setting, moves, b, h, instant, work.position, work.joints, placed):
                     inside[b, h] = False
                     break
                 last = instant

@@ -18,7 +18,7 @@ from stable_baselines3.common.utils import is_vectorized_observation
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
-from viapoint.envs.common.validation import whole_number
+from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
@@ -185,16 +185,7 @@ class PlanPolicy(BasePolicy):
             got = ", ".join(map(str, observation))
             raise ValueError(f"observation must have the parts {wanted}; got {got}")
         for name, each in observation.items():
-            size = np.shape(each)[-1:]
-            if size != parts[name].shape:
-                raise ValueError(
-                    f"{name} must have {parts[name].shape[0]} values, as in training; got {size}"
-                )
-            if not np.isfinite(np.asarray(each)).all():
-                wrong = np.argwhere(~np.isfinite(np.asarray(each)))
-                raise ValueError(
-                    f"observation must be finite; {name} is not, in {len(wrong)} places, first {wrong[0].tolist()}"
-                )
+            finite_array(name, each, (..., *parts[name].shape))
         several = is_vectorized_observation(cast(Any, dict(observation)), parts)
         batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
         if not len(batch[next(iter(batch))]):
@@ -215,15 +206,6 @@ class PlanPolicy(BasePolicy):
             raise ValueError("start and goal must differ: no movement leads from a point to itself")
 
 
-def task_in(env: VecEnv) -> Task | None:
-    """Return the task of a vector environment of this package; None for others."""
-    try:
-        (task,) = env.get_attr("task", indices=[0])
-    except AttributeError:
-        return None
-    return task if isinstance(task, Task) else None
-
-
 class PlanAlgorithm(Agent, OffPolicyAlgorithm):
     """Off-policy algorithm that trains a policy that ranks plans.
 
@@ -240,7 +222,6 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         learning_rate: Any,
         *,
         policy_kwargs: dict[str, Any] | None,
-        _init_setup_model: bool,
         **kwargs: Any,
     ) -> None:
         check_arguments(type(self), vars(self))
@@ -254,14 +235,24 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
             sde_support=False,
             **kwargs,
         )
-        if self.env is not None:
-            self.policy_kwargs.setdefault("task", self._task_of(self.env).as_dict())
-        if _init_setup_model:
-            self._setup_model()
+        assert self.env is not None
+        self.policy_kwargs.setdefault("task", self._task_of(self.env).as_dict())
+        self._check_env(self.env)
+        self._setup_model()
 
-    @abstractmethod
     def _task_of(self, env: VecEnv) -> Task:
         """Return the task of an environment, if the algorithm is made for it; ValueError otherwise."""
+        try:
+            (task,) = env.get_attr("task", indices=[0])
+        except AttributeError:
+            task = None
+        if not isinstance(task, Task) or task.stepwise:
+            raise ValueError(
+                f"{type(self).__name__} needs an environment of this package in which an action is a whole movement, "
+                "as in viapoint/PlanarObstacles-v0 and viapoint/PlanarSensed-v0; got "
+                f"{'one with control steps' if isinstance(task, Task) else 'another one'}"
+            )
+        return task
 
     def _check_env(self, env: VecEnv) -> None:
         normalized = unwrap_vec_normalize(env)
@@ -271,11 +262,6 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
             )
         check_unwrapped(env)
         check_same_task(Task.from_dict(self.policy_kwargs["task"]), self._task_of(env))
-
-    def _setup_model(self) -> None:
-        if self.env is not None:
-            self._check_env(self.env)
-        super()._setup_model()
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         total, callback = super()._setup_learn(*args, **kwargs)

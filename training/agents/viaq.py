@@ -32,7 +32,7 @@ from viapoint.envs.task import Task
 from viapoint.primitives.array_api import Array
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.pairs import PairNetwork, Pairs, pairs_of
-from viapoint.training.agents.plan_agent import Numbers, Observation, PlanAlgorithm, PlanPolicy, task_in
+from viapoint.training.agents.plan_agent import Numbers, Observation, PlanAlgorithm, PlanPolicy
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.movements import INSTANTS
 from viapoint.training.planning.problem import Problem, moves_of
@@ -275,7 +275,6 @@ class ViaQ(PlanAlgorithm):
         train_freq: Steps of all environments between two rounds of updates.
         tau: Rate at which the target critic follows, in tasks with replanning.
         policy_kwargs: Arguments of :class:`ViaQPolicy`; `env` provides the task.
-        _init_setup_model: False to set up the networks later.
         **kwargs: Arguments that all algorithms of Stable-Baselines3 have, such as `seed`, `device`, `verbose` and
             `tensorboard_log`.
 
@@ -313,7 +312,6 @@ class ViaQ(PlanAlgorithm):
         train_freq: int | tuple[int, str] = 1,
         tau: float = 0.005,
         policy_kwargs: dict[str, Any] | None = None,
-        _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
         self.explore_uniformly, self.temperature = explore_uniformly, temperature
@@ -331,7 +329,6 @@ class ViaQ(PlanAlgorithm):
             policy_kwargs=policy_kwargs,
             train_freq=train_freq,
             tau=tau,
-            _init_setup_model=_init_setup_model,
             **kwargs,
         )
 
@@ -343,12 +340,7 @@ class ViaQ(PlanAlgorithm):
         return prepared
 
     def _task_of(self, env: VecEnv) -> Task:
-        task = task_in(env)
-        if task is None or task.stepwise:
-            raise ValueError(
-                "ViaQ needs an environment of this package in which an action is a whole movement, such as "
-                f"viapoint/PlanarObstacles-v0; got {'another one' if task is None else 'one with control steps'}"
-            )
+        task = super()._task_of(env)
         if task.sensor is not None:
             raise ValueError(
                 "viaq needs the obstacles; where a sensor sees them, viarank learns to place via-points"

@@ -35,7 +35,7 @@ from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training.agents.model_io import ALGORITHMS
-from viapoint.training.agents.plan_agent import Observation, PlanAlgorithm, PlanPolicy, task_in
+from viapoint.training.agents.plan_agent import Observation, PlanAlgorithm, PlanPolicy
 from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.cautious import (
@@ -117,7 +117,7 @@ class ViaRankPolicy(PlanPolicy):
         self.refine = refine
         self.belief = belief
         self._check_candidates()
-        sensor = _check_task(self.task).sensor
+        sensor = self.task.sensor
         assert sensor is not None
         self.network = SightNetwork(sensor, width=width)
         self._make_optimizer(self.network, lr_schedule)
@@ -208,24 +208,6 @@ class ViaRankPolicy(PlanPolicy):
             )
 
 
-def _check_task(task: Task | None) -> Task:
-    """Return a task for which this agent is made; ValueError for others."""
-    if task is None:
-        got = "another one"
-    elif task.sensor is None:
-        got = "one without a sensor"
-    elif task.stepwise:
-        got = "one with control steps"
-    elif task.moving_obstacles:
-        got = "one with moving obstacles"
-    else:
-        return task
-    raise ValueError(
-        "viarank needs an environment of this package with a sensor and obstacles at rest, in which an action is a "
-        f"movement, such as viapoint/PlanarSensed-v0; got {got}"
-    )
-
-
 class _NoBuffer(ReplayBuffer):
     """Replay buffer that keeps nothing: the algorithm learns from scenes that are new, or under way in `env`."""
 
@@ -254,7 +236,6 @@ class ViaRank(PlanAlgorithm):
         labels: Plans of each scene that are learned from: the better half are the best candidates, the others random.
         train_freq: Steps of all environments between two rounds of updates.
         policy_kwargs: Arguments of :class:`ViaRankPolicy`; `env` provides the task.
-        _init_setup_model: False to set up the network later.
         **kwargs: Arguments that all algorithms of Stable-Baselines3 have, such as `seed`, `device`, `verbose` and
             `tensorboard_log`.
 
@@ -288,7 +269,6 @@ class ViaRank(PlanAlgorithm):
         labels: int = 24,
         train_freq: int | tuple[int, str] = 1,
         policy_kwargs: dict[str, Any] | None = None,
-        _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
         self.explore_candidates, self.labels = explore_candidates, labels
@@ -304,14 +284,19 @@ class ViaRank(PlanAlgorithm):
             replay_buffer_class=_NoBuffer,
             policy_kwargs=policy_kwargs,
             train_freq=train_freq,
-            _init_setup_model=_init_setup_model,
             **kwargs,
         )
         if labels > explore_candidates:
             raise ValueError(f"labels must be at most explore_candidates, {explore_candidates}, got {labels}")
 
     def _task_of(self, env: VecEnv) -> Task:
-        return _check_task(task_in(env))
+        task = super()._task_of(env)
+        if task.sensor is None or task.moving_obstacles:
+            raise ValueError(
+                "viarank needs a sensor and obstacles at rest, as in viapoint/PlanarSensed-v0; where the obstacles are "
+                "known, viaq learns to place via-points"
+            )
+        return task
 
     def _candidates(self, number: int) -> NDArray[np.float32]:
         """Return random candidates of some scenes, shape (number, H, m), of as many as a decision compares."""
