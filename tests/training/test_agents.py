@@ -31,6 +31,7 @@ import viapoint.envs.geometry.distance
 import viapoint.training.planning.movements
 import viapoint.training.planning.search
 from viapoint.envs.geometry.obstacles import BOX, bounding_boxes, no_obstacles, unpack
+from viapoint.envs.rewards import TERMS
 from viapoint.training import GeometrySearch, ViaQ, ViaRank, ViaVecEnv, evaluate, load_agent
 from viapoint.training.agents import viaq
 from viapoint.training.agents.agent import SAC
@@ -52,7 +53,6 @@ from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import INFEASIBLE, plan_clearances, registered_task
 from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import scenes_for
-from viapoint.training.vec_env import TERMS
 
 FEW = {"width": 8, "instants": 8, "candidates": 32, "refinements": 1, "per_refinement": 16}
 SMALL = {

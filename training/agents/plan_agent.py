@@ -18,6 +18,7 @@ from stable_baselines3.common.utils import is_vectorized_observation
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
+from viapoint.envs.common.arrays import Observation
 from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.task import Task
@@ -27,7 +28,7 @@ from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.checks import unknown_name
 from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
 from viapoint.training.planning.movements import FINE_INSTANTS
-from viapoint.training.planning.problem import Problem, moves_of
+from viapoint.training.planning.problem import Numbers, Problem, moves_of
 from viapoint.training.vec_env import check_spaces, check_unwrapped
 
 N_ELITES = 8  # Number of candidates around which each round of refinement samples
@@ -35,9 +36,6 @@ N_ELITES = 8  # Number of candidates around which each round of refinement sampl
 SPREAD = 0.15
 # Number of candidates that are looked at together for one within reach, after the best one
 LOOKED_AT = 32
-
-Observation = Mapping[str, NDArray[Any]]
-Numbers = NDArray[np.floating[Any]]
 
 
 class PlanPolicy(BasePolicy):

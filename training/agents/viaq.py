@@ -24,20 +24,20 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 from torch.nn import functional
 
-from viapoint.envs.common.arrays import Float, Single, norm
+from viapoint.envs.common.arrays import Float, Observation, Single, norm
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import turned
-from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
+from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT, TERMS
 from viapoint.envs.task import Task
 from viapoint.primitives.array_api import Array
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.pairs import PairNetwork, Pairs, pairs_of
-from viapoint.training.agents.plan_agent import Numbers, Observation, PlanAlgorithm, PlanPolicy
+from viapoint.training.agents.plan_agent import PlanAlgorithm, PlanPolicy
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.movements import INSTANTS
-from viapoint.training.planning.problem import Problem, moves_of
+from viapoint.training.planning.problem import Numbers, Problem, moves_of
 from viapoint.training.planning.search import INFEASIBLE, best_of, merits, refined_actions
-from viapoint.training.vec_env import ELAPSED, TERMS
+from viapoint.training.vec_env import ELAPSED
 
 KEEP = 0.1  # Minimum gain of Q for which a running plan is revised
 # Greatest number of proposals that are checked; all further checks are of plans around the best of them

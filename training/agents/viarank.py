@@ -28,14 +28,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 from torch.nn import functional
 
-from viapoint.envs.common.arrays import Float, Single
+from viapoint.envs.common.arrays import Float, Observation, Single
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training.agents.model_io import ALGORITHMS
-from viapoint.training.agents.plan_agent import Observation, PlanAlgorithm, PlanPolicy
+from viapoint.training.agents.plan_agent import PlanAlgorithm, PlanPolicy
 from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.cautious import (
