@@ -381,7 +381,7 @@ class ViaRank(PlanAlgorithm):
         others = best.shape[1] + others[:, : self.labels - best.shape[1]]
         return np.concatenate((best, np.take_along_axis(order, others, axis=1)), axis=1).astype(np.int64)
 
-    def calibrate(self, number: int = CALIBRATION_SCENES) -> None:
+    def calibrate(self) -> None:
         """Fit predicted success to what geometry says of the chosen plans in scenes that are drawn, always the same.
 
         The choice of plans does not change. The two numbers are those of J. Platt, Probabilistic outputs for support
@@ -390,7 +390,7 @@ class ViaRank(PlanAlgorithm):
         policy, task = self.policy, self.policy.task
         policy.set_training_mode(False)
         chances, labels = [], []
-        for first in range(0, number, BLOCK):
+        for first in range(0, CALIBRATION_SCENES, BLOCK):
             truth, believed, sight = self._drawn([(CALIBRATION, first + each) for each in range(BLOCK)])
             actions, success = policy.best(believed, sight)
             # In hand space, exact geometry keeps room at a straight elbow that successful movements need not keep.
