@@ -167,6 +167,8 @@ class Config:
                 value = check_registered(value)
             elif str(each.type) == "NamedValues":
                 value = _plain(name, value)
+                if name == "env_kwargs":
+                    check_env_kwargs(value)
             elif name in RANGES and value is not each.default and not isinstance(value, tuple | list):
                 value = check_whole(name, value)
             object.__setattr__(self, name, value)
@@ -215,7 +217,6 @@ class TrainConfig(Config):
             raise ValueError(f"env must be the id of an environment, got {self.env!r}")
         if self.algo is not None and self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
-        check_env_kwargs(self.env_kwargs)
         if self.arm is not None:
             env, argument = env_of_arm(self.arm, None if self.env == DEFAULT_ENV else self.env)
             object.__setattr__(self, "env", env)
@@ -309,9 +310,6 @@ class AgentConfig(Config):
     env_kwargs: NamedValues = field(default_factory=dict)
     """Arguments of the environment, values in YAML: sensor=hand_rays decide_at=[sight]."""
 
-    def _check(self) -> None:
-        check_env_kwargs(self.env_kwargs)
-
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig(AgentConfig):
@@ -344,7 +342,6 @@ class EvaluateConfig(AgentConfig):
         return self.problems is not None or self.scenes == BENCHMARK
 
     def _check(self) -> None:
-        super()._check()
         if self.of_planners and not (self.agent is self.env is None):
             raise ValueError(f"{BENCHMARK} measures planners: name neither an agent nor an environment")
         if self.of_planners and self.arm is not None and self.problems is None:
@@ -375,7 +372,6 @@ class PlayConfig(AgentConfig):
     checks: int = 0  # Number of proposals that the agent checks with exact geometry; 0 for none.
 
     def _check(self) -> None:
-        super()._check()
         if self.agent is None and self.checks:
             raise ValueError(NOTHING_TO_CHECK)
         check_file("video", self.video, ".mp4")
@@ -396,7 +392,6 @@ class RecordConfig(AgentConfig):
     seed: int = 0  # Seed of the first episode; others follow.
 
     def _check(self) -> None:
-        super()._check()
         if self.agent is None:
             raise ValueError("name an agent (run folder, model folder or id), or a baseline such as random")
 
