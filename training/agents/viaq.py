@@ -495,8 +495,6 @@ class OutcomeReplayBuffer(DictReplayBuffer):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        if self.optimize_memory_usage:
-            raise ValueError("optimize_memory_usage must be False: the buffer stores the terms of the reward")
         self._begins = False
         self.elapsed = np.full((self.buffer_size, self.n_envs), np.inf, dtype=np.float32)
         self.outcomes = np.full(
