@@ -117,7 +117,8 @@ class ViaVecEnv(VecEnv):
         mode = self.venv.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(f"{env_id} must have autoreset mode SAME_STEP, not {mode}")
-        self.env_id, self.env_kwargs = env_id, dict(kwargs)
+        self.env_id = env_id
+        self.env_kwargs = dict(kwargs)
         self.recorded_id = env_id  # of an agent's file, which need not be registered here; tables name it
         spaces = self.venv.single_observation_space, self.venv.single_action_space
         VecEnv.__init__(self, num_envs, *spaces)

@@ -314,8 +314,10 @@ class ViaQ(PlanAlgorithm):
         policy_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        self.explore_uniformly, self.temperature = explore_uniformly, temperature
-        self.explore_candidates, self.next_candidates = explore_candidates, next_candidates
+        self.explore_uniformly = explore_uniformly
+        self.temperature = temperature
+        self.explore_candidates = explore_candidates
+        self.next_candidates = next_candidates
         super().__init__(
             policy,
             env,

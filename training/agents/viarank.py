@@ -271,7 +271,8 @@ class ViaRank(PlanAlgorithm):
         policy_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        self.explore_candidates, self.labels = explore_candidates, labels
+        self.explore_candidates = explore_candidates
+        self.labels = labels
         super().__init__(
             policy,
             env,
