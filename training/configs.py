@@ -104,8 +104,9 @@ def _listed(ids: Iterable[str]) -> str:
 ENV = tyro.conf.arg(
     metavar="ID", help=f"Id of a registered environment: {_listed(ENV_IDS)}; or my_module:my/Task-v0."
 )
-AGENT = tyro.conf.arg(metavar="AGENT", help="Run folder, model folder, or id of a shipped agent.")
-PRETRAINED = tyro.conf.arg(metavar="ID", help=f"Shipped agent: {_listed(SHIPPED_IDS)}.")
+AGENT = tyro.conf.arg(
+    metavar="AGENT", help=f"Run folder, model folder, or id of a shipped agent: {_listed(SHIPPED_IDS)}."
+)
 ARM = tyro.conf.arg(metavar="ARM", help="Arm: panda, planar, or an MJCF or URDF file.")
 # Environments of the built-in arms; that of other arms is viapoint/Obstacles-v0
 ARM_ENVS = {"planar": DEFAULT_ENV, "panda": "viapoint/PandaObstacles-v0"}
@@ -166,6 +167,8 @@ class Config:
                 value = check_registered(value)
             elif str(each.type) == "NamedValues":
                 value = _plain(name, value)
+                if name == "env_kwargs":
+                    check_env_kwargs(value)
             elif name in RANGES and value is not each.default and not isinstance(value, tuple | list):
                 value = check_whole(name, value)
             object.__setattr__(self, name, value)
@@ -214,7 +217,6 @@ class TrainConfig(Config):
             raise ValueError(f"env must be the id of an environment, got {self.env!r}")
         if self.algo is not None and self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
-        check_env_kwargs(self.env_kwargs)
         if self.arm is not None:
             env, argument = env_of_arm(self.arm, None if self.env == DEFAULT_ENV else self.env)
             object.__setattr__(self, "env", env)
@@ -303,18 +305,10 @@ class AgentConfig(Config):
     """Configuration of a command for an agent, an environment or an arm."""
 
     agent: Annotated[tyro.conf.Positional[str | None], AGENT] = None
-    pretrained: Annotated[str | None, PRETRAINED] = None  # as if the id were given as agent
     env: Annotated[str | None, ENV] = None  # default: that of the agent
     arm: Annotated[str | None, ARM] = None  # in place of that of the agent, if any
     env_kwargs: NamedValues = field(default_factory=dict)
     """Arguments of the environment, values in YAML: sensor=hand_rays decide_at=[sight]."""
-
-    def _check(self) -> None:
-        check_env_kwargs(self.env_kwargs)
-        if self.pretrained is not None:
-            if self.agent not in (None, self.pretrained):
-                raise ValueError(f"the agent is named twice: {self.agent} and pretrained={self.pretrained}")
-            object.__setattr__(self, "agent", self.pretrained)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -348,7 +342,6 @@ class EvaluateConfig(AgentConfig):
         return self.problems is not None or self.scenes == BENCHMARK
 
     def _check(self) -> None:
-        super()._check()
         if self.of_planners and not (self.agent is self.env is None):
             raise ValueError(f"{BENCHMARK} measures planners: name neither an agent nor an environment")
         if self.of_planners and self.arm is not None and self.problems is None:
@@ -379,7 +372,6 @@ class PlayConfig(AgentConfig):
     checks: int = 0  # Number of proposals that the agent checks with exact geometry; 0 for none.
 
     def _check(self) -> None:
-        super()._check()
         if self.agent is None and self.checks:
             raise ValueError(NOTHING_TO_CHECK)
         check_file("video", self.video, ".mp4")
@@ -400,7 +392,6 @@ class RecordConfig(AgentConfig):
     seed: int = 0  # Seed of the first episode; others follow.
 
     def _check(self) -> None:
-        super()._check()
         if self.agent is None:
             raise ValueError("name an agent (run folder, model folder or id), or a baseline such as random")
 

@@ -195,8 +195,6 @@ def read_bytes(path: Path, largest: int | None = None) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise BadFileError(path, f"cannot be read ({error.strerror})") from None
-    except MemoryError:
-        raise BadFileError(path, "does not fit into memory") from None
 
 
 class _Loader(yaml.SafeLoader):

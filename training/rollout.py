@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from viapoint.envs.common.arrays import Float, Int, Observation
 from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.vector_env import ReachVectorEnv
 from viapoint.training.planning.search import registered_task
-
-if TYPE_CHECKING:
-    from viapoint.envs.vector_env import ReachVectorEnv
 
 # Function of observations and scenes that returns actions, shape (N, m)
 Decide = Callable[[Observation, Scenes], Float]

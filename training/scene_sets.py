@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.arrays import Float, Int
-from viapoint.envs.geometry.obstacles import ABSENT, KINDS, no_obstacles
+from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
 from viapoint.envs.geometry.shapes import IN_TABLES, PLAIN_KINDS
-from viapoint.envs.scenes.scene import NEVER, Scenes, check_scenes, resting
+from viapoint.envs.scenes.scene import NEVER, Scenes, check_scenes
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import COURSES, Task
 
@@ -123,18 +123,6 @@ def _place(name: str, part: str) -> str:
     return f"{name}/{part}" if name else part
 
 
-def shipped_path(env_id: str) -> Path:
-    """Return the path of the file that holds the shipped sets of an environment."""
-    return SHIPPED / f"{env_id.removeprefix('viapoint/')}.npz"
-
-
-def shipped_sets(path: Path) -> dict[str, FrozenScenes]:
-    """Return the sets of a shipped file by their names."""
-    with np.load(path, allow_pickle=False) as archive:
-        names = [name for name in SETS if _place(name, "task") in archive]
-    return {name: load(path, name) for name in names}
-
-
 def shipped_set(name: str, task: Task) -> FrozenScenes | None:
     """Return the shipped set whose scenes are those of a task, or None if there is none."""
     for path in sorted(SHIPPED.glob("*.npz")):
@@ -175,32 +163,6 @@ def load(path: Path, name: str = "") -> FrozenScenes:
     """
     if not path.is_file():
         raise ValueError(f"there is no file of scenes {path}")
-    content: dict[str, Any] = _read(path, name)
-    obstacles = no_obstacles(*content["kind"].shape)
-    obstacles = obstacles._replace(**{part: content[part] for part in ("kind", *OBSTACLE_PARTS)})
-    frozen = FrozenScenes(
-        name=name or str(path),
-        task=json.loads(str(content["task"])),
-        scenes=Scenes(obstacles=obstacles, **{part: content[part] for part in SCENE_PARTS}),
-        share=content["share"],
-        family=content["family"],
-    )
-    if frozen.sha256 != str(content["sha256"]):
-        raise ValueError(f"{path} is damaged: its content does not have the hash that it states")
-    return frozen
-
-
-def _smallest(array: NDArray[Any]) -> NDArray[Any]:
-    """Return an array in the smallest type that holds its values."""
-    if array.dtype.kind == "f":
-        single = array.astype(np.float32)
-        same = (single.astype(np.float64) == array) | np.isnan(array)
-        return single if same.all() else array
-    return array.astype(np.int8) if array.dtype.kind == "i" else array
-
-
-def _read(path: Path, name: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a set, whose shapes are consistent."""
     try:
         with zipfile.ZipFile(path) as packed:
             size = sum(part.file_size for part in packed.infolist())
@@ -214,32 +176,30 @@ def _read(path: Path, name: str) -> dict[str, NDArray[Any]]:
             if content[part].dtype.kind == "f":
                 content[part] = content[part].astype(np.float64)
         content["kind"] = content["kind"].astype(np.int64)
-        _check_content(content)
+        obstacles = no_obstacles(*content["kind"].shape)
+        obstacles = obstacles._replace(**{part: content[part] for part in ("kind", *OBSTACLE_PARTS)})
+        frozen = FrozenScenes(
+            name=name or str(path),
+            task=json.loads(str(content["task"])),
+            scenes=Scenes(obstacles=obstacles, **{part: content[part] for part in SCENE_PARTS}),
+            share=content["share"],
+            family=content["family"],
+        )
+        intact = frozen.sha256 == str(content["sha256"])
     except Exception as error:  # an archive can be broken in any of its layers
         raise ValueError(f"{path} is not an .npz file of scenes: {error or type(error).__name__}") from None
-    return content
+    if not intact:
+        raise ValueError(f"{path} is damaged: its content does not have the hash that it states")
+    return frozen
 
 
-def _check_content(content: Mapping[str, NDArray[Any]]) -> None:
-    """Raise ValueError unless the task is a record and all arrays are of N > 0 scenes with n obstacles each."""
-    if not isinstance(json.loads(str(content["task"])), dict):
-        raise ValueError("its task is no record")
-    (number, joints), (_, rows) = content["start"].shape, content["kind"].shape
-    like = resting(np.empty((number, joints)), np.empty((number, joints)), no_obstacles(number, rows))
-    per_scene = {"share": np.empty(number), "family": np.empty(number, np.str_)}
-    arrays: dict[str, Any] = {**like._asdict(), **like.obstacles._asdict(), **per_scene}
-    for name in (*CONTENT, REACH):
-        found, wanted = content[name], arrays[name]
-        kinds = "U" if name == "family" else "fi"
-        if found.shape != wanted.shape or not number or found.dtype.kind not in kinds:
-            raise ValueError(f"{name} of {number} scenes is {found.dtype} of shape {found.shape}")
-        if name not in ("share", "family") and not np.isfinite(found).all():
-            raise ValueError(f"{name} is not finite")
-    plain = [number for number in range(len(KINDS)) if number not in IN_TABLES]
-    if not np.isin(content["kind"], [ABSENT, *plain]).all():
-        raise ValueError("an obstacle has an unknown kind")
-    if (content["share"] < 0.0).any() or (content["share"] > 1.0).any():
-        raise ValueError("a solution share is not between 0 and 1")
+def _smallest(array: NDArray[Any]) -> NDArray[Any]:
+    """Return an array in the smallest type that holds its values."""
+    if array.dtype.kind == "f":
+        single = array.astype(np.float32)
+        same = (single.astype(np.float64) == array) | np.isnan(array)
+        return single if same.all() else array
+    return array.astype(np.int8) if array.dtype.kind == "i" else array
 
 
 def drawn(name: str, task: Task, number: int) -> FrozenScenes:

@@ -15,13 +15,11 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 import viapoint.envs
+from viapoint.envs.common.arrays import Observation
 from viapoint.envs.registration import check_registered
-from viapoint.envs.rewards import TERMS as TERMS
 from viapoint.training.files import as_plain
 
 assert viapoint.envs.TASKS, "importing it registers the environments"
-
-Observation = dict[str, NDArray[np.float32]] | NDArray[Any]
 
 ELAPSED = "elapsed"  # Name of the duration of a decision in infos, [s]
 # Metrics of an episode that `episode` in the infos holds too, as with `info_keywords` of SB3's `Monitor`
@@ -115,14 +113,12 @@ class ViaVecEnv(VecEnv):
 
     def __init__(self, env_id: str, num_envs: int, seed: int | None = None, **kwargs: Any) -> None:
         env_id = check_registered(env_id)
-        extra: dict[str, Any] = {}
-        if gym.spec(env_id).vector_entry_point is None:  # copies of the single environment
-            extra["vector_kwargs"] = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        self.venv: Any = gym.make_vec(env_id, num_envs=num_envs, **extra, **kwargs)
+        self.venv: Any = gym.make_vec(env_id, num_envs=num_envs, **kwargs)
         mode = self.venv.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(f"{env_id} must have autoreset mode SAME_STEP, not {mode}")
-        self.env_id, self.env_kwargs = env_id, dict(kwargs)
+        self.env_id = env_id
+        self.env_kwargs = dict(kwargs)
         self.recorded_id = env_id  # of an agent's file, which need not be registered here; tables name it
         spaces = self.venv.single_observation_space, self.venv.single_action_space
         VecEnv.__init__(self, num_envs, *spaces)
@@ -135,8 +131,8 @@ class ViaVecEnv(VecEnv):
 
     @property
     def physics_steps(self) -> int:
-        """Number of physics steps so far; 0 if the environment does not count them."""
-        return int(getattr(self.venv.unwrapped, "physics_steps", 0))
+        """Number of physics steps so far."""
+        return int(self.venv.unwrapped.physics_steps)
 
     def reset(self) -> Observation:
         """Start a new episode in every copy, with the options of `set_options`, if any."""

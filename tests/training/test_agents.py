@@ -30,13 +30,19 @@ import viapoint.envs.geometry.clearance
 import viapoint.training.planning.movements
 import viapoint.training.planning.search
 from viapoint.envs.geometry.obstacles import BOX, bounding_boxes, no_obstacles, unpack
+from viapoint.envs.rewards import TERMS
 from viapoint.training import GeometrySearch, ViaQ, ViaRank, ViaVecEnv, evaluate, load_agent
-from viapoint.training.agents import viaq_policy
+from viapoint.training.agents import viaq
 from viapoint.training.agents.agent import SAC
 from viapoint.training.agents.pairs import CLEAR, LENGTHS, NO_OBSTACLE, pairs_of
-from viapoint.training.agents.viaq import OutcomeReplayBuffer, Outcomes, outcome_of
-from viapoint.training.agents.viaq_critic import Values, _Saturated
-from viapoint.training.agents.viaq_policy import ViaQPolicy
+from viapoint.training.agents.viaq import (
+    OutcomeReplayBuffer,
+    Outcomes,
+    Values,
+    ViaQPolicy,
+    _Saturated,
+    outcome_of,
+)
 from viapoint.training.planning.baselines import agent_method
 from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.candidates import best_duration, candidate_actions, sobol_actions
@@ -46,7 +52,6 @@ from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import INFEASIBLE, plan_clearances, registered_task
 from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import scenes_for
-from viapoint.training.vec_env import TERMS
 
 FEW = {"width": 8, "instants": 8, "candidates": 32, "refinements": 1, "per_refinement": 16}
 SMALL = {
@@ -215,9 +220,8 @@ def test_refinement_solves_more_than_as_many_checks(made):
         observation = env.reset()
     assert solved[1] > solved[0] + 0.3
     replanning = model_on(made(MOVING))
-    replanning.policy.refine = 4
     with pytest.raises(ValueError, match="refine"):
-        replanning.predict(replanning.env.reset())
+        replanning.policy.refine = 4
 
 
 def policy_of(task, **kwargs):
@@ -339,14 +343,14 @@ def test_refined_candidates_are_apart_from_each_other(monkeypatch):
         refined.append(actions)
         return actions
 
-    monkeypatch.setattr(viaq_policy, "refined_actions", refine)
+    monkeypatch.setattr(viaq, "refined_actions", refine)
     agent = load_agent(PLANE)
     agent.policy.refine = 4
     problem = problem_of(agent.policy.task, 16)
     agent.policy._chosen(problem)
     vias = refined[0][..., :2]
     distance = np.linalg.norm(vias[:, :, None] - vias[:, None], axis=-1)
-    assert distance[:, ~np.eye(4, dtype=bool)].min() >= viaq_policy.APART
+    assert distance[:, ~np.eye(4, dtype=bool)].min() >= viaq.APART
     actions, values = agent.policy.propose(problem)
     best = actions[np.arange(16), values.argmax(axis=1)]
     np.testing.assert_array_equal(refined[0][:, 0], best)
@@ -404,7 +408,7 @@ def refuse_geometry(monkeypatch):
         for name, function in inspect.getmembers(module, callable):
             if getattr(function, "__module__", "") == module.__name__ and not inspect.isclass(function):
                 monkeypatch.setattr(module, name, refuse)
-                for user in (viaq_policy, viapoint.training.planning.movements):
+                for user in (viaq, viapoint.training.planning.movements):
                     if getattr(user, name, None) is function:
                         monkeypatch.setattr(user, name, refuse)
 
@@ -494,7 +498,7 @@ def test_as_many_plans_are_checked_as_one_says_and_the_best_of_them_is_taken(
     small, env_id, checks, monkeypatch
 ):
     model, env = small(env_id)
-    observation, checked, exact = env.reset(), {}, viaq_policy.merits
+    observation, checked, exact = env.reset(), {}, viaq.merits
     model.policy.checks = 0
     unchecked = model.policy.decide(observation)
 
@@ -504,7 +508,7 @@ def test_as_many_plans_are_checked_as_one_says_and_the_best_of_them_is_taken(
             checked.setdefault(goal.tobytes(), []).append((some, worth))
         return found
 
-    monkeypatch.setattr(viaq_policy, "merits", counted)
+    monkeypatch.setattr(viaq, "merits", counted)
     model.policy.checks = checks
     decided = model.policy.decide(observation)
     most = min(checks, 48)  # there are 48 candidates
@@ -728,7 +732,9 @@ def test_sets_of_scenes_are_solvable_and_partly_hidden() -> None:
     frozen = scenes_for("validation", task)
     known = registered_task(PLANE)
     assert not np.isin(frozen.scenes.start[:, 0], scenes_for("validation", known).scenes.start[:, 0]).any()
-    assert 0.1 < frozen.hidden.mean() < 0.5
+    obstacles = frozen.scenes.obstacles
+    hidden = task.sensor.hidden(*task.sensor.pose(task.arm, frozen.scenes.start), obstacles)
+    assert 0.1 < (hidden.sum(axis=1) / obstacles.present.sum(axis=1)).mean() < 0.5
     problem = Problem.of_scenes(frozen.scenes, task)
     straight = np.zeros((len(frozen.share), 1, task.action.size))
     assert (plan_clearances(task, problem, straight, 0.01, 0.0)[:, 0] < 0.01).all()

@@ -9,9 +9,9 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from frozen_scenes import shipped_path
 from gymnasium.wrappers import FlattenObservation, NormalizeObservation, RescaleAction
 from helpers import JUMPS, MOVING, PANDA, PLANE, REACH, SENSED, STEP
-from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecExtractDictObs, VecFrameStack, VecNormalize
@@ -49,7 +49,7 @@ from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.benchmark import benchmark_planner
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
-from viapoint.training.scene_sets import load, scenes_for, shipped_path
+from viapoint.training.scene_sets import load, scenes_for
 
 CHANGING = MOVING, JUMPS
 STALLING = {"stop_when_stalled": 0.3}
@@ -71,7 +71,6 @@ CONFIGURATIONS = [
     (TrainConfig, STALLING),  # the preset has no more decisions than it must make
     (TrainConfig, {**STALLING, "n_timesteps": 10**5, "eval_every": 0}),
     *((EvaluateConfig, {"env": PLANE, "checks": checks}) for checks in ((8,), ())),
-    (EvaluateConfig, {"agent": "runs/x", "pretrained": PLANE}),
     (PlayConfig, {"agent": "a", "video": "film.gif"}),
     (LiveConfig, {"port": 70_000}),
     (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}),
@@ -201,7 +200,6 @@ ZERO = np.zeros((2, 3))
 CALLS = [
     *(lambda name=name: make_method(name, PLANE) for name in ("magic", "search", "search3", "sobol0")),
     *(lambda name=name: make_method(name, MOVING) for name in ("constant", "rest:ompl", "ompl")),
-    lambda: SAC("MultiInputPolicy", ViaVecEnv(PLANE, 1), buffer_size=2, replay_buffer_class=HerReplayBuffer),
     lambda: benchmark_planner("search99999999999"),
     *(lambda more=more: GeometrySearch(PLANE, **more) for more in (
         {"n_checks": 10**6}, {"refinements": 64, "per_round": 2048}, {"n_checks": 1.5}, {"refinements": -1},
@@ -363,7 +361,6 @@ COMMANDS = [
     ("train --n-timesteps 1 --out full", "full"),
     ("train --resume --out full", "full"),
     ("evaluate", "--env"),
-    ("evaluate --pretrained nobody", "nobody"),
     ("plan --position 0.4 0.3", "--position needs 3 numbers for panda, x y z, got 2"),
     ("plan --goal 0.4 0.3", "--goal needs 7 numbers"),
     ("evaluate --baselines straight --agent", "--agent needs a name"),

@@ -33,8 +33,7 @@ from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
 from viapoint.envs.arms.stored import keep_arm, with_kept_arm
 from viapoint.envs.common.validation import is_number
-from viapoint.envs.plans import MOST_VIAS
-from viapoint.envs.task import MOST_OBSTACLES, Task
+from viapoint.envs.task import Task
 from viapoint.training.agents.extractors import SceneExtractor
 from viapoint.training.files import (
     BadFileError,
@@ -87,14 +86,6 @@ LIMITS: dict[str, tuple[float, float]] = {
 
 LARGEST_MODEL_JSON = 1 << 20  # Greatest size of `model.json`, [bytes]
 LARGEST_WEIGHTS = 1 << 30  # Greatest size of `weights.safetensors`, [bytes]
-# Greatest values in a file of those arguments of an environment that memory and time grow with
-LARGEST_ARGUMENTS = {
-    "n_via": MOST_VIAS,
-    "n_obstacles": MOST_OBSTACLES,
-    "width": 8192,
-    "height": 8192,
-    "threads": 1024,
-}
 ANY_TASK = "viapoint/Obstacles-v0"  # Id of an environment that can be any task
 # Number of parameters beyond its weights up to which a model is built, so that the error names the tensor
 SPARE_PARAMETERS = 100_000
@@ -152,7 +143,7 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
         reason = f"does not describe a model that can be built here ({type(error).__name__}: {error})"
         raise BadFileError(path, reason + written) from None
     _put_weights(model, arrays, tensors)
-    if record.get("weights_sha256", "") not in ("", _digest(tensors)):
+    if record.get("weights_sha256") != _digest(tensors):
         raise BadFileError(tensors, "is damaged: its hash is not the one that model.json states")
     return model
 
@@ -346,32 +337,24 @@ def _digest(path: Path) -> str:
 
 
 def _own_environment(record: Mapping[str, Any], folder: Path) -> ViaVecEnv:
-    """Return one copy of the environment that a file names by `id` and `kwargs`, or by its `task` alone.
+    """Return one copy of the environment that a file names by `id` and `kwargs`, which must have its `task`.
 
     The id of a user's own environment need not be registered where the model is loaded; one of another task raises
     BadFileError.
     """
-    env_id, kwargs = record["id"], record["kwargs"]
+    env_id, kwargs, task = record["id"], record["kwargs"], record["task"]
     if env_id not in gym.registry:  # never lets Gymnasium import a module named in a file
-        if "task" not in record:
-            raise ValueError(f"environment {env_id!r} is not known")
         limit = kwargs.get("max_episode_steps", record.get("max_episode_steps"))
-        env_id, kwargs = ANY_TASK, {**record["task"]}
+        env_id, kwargs = ANY_TASK, {**task}
         if limit is not None:
             kwargs["max_episode_steps"] = limit
-    for name, most in LARGEST_ARGUMENTS.items():
-        value = np.max(kwargs.get(name) or 0)
-        if value > most:
-            raise ValueError(f"{name} may be at most {most} in a file, got {value}")
     env = ViaVecEnv(env_id, 1, **kwargs)
     env.recorded_id = record["id"]
-    if "task" in record:
-        try:
-            check_same_task(Task.of(**record["task"]), _task_of(env))
-        except ValueError as error:
-            raise BadFileError(
-                folder, f"holds an agent for another {env_id} than is registered: {error}"
-            ) from None
+    try:
+        check_same_task(Task.of(**task), _task_of(env))
+    except ValueError as error:
+        reason = f"holds an agent for another {env_id} than is registered: {error}"
+        raise BadFileError(folder, reason) from None
     return env
 
 

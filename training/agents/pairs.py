@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from stable_baselines3.common.torch_layers import create_mlp
 from torch import Tensor, nn
 
 from viapoint.envs.common.arrays import Bool, Float, Int
@@ -119,13 +120,6 @@ class Work(NamedTuple):
 
 
 @inner
-def _place(given: Given, b: int, h: int, instant: int, work: Work) -> bool:
-    """Place the arm at an instant of a movement, and return True within reach and joint ranges."""
-    position, joints, placed = work.position, work.joints, work.placed
-    return bool(place_at(given.setting, given.moves, b, h, instant, position, joints, placed))
-
-
-@inner
 def _local(given: Given, b: int, row: int, point: Float, time: float, local: Float) -> None:
     """Fill in a point in the frame of an obstacle at a time, shape (3,), [m]."""
     obstacles = given.obstacles
@@ -155,7 +149,7 @@ def _place_sphere(
 ) -> bool:
     """Fill in a sphere's centre in the frame of an obstacle at an instant, and return True within reach."""
     moves, placed = given.moves, work.placed
-    if not _place(given, b, h, instant, work):
+    if not place_at(given.setting, moves, b, h, instant, work.position, work.joints, placed):
         return False
     place_group(given.setting.spheres, group, placed)
     _local(given, b, row, placed.centre[sphere], moves.duration[b, h] * instant / (INSTANTS - 1), local)
@@ -256,7 +250,7 @@ def _gather(
                 time = moves.duration[b, h] * instant / (INSTANTS - 1)
                 if k > 0 and time > until[b, h]:
                     break
-                if not _place(given, b, h, instant, work):
+                if not place_at(setting, moves, b, h, instant, work.position, work.joints, placed):
                     inside[b, h] = False
                     break
                 last = instant
@@ -319,13 +313,7 @@ class PairNetwork(nn.Module):
 
     def __init__(self, shapes: Sequence[str], width: int) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(LENGTHS + len(shapes), width),
-            nn.ReLU(),
-            nn.Linear(width, width),
-            nn.ReLU(),
-            nn.Linear(width, 1),
-        )
+        self.layers = nn.Sequential(*create_mlp(LENGTHS + len(shapes), 1, [width, width]))
         self.nearness = nn.Parameter(torch.tensor([1.0, -2.0]))
         """Slope and offset of a skip connection from the distance of the bounding box. It makes the nearest pair the
         minimum at the start of training."""

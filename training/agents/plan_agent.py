@@ -18,7 +18,8 @@ from stable_baselines3.common.utils import is_vectorized_observation
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
-from viapoint.envs.common.validation import whole_number
+from viapoint.envs.common.arrays import Observation
+from viapoint.envs.common.validation import finite_array, whole_number
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
@@ -27,7 +28,7 @@ from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.checks import unknown_name
 from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
 from viapoint.training.planning.movements import FINE_INSTANTS
-from viapoint.training.planning.problem import Problem, moves_of
+from viapoint.training.planning.problem import Numbers, Problem, moves_of
 from viapoint.training.vec_env import check_spaces, check_unwrapped
 
 N_ELITES = 8  # Number of candidates around which each round of refinement samples
@@ -35,9 +36,6 @@ N_ELITES = 8  # Number of candidates around which each round of refinement sampl
 SPREAD = 0.15
 # Number of candidates that are looked at together for one within reach, after the best one
 LOOKED_AT = 32
-
-Observation = Mapping[str, NDArray[Any]]
-Numbers = NDArray[np.floating[Any]]
 
 
 class PlanPolicy(BasePolicy):
@@ -77,6 +75,8 @@ class PlanPolicy(BasePolicy):
     def _check_setting(self, name: str, value: Any) -> None:
         """Check a setting; a wrong type, or a number out of range, raises ValueError."""
         check_arguments(type(self), {name: value})
+        if name == "refine" and value and not self.can_refine:
+            raise ValueError(f"refine must be 0 where plans are revised or have no via-points, got {value}")
 
     @property
     def all_candidates(self) -> int:
@@ -92,15 +92,6 @@ class PlanPolicy(BasePolicy):
         """True for tasks whose movements begin at rest and have via-points, which can be refined."""
         return not self.replanning and self.task.n_via > 0
 
-    def _check_refine(self) -> None:
-        if self.refine and not self.can_refine:
-            raise ValueError(
-                f"refine must be 0 where plans are revised or have no via-points, got {self.refine}"
-            )
-
-    def _own(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.OWN}
-
     def _make_optimizer(self, network: torch.nn.Module, lr_schedule: Any) -> None:
         """Create the optimizer of the network."""
         self.optimizer = self.optimizer_class(
@@ -110,8 +101,9 @@ class PlanPolicy(BasePolicy):
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {name: getattr(self, name) for name in self.OWN}
         always = {"task": self.task.as_dict(), "lr_schedule": self._dummy_schedule}
-        return {**super()._get_constructor_parameters(), **self._own(), **always}
+        return {**super()._get_constructor_parameters(), **own, **always}
 
     def proposals(self, number: int, values: Callable[[Numbers], Numbers]) -> tuple[Numbers, Numbers]:
         """Return candidates of some problems, shape (B, N, m), and their values, shape (B, N); the first is zero.
@@ -172,10 +164,6 @@ class PlanPolicy(BasePolicy):
     def decide(self, observation: Observation) -> Numbers:
         """Return the chosen actions, shape (B, m), for parts of B observations."""
 
-    def forward(self, observation: Any, deterministic: bool = True) -> Tensor:
-        """Return the chosen actions, shape (B, m)."""
-        return self._predict(observation, deterministic)
-
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         arrays = {name: each.cpu().numpy() for name, each in observation.items()}
         return torch.as_tensor(self.decide(arrays), dtype=torch.float32, device=self.device)
@@ -187,8 +175,6 @@ class PlanPolicy(BasePolicy):
             ValueError: The observation has other parts or sizes than the observation space, or is not finite; in tasks
                 with whole movements, start and goal are the same; with a sensor, points are not on its rays.
         """
-        if isinstance(observation, tuple):  # the base class explains the mistake
-            return super().predict(cast(Any, observation), state, *args, **kwargs)
         parts: Any = self.observation_space
         wanted = ", ".join(parts.spaces)
         if not isinstance(observation, Mapping):
@@ -197,16 +183,7 @@ class PlanPolicy(BasePolicy):
             got = ", ".join(map(str, observation))
             raise ValueError(f"observation must have the parts {wanted}; got {got}")
         for name, each in observation.items():
-            size = np.shape(each)[-1:]
-            if size != parts[name].shape:
-                raise ValueError(
-                    f"{name} must have {parts[name].shape[0]} values, as in training; got {size}"
-                )
-            if not np.isfinite(np.asarray(each)).all():
-                wrong = np.argwhere(~np.isfinite(np.asarray(each)))
-                raise ValueError(
-                    f"observation must be finite; {name} is not, in {len(wrong)} places, first {wrong[0].tolist()}"
-                )
+            finite_array(name, each, (..., *parts[name].shape))
         several = is_vectorized_observation(cast(Any, dict(observation)), parts)
         batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
         if not len(batch[next(iter(batch))]):
@@ -227,19 +204,10 @@ class PlanPolicy(BasePolicy):
             raise ValueError("start and goal must differ: no movement leads from a point to itself")
 
 
-def task_in(env: VecEnv) -> Task | None:
-    """Return the task of a vector environment of this package; None for others."""
-    try:
-        (task,) = env.get_attr("task", indices=[0])
-    except AttributeError:
-        return None
-    return task if isinstance(task, Task) else None
-
-
 class PlanAlgorithm(Agent, OffPolicyAlgorithm):
     """Off-policy algorithm that trains a policy that ranks plans.
 
-    `own` names the attributes of the subclass that are hyperparameters.
+    Subclasses set their own hyperparameters as attributes, and then call the constructor.
     """
 
     LARGEST_GRADIENT: float  # Norm to which gradients are clipped
@@ -251,14 +219,11 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         env: Any,
         learning_rate: Any,
         *,
-        own: tuple[str, ...],
         policy_kwargs: dict[str, Any] | None,
-        _init_setup_model: bool,
         **kwargs: Any,
     ) -> None:
-        checked = {name: getattr(self, name) for name in own}
-        checked.update((name, value) for name, value in kwargs.items() if name in LIMITS)
-        check_arguments(type(self), checked)
+        check_arguments(type(self), vars(self))
+        check_arguments(type(self), {name: value for name, value in kwargs.items() if name in LIMITS})
         super().__init__(
             policy,
             env,
@@ -268,14 +233,24 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
             sde_support=False,
             **kwargs,
         )
-        if self.env is not None:
-            self.policy_kwargs.setdefault("task", self._task_of(self.env).as_dict())
-        if _init_setup_model:
-            self._setup_model()
+        assert self.env is not None
+        self.policy_kwargs.setdefault("task", self._task_of(self.env).as_dict())
+        self._check_env(self.env)
+        self._setup_model()
 
-    @abstractmethod
     def _task_of(self, env: VecEnv) -> Task:
         """Return the task of an environment, if the algorithm is made for it; ValueError otherwise."""
+        try:
+            (task,) = env.get_attr("task", indices=[0])
+        except AttributeError:
+            task = None
+        if not isinstance(task, Task) or task.stepwise:
+            raise ValueError(
+                f"{type(self).__name__} needs an environment of this package in which an action is a whole movement, "
+                "as in viapoint/PlanarObstacles-v0 and viapoint/PlanarSensed-v0; got "
+                f"{'one with control steps' if isinstance(task, Task) else 'another one'}"
+            )
+        return task
 
     def _check_env(self, env: VecEnv) -> None:
         normalized = unwrap_vec_normalize(env)
@@ -285,12 +260,6 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
             )
         check_unwrapped(env)
         check_same_task(Task.of(**self.policy_kwargs["task"]), self._task_of(env))
-
-    def _setup_model(self) -> None:
-        if self.env is not None:
-            self._check_env(self.env)
-        super()._setup_model()
-        self.actor = self.policy
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         total, callback = super()._setup_learn(*args, **kwargs)
@@ -340,9 +309,6 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
 
     def _after_update(self) -> None:
         """Follow an update of the network."""
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []

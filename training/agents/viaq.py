@@ -1,8 +1,9 @@
 """Q-learning over candidate plans, with a critic that is a minimum over obstacles.
 
 The algorithm extends :class:`OffPolicyAlgorithm` of Stable-Baselines3. There is no actor: the policy evaluates many
-candidate actions with the critic and takes the best one, as QT-Opt does (Kalashnikov et al. 2018, arXiv 1806.10293).
-The critic is regressed on the terms of the reward that `info` reports; training computes no distance to an obstacle.
+candidate actions with the critic and takes the best one, as QT-Opt does (Kalashnikov et al. 2018, arXiv 1806.10293),
+after exact checks or refinement of the best ones where they are asked for. The critic is regressed on the terms of the
+reward that `info` reports; training computes no distance to an obstacle.
 """
 
 from __future__ import annotations
@@ -12,26 +13,42 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
-from viapoint.envs.common.arrays import Single
+from viapoint.envs.common.arrays import Float, Observation, Single, norm
+from viapoint.envs.outcome import SETTLING
+from viapoint.envs.plans import turned
+from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT, TERMS
 from viapoint.envs.task import Task
 from viapoint.primitives.array_api import Array
 from viapoint.training.agents.model_io import ALGORITHMS
-from viapoint.training.agents.plan_agent import PlanAlgorithm, task_in
-from viapoint.training.agents.viaq_critic import Values
-from viapoint.training.agents.viaq_policy import KEEP, ViaQPolicy
+from viapoint.training.agents.pairs import PairNetwork, Pairs, pairs_of
+from viapoint.training.agents.plan_agent import PlanAlgorithm, PlanPolicy
 from viapoint.training.planning.candidates import candidate_actions
-from viapoint.training.planning.problem import Problem
-from viapoint.training.vec_env import ELAPSED, TERMS
+from viapoint.training.planning.movements import INSTANTS
+from viapoint.training.planning.problem import Numbers, Problem, moves_of
+from viapoint.training.planning.search import INFEASIBLE, best_of, merits, refined_actions
+from viapoint.training.vec_env import ELAPSED
 
+KEEP = 0.1  # Minimum gain of Q for which a running plan is revised
+# Greatest number of proposals that are checked; all further checks are of plans around the best of them
+PROPOSALS = 32
+# Least distance of the via-points of two candidates that are refined, in the action space. Of .2 to 1.8, .5 solved most
+# of the `validation` scenes of PandaObstacles.
+APART = 0.5
+LOCAL_ROUNDS = 4  # Rounds of checks around the best checked plans
+SPARE = 0.2  # Greatest time that is left after a movement, or missing for it, at the input of the critic, [s]
+BLOCK = 64  # Scenes that are decided together
+MOTION_SCALES = (1.0, 0.1)  # Scales of velocity and acceleration at the input of the critic
 # Unit of errors of the clearance term, as a share of the weight of the term: 2 cm
 CLEARANCE_SCALE = 0.4
 # Share of the weight of the clearance term by which the obstacles must be nearer than the arm itself: 1 mm
@@ -42,6 +59,201 @@ CONTACT_WEIGHT = 0.1
 LOWER = 1e-6  # Smallest decrease of the clearance term that counts as a decrease
 # Largest difference between the reward and the sum of its terms that counts as rounding
 REWARD_TOLERANCE = 1e-4
+# Number of effort features: log jerk, duration, log duration, and spare time if time is limited
+EFFORT = 4
+IN_TIME = 20.0  # Logits of arrival for each second of spare time in tasks with a time limit, [1/s]
+# Logits of arrival that a movement beyond reach or joint ranges loses: it is not executed
+OUTSIDE = 20.0
+# Penalty on the merit of plans that are unlikely to succeed; larger than the range of Q
+UNLIKELY = 10.0
+
+
+class ViaQPolicy(PlanPolicy):
+    """Policy that ranks candidates with a critic and can check the best ones with exact geometry.
+
+    Args:
+        observation_space: Observation space of the environment.
+        action_space: Action space of the environment.
+        lr_schedule: Learning rate as a function of the remaining progress.
+        task: Task of the environment as plain values, see :meth:`viapoint.envs.task.Task.as_dict`.
+        width: Width of the hidden layers of the pair network.
+        instants: Instants of a plan at which the arm is looked at, 2 to 64.
+        candidates: Number of Sobol points in the action space.
+        refinements: Rounds of candidates around the best ones.
+        per_refinement: Candidates of each round.
+        checks: Greatest number of plans that exact geometry checks, the best candidates first; 0 for none.
+        refine: Number of best candidates, some distance apart, that the planner refines by the gradient of clearance;
+            the best one is taken after an exact check. 0 for none. Only for tasks whose actions are whole movements.
+    """
+
+    OWN = "width", "instants", "candidates", "refinements", "per_refinement", "checks", "refine"
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        lr_schedule: Any,
+        *,
+        task: Mapping[str, Any],
+        width: int = 32,
+        instants: int = 32,
+        candidates: int = 256,
+        refinements: int = 4,
+        per_refinement: int = 64,
+        checks: int = 0,
+        refine: int = 0,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, task=task, **kwargs)
+        self.width = width
+        self.instants = instants
+        self.candidates = candidates
+        self.refinements = refinements
+        self.per_refinement = per_refinement
+        self.checks = checks
+        self.refine = refine
+        self._check_candidates()
+        self.critic = ViaQCritic(self.task, width=self.width)
+        self.critic_target: ViaQCritic | None = None
+        if self.replanning:  # values of later decisions are learned from a critic that changes slowly
+            self.critic_target = ViaQCritic(self.task, width=self.width)
+            self.critic_target.load_state_dict(self.critic.state_dict())
+            self.critic_target.requires_grad_(False)
+        self._make_optimizer(self.critic, lr_schedule)
+
+    @property
+    def network(self) -> ViaQCritic:
+        """Network that is trained."""
+        return self.critic
+
+    def inputs(self, problem: Problem, actions: Numbers, until: Float | None = None) -> PlanInputs:
+        """Return the critic's inputs for actions of shape (B, H, m) in B problems.
+
+        After the times `until`, shape (B, H), [s], contact does not count.
+        """
+        moves = moves_of(self.task, problem, actions)
+        spare = np.zeros_like(moves.duration)
+        if problem.time_left is not None:
+            spare = np.clip(problem.time_left[:, None] - moves.duration - SETTLING, -SPARE, SPARE)
+        effort = np.stack((moves.rough, moves.relative, np.log(moves.relative), spare), axis=-1)
+        instants = np.linspace(0, INSTANTS - 1, min(self.instants, INSTANTS)).round().astype(np.int64)
+        pairs = pairs_of(self.task, problem, moves, instants, until)
+        ends = seen_ends(self.task, problem)
+        # Geometry is computed on the processor, the networks may be on another device.
+        device = self.device
+        return PlanInputs(
+            _tensor(ends).to(device),
+            _tensor(actions).to(device),
+            _tensor(effort).to(device),
+            pairs.to(device),
+        )
+
+    @torch.inference_mode()
+    def values(self, problem: Problem, actions: Numbers) -> Numbers:
+        """Return the ranking criterion of H actions in each of B problems, shape (B, H); see :meth:`ViaQCritic.merit`.
+
+        In replanning tasks a first action of zero, which keeps the plan, gets a bonus of KEEP.
+        """
+        values: Numbers = self.critic.merit(self.critic(self.inputs(problem, actions))).cpu().numpy()
+        if self.replanning:
+            values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
+        return values
+
+    def propose(self, problem: Problem) -> tuple[Numbers, Numbers]:
+        """Return candidates, shape (B, N, m), and their ranking criterion, shape (B, N); the first is zero."""
+        return self.proposals(len(problem.start), lambda actions: self.values(problem, actions))
+
+    def decide(self, observation: Observation) -> Numbers:
+        """Return the chosen actions, shape (B, m), for B observations, arrays by name."""
+        number = len(observation["joints"])
+        pieces = []
+        for first in range(0, number, BLOCK):
+            some = {name: part[first : first + BLOCK] for name, part in observation.items()}
+            pieces.append(self._chosen(Problem.of_observation(some, self.task)))
+        return np.concatenate(pieces)
+
+    def _chosen(self, problem: Problem) -> Numbers:
+        """Return the chosen actions of B problems, shape (B, m)."""
+        actions, values = self.propose(problem)
+        if not self.checks and not self.refine:
+            first = self.best_within_reach(problem, actions, values)
+            return np.asarray(actions[np.arange(len(first)), first])
+        count = min(max(self.checks, self.refine), values.shape[1])
+        local = max(count - PROPOSALS, 0) if self.checks else 0
+        promising = self._promising(values, count - local)
+        checked = np.take_along_axis(actions, promising[..., None], axis=1)
+        if self.refine:
+            refined = refined_actions(self.task, problem, self._apart(actions, values, self.refine))
+            checked = np.concatenate((checked, refined), axis=1)
+        worth = merits(self.task, problem, checked)
+        best = best_of(self.task, problem, checked, worth)
+        # Plans that are not clear have a merit near INFEASIBLE.
+        rows = np.flatnonzero(self.replanning | (worth.max(axis=1) < 0.5 * INFEASIBLE))
+        if local and rows.size:
+            best[rows] = self._improved(problem.take(rows), checked[rows], worth[rows], local)
+        return best
+
+    def _improved(self, problem: Problem, checked: Numbers, worth: Numbers, count: int) -> Numbers:
+        """Return the best of checked actions and of `count` further ones around the best of them, shape (B, m)."""
+        for each in range(LOCAL_ROUNDS):
+            share = (count + each) // LOCAL_ROUNDS
+            if share:
+                top = np.argsort(-worth, axis=1, kind="stable")[:, :4]
+                near = self.around(np.take_along_axis(checked, top[..., None], axis=1), each)[:, :share]
+                checked = np.concatenate((checked, near), axis=1)
+                worth = np.concatenate((worth, merits(self.task, problem, near)), axis=1)
+        return best_of(self.task, problem, checked, worth)
+
+    def _promising(self, values: Numbers, count: int) -> NDArray[np.intp]:
+        """Return indices of candidates to check, shape (B, count), for ranking criteria of shape (B, N).
+
+        Refined candidates resemble each other, so at least half of the checks go to the best Sobol points.
+        """
+        if self.replanning:  # the action that keeps the plan is always checked, and first
+            values = np.concatenate((np.full_like(values[:, :1], np.inf), values[:, 1:]), axis=1)
+        refined = min(count // 2, values.shape[1] - self.candidates)
+        spread = min(count - refined, self.candidates)
+        first = np.argsort(-values[:, : self.candidates], axis=1, kind="stable")[:, :spread]
+        last = np.argsort(-values[:, self.candidates :], axis=1, kind="stable")[:, :refined]
+        return np.concatenate((first, last + self.candidates), axis=1)
+
+    def _apart(self, actions: Numbers, values: Numbers, count: int) -> Numbers:
+        """Return the best candidates that are APART from each other, shape (B, count, m).
+
+        The planner's refinement would bring those that are close together to the same movement.
+        """
+        vias = actions[..., : self.task.n_via * self.task.action.dimension]
+        left = values.copy()
+        rows = np.arange(len(values))
+        found = []
+        for _ in range(count):
+            best = left.argmax(axis=1)
+            found.append(actions[rows, best])
+            left[norm(vias - vias[rows, best][:, None]) < APART] = -np.inf
+        return np.stack(found, axis=1)
+
+
+def seen_ends(task: Task, problem: Problem) -> Float:
+    """Return start, goal, distance and, in replanning tasks, the present motion, scaled to order one, shape (B, E).
+
+    In hand space, velocity and acceleration are in the frame of the line from hand to goal.
+    """
+    scale = 2.0 if task.space.of_hand else 0.5
+    line = problem.goal - problem.start
+    ends = [scale * problem.start, scale * problem.goal, scale * norm(line)[:, None]]
+    if problem.remaining is not None and problem.time_left is not None:
+        for part, size in zip((problem.velocity, problem.acceleration), MOTION_SCALES, strict=True):
+            if task.space.of_hand:
+                mirrored = np.where(norm(line)[:, None] > 0.0, line * (1.0, -1.0), (1.0, 0.0))
+                part = turned(part, mirrored)
+            ends.append(size * part)
+        ends += [problem.remaining[:, None], problem.time_left[:, None]]
+    return np.concatenate(ends, axis=-1)
+
+
+def _tensor(values: Any) -> Tensor:
+    """Return a single-precision tensor; read-only arrays are copied."""
+    return torch.from_numpy(np.require(values, dtype=np.float32, requirements=["C", "W"]))
 
 
 class ViaQ(PlanAlgorithm):
@@ -63,7 +275,6 @@ class ViaQ(PlanAlgorithm):
         train_freq: Steps of all environments between two rounds of updates.
         tau: Rate at which the target critic follows, in tasks with replanning.
         policy_kwargs: Arguments of :class:`ViaQPolicy`; `env` provides the task.
-        _init_setup_model: False to set up the networks later.
         **kwargs: Arguments that all algorithms of Stable-Baselines3 have, such as `seed`, `device`, `verbose` and
             `tensorboard_log`.
 
@@ -101,16 +312,16 @@ class ViaQ(PlanAlgorithm):
         train_freq: int | tuple[int, str] = 1,
         tau: float = 0.005,
         policy_kwargs: dict[str, Any] | None = None,
-        _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
-        self.explore_uniformly, self.temperature = explore_uniformly, temperature
-        self.explore_candidates, self.next_candidates = explore_candidates, next_candidates
+        self.explore_uniformly = explore_uniformly
+        self.temperature = temperature
+        self.explore_candidates = explore_candidates
+        self.next_candidates = next_candidates
         super().__init__(
             policy,
             env,
             learning_rate,
-            own=("explore_uniformly", "temperature", "explore_candidates", "next_candidates"),
             buffer_size=buffer_size,
             learning_starts=learning_starts,
             batch_size=batch_size,
@@ -120,7 +331,6 @@ class ViaQ(PlanAlgorithm):
             policy_kwargs=policy_kwargs,
             train_freq=train_freq,
             tau=tau,
-            _init_setup_model=_init_setup_model,
             **kwargs,
         )
 
@@ -132,12 +342,7 @@ class ViaQ(PlanAlgorithm):
         return prepared
 
     def _task_of(self, env: VecEnv) -> Task:
-        task = task_in(env)
-        if task is None or task.stepwise:
-            raise ValueError(
-                "ViaQ needs an environment of this package in which an action is a whole movement, such as "
-                f"viapoint/PlanarObstacles-v0; got {'another one' if task is None else 'one with control steps'}"
-            )
+        task = super()._task_of(env)
         if task.sensor is not None:
             raise ValueError(
                 "viaq needs the obstacles; where a sensor sees them, viarank learns to place via-points"
@@ -292,8 +497,6 @@ class OutcomeReplayBuffer(DictReplayBuffer):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        if self.optimize_memory_usage:
-            raise ValueError("optimize_memory_usage must be False: the buffer stores the terms of the reward")
         self._begins = False
         self.elapsed = np.full((self.buffer_size, self.n_envs), np.inf, dtype=np.float32)
         self.outcomes = np.full(
@@ -356,3 +559,125 @@ def outcome_of(info: Mapping[str, Any], reward: float, before: float = np.nan) -
     lower = first or clearance < -LOWER
     so_far = clearance if first else before + clearance
     return float(succeeded), float(contact), so_far, float(lower), goal_error, smoothness + duration
+
+
+class Values(NamedTuple):
+    """Predictions of the critic for H plans in each of B scenes, shape (B, H) each."""
+
+    margin: Tensor  # Predicted clearance from obstacles, [m]
+    self_clearance: Tensor  # Computed clearance of the arm from itself, [m]
+    no_contact: Tensor  # Logit of the probability of no contact
+    arrival: Tensor  # Logit of the probability of success given no contact
+    clearance: Tensor  # Predicted clearance term of the reward
+    effort_terms: Tensor  # Predicted sum of the terms for smoothness and duration
+
+
+class PlanInputs(NamedTuple):
+    """Inputs of the critic for H plans in each of B scenes."""
+
+    ends: Tensor  # Start, goal and, in replanning tasks, the present motion, shape (B, E)
+    actions: Tensor  # Shape (B, H, m)
+    effort: Tensor  # Shape (B, H, EFFORT)
+    pairs: Pairs  # Nearest pairs of spheres and obstacles
+
+
+class _Saturated(torch.autograd.Function):
+    """Clamp whose gradient can move values back into the range, but not farther out of it."""
+
+    @staticmethod
+    def forward(context: Any, values: Tensor, low: float, high: float) -> Tensor:
+        context.save_for_backward(values)
+        context.bounds = low, high
+        return values.clamp(low, high)
+
+    @staticmethod
+    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        (values,), (low, high) = context.saved_tensors, context.bounds
+        outwards = ((values > high) & (gradient < 0.0)) | ((values < low) & (gradient > 0.0))
+        return torch.where(outwards, 0.0, gradient), None, None
+
+
+class ViaQCritic(nn.Module):
+    """Network that predicts the value of plans from their margin and effort.
+
+    The margin m(s, a) is learned (see :mod:`viapoint.training.agents.pairs`). Kinematics says whether the movement
+    stays within reach and joint ranges, and how far the arm is from itself, s(a):
+
+        P(clear) = sigmoid(k m + b) sigmoid(k' s + b'),  P(success) = P(clear) sigmoid(d + r(s, a)),
+        Q(s, a) = w_s P(success) - w_c (1 - P(clear)) - w_g (1 - P(success)) + w_m clip(min(m, s)) + e(s, a)
+
+    Args:
+        task: Task of the environment.
+        width: Width of the hidden layers of the pair network.
+    """
+
+    def __init__(self, task: Task, *, width: int) -> None:
+        super().__init__()
+        dimension, size = task.space.dimension, task.action.size
+        ends = (4 * dimension + 3) if task.replanning else (2 * dimension + 1)
+        self.replanning = task.replanning
+        self.pairs = PairNetwork(task.shapes, width)
+        self.arrival = nn.Parameter(torch.tensor(2.0))  # Logit d of arrival of a movement within reach
+        self.rest = nn.Sequential(*create_mlp(ends + EFFORT + (0 if task.replanning else size), 2, [64, 64]))
+        for parameter in self.rest[-1].parameters():
+            nn.init.zeros_(parameter)
+        weights = task.weights
+        self.linear = nn.Parameter(torch.tensor([-weights.smoothness, -weights.duration, 0.0, 0.0]))
+        """Weights of the effort features, initialised from the reward weights."""
+        self.slope = nn.Parameter(torch.tensor([6.0, 0.0]))  # Logarithm of k [1/m], and b
+        self.self_slope = nn.Parameter(torch.tensor([6.0, 2.0]))  # Logarithm of k' [1/m], and b'
+        self.scales = nn.Parameter(
+            torch.tensor([weights.success, weights.collision, weights.goal_error, weights.clearance])
+        )
+        """w_s, w_c, w_g and w_m, initialised from the reward weights and adapted to the rewards."""
+
+    def forward(self, inputs: PlanInputs) -> Values:
+        """Return the predictions for each plan."""
+        margin, own = self.pairs(inputs.pairs), inputs.pairs.self_clearance
+        reach = self.arrival - OUTSIDE * (~inputs.pairs.inside).to(margin.dtype)
+        # Keeping a plan and planning the same movement again have the same value, so the action itself is not an input.
+        ends = inputs.ends[:, None].expand(-1, inputs.actions.shape[1], -1)
+        known = ends if self.replanning else torch.cat((ends, inputs.actions), dim=-1)
+        rest = self.rest(torch.cat((known, inputs.effort), dim=-1))
+        obstacles = margin * torch.exp(self.slope[0]) + self.slope[1]
+        itself = own * torch.exp(self.self_slope[0]) + self.self_slope[1]
+        return Values(
+            margin,
+            own,
+            both(obstacles, itself),
+            reach + rest[..., 1] + IN_TIME * inputs.effort[..., 3],
+            torch.minimum(self.clearance_term(margin), self.clearance_term(own)),
+            rest[..., 0] + inputs.effort @ self.linear,
+        )
+
+    def clearance_term(self, clearance: Tensor) -> Tensor:
+        """Return the clearance term of the reward for a clearance, [m]."""
+        low, high = CLEARANCE_RANGE
+        clip: Any = _Saturated.apply
+        term: Tensor = clip(clearance, low, high) * (self.scales[3] / CLEARANCE_UNIT)
+        return term
+
+    def value(self, values: Values) -> Tensor:
+        """Return Q, shape (B, H)."""
+        clear = torch.sigmoid(values.no_contact)
+        success = clear * torch.sigmoid(values.arrival)
+        won, lost, missed, _ = self.scales
+        total: Tensor = won * success - lost * (1.0 - clear) - missed * (1.0 - success)
+        return total + values.clearance + values.effort_terms
+
+    def merit(self, values: Values) -> Tensor:
+        """Return the ranking criterion, shape (B, H): Q if success is more likely than not, otherwise a lower number.
+
+        If no plan is likely to succeed, Q prefers plans out of reach, which are not executed and so touch nothing. The
+        probability of success ranks such plans instead.
+        """
+        success = torch.sigmoid(values.no_contact) * torch.sigmoid(values.arrival)
+        merit: Tensor = torch.where(success > 0.5, self.value(values), success - UNLIKELY)
+        return merit
+
+
+def both(first: Tensor, second: Tensor) -> Tensor:
+    """Return the logit of the product of two probabilities that are given as logits."""
+    log = functional.logsigmoid(first) + functional.logsigmoid(second)
+    log = log.clamp(max=-1e-6)
+    return log - torch.log(-torch.expm1(log))

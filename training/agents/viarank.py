@@ -28,14 +28,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 from torch.nn import functional
 
-from viapoint.envs.common.arrays import Float, Single
+from viapoint.envs.common.arrays import Float, Observation, Single
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training.agents.model_io import ALGORITHMS
-from viapoint.training.agents.plan_agent import Observation, PlanAlgorithm, PlanPolicy, task_in
+from viapoint.training.agents.plan_agent import PlanAlgorithm, PlanPolicy
 from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.cautious import (
@@ -117,8 +117,7 @@ class ViaRankPolicy(PlanPolicy):
         self.refine = refine
         self.belief = belief
         self._check_candidates()
-        self._check_refine()
-        sensor = _check_task(self.task).sensor
+        sensor = self.task.sensor
         assert sensor is not None
         self.network = SightNetwork(sensor, width=width)
         self._make_optimizer(self.network, lr_schedule)
@@ -170,7 +169,6 @@ class ViaRankPolicy(PlanPolicy):
 
     def best(self, problem: Problem, sight: Sight) -> tuple[Float, Float]:
         """Return the best actions of B problems, shape (B, m), and probabilities that are too high, shape (B,)."""
-        self._check_refine()  # it may have been set after construction
         chosen, success = [], []
         for first in range(0, len(problem.start), BLOCK):
             rows = slice(first, first + BLOCK)
@@ -210,24 +208,6 @@ class ViaRankPolicy(PlanPolicy):
             )
 
 
-def _check_task(task: Task | None) -> Task:
-    """Return a task for which this agent is made; ValueError for others."""
-    if task is None:
-        got = "another one"
-    elif task.sensor is None:
-        got = "one without a sensor"
-    elif task.stepwise:
-        got = "one with control steps"
-    elif task.moving_obstacles:
-        got = "one with moving obstacles"
-    else:
-        return task
-    raise ValueError(
-        "viarank needs an environment of this package with a sensor and obstacles at rest, in which an action is a "
-        f"movement, such as viapoint/PlanarSensed-v0; got {got}"
-    )
-
-
 class _NoBuffer(ReplayBuffer):
     """Replay buffer that keeps nothing: the algorithm learns from scenes that are new, or under way in `env`."""
 
@@ -256,7 +236,6 @@ class ViaRank(PlanAlgorithm):
         labels: Plans of each scene that are learned from: the better half are the best candidates, the others random.
         train_freq: Steps of all environments between two rounds of updates.
         policy_kwargs: Arguments of :class:`ViaRankPolicy`; `env` provides the task.
-        _init_setup_model: False to set up the network later.
         **kwargs: Arguments that all algorithms of Stable-Baselines3 have, such as `seed`, `device`, `verbose` and
             `tensorboard_log`.
 
@@ -290,15 +269,14 @@ class ViaRank(PlanAlgorithm):
         labels: int = 24,
         train_freq: int | tuple[int, str] = 1,
         policy_kwargs: dict[str, Any] | None = None,
-        _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
-        self.explore_candidates, self.labels = explore_candidates, labels
+        self.explore_candidates = explore_candidates
+        self.labels = labels
         super().__init__(
             policy,
             env,
             learning_rate,
-            own=("explore_candidates", "labels"),
             buffer_size=1,
             learning_starts=learning_starts,
             batch_size=batch_size,
@@ -307,14 +285,19 @@ class ViaRank(PlanAlgorithm):
             replay_buffer_class=_NoBuffer,
             policy_kwargs=policy_kwargs,
             train_freq=train_freq,
-            _init_setup_model=_init_setup_model,
             **kwargs,
         )
         if labels > explore_candidates:
             raise ValueError(f"labels must be at most explore_candidates, {explore_candidates}, got {labels}")
 
     def _task_of(self, env: VecEnv) -> Task:
-        return _check_task(task_in(env))
+        task = super()._task_of(env)
+        if task.sensor is None or task.moving_obstacles:
+            raise ValueError(
+                "viarank needs a sensor and obstacles at rest, as in viapoint/PlanarSensed-v0; where the obstacles are "
+                "known, viaq learns to place via-points"
+            )
+        return task
 
     def _candidates(self, number: int) -> NDArray[np.float32]:
         """Return random candidates of some scenes, shape (number, H, m), of as many as a decision compares."""
@@ -399,7 +382,7 @@ class ViaRank(PlanAlgorithm):
         others = best.shape[1] + others[:, : self.labels - best.shape[1]]
         return np.concatenate((best, np.take_along_axis(order, others, axis=1)), axis=1).astype(np.int64)
 
-    def calibrate(self, number: int = CALIBRATION_SCENES) -> None:
+    def calibrate(self) -> None:
         """Fit predicted success to what geometry says of the chosen plans in scenes that are drawn, always the same.
 
         The choice of plans does not change. The two numbers are those of J. Platt, Probabilistic outputs for support
@@ -408,7 +391,7 @@ class ViaRank(PlanAlgorithm):
         policy, task = self.policy, self.policy.task
         policy.set_training_mode(False)
         chances, labels = [], []
-        for first in range(0, number, BLOCK):
+        for first in range(0, CALIBRATION_SCENES, BLOCK):
             truth, believed, sight = self._drawn([(CALIBRATION, first + each) for each in range(BLOCK)])
             actions, success = policy.best(believed, sight)
             # In hand space, exact geometry keeps room at a straight elbow that successful movements need not keep.
@@ -429,9 +412,6 @@ class ViaRank(PlanAlgorithm):
     def _sampler(self) -> SceneSampler:
         """Sampler of the scenes that are learned from."""
         return self.policy.task.sampler()
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_sampler"]
 
 
 ALGORITHMS["viarank"] = ViaRank

@@ -5,12 +5,17 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import shutil
 import sys
+import warnings
+from collections import defaultdict
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any, TextIO
 
 import gymnasium as gym
+import numpy as np
 import pandas as pd
 
 from viapoint.envs.arms.registry import arm_of
@@ -19,16 +24,17 @@ from viapoint.training import trainer as training
 from viapoint.training.agents.agent import Agent, best_model, load_agent
 from viapoint.training.checks import SHIPPED_IDS
 from viapoint.training.configs import AgentConfig, EvaluateConfig, PlayConfig, RecordConfig, TrainConfig
-from viapoint.training.datasets import dataset_folder, record_dataset
 from viapoint.training.evaluation import evaluate as measure
 from viapoint.training.files import BadFileError, read_json, versions, write_json
 from viapoint.training.planning import benchmark
-from viapoint.training.planning.baselines import agent_method, make_method
+from viapoint.training.planning.baselines import Method, PlannerMethod, agent_method, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.report import scene_progress
 from viapoint.training.scene_sets import evenly_spread, scenes_for
 
 MOST_FAULTS = 10  # Greatest number of problems that are named with what is wrong
+# Groups, name and version of a dataset, as Minari allows them; it does not always ask for a version
+DATASET_ID = re.compile(r"([-\w]{2,}/)*[-\w]+-v\d+")
 
 
 def train(config: TrainConfig) -> None:
@@ -162,7 +168,83 @@ def record(config: RecordConfig) -> None:
         method = make_method(name, env_id, **env_kwargs)
     usual = re.sub(r"[^-\w/]+", "-", f"{env_id.rpartition('-v')[0]}/{method.name}")  # a name of Minari
     dataset = f"{usual}-v0" if config.dataset is None else config.dataset
-    with scene_progress() as progress:
-        found = record_dataset(dataset, env_id, env_kwargs, method, config.episodes, config.seed, progress)
+    found = record_dataset(dataset, env_id, env_kwargs, method, config.episodes, config.seed)
     print(f"{found.total_episodes} episodes, {found.total_steps} decisions: {dataset_folder(dataset)}")
     print(f"load them with minari.load_dataset({dataset!r})")
+
+
+def dataset_folder(dataset_id: str) -> Path:
+    """Return the folder of a dataset, in MINARI_DATASETS_PATH or, by default, in ~/.minari/datasets."""
+    from minari.storage import get_dataset_path
+
+    if not DATASET_ID.fullmatch(dataset_id):
+        allowed = "letters, digits, - and _, two or more in a group"
+        raise ValueError(f"dataset must be named like group/name-v0, of {allowed}, got {dataset_id!r}")
+    return Path(get_dataset_path(dataset_id))
+
+
+def record_dataset(
+    dataset_id: str, env_id: str, env_kwargs: Mapping[str, Any], method: Method, episodes: int, seed: int = 0
+) -> Any:
+    """Record episodes of a method as a Minari dataset, such as group/name-v0, and return it.
+
+    Episode i is reset with `seed + i`. Actions are in single precision, as the action space has them, so that a replay
+    gives the same.
+
+    Raises:
+        ValueError: The dataset exists, its name is not allowed, or decisions of the method are no actions.
+        ImportError: Minari is not installed.
+    """
+    import minari
+
+    if isinstance(method, PlannerMethod):
+        raise ValueError(f"movements of {method.name} are no actions; those of an agent or search512 are")
+    folder = dataset_folder(dataset_id)
+    if folder.exists():
+        raise ValueError(f"dataset {dataset_id} exists in {folder}; name another one, or a new version")
+    with scene_progress() as progress, closing(gym.make(env_id, **env_kwargs)) as env:
+        buffers = []
+        for episode in range(episodes):
+            buffers.append(_episode(env, method, episode, seed + episode))
+            progress(method.name, episode + 1, episodes)
+        told = f"{episodes} episodes of {method.name} in {env_id}, seeds {seed} to {seed + episodes - 1}"
+        about: Any = {"algorithm_name": method.name, "description": told}
+        with warnings.catch_warnings():
+            # An author, a web address and an evaluation environment may be missing.
+            warnings.simplefilter("ignore", UserWarning)
+            try:
+                return minari.create_dataset_from_buffers(dataset_id, buffers, env=env, **about)
+            except BaseException:
+                shutil.rmtree(folder, ignore_errors=True)  # a dataset is whole, or not there
+                raise
+
+
+def _episode(env: gym.Env[Any, Any], method: Method, number: int, seed: int) -> Any:
+    """Play one episode, and return it as a buffer of Minari.
+
+    Minari's DataCollector would do so with JAX, which nothing else here needs.
+    """
+    from minari.data_collector import EpisodeBuffer
+
+    unwrapped: Any = env.unwrapped
+    observation, _ = env.reset(seed=seed)
+    seen = [observation]
+    infos: list[dict[str, Any]] = []
+    names = ("actions", "rewards", "terminations", "truncations")
+    played: dict[str, list[Any]] = defaultdict(list)
+    over = False
+    while not over:
+        batch = {name: part[None] for name, part in observation.items()}
+        decided = method.decide(batch, unwrapped.batch.scenes)[0]
+        action = np.clip(decided, -1.0, 1.0).astype(np.float32)
+        observation, *result, info = env.step(action)
+        seen.append(observation)
+        infos.append(info)
+        for name, value in zip(names, (action, *result), strict=True):
+            played[name].append(value)
+        over = any(result[1:])
+    observations = {name: np.stack([each[name] for each in seen]) for name in observation}
+    reports = {name: np.array([each[name] for each in infos]) for name in infos[0]}
+    actions = np.stack(played.pop("actions"))
+    told = {"id": number, "seed": seed, "observations": observations, "actions": actions, "infos": reports}
+    return EpisodeBuffer(**told, **played)
