@@ -12,6 +12,7 @@ import pytest
 from frozen_scenes import shipped_path
 from gymnasium.wrappers import FlattenObservation, NormalizeObservation, RescaleAction
 from helpers import JUMPS, MOVING, PANDA, PLANE, REACH, SENSED, STEP
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecExtractDictObs, VecFrameStack, VecNormalize
@@ -200,6 +201,7 @@ ZERO = np.zeros((2, 3))
 CALLS = [
     *(lambda name=name: make_method(name, PLANE) for name in ("magic", "search", "search3", "sobol0")),
     *(lambda name=name: make_method(name, MOVING) for name in ("constant", "rest:ompl", "ompl")),
+    lambda: SAC("MultiInputPolicy", ViaVecEnv(PLANE, 1), buffer_size=2, replay_buffer_class=HerReplayBuffer),
     lambda: benchmark_planner("search99999999999"),
     *(lambda more=more: GeometrySearch(PLANE, **more) for more in (
         {"n_checks": 10**6}, {"refinements": 64, "per_round": 2048}, {"n_checks": 1.5}, {"refinements": -1},

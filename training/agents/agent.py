@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import sb3_contrib
 import stable_baselines3
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -120,6 +121,15 @@ class Agent(BaseAlgorithm):
             )
         model.trainable = env is not None
         return model
+
+    def _setup_model(self) -> None:
+        buffer = getattr(self, "replay_buffer_class", None)
+        if buffer is not None and issubclass(buffer, HerReplayBuffer):
+            raise ValueError(
+                "HerReplayBuffer does not apply: the observation has no achieved_goal, and the reward of another goal "
+                "depends on contact and jerk of a movement that was not made; leave replay_buffer_class out"
+            )
+        super()._setup_model()  # type: ignore[safe-super]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         if not self.trainable:
