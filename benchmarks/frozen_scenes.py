@@ -16,7 +16,6 @@ import contextlib
 import dataclasses
 import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,10 +41,10 @@ from viapoint.training.scene_sets import (
     OBSTACLE_PARTS,
     SCENE_PARTS,
     SETS,
-    SHIPPED,
     FrozenScenes,
-    load,
     save_sets,
+    shipped_path,
+    shipped_sets,
 )
 
 SEEDS = {"validation": 11, "test": 12, "hard": 13, "uniform": 14}  # First part of seeds
@@ -181,18 +180,6 @@ class Maker:
                 clearance = plan_clearances(self.task, problem, decided[:, None], 0.0, 0.0, exact=True)
                 solved[rows] &= clearance[:, 0] >= 0.0
         return solved
-
-
-def shipped_path(env_id: str) -> Path:
-    """Return the path of the file that holds the shipped sets of an environment."""
-    return SHIPPED / f"{env_id.removeprefix('viapoint/')}.npz"
-
-
-def shipped_sets(path: Path) -> dict[str, FrozenScenes]:
-    """Return the sets of a shipped file by their names."""
-    with np.load(path, allow_pickle=False) as archive:
-        names = [name for name in SETS if f"{name}/task" in archive]
-    return {name: load(path, name) for name in names}
 
 
 def rounded(scenes: Scenes) -> Scenes:

@@ -6,7 +6,6 @@ import dataclasses
 import frozen_scenes as make
 import numpy as np
 import pytest
-from frozen_scenes import shipped_path, shipped_sets
 from helpers import MOVING, PLANE, REACH
 
 from viapoint.envs import ENV_IDS, Task
@@ -21,7 +20,9 @@ from viapoint.training.scene_sets import (
     drawn,
     load,
     scenes_for,
+    shipped_path,
     shipped_set,
+    shipped_sets,
 )
 
 FILES = sorted(shipped_path(PLANE).parent.glob("*.npz"))

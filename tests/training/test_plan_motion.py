@@ -8,7 +8,6 @@ import sys
 
 import numpy as np
 import pytest
-from frozen_scenes import shipped_path
 from helpers import PANDA as PANDA_TASK
 from helpers import PLANE, UR5E, WHOLE, scenes_of
 
@@ -48,7 +47,7 @@ from viapoint.training.planning.movements import (
 from viapoint.training.planning.rrt_connect import clear_path, points_on
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
-from viapoint.training.scene_sets import BANDS, load, scenes_for
+from viapoint.training.scene_sets import BANDS, load, scenes_for, shipped_path
 
 PANDA = arm_of("panda")
 GOAL = PANDA.home + np.array([0.8, 0.5, 0.0, 0.6, 0.0, 0.3, 0.0])

@@ -9,7 +9,6 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from frozen_scenes import shipped_path
 from gymnasium.wrappers import FlattenObservation, NormalizeObservation, RescaleAction
 from helpers import JUMPS, MOVING, PANDA, PLANE, REACH, SENSED, STEP
 from stable_baselines3 import HerReplayBuffer
@@ -50,7 +49,7 @@ from viapoint.training.planning.baselines import agent_method, make_method
 from viapoint.training.planning.benchmark import benchmark_planner
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
-from viapoint.training.scene_sets import load, scenes_for
+from viapoint.training.scene_sets import load, scenes_for, shipped_path
 
 CHANGING = MOVING, JUMPS
 STALLING = {"stop_when_stalled": 0.3}
