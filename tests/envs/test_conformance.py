@@ -271,7 +271,8 @@ def test_a_loop_as_in_cleanrl_learns():
     torch = pytest.importorskip("torch")
     torch.manual_seed(0)
     number, steps = 32, 4
-    envs = wrappers.FlattenObservation(native("viapoint/PlanarReach-v0", number=number))
+    envs = gym.make_vec("viapoint/PlanarReach-v0", num_envs=number, autoreset_mode="NextStep")
+    envs = wrappers.FlattenObservation(envs)
     envs = wrappers.RecordEpisodeStatistics(envs)
     size, actions = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     actor = torch.nn.Sequential(torch.nn.Linear(size, 32), torch.nn.Tanh(), torch.nn.Linear(32, actions))
