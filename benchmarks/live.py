@@ -33,7 +33,7 @@ def main() -> None:
     tests = Path(__file__).parents[1] / "tests"
     sys.path += [str(tests), str(tests / "training")]
     import browser
-    from test_live_page import drag, steady
+    from test_live_page import on_screen, steady
 
     torch.set_num_threads(1)  # as the command `viapoint live` does
     window = browser.Browser()
@@ -48,7 +48,8 @@ def main() -> None:
             goal = tool(session.state.scene.goal)
             other = goal + DISTANCE * np.sign(middle - goal) * (1.0, 1.0, 0.0)
             for k in range(DRAGS):
-                drag(tab, session, tool(session.state.scene.goal), (other, goal)[k % 2], steps=STEPS)
+                ends = tool(session.state.scene.goal), (other, goal)[k % 2]
+                tab.drag(*(on_screen(tab, session, place) for place in ends), steps=STEPS)
                 time.sleep(0.3)
                 browser.wait_for(lambda s=session: s.idle)
             taken = 1e3 * np.array(session.latencies)
