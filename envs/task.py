@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.registry import arm_of
+from viapoint.envs.arms.registry import arm_names, arm_of
 from viapoint.envs.common.validation import (
     fewest_and_most,
     finite_array,
@@ -21,7 +21,7 @@ from viapoint.envs.common.validation import (
     record_of,
     whole_number,
 )
-from viapoint.envs.geometry.shapes import check_kinds
+from viapoint.envs.geometry.shapes import PLAIN_KINDS, REGISTERED_MESHES, check_kinds
 from viapoint.envs.observation import ObservationLayout
 from viapoint.envs.outcome import SETTLING, TOLERANCES, Tolerance
 from viapoint.envs.plans import (
@@ -131,6 +131,12 @@ class Task:
         plane = is_planar(arm)
         shapes = (PLANE_SHAPES if plane else SPACE_SHAPES) if shapes is None else shapes
         kinds = check_kinds(names_of("shapes", shapes))
+        single = [kind for kind in kinds if kind in PLAIN_KINDS or kind in REGISTERED_MESHES]
+        if len(single) < len(kinds):
+            raise ValueError(
+                f"shapes must be some of {', '.join((*PLAIN_KINDS, *REGISTERED_MESHES))}, got {', '.join(kinds)}; "
+                "register_mesh gives a mesh a name, and PointCloud.covering gives the spheres of a cloud"
+            )
         families = default_families(plane, kinds, n_obstacles[1]) if families is None else families
         names = names_of("families", families)
         if isinstance(sensor, str):
@@ -273,6 +279,10 @@ class Task:
         """Return the task as plain values for JSON, which :meth:`of` takes again; the arm by its name, or its file."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         values["arm"] = self.arm.file or self.arm.name
+        if not self.arm.file and self.arm.name not in arm_names():
+            raise ValueError(
+                f"the arm {self.arm.name!r} has no file that a task could be read from again: call register_arm with it"
+            )
         values["space"] = values.pop("space_name")
         values["reward_weights"] = dataclasses.asdict(values.pop("weights"))
         sensor = values.pop("sensor")

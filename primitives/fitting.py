@@ -260,7 +260,10 @@ def _checked(time_name: str, time: Any, name: str, position: Any, fewest: int) -
     order = "must ascend: sort the samples, and keep one of equal times"
     require(ascending.reshape(*batch, count), time_name, times.reshape(*batch, count), order)
     moves = np.ptp(places, axis=1).any(axis=-1)
-    require(moves, name, 1.0 * moves, "must change: there is no movement in equal samples")
+    if not moves.all():
+        still = int(moves.argmin())
+        which = f" of movement {still}" if batch else ""
+        raise ValueError(f"{name}{which} must change, all samples are {places[still, 0].tolist()}")
     return list(zip(times, places, strict=True)), batch, position
 
 

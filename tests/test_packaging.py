@@ -14,6 +14,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
@@ -153,6 +154,14 @@ def test_modules_models_scenes_agents_and_the_command_are_inside_and_nothing_els
 IMPORT = re.compile(r"^\s*(?:from (\w[\w.]*) import |import (\w[\w.]*)(?: as \w+)?$)", re.MULTILINE)
 OF_OTHER_NAMES = {"yaml", "pil", "mpl_toolkits", "glfw"}
 """PyYAML, and what Matplotlib and MuJoCo bring."""
+
+
+def test_links_of_the_description_lead_to_the_repository(tmp_path):
+    jobs = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text())["jobs"]
+    (script,) = [step["run"] for step in jobs["build"]["steps"] if step.get("name", "").startswith("Links")]
+    shutil.copy(ROOT / "README.md", tmp_path)
+    names = {**os.environ, "GITHUB_REPOSITORY": "o/r", "GITHUB_REF_NAME": "v1"}
+    subprocess.run(["bash", "-ec", script], cwd=tmp_path, env=names, check=True)
 
 
 @pytest.mark.parametrize("folder", FOLDERS)

@@ -74,6 +74,11 @@ def check_families(families: Sequence[str], plane: bool, kinds: Iterable[str], m
         ValueError: A name is unknown, or a family needs other kinds or more obstacles.
     """
     known = scene_families(plane)
+    if not most and tuple(families) != default_families(plane, kinds, most):
+        raise ValueError(
+            f"families need n_obstacles of 1 or more, or (0, 1) for one without obstacles, got {', '.join(families)}; "
+            "without, ends are free configurations"
+        )
     for name in families:
         if name not in known:
             others = "others need register_scene_family in this process"

@@ -93,6 +93,10 @@ def draw_given(
     if "turns" in options:
         turns = _rows("turns", options["turns"], (number, sampler.rows, 4))
         given = (turns != 0.0).any(axis=-1)
+        absent = given & ~obstacles.present
+        if absent.any():
+            row = int(absent.any(axis=0).argmax())
+            raise ValueError(f"options['turns']: obstacle {row} is not there, and cannot turn")
         scenes.turn_time[given] = turns[given][:, 0]
         scenes = scenes._replace(turn_velocity=turns[..., 1:].copy())
     # What is wrong with the given parts is said before others are drawn around them.

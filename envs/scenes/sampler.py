@@ -119,6 +119,11 @@ class SceneSampler:
             pending = pending[~found]
             if not len(pending):
                 return draft.scenes.with_rows(self.rows)
+        if "obstacles" in given:
+            raise RuntimeError(
+                f"obstacles must leave room for start and goal of the arm {self.task.arm.name!r}, but in {ATTEMPTS} "
+                "attempts no free ones were found; give fewer or other obstacles, or both ends"
+            )
         raise RuntimeError(
             f"no scene of the families {', '.join(self.task.families)} with {self.room.fewest} to {self.room.most} "
             f"obstacles was found in {ATTEMPTS} attempts for the arm {self.task.arm.name!r}; allow fewer obstacles or "

@@ -190,9 +190,8 @@ def test_a_mesh_survives_json_and_one_without_a_name_changes_nothing():
     first, _ = env.reset(seed=1, options={**PANDA_ENDS, "obstacles": [mesh]})
     text = ve.scene_to_json(env.batch.scenes, env.task.arm)
     same(env.reset(seed=1, options=ve.scene_from_json(text))[0], first)
-    other = gym.make(PANDA, shapes=("box", "convex_mesh"), families="clutter").unwrapped
     with pytest.raises(ValueError, match="register_mesh"):
-        other.reset(seed=2, options={**PANDA_ENDS, "obstacles": [mesh]})
+        gym.make(PANDA, shapes=("box", "convex_mesh"))
 
 
 def test_where_nothing_fits_the_random_generator_stays_as_it_was():
@@ -202,7 +201,7 @@ def test_where_nothing_fits_the_random_generator_stays_as_it_was():
     start = np.array([0.2, 0.5, 0.0])
     ways = 0.56 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
     walls = [ve.Box((0.5, 0.5, 0.04), position=start + way) for way in ways]
-    with pytest.raises(ValueError, match="was found"):
+    with pytest.raises(ValueError, match="leave room"):
         refused.reset(options={"start": start, "obstacles": walls})
     same(refused.reset()[0], usual.reset()[0])
 

@@ -440,7 +440,7 @@ def test_a_plane_movement_needs_no_other_columns_and_is_that_of_the_function(tmp
     written = pd.read_csv(tmp_path / "fit.csv").iloc[0]
     np.testing.assert_allclose(written[["via1_x", "via1_y"]].astype(float), fit.via_points[0], atol=1e-9)
     assert "via1_z" not in written
-    for format_ in ({"sep": ";", "decimal": ","}, {"sep": "\t"}, {"sep": " "}):
+    for format_ in ({"sep": ";", "decimal": ","}, {"sep": "\t", "decimal": ","}, {"sep": " "}):
         table.assign(movement="1,5").rename(columns=str.title).to_csv(path, index=False, **format_)
         run("fit", path, "--out", tmp_path, "--n-via", 1, "--no-free-ends")
         again = pd.read_csv(tmp_path / "fit.csv", dtype={"movement": str}).iloc[0]
@@ -448,20 +448,20 @@ def test_a_plane_movement_needs_no_other_columns_and_is_that_of_the_function(tmp
         pd.testing.assert_series_equal(again, written.drop("movement"), check_dtype=False)
 
 
-@pytest.mark.parametrize(("column", "told"), [("time", "seconds"), ("x", "metres")])
-def test_other_units_than_seconds_and_metres_are_told(column, told, tmp_path, capsys):
+FILTERED = "where samples were filtered"
+
+
+@pytest.mark.parametrize(
+    ("scaled", "most", "told"), [("time", 1, "seconds"), ("x", 1, "metres"), ([], 1, FILTERED), ([], 2, "")]
+)
+def test_other_units_and_the_most_via_points_are_told(scaled, most, told, tmp_path, capsys):
     table = recorded("time", "x", "y")
-    table[column] *= 1000.0
+    table[scaled] *= 1000.0
     table.to_csv(tmp_path / "one.csv", index=False)
-    run("fit", tmp_path / "one.csv", "--out", tmp_path, "--n-via", 1)
-    assert told in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("most", "told"), [(1, True), (2, False)])
-def test_the_most_via_points_are_told(most, told, tmp_path, capsys):
-    recorded("time", "x", "y").to_csv(tmp_path / "one.csv", index=False)
     run("fit", tmp_path / "one.csv", "--out", tmp_path, "--n-via", 0, most)
-    assert ("where samples were filtered" in capsys.readouterr().err) == told
+    printed = capsys.readouterr().err
+    assert told in printed
+    assert (FILTERED in printed) == (most == 1)
 
 
 def test_movements_that_cannot_be_fitted_are_left_out_and_doubtful_ones_told(tmp_path, capsys):
@@ -503,7 +503,7 @@ TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
         (["", *TABLE[:3], "0.1,,0.2"], "line 5, column x: nothing"),
         (["time,x,y,x", "0.0,0.1,0.2,0.1"], "several columns x"),
         (["time,x,y,movement", "0.0,0.1,0.2,a", "", "0.1,0.1,0.2,"], "names no movement in line 4"),
-        (["time,x,y,movement", "0.0,0.1,0.2,null"], "names no movement in line 2"),
+        (["time,x,y,movement", "0.0,0.1,0.2,NA"], "names no movement in line 2; NA"),
     ],
 )
 def test_lines_at_fault_are_told_by_their_number_in_the_file(lines, told, tmp_path, failed):

@@ -81,7 +81,8 @@ def read_movements(path: Path) -> Movements:
         print(f"columns that are not read: {', '.join(unread)}; {told}", file=sys.stderr)
     labels = table["movement"].str.strip() if "movement" in table else pd.Series("1", index=table.index)
     if labels.isna().any():
-        raise BadFileError(path, f"names no movement in line {labels.isna().idxmax()}")
+        line = labels.isna().idxmax()
+        raise BadFileError(path, f"names no movement in line {line}; NA, null and the like stand for no name")
     begins = labels[labels != labels.shift()]
     again = begins[begins.duplicated()]
     if len(again):
@@ -145,7 +146,7 @@ def _read_table(path: Path) -> pd.DataFrame:
     if twice:
         raise BadFileError(path, f"has several columns {twice[0]}")
     samples = table.iloc[1:].dropna(how="all").set_axis(head, axis="columns")  # without blank lines
-    if separator == ";":  # of spreadsheets where decimals have commas
+    if separator != ",":  # of spreadsheets where decimals have commas
         numbers = samples.columns != "movement"
         samples.loc[:, numbers] = samples.loc[:, numbers].replace(",", ".", regex=True)
     return samples
