@@ -186,8 +186,8 @@ def test_a_mesh_survives_json_and_one_without_a_name_changes_nothing():
     ve.register_mesh("pebble", vertices)
     ve.register_mesh("gravel", vertices[::-1])
     env = gym.make(PANDA, shapes=("box", "gravel"), families="clutter").unwrapped
-    mesh = {"shape": "gravel", "position": (0.5, -0.5, 0.5)}
-    first, _ = env.reset(seed=1, options={**PANDA_ENDS, "obstacles": [mesh]})
+    mesh = {"obstacles": [{"shape": "gravel", "position": (0.5, -0.5, 0.5)}]}
+    first, _ = env.reset(seed=1, options={**PANDA_ENDS, **mesh})
     text = ve.scene_to_json(env.batch.scenes, env.task.arm)
     same(env.reset(seed=1, options=ve.scene_from_json(text))[0], first)
     with pytest.raises(ValueError, match="register_mesh"):

@@ -448,11 +448,8 @@ def test_a_plane_movement_needs_no_other_columns_and_is_that_of_the_function(tmp
         pd.testing.assert_series_equal(again, written.drop("movement"), check_dtype=False)
 
 
-FILTERED = "where samples were filtered"
-
-
 @pytest.mark.parametrize(
-    ("scaled", "most", "told"), [("time", 1, "seconds"), ("x", 1, "metres"), ([], 1, FILTERED), ([], 2, "")]
+    ("scaled", "most", "told"), [("time", 1, "seconds"), ("x", 1, "metres"), ([], 1, "filtered"), ([], 2, "")]
 )
 def test_other_units_and_the_most_via_points_are_told(scaled, most, told, tmp_path, capsys):
     table = recorded("time", "x", "y")
@@ -461,7 +458,7 @@ def test_other_units_and_the_most_via_points_are_told(scaled, most, told, tmp_pa
     run("fit", tmp_path / "one.csv", "--out", tmp_path, "--n-via", 0, most)
     printed = capsys.readouterr().err
     assert told in printed
-    assert (FILTERED in printed) == (most == 1)
+    assert ("filtered" in printed) == (most == 1)
 
 
 def test_movements_that_cannot_be_fitted_are_left_out_and_doubtful_ones_told(tmp_path, capsys):
