@@ -490,8 +490,7 @@ def test_no_obstacle_comes_while_the_arm_settles(speed) -> None:
 
 def test_the_benchmark_is_that_of_the_literature() -> None:
     arm, problems = benchmark_panda(), benchmark_problems()
-    assert len(problems) == 700
-    assert len(arm.spheres.radius) == 59
+    assert (len(problems), len(arm.spheres.radius)) == (700, 59)
     faults = []
     for each in problems:
         plan = plan_motion(arm, each.start, each.goal, each.obstacles, time_limit=0.0)
@@ -666,7 +665,7 @@ def test_planners_are_measured_on_problems_of_another_arm(tmp_path, capsys, fail
 
 
 def test_narrow_passages_that_a_search_finds_are_planned() -> None:
-    # A third of these scenes were not solved when every refinement asked for a clearance of 4 cm.
+    """A third of these scenes were not solved when every refinement asked for a clearance of 4 cm."""
     task = registered_task(WHOLE)
     frozen = scenes_for("validation", task, 60)
     hard = frozen.take(frozen.band == len(BANDS) - 1).scenes
