@@ -62,7 +62,7 @@ class Spheres(NamedTuple):
     Groups of more than PART spheres are divided into parts of PART neighbours, the last one of fewer. Their bounding
     spheres stand behind those of the groups. A group of fewer has none.
     """
-    room: float = 0.0  # Distance that is added to the clearance of the arm from itself, [m]
+    self_allowance: float = 0.0  # Distance that is added to the clearance of the arm from itself, [m]
 
 
 @inner

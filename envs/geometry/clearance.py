@@ -250,12 +250,12 @@ def nearest_spheres(
     """Return the clearance of a pair of groups, at most `least`, [m], and the spheres that have it, -1 for none."""
     first, second = spheres.pairs[pair, 0], spheres.pairs[pair, 1]
     # Most pairs are apart, which takes less time to see than a call.
-    sizes = spheres.ball_radius[first] + spheres.ball_radius[second] - spheres.room
+    sizes = spheres.ball_radius[first] + spheres.ball_radius[second] - spheres.self_allowance
     if _are_apart(placed.ball, first, placed.ball, second, sizes + least):
         return least, -1, -1
-    within, stop = least - spheres.room, floor - spheres.room
+    within, stop = least - spheres.self_allowance, floor - spheres.self_allowance
     apart, one, other = _nearest_spheres(spheres, placed, first, second, within, stop)
-    return apart + spheres.room if one >= 0 else least, one, other
+    return apart + spheres.self_allowance if one >= 0 else least, one, other
 
 
 @inner

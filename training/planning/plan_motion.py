@@ -114,12 +114,12 @@ class _Problem(NamedTuple):
     def setting(self, near: float = np.inf) -> Setting:
         """Return arm and space; in the plane without spheres that are farther than `near` from all obstacles, [m]."""
         found = arm_setting(self.arm, self.space.of_hand, self.obstacles, room=-RANGE_TOLERANCE, near=near)
-        return found._replace(spheres=found.spheres._replace(room=self.margin))
+        return found._replace(spheres=found.spheres._replace(self_allowance=self.margin))
 
     @property
     def spheres(self) -> Spheres:
-        """Spheres of the arm. Only obstacles are kept at the margin: parts of some arms are always nearer."""
-        return self.arm.spheres._replace(room=self.margin)
+        """Spheres of the arm. The margin is not for the arm itself: parts of some arms are always near one another."""
+        return self.arm.spheres._replace(self_allowance=self.margin)
 
     @property
     def in_motion(self) -> bool:
@@ -701,7 +701,7 @@ def _search_around(
         if found is None:
             continue
         free += found.success
-        if best is None or (found.success, best.jerk) > (best.success, found.jerk):
+        if best is None or (found.success, -found.jerk) > (best.success, -best.jerk):
             best = found
         if free >= problem.enough + (best.jerk > JAGGED):
             return best, tried
@@ -862,7 +862,7 @@ def _known(
     if clearance is None or clearance >= NEAR or problem.moves:
         clearance = _exact(problem, movement)
     kept = clearance
-    if problem.margin > 0.0 and clearance != OUTSIDE:  # of which own clearances have more
+    if problem.margin > 0.0 and clearance != OUTSIDE:  # in which own clearances count with the margin
         clearance = min(clearance, _exact(problem._replace(margin=0.0), movement))
     cost = np.einsum("ij,id,jd->", table.cost[times], movement.offsets, movement.offsets)
     straight_cost = float(straight_jerk_cost(float(np.linalg.norm(problem.goal - problem.start)), 1.0))

@@ -234,7 +234,7 @@ def _add_obstacles(time: float, wanted: float, work: _Work) -> tuple[float, floa
 def _add_own(wanted: float, work: _Work) -> tuple[float, float]:
     """Add the residuals of the placed arm from itself; return their sum of squares, and the least clearance."""
     spheres, placed, total, nearest = work.setting.spheres, work.placed, 0.0, wanted
-    wanted += spheres.room
+    wanted += spheres.self_allowance
     for pair in range(len(spheres.pairs)):
         least, one, other = nearest_spheres(spheres, placed, pair, wanted, -1e9)
         if one < 0:
@@ -247,7 +247,7 @@ def _add_own(wanted: float, work: _Work) -> tuple[float, float]:
         work.pull[:] = 0.0
         _pull(work, one, spheres.link[spheres.pairs[pair, 0]], x, y, z, -1.0)
         _pull(work, other, spheres.link[spheres.pairs[pair, 1]], x, y, z, 1.0)
-        nearest = min(nearest, least - spheres.room)
+        nearest = min(nearest, least - spheres.self_allowance)
         missing = wanted - least
         total += missing * missing
         _add_residual(missing, work)
