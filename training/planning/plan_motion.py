@@ -66,7 +66,7 @@ SPREADS = 0.8, 1.0
 HAND_SPREADS = 0.15, 0.3  # Spreads of the same seeds in hand space, [m]
 NARROW = 8  # Number of seeds with the first spread
 # Number of seeds after which a path is looked for, where none became free, and of seeds along this path
-EARLY, ALONG = 8, 4
+EARLY, ALONG = 4, 4
 # Paths that are looked for in turn: clearances beyond what movements keep, as shares of those of the ends up to ROOM,
 # [m], of which smooth movements need some; and greatest shares of the time that is left. Random seeds follow the first
 # turn.

@@ -10,15 +10,19 @@ import math
 
 import numpy as np
 
-from viapoint.envs.arms.kinematics import Chain, Spheres
+from viapoint.envs.arms.inverse_kinematics import descend
+from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position
 from viapoint.envs.common.arrays import Float, Int, norm
 from viapoint.envs.geometry.clearance import Placed, memory, obstacle_clearance, place, self_clearance
-from viapoint.envs.geometry.compiled import clock, compiled, inlined, inner, kernel
+from viapoint.envs.geometry.compiled import clock, compiled, inlined, inner, kernel, rotated
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.training.planning.movements import Setting
 
 SPACING = 0.03  # Greatest way of a part of the arm by one joint between two checks along a line, [m]
 STEP = 1.0  # Longest step of a tree, [rad]
+# Share of targets at which the tool of some node is shifted, by FAR at most along each axis, [m]. Out of a narrow shelf
+# an arm pulls its hand back along a line, which random targets in joint space seldom hit.
+SHIFTED, FAR = 0.05, 0.3
 METRE = 4.0  # Angle that counts as much as a metre of a sliding joint, [rad]
 MOST_NODES, MOST_SAMPLES = 20_000, 300_000  # Greatest numbers of nodes of a tree and of its targets
 SHORTCUTS = 200  # Number of shortcuts that are tried
@@ -60,10 +64,13 @@ def clear_path(
     for _ in range(MOST_SAMPLES):
         if count.max() == MOST_NODES or clock() > until:
             break
-        for j in range(joints):
-            target[j] = rng.uniform(low[j], high[j])
         one = int(count[0] > count[1])  # the smaller tree grows
         other = 1 - one
+        if rng.uniform(0.0, 1.0) < SHIFTED:
+            _shift(setting, node[one, int(rng.uniform(0.0, count[one]))], rng, target, placed)
+        else:
+            for j in range(joints):
+                target[j] = rng.uniform(low[j], high[j])
         if _grow(setting, node[one], parent[one], count, one, target, obstacles, margin, here, placed) < 0.0:
             continue
         reached = node[one, count[one] - 1]
@@ -80,6 +87,21 @@ def clear_path(
             )
             return path[:length]
     return np.empty((0, joints))
+
+
+@compiled
+def _shift(setting: Setting, node: Float, rng: np.random.Generator, target: Float, placed: Placed) -> None:
+    """Fill in a target with the tool of a node shifted at random, and turned as before if joints suffice for that."""
+    chain = setting.chain
+    last = len(node)
+    _copy(node, target)
+    here = tool_position(chain, node, placed.rotation, placed.origin)
+    place, axes = np.empty(3), np.empty((3, 3))
+    for i in range(3):
+        place[i] = here[i] + rng.uniform(-FAR, FAR)
+        turn = chain.tool_rotation
+        axes[0, i], axes[1, i], axes[2, i] = rotated(placed.rotation[last], (turn[0, i], turn[1, i], turn[2, i]))
+    descend(chain, setting.joint_range, place, axes, last >= 6, target)
 
 
 @inner
