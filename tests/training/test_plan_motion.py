@@ -25,8 +25,8 @@ from viapoint.envs import (
     load_arm,
     obstacles_to_json,
 )
-from viapoint.envs.arms.kinematics import torques
-from viapoint.envs.geometry.clearance import row_clearances
+from viapoint.envs.arms.kinematics import link_poses, torques
+from viapoint.envs.geometry.clearance import memory, row_clearances
 from viapoint.envs.geometry.obstacles import pack, unpack
 from viapoint.envs.scenes.options import draw_given
 from viapoint.envs.spaces import space_of
@@ -47,7 +47,7 @@ from viapoint.training.planning.movements import (
     movement_table,
     table_with,
 )
-from viapoint.training.planning.rrt_connect import clear_path, points_on
+from viapoint.training.planning.rrt_connect import _shift, clear_path, points_on
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import BANDS, load, scenes_for, shipped_path
@@ -761,9 +761,8 @@ def test_movements_along_paths_are_smoother_than_those_through_their_points() ->
     durations = np.sqrt(np.linalg.norm(np.diff(points, axis=0), axis=1))
     table = table_with((durations / durations.sum())[None], FINE_INSTANTS)
     _, _, cost = module._moved(given, 0.0, table, points[1:-1], 1.0, np.inf)
-    assert cost < 30.0 * refine.unit_of_jerk(
-        ends[1] - ends[0], False
-    )  # through the points themselves, 1,000 times
+    # Through the points themselves, it has 1,000 times this unit.
+    assert cost < 30.0 * refine.unit_of_jerk(ends[1] - ends[0], False)
 
 
 LIFT = """<mujoco><worldbody><body name="carriage"><joint name="lift" type="slide" axis="0 0 1" range="0 0.5"/>
@@ -797,6 +796,25 @@ def test_a_path_of_trees_is_clear_between_its_ends(arm):
     wall = Box((0.01, 2.0, 2.0), position=(0.25, 0.0, 0.0), quaternion=(0.707, 0.0, 0.0, 0.707))
     rng = np.random.default_rng(5)
     assert not len(clear_path(setting, ends, pack([[*shapes, wall]]), 0.002, rng, 0.1))
+
+
+def test_some_targets_of_trees_shift_the_tool_and_leave_it_turned_as_it_is():
+    """At the limits of the joints, the tool comes as near as it can."""
+    arm = benchmark_panda()
+    setting, placed, rng = (
+        arm_setting(arm, False, pack([[]])),
+        memory(arm.chain, arm.spheres),
+        np.random.default_rng(0),
+    )
+    targets = np.empty((20, len(arm.home)))
+    for target in targets:
+        _shift(setting, arm.home, rng, target, placed)
+    axes, _ = link_poses(arm.chain, np.concatenate((arm.home[None], targets)))
+    kept = np.abs(axes[1:, -1] - axes[0, -1]).max(axis=(1, 2)) < 1e-4
+    shifts = np.abs(arm.hand(targets) - arm.hand(arm.home)).max(axis=-1)
+    assert kept.sum() > 10
+    assert 0.1 < shifts[kept].max() < 0.3
+    assert ((targets >= arm.joint_range[:, 0]) & (targets <= arm.joint_range[:, 1])).all()
 
 
 def test_a_seed_that_is_free_is_not_lost(monkeypatch):
