@@ -139,12 +139,8 @@ def test_train_then_evaluate_then_play(trained, shipped, tmp_path, capsys):
 def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, tmp_path):
     few, file = shipped.take(slice(3, 6)), tmp_path / "validation.npz"
     few.save(file)
-    for words in (
-        ("validation",),
-        ("validation", "--n-scenes", 4),
-        (file,),
-        ("validation", "--n-scenes", 40),
-    ):
+    some = "validation", "--n-scenes"
+    for words in (["validation"], [*some, 4], [file], [*some, 40]):
         run("evaluate", trained, "--baselines", "straight", "--scenes", *words)
     run("evaluate", trained, "--baselines", "random", "--scenes", "validation", "--n-scenes", 4)
     kept = [json.loads(path.read_text()) for path in (trained / "evaluations").glob("validation-*.json")]
@@ -238,7 +234,6 @@ def test_an_interrupted_demo_goes_on_and_what_is_done_is_not_done_again(quick, c
     methods = json.loads((quick.out / "table.json").read_text())["methods"]
     assert {"agent", "agent, 16 checks", "untrained", "search512"} <= set(methods)
     assert methods["straight"]["success"]["rate"] == 0.0
-
     for name in ("evaluate", "gallery", "record_video"):
         monkeypatch.setattr(demo, name, pytest.fail)
     demo.run(quick)
@@ -249,6 +244,8 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     shutil.copy(UR5E, tmp_path / "my_arm.xml")
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "run"
+    few = "--n-scenes", 4, "--scenes", "validation"
+    run("evaluate", "--arm", "my_arm.xml", "--baselines", "straight", "plan_motion", *few)
     run(
         "train", "--arm", "my_arm.xml", "--env-kwargs", "n_obstacles=2",
         "--n-timesteps", 64, "--n-envs", 16, "--eval-every", 0, "--out", folder, "--hyperparameters", *FEW,
@@ -259,14 +256,13 @@ def test_the_command_line_takes_an_arm_of_a_file(tmp_path, monkeypatch) -> None:
     agent = load_agent(folder)
     result = evaluate(agent, baselines=["straight"], scenes="validation", n_scenes=4)
     assert len(result.rows) == 2
-
     seen = agent.observation_space.sample()
     action, _ = agent.predict(seen, deterministic=True)
     (tmp_path / "my_arm.xml").unlink()  # the run keeps a copy
     kept = load_agent(folder)
     assert Run(folder).config.env_kwargs["arm"] == str(folder / "arm.xml")
     np.testing.assert_array_equal(kept.predict(seen, deterministic=True)[0], action)
-    run("evaluate", folder, "--baselines", "straight", "--n-scenes", 4, "--scenes", "validation")
+    run("evaluate", folder, "--baselines", "straight", *few)
 
 
 def test_a_run_goes_on_with_its_copy_of_an_arm(tmp_path, capsys) -> None:
@@ -286,13 +282,6 @@ def test_a_run_goes_on_with_its_copy_of_an_arm(tmp_path, capsys) -> None:
     assert Run(tmp_path / "run").config == Run(tmp_path / "same").config
     first, second = (tmp_path / name / "final" / "weights.safetensors" for name in ("run", "same"))
     assert first.read_bytes() == second.read_bytes()
-
-
-def test_methods_are_measured_on_an_arm_of_a_file(tmp_path) -> None:
-    out = tmp_path / "results.json"
-    words = ["--baselines", "straight", "plan_motion", "--scenes", "validation", "--n-scenes", 4]
-    run("evaluate", "--arm", UR5E, *words, "--json", out)
-    assert out.is_file()
 
 
 GOOD, GONE = "print('fine')", "import no_such_module"
@@ -420,9 +409,8 @@ def test_a_file_gives_a_table_and_a_figure(tmp_path, capsys):
     assert list(table["n_via"]) == [1, 0]
     assert all(name in printed for name in WAYPOINTS)
     around = table.iloc[0]
-    np.testing.assert_allclose(
-        around[["via1_x", "via1_y", "via1_z"]].astype(float), WAYPOINTS["around"][1], atol=5e-3
-    )
+    via = around[["via1_x", "via1_y", "via1_z"]].astype(float)
+    np.testing.assert_allclose(via, WAYPOINTS["around"][1], atol=5e-3)
     np.testing.assert_allclose(around[["duration", "via1_time"]].astype(float), [1.0, 0.5], atol=0.02)
     assert table["via1_x"].isna().tolist() == [False, True]
     assert np.ptp(imread(folder / "fit.png")) > 0.5
