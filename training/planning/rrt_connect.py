@@ -92,16 +92,16 @@ def clear_path(
 @compiled
 def _shift(setting: Setting, node: Float, rng: np.random.Generator, target: Float, placed: Placed) -> None:
     """Fill in a target with the tool of a node shifted at random, and turned as before if joints suffice for that."""
-    chain = setting.chain
-    last = len(node)
-    _copy(node, target)
-    here = tool_position(chain, node, placed.rotation, placed.origin)
+    chain, turn = setting.chain, setting.chain.tool_rotation
+    joints = len(node)
     place, axes = np.empty(3), np.empty((3, 3))
+    here = tool_position(chain, node, placed.rotation, placed.origin)
     for i in range(3):
         place[i] = here[i] + rng.uniform(-FAR, FAR)
-        turn = chain.tool_rotation
-        axes[0, i], axes[1, i], axes[2, i] = rotated(placed.rotation[last], (turn[0, i], turn[1, i], turn[2, i]))
-    descend(chain, setting.joint_range, place, axes, last >= 6, target)
+        axis = turn[0, i], turn[1, i], turn[2, i]
+        axes[0, i], axes[1, i], axes[2, i] = rotated(placed.rotation[joints], axis)
+    _copy(node, target)
+    descend(chain, setting.joint_range, place, axes, joints >= 6, target)
 
 
 @inner
