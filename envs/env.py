@@ -35,6 +35,8 @@ class ReachEnv(gym.Env[Any, Any]):
     metadata = SINGLE_METADATA
 
     def __init__(self, **kwargs: Any) -> None:
+        if "num_envs" in kwargs:
+            raise TypeError("got an unexpected keyword argument 'num_envs'; gym.make_vec makes batches")
         self.batch = ReachVectorEnv(1, **kwargs)
         """Vector environment with one environment."""
         self.observation_space = self.batch.single_observation_space

@@ -64,11 +64,10 @@ def test_arguments_of_one_environment(env_id, kwargs):
 
 def test_an_unknown_argument_is_the_error_that_others_raise():
     """TorchRL looks for these words."""
-    for make in (gym.make, gym.make_vec):
-        with pytest.raises(
-            TypeError, match="got an unexpected keyword argument 'speed'; arguments are arm, "
-        ):
-            make(PLANE, speed=3)
+    arguments = gym.make, "speed", "arguments are arm, "
+    for make, name, told in (arguments, (gym.make_vec, *arguments[1:]), (gym.make, "num_envs", "make_vec")):
+        with pytest.raises(TypeError, match=f"got an unexpected keyword argument '{name}'; .*{told}"):
+            make(PLANE, **{name: 3})
 
 
 def both(env_id):
