@@ -13,7 +13,7 @@ from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, 
 from viapoint.envs.events import NEVER, Event, EventPredictor, next_step
 from viapoint.envs.executor import CONTROL_STRIDE, Executor, Piece, blocks
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
-from viapoint.envs.outcome import SETTLING, Outcome, Rollout, straight_jerk_cost
+from viapoint.envs.outcome import SETTLING, Outcome, Rollout, relative_jerk, straight_jerk_cost
 from viapoint.envs.plans import MAX_START_OFFSET, Motion, Movements, Plan, jerk_cost_between
 from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed
 from viapoint.envs.rewards import reward_terms
@@ -400,7 +400,7 @@ class Episodes:
             first_contact_time=np.where(touched, state.first_contact * timestep, -1.0),
             goal_error=error,
             duration=duration,
-            jerk_ratio=np.maximum(state.jerk_cost / straight, 1.0),
+            jerk_ratio=relative_jerk(state.jerk_cost, straight),
             tracking_error=np.sqrt(state.deviation / np.maximum(state.steps, 1)),
             **same,
         )

@@ -113,3 +113,13 @@ def straight_jerk_cost(length: Float | float, duration: Float | float) -> Float:
     Half the integral of the squared jerk is 360 A^2 / T^5 for length A and duration T.
     """
     return np.asarray(360.0 * length**2 / duration**5)
+
+
+def relative_jerk(cost: Float | float, straight: Float | float) -> Float:
+    """Return jerk costs relative to those of straight movements, at least 1, and 1 where there is no movement at all.
+
+    Where the straight movement is none, but the other one moves, it is NaN.
+    """
+    cost, straight = np.broadcast_arrays(cost, straight)
+    none = np.where(cost == 0.0, 1.0, np.nan)
+    return np.maximum(np.divide(cost, straight, where=straight > 0.0, out=none), 1.0)

@@ -60,17 +60,31 @@ def register_all() -> None:
             )
 
 
+MODULES: dict[str, str] = {}  # Modules that ids were given with
+
+
+def full_id(env_id: str) -> str:
+    """Return an id as it was given, with the module in front of it, if any."""
+    return f"{MODULES[env_id]}:{env_id}" if env_id in MODULES else env_id
+
+
 def check_registered(env_id: str) -> str:
     """Return an id that Gymnasium knows, without the module in front of it (`my_module:my/Task-v0`), which is imported.
 
+    :func:`full_id` returns it with the module.
+
     Raises:
-        ValueError: There is no such module or environment; the message names the closest id.
+        ValueError: It is no id, or there is no such module or environment; the message names the closest id.
     """
+    if not isinstance(env_id, str):
+        raise ValueError(f"env must be the id of an environment, got {env_id!r}")
     module, _, name = env_id.rpartition(":")
     try:
         if module:
             importlib.import_module(module)
         gym.spec(name)
+        if module and name not in ENV_IDS:
+            MODULES[name] = module
     except ImportError as error:
         raise ValueError(f"the module of {env_id!r} cannot be imported: {error}") from error
     except gym.error.Error:

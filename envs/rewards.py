@@ -10,9 +10,11 @@ import numpy as np
 from viapoint.envs.common.arrays import Bool, Float
 from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.outcome import Outcome, straight_jerk_cost
+from viapoint.envs.plans import SHORTEST_DURATION
 
 CLEARANCE_RANGE = (-0.05, 0.01)  # Range in which clearance changes the reward, [m]
 CLEARANCE_UNIT = 0.05  # Unit of the clearance term, [m]
+SMALLEST = 1e-6  # Least length of a way to the goal that rewards are relative to, [m] or [rad]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +82,8 @@ def reward_terms(
     """
     later = ~first  # before the first decision nothing was commanded
     clearance = _bounded(after.planned_clearance) - later * _bounded(before.planned_clearance)
+    # An arm that is at the goal already has no way to go, and needs no time.
+    length, zero_duration = np.maximum(length, SMALLEST), np.maximum(zero_duration, SHORTEST_DURATION)
     cost = straight_jerk_cost(length, zero_duration)  # J_0
     rough = np.log1p(after.jerk_cost / cost) - np.log1p(before.jerk_cost / cost)
     spent = (after.duration - before.duration) / zero_duration

@@ -59,7 +59,7 @@ def check_whole(name: str, value: Any) -> int:
 
 def named_path(name: str, value: str | Path) -> Path:
     """Return a path of its text, which must not be empty: Python would take that for the present folder."""
-    if not str(value):
+    if not isinstance(value, str | Path) or not str(value):
         raise ValueError(f"{name} must name a file or folder, got {value!r}")
     return Path(value).expanduser()
 

@@ -18,7 +18,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.registry import ARM_FILES, arm_of
 from viapoint.envs.common.validation import is_number
-from viapoint.envs.registration import ENV_IDS, check_registered
+from viapoint.envs.registration import ENV_IDS, check_registered, full_id
 from viapoint.envs.task import Task
 from viapoint.primitives.fitting import MOST_VIA_POINTS, USUAL_RANGE
 from viapoint.training.checks import (
@@ -161,8 +161,10 @@ class Config:
         """Check the values."""
         for each in dataclasses.fields(self):
             name, value = each.name, getattr(self, each.name)
-            if isinstance(value, str) and "Path" in str(each.type):
+            if "Path" in str(each.type) and value is not None and name != "packages":
                 value = named_path(name, value)
+            elif str(each.type) == "bool" and not isinstance(value, bool):
+                raise ValueError(f"{name} must be True or False, got {value!r}")
             elif name == "env" and isinstance(value, str):
                 value = check_registered(value)
             elif str(each.type) == "NamedValues":
@@ -287,7 +289,7 @@ class TrainConfig(Config):
         """Command that trains with this configuration, apart from where it is written and what is shown."""
         words = ["viapoint", "train"]
         for name in ("env", "algo", "seed", "n_timesteps", "n_envs", "env_kwargs", "hyperparameters"):
-            value = getattr(self, name)
+            value = full_id(self.env) if name == "env" else getattr(self, name)
             if value not in (None, {}):
                 given = to_words(value) if isinstance(value, dict) else [str(value)]
                 words += [f"--{name.replace('_', '-')}", *given]

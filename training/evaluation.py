@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,7 +30,7 @@ from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import Outcomes, SceneSimulation, joined, whole_task
 from viapoint.training.scene_sets import BANDS, DRAWN, SETS, FrozenScenes, scenes_for
 from viapoint.training.statistics import mcnemar, wilson
-from viapoint.training.vec_env import env_arguments
+from viapoint.training.vec_env import ViaVecEnv, env_arguments
 
 Progress = Callable[[str, int, int], None]  # Method's name, scenes done, all scenes
 
@@ -204,9 +204,9 @@ def evaluate(
     if not isinstance(scenes, str | Path | FrozenScenes):
         raise ValueError(f"scenes must be one of {', '.join(SETS)}, a file or a set, got {scenes!r}")
     settings: list[dict[str, int]] = []
-    for number in [checks] if checks is None or isinstance(checks, int) else checks:
+    for number in checks if isinstance(checks, Iterable) else [checks]:
         settings.append({} if number is None else {"checks": check_whole("checks", number)})
-    for number in [refine] if isinstance(refine, int) else refine:
+    for number in refine if isinstance(refine, Iterable) else [refine]:
         settings.append({"checks": 0, "refine": check_whole("refine", number)})
     if isinstance(agent, str | Path):
         agent = load_agent(agent)
@@ -240,6 +240,9 @@ def _environment_of(agent: Any, env: str | None, env_kwargs: Any) -> tuple[str, 
         if env is None:
             raise ValueError("env must be the id of an environment where no trained agent is given")
         return check_registered(env), whole_task(env, env_kwargs or {})
+    # Stable-Baselines3 loads models without an environment.
+    if agent.get_env() is None and env is not None:
+        agent.set_env(ViaVecEnv(env, agent.n_envs, **(env_kwargs or {})))
     mine, kwargs = env_arguments(agent.get_env())
     if env is not None and check_registered(env) != mine:
         raise ValueError(f"env must be {mine}, on which the agent was trained, or be left out, got {env!r}")

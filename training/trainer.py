@@ -18,6 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
 
+from viapoint.envs.registration import full_id
 from viapoint.training.agents.model_io import build
 from viapoint.training.configs import TrainConfig
 from viapoint.training.evaluation import MethodResult, evaluate, one_thread
@@ -206,7 +207,9 @@ def _restore_settings(run: Run, config: TrainConfig) -> None:
 
 def _resume_command(run: Run) -> str:
     """Return the command that goes on with a run."""
-    return shlex.join(["viapoint", "train", "--resume", "--out", str(run.folder)])
+    env = full_id(run.config.env)  # a run does not know the module that registers an id
+    named = ["--env", env] if env != run.config.env else []
+    return shlex.join(["viapoint", "train", "--resume", *named, "--out", str(run.folder)])
 
 
 class RunCallback(CallbackList):

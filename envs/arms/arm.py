@@ -12,9 +12,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.kinematics import Chain, Spheres, forward, inverse_dynamics
+from viapoint.envs.arms.kinematics import Chain, Spheres, forward, inverse_dynamics, sphere_centres
 from viapoint.envs.arms.spheres import Capsule, LeftOut, cover, overlapping
-from viapoint.envs.common.arrays import Float
+from viapoint.envs.common.arrays import Float, Int, norm
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import add_to_model
 from viapoint.envs.geometry.shapes import as_obstacle
@@ -109,6 +109,18 @@ class Arm:
     def hand(self, joints: Any) -> Float:
         """Return places of the tool, shape (..., 3), [m], for joint positions of shape (..., J)."""
         return forward(self.chain, joints)[0]
+
+    def nearest_bodies(self, joints: Float) -> str:
+        """Return the names of the two bodies that are nearest to one another at joint positions of shape (J,)."""
+        centre, spheres = sphere_centres(self.chain, self.spheres, joints), self.spheres
+
+        def apart(pair: Int) -> float:
+            one, other = (slice(spheres.first[group], spheres.first[group + 1]) for group in pair)
+            away = norm(centre[one, None] - centre[None, other])
+            return float((away - spheres.radius[one, None] - spheres.radius[None, other]).min())
+
+        first, second = min(spheres.pairs, key=apart)
+        return f"{self.group_names[first]} and {self.group_names[second]}"
 
     def compile(self, n_obstacles: int, meshes: Sequence[str] = ()) -> mujoco.MjModel:
         """Return the MuJoCo model of the arm with movable obstacles `obstacle_0`, ..., also registered meshes."""

@@ -16,7 +16,7 @@ import numpy as np
 from viapoint.envs.arms.kinematics import PART, Chain, Spheres, link_frames, transform
 from viapoint.envs.common.arrays import Bool, Float
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.compiled import compiled, inlined, inner, kernel, rotated, rotated_back
+from viapoint.envs.geometry.compiled import Vector, compiled, inlined, inner, kernel, rotated, rotated_back
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.envs.geometry.shapes import Distance, Shape, as_obstacles, local_distance
 
@@ -180,12 +180,13 @@ def group_clearance(
     time: float,
     least: float,
     floor: float,
-) -> tuple[float, int]:
+) -> tuple[float, int, Vector]:
     """Return the clearance of a group of spheres from an obstacle, at most `least`, [m], and the sphere that has it.
 
-    The sphere is -1 if none is nearer than `least`. The arguments are those of :func:`obstacle_clearance`.
+    The third result is the normal of the obstacle there. The sphere is -1 if none is nearer than `least`. The arguments
+    are those of :func:`obstacle_clearance`.
     """
-    nearest = -1
+    nearest, normal = -1, (0.0, 0.0, 0.0)
     ball = spheres.first[group] - 1  # stands for the bounding ball of the group, which comes first
     for sphere in range(ball, spheres.first[group + 1]):
         if sphere == ball:
@@ -199,17 +200,18 @@ def group_clearance(
             y = placed.centre[sphere, 1]
             z = placed.centre[sphere, 2]
         limit = least + radius
-        distance = point_distance_and_normal(obstacles, scene, row, x, y, z, time, limit)[0] - radius
+        distance, a, b, c = point_distance_and_normal(obstacles, scene, row, x, y, z, time, limit)
+        distance -= radius
         if sphere == ball:
             if distance >= least:
                 break
             place_group(spheres, group, placed)
         elif distance < least:
             least = distance
-            nearest = sphere
+            nearest, normal = sphere, (a, b, c)
             if least < floor:
                 break
-    return least, nearest
+    return least, nearest, normal
 
 
 @inner
@@ -237,7 +239,7 @@ def obstacle_clearance(
         for row in range(first, last):
             if obstacles.kind[scene, row] == ABSENT:
                 continue
-            least, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
+            least, _, _ = group_clearance(spheres, placed, group, obstacles, scene, row, time, least, floor)
             if least < floor:
                 return least
     return least
@@ -400,31 +402,28 @@ def movement_clearance(
                 if not is_placed:
                     place(chain, spheres, path[k], placed)
                     is_placed = True
-                most = (least_self if of_pair else least) + WINDOW
-                apart = _nearest(spheres, placed, check, obstacles, scene, begin + k * step, most)
-                bounds.apart[check] = apart
-                if of_pair:
-                    least_self = min(least_self, apart)
-                else:
-                    least = min(least, apart)
-                if not looks_between:
-                    continue
-                way = _way(spheres, bounds, check, drift)
-                low = min(least, least_self)
-                if way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
-                    continue
-                share = _until_next(bound + way, way, low, floor)
+                # First the configuration itself, and then what may be nearer on the way from the one before.
+                time, way, share = begin + k * step, 0.0, 0.0
                 while share < 1.0:
-                    _place_between(chain, spheres, path, k, share, between, placed)
-                    time = begin + (k - 1 + share) * step
+                    if way > 0.0:
+                        _place_between(chain, spheres, path, k, share, between, placed)
+                        is_placed = False
+                        time = begin + (k - 1 + share) * step
                     most = (least_self if of_pair else least) + WINDOW
                     apart = _nearest(spheres, placed, check, obstacles, scene, time, most)
                     if of_pair:
                         least_self = min(least_self, apart)
                     else:
                         least = min(least, apart)
-                    share += _until_next(apart, way, min(least, least_self), floor)
-                is_placed = False
+                    low = min(least, least_self)
+                    if way > 0.0:
+                        share += _until_next(apart, way, low, floor)
+                        continue
+                    bounds.apart[check] = apart
+                    way = _way(spheres, bounds, check, drift)
+                    if not looks_between or way == 0.0 or 0.5 * (bound + apart) >= _certain(low, floor):
+                        break
+                    share = _until_next(bound + way, way, low, floor)
     return least, least_self
 
 
@@ -438,7 +437,7 @@ def _nearest(
         return nearest_spheres(spheres, placed, check - groups, most, -FAR)[0]
     for row in range(obstacles.kind.shape[1]):
         if obstacles.kind[scene, row] != ABSENT:
-            most, _ = group_clearance(spheres, placed, check, obstacles, scene, row, time, most, -FAR)
+            most, _, _ = group_clearance(spheres, placed, check, obstacles, scene, row, time, most, -FAR)
             if most < -FAR:
                 break
     return most

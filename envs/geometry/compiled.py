@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from numba import njit, types
+from numba import njit, typeof, types
 from numba.core.caching import IndexDataCacheFile
 
 from viapoint.envs.common.arrays import Float
@@ -26,17 +26,34 @@ for each array and call. Divisions by zero give infinity instead of an exception
 INNER: dict[str, Any] = {"no_cpython_wrapper": True}  # Further options of functions that Python never calls
 
 
+def _for_types(made: Any) -> Any:
+    """Return a function that compiled functions call by the types of arguments, also where these are constants.
+
+    Otherwise, Numba compiles it again for each constant that they pass, and for defaults.
+    """
+    fold = made._compiler.fold_argument_types
+    type_of, unliteral = cast("Any", typeof), cast("Any", types.unliteral)
+
+    def fold_to_types(*given: Any) -> tuple[Any, tuple[types.Type, ...]]:
+        signature, folded = fold(*given)
+        plain = (type_of(each.value) if isinstance(each, types.Omitted) else each for each in folded)
+        return signature, tuple(map(unliteral, plain))
+
+    made._compiler.fold_argument_types = fold_to_types
+    return made
+
+
 def compiled(function: Function) -> Function:
     """Compile a function of plain numbers and arrays with Numba when it is first called.
 
     The machine code is cached on disk, and runs without Python's global lock.
     """
-    return cast("Function", njit(cache=True, **COMPILED)(function))
+    return cast("Function", _for_types(njit(cache=True, **COMPILED)(function)))
 
 
 def kernel(function: Function) -> Function:
     """Compile a function that makes no arrays; the machine code is cached on disk."""
-    return cast("Function", njit(cache=True, **KERNEL)(function))
+    return cast("Function", _for_types(njit(cache=True, **KERNEL)(function)))
 
 
 def inner(function: Function) -> Function:
@@ -44,7 +61,7 @@ def inner(function: Function) -> Function:
 
     It has no entrance for calls from Python, which for packed obstacles takes half a second to compile.
     """
-    made: Any = njit(cache=True, **KERNEL, **INNER)(function)
+    made = _for_types(njit(cache=True, **KERNEL, **INNER)(function))
 
     def refuse(*_: Any, **__: Any) -> None:
         raise TypeError(f"{function.__name__} is for compiled functions; from Python, call its `py_func`")

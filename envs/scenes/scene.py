@@ -257,8 +257,10 @@ def _check_end(
         allowed = f"must be from {low:.4g} to {high:.4g}"
         _refuse(there & outside, f"{name}: joint {arm.joint_names[joint]!r} {allowed}", position)
     rows, own = row_clearances(arm.chain, arm.spheres, joints, obstacles, FAR)
-    touches = "the arm touches itself; its clearance must be over 0 m"
-    _refuse(there & (own <= 0.0), f"{name}: {touches}", own)
+    wrong = there & (own <= 0.0)
+    bodies = arm.nearest_bodies(joints[wrong.argmax()]) if wrong.any() else ""
+    touches = f"the arm touches itself ({bodies}); its clearance must be over 0 m"
+    _refuse(wrong, f"{name}: {touches}", own)
     touches = f"touches the arm at the {name}; its clearance must be over 0 m"
     _refuse(there[:, None] & obstacles.present & (rows <= 0.0), touches, rows, names)
 

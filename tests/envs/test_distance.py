@@ -46,6 +46,21 @@ def measured(obstacles, points, time=0.0, limit=FAR):
     return found, normals
 
 
+@compiled
+def raised(value, by=1):
+    return value + by
+
+
+@compiled
+def raised_by_constants(value):
+    return raised(value) + raised(value, 2) + raised(0, value)
+
+
+def test_constants_and_defaults_compile_no_function_again():
+    assert raised_by_constants(1) == 6
+    assert len(raised.overloads) == 1
+
+
 def coal_bodies(shape):
     """The shape as geometries and poses of coal."""
     turn, place = shape.rotation, np.array(shape.position)

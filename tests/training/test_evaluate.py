@@ -78,6 +78,12 @@ def test_every_method_meets_the_same_scenes(small_scenes, solutions):
     assert len(record["outcomes"]["a"]["action"]) == 40
 
 
+def test_a_model_that_was_loaded_without_an_environment_gets_the_one_that_is_named():
+    model = PPO("MultiInputPolicy", ViaVecEnv(PLANE, 2), n_steps=2, batch_size=4, seed=0)
+    model.env = None
+    assert len(evaluate(model, env=PLANE, checks=np.int64(0), scenes="validation", n_scenes=2).rows) == 1
+
+
 @pytest.mark.parametrize("env_id", [REACH, "viapoint/PlanarReachStep-v0", MOVING])
 def test_a_model_of_normalised_observations_sees_such_ones(env_id, monkeypatch):
     env = VecNormalize(ViaVecEnv(env_id, 8, seed=0, threads=1), norm_reward=False)

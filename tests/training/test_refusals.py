@@ -66,7 +66,7 @@ CONFIGURATIONS = [
     (TrainConfig, {"env_kwargs": {"sensor": object()}}),
     (TrainConfig, {"env_kwargs": {"arm": dataclasses.replace(arm_of("panda"), home=np.zeros(7))}}),
     *((TrainConfig, {"env_kwargs": {name: 1}}) for name in ELSEWHERE),
-    (TrainConfig, {"hyperparameters": 5}),
+    *((TrainConfig, {name: 5}) for name in ("hyperparameters", "progress")),
     *((TrainConfig, {"stop_when_stalled": share}) for share in (0.0, 1.0, True, "0.3", math.nan)),
     (TrainConfig, STALLING),  # the preset has no more decisions than it must make
     (TrainConfig, {**STALLING, "n_timesteps": 10**5, "eval_every": 0}),
@@ -74,7 +74,7 @@ CONFIGURATIONS = [
     (PlayConfig, {"agent": "a", "video": "film.gif"}),
     (LiveConfig, {"port": 70_000}),
     (DemoConfig, {"env": "viapoint/PlanarWholeArmStep-v0"}),
-    *((kind, {"out": ""}) for kind in (TrainConfig, DemoConfig, PaperConfig)),
+    *((kind, {"out": out}) for kind in (TrainConfig, DemoConfig, PaperConfig) for out in ("", 3)),
     (EvaluateConfig, {"env": PLANE, "json": ""}),
 ]
 

@@ -16,6 +16,7 @@ from viapoint.training.agents.agent import find_model
 from viapoint.training.cli import commands
 from viapoint.training.configs import EvaluateConfig
 from viapoint.training.files import BadFileError
+from viapoint.training.trainer import _resume_command
 
 
 def actions(env, seed=0):
@@ -102,13 +103,14 @@ def test_an_id_may_name_the_module_that_registers_it(tmp_path, monkeypatch):
     named = "own_ids:me/Named-v0"
     assert TrainConfig(env=named).env == EvaluateConfig(env=named).env == "me/Named-v0"
     assert ViaVecEnv(named, 1).env_id == check_registered(named) == "me/Named-v0"
-    assert (
-        evaluate(env=named, baselines=["straight"], scenes="validation", n_scenes=2).env_id == "me/Named-v0"
-    )
+    measured = evaluate(env=named, baselines=["straight"], scenes="validation", n_scenes=2)
+    assert measured.env_id == "me/Named-v0"
+    run = Run.create(TrainConfig(env=named, out=tmp_path / "run"))
+    assert all(f"--env {named}" in command for command in (run.config.command, _resume_command(run)))
     study = Study.from_dict({"environments": [named], "baselines": ["straight"], "scenes": ["validation"]})
     assert study.trials[0].env_id == named  # workers import it
     assert find_model(f"viapoint.envs:{PLANE}") == find_model(PLANE)
-    for wrong in ("own_idz:me/Named-v0", "own_ids:me/Named-v1", "me Named"):
+    for wrong in ("own_idz:me/Named-v0", "own_ids:me/Named-v1", "me Named", 3):
         with pytest.raises(ValueError):
             check_registered(wrong)
 

@@ -30,7 +30,7 @@ from viapoint.envs.common.validation import as_real_array, finite_array, number_
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, pack
 from viapoint.envs.geometry.shapes import Shape, as_obstacles
-from viapoint.envs.outcome import SETTLING, straight_jerk_cost
+from viapoint.envs.outcome import SETTLING, relative_jerk, straight_jerk_cost
 from viapoint.envs.plans import Plan, SpaceName
 from viapoint.envs.scenes.options import Pose, as_pose
 from viapoint.envs.spaces import Space, space_of
@@ -506,7 +506,7 @@ def _fault(problem: _Problem) -> tuple[str, float]:
             continue
         if apart == own[end]:
             apart -= problem.margin
-            which = f"the arm touches itself at the {name}"
+            which = f"the arm touches itself at the {name} ({arm.nearest_bodies(joints[end])})"
         else:
             called = f" {problem.names[row]!r}" if problem.names and problem.names[row] else ""
             touches = "in contact with" if apart < 0.0 else "nearer than the margin to"
@@ -546,10 +546,11 @@ def _plan(
     if several:
         number = -(-number // ROUNDS)  # rounded up
         duration *= 1.0 if problem.in_motion else LONGER  # the straight one in motion has it already
-    tried, best = 0, None
+    tried, best, source = 0, None, "given"
     for _ in range(ROUNDS if several else 1):
         follows = paths and not problem.moves
-        found, more = _search(problem, kept, duration, number, until, early=EARLY if follows else math.inf)
+        early = EARLY if follows else math.inf
+        found, more = _search(problem, kept, duration, number, until, early=early, source=source)
         tried += more
         if found is None and follows and time.perf_counter() < until:
             problem = problem._replace(given=problem.given[:0])
@@ -559,7 +560,7 @@ def _plan(
             best = found
             if best.success or not several:
                 return dataclasses.replace(best, seeds=tried)
-            problem = problem._replace(given=best.waypoints[None, 1:-1])
+            problem, source = problem._replace(given=best.waypoints[None, 1:-1]), best.source
         duration *= LONGER
     plan = best or _known(problem, straight, "straight", problem.least)
     ended = "the time limit was reached" if time.perf_counter() >= until else "no free one was found"
@@ -866,7 +867,7 @@ def _known(
         clearance = min(clearance, _exact(problem._replace(margin=0.0), movement))
     cost = np.einsum("ij,id,jd->", table.cost[times], movement.offsets, movement.offsets)
     straight_cost = float(straight_jerk_cost(float(np.linalg.norm(problem.goal - problem.start)), 1.0))
-    jerk = 1.0 if cost == 0.0 else max(float(cost) / straight_cost, 1.0) if straight_cost else np.nan
+    jerk = float(relative_jerk(float(cost), straight_cost))
     reason = fault
     if not reason and clearance == OUTSIDE:
         reason = "it leaves the joint limits or the reach"

@@ -214,15 +214,13 @@ def _add_obstacles(time: float, wanted: float, work: _Work) -> tuple[float, floa
             seen[3] = min(seen[3], apart)
             if apart >= wanted:
                 continue
-            least, sphere = group_clearance(spheres, placed, group, obstacles, 0, row, time, wanted, -1e9)
+            least, sphere, (x, y, z) = group_clearance(
+                spheres, placed, group, obstacles, 0, row, time, wanted, -1e9
+            )
             if sphere < 0:
                 continue
-            x = placed.centre[sphere, 0]
-            y = placed.centre[sphere, 1]
-            z = placed.centre[sphere, 2]
-            _, a, b, c = point_distance_and_normal(obstacles, 0, row, x, y, z, time, 1e9)
             work.pull[:] = 0.0
-            _pull(work, sphere, spheres.link[group], a, b, c, -1.0)
+            _pull(work, sphere, spheres.link[group], x, y, z, -1.0)
             nearest = min(nearest, least)
             missing = wanted - least
             total += missing * missing
