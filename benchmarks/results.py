@@ -43,6 +43,7 @@ SENSED_BASELINES = (
     "thick:plan_motion",
     "cautious512",
     "cautious2048",
+    "deep:plan_motion",
     "seen:search512",
     "known:search512",
     "known:plan_motion",
@@ -72,10 +73,11 @@ REACHES = [f"{name}, reaches" for name in INTERVALS]
 """Names of these variants."""
 PAGES = Path("docs/results.md"), Path("docs/results-sensed.md"), Path("docs/results-details.md")
 PICTURE = Path("docs/images/results.png")
-DETAILS = ("points:", "fitted:", "agent, seed", "untrained, ")
+DETAILS = ("points:", "fitted:", "thick:plan_motion", "agent, seed", "untrained, ")
 """Beginnings of methods that are on other pages or in the file only."""
 SHOWN: dict[str, dict[str, Any]] = {
     "plan_motion": METHOD_STYLES["plan_motion"],
+    "deep:plan_motion": METHOD_STYLES["plan_motion"],
     "known:plan_motion": METHOD_STYLES["plan_motion"],
     "ompl": METHOD_STYLES["ompl"],
     "search512": METHOD_STYLES["search"],
@@ -138,8 +140,8 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
         for when, kwargs in LOOKING.items():
             settings = {**common, "env_kwargs": {"sensor": "hand_rays", **kwargs}}
             once = kwargs["decide_at"] == "end"
-            stronger = "thick:plan_motion" if once else "thick:search4096"
-            rows = evaluate(**settings, baselines=["thick:search512", stronger, "known:search512"]).rows
+            stronger = ["thick:plan_motion", "deep:plan_motion"] if once else ["thick:search4096"]
+            rows = evaluate(**settings, baselines=["thick:search512", *stronger, "known:search512"]).rows
             if not once:
                 rows += seeds_of(config.looks, short, settings, untrained="horizon" in kwargs["decide_at"])
             for row in rows:

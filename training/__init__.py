@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from viapoint.training.planning.plan_motion import plan_motions as plan_motions
     from viapoint.training.planning.search import GeometrySearch as GeometrySearch
     from viapoint.training.runs import Run as Run
+    from viapoint.training.scene_sets import FrozenScenes as FrozenScenes
     from viapoint.training.study import Study as Study
     from viapoint.training.study import run_study as run_study
     from viapoint.training.trainer import train as train

@@ -322,9 +322,9 @@ class EvaluateConfig(AgentConfig):
 
     baselines: tuple[str, ...] = USUAL_BASELINES
     """Some of straight, random, plan_motion, ompl, search512 or another number (the best of that many computed plans),
-    sobol512 (of fixed plans); with an agent, untrained (its network before training); with a sensor, cautious512, and
-    points:, thick:, fitted:, seen: or known: before a planner; with moving obstacles, rest:, reach: or known: before
-    searchN."""
+    sobol512 (of fixed plans); with an agent, untrained (its network before training); with a sensor, cautious512,
+    deep:plan_motion, and points:, thick:, fitted:, seen: or known: before a planner; with moving obstacles, rest:,
+    reach: or known: before searchN."""
     checks: tuple[int, ...] = (0,)
     """Numbers of proposals that the agent checks with exact geometry, one row of the table each; 0 for none."""
     refine: tuple[int, ...] = ()  # Numbers of proposals that the planner refines, one further row each.

@@ -42,7 +42,19 @@ SCENE_FIELDS = ("arm", "n_obstacles", "whole_arm", "moving_obstacles", "n_jumps"
 
 @dataclass(frozen=True, kw_only=True)
 class FrozenScenes:
-    """Set of N scenes."""
+    """Set of N scenes.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> import numpy as np
+        >>> from viapoint.training import FrozenScenes
+        >>> envs = gym.make_vec("viapoint.envs:viapoint/PlanarObstacles-v0", num_envs=2)
+        >>> _ = envs.reset(seed=0)
+        >>> share, family = np.full(2, np.nan), np.full(2, "mine")
+        >>> mine = FrozenScenes(name="mine", task=envs.task.as_dict(), scenes=envs.scenes, share=share, family=family)
+        >>> mine.take([0]).scenes.start.shape
+        (1, 2)
+    """
 
     name: str  # Name of the set, or path of its file
     task: Mapping[str, Any]  # Task of the scenes, see :meth:`~viapoint.envs.task.Task.as_dict`

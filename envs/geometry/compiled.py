@@ -31,6 +31,8 @@ def _for_types(made: Any) -> Any:
 
     Otherwise, Numba compiles it again for each constant that they pass, and for defaults.
     """
+    if not hasattr(made, "_compiler"):  # Numba is switched off
+        return made
     fold = made._compiler.fold_argument_types
     type_of, unliteral = cast("Any", typeof), cast("Any", types.unliteral)
 

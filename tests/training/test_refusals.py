@@ -223,7 +223,7 @@ CALLS = [
     )),
     lambda: evaluate(baselines=["straight"]),
     lambda: evaluate(env=PLANE, baselines=["untrained"]),
-    *(lambda name=name: make_method(name, PLANE) for name in ("cautious64", "thick:search64")),
+    *(lambda name=name: make_method(name, PLANE) for name in ("cautious64", "thick:search64", "deep:plan_motion")),
     *(lambda name=name: make_method(name, SENSED) for name in (
         "cautious0", "thin:search64", "thick:straight", "thick:cautious64", "thick:points:search64",
     )),

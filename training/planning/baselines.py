@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,6 +15,7 @@ from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.checks import unknown_name
+from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.candidates import MOST_CANDIDATES
 from viapoint.training.planning.cautious import (
     BELIEFS,
@@ -31,6 +32,11 @@ from viapoint.training.planning.rrt_connect import VIA_COUNTS
 from viapoint.training.planning.search import GeometrySearch, registered_task
 from viapoint.training.rollout import Outcomes, SceneSimulation
 from viapoint.training.vec_env import env_arguments, predicted_actions
+
+DEEP = "deep:plan_motion"  # Name of the planner that assumes the greatest depth behind what is seen
+# Its first depth, [m], the factor from one to the next, the depth that ends it, and the time for each, [s]
+DEEPEST = {"hand": 0.4, "joints": 0.12}
+SHALLOWER, SHALLOWEST, DEEP_TIME = 0.8, 0.02, 0.02
 
 
 class Method(Protocol):
@@ -86,19 +92,22 @@ class PlannerMethod:
             import_ompl()  # an error where it is not installed
         self.name, self._simulation, self._planner = name, simulation, PLANNERS[name]
 
-    def plan(self, scene: Scenes) -> MotionPlan:
-        """Return the plan of one scene."""
+    def plan(self, scene: Scenes, **kwargs: Any) -> MotionPlan:
+        """Return the plan of one scene; further arguments are those of the planner."""
         task = self._simulation.task
         start = task.space.coordinates(scene.start)[0]
         goal = task.space.coordinates(scene.goal)[0]
-        return self._planner(task.arm, start, goal, scene.obstacles, space=task.space_name)
+        return self._planner(task.arm, start, goal, scene.obstacles, space=task.space_name, **kwargs)
 
     def decide(self, observation: Observation, scenes: Scenes) -> Float:
         """Return plans as rows, see :class:`Method`."""
+        return self.rows([self.plan(scenes.take([i])) for i in range(len(scenes.start))])
+
+    def rows(self, plans: Sequence[MotionPlan]) -> Float:
+        """Return plans as rows."""
         dimension, most = self._simulation.task.space.dimension, VIA_COUNTS[-1]
-        rows = np.zeros((len(scenes.start), 2 + most + (most + 2) * dimension))
-        for i in range(len(rows)):
-            plan = self.plan(scenes.take([i]))
+        rows = np.zeros((len(plans), 2 + most + (most + 2) * dimension))
+        for i, plan in enumerate(plans):
             row = np.concatenate(([len(plan.durations) - 1], plan.durations, plan.waypoints.ravel()))
             rows[i, : len(row)] = row
         return rows
@@ -117,6 +126,35 @@ class PlannerMethod:
             for name, values in result.items():
                 outcomes.setdefault(name, np.zeros(len(decisions), dtype=values.dtype))[rows] = values
         return outcomes
+
+
+class DeepPlanner(PlannerMethod):
+    """Planner that keeps as far as it can from what may be behind the fronts that a sensor sees.
+
+    It plans as if all that is seen went on behind its front, to the greatest depth of a falling sequence with which a
+    movement is found. The numbers were tuned on `validation` scenes.
+    """
+
+    def __init__(self, simulation: SceneSimulation) -> None:
+        super().__init__(simulation, "plan_motion")
+        self.name = DEEP
+
+    def decide(self, observation: Observation, scenes: Scenes) -> Float:
+        """Return plans as rows, see :class:`Method`."""
+        task = self._simulation.task
+        sight = Sight.of(observation, task)
+        plans = dict[int, MotionPlan]()
+        depth = DEEPEST[task.space_name]
+        while depth > SHALLOWEST:
+            left = [row for row in range(len(scenes.start)) if row not in plans or not plans[row].success]
+            if not left:
+                break
+            believed = thick_points(task, sight.take(left), depth)
+            for i, row in enumerate(left):
+                scene = scenes.take([row])._replace(obstacles=believed.take([i]))
+                plans[row] = self.plan(scene, time_limit=DEEP_TIME)
+            depth *= SHALLOWER
+        return self.rows([plans[row] for row in range(len(scenes.start))])
 
 
 class AgentMethod:
@@ -216,6 +254,8 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
     sensed = task.sensor is not None
     predicted = task.replanning and task.moving_obstacles
     counted = tuple(COUNTED) if sensed else SEARCHES
+    if sensed and name == DEEP and not task.replanning:
+        return DeepPlanner
     belief, _, planner = name.rpartition(":")
     if sensed and name in PLANNERS:  # they take the obstacles that they are given, which are not known here
         belief = DEFAULT_BELIEF
@@ -234,10 +274,10 @@ def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
         return METHODS[name]
     if name == "untrained":
         raise ValueError("untrained needs an agent, whose network it is before training")
-    if not sensed and (belief in BELIEFS or _counted(name, COUNTED)):
+    if not sensed and (belief in BELIEFS or name == DEEP or _counted(name, COUNTED)):
         raise ValueError(f"{name} needs a task with a sensor: it plans with what is seen")
     names = [*METHODS, *(() if task.replanning else PLANNERS), *(f"{each}N" for each in counted), "untrained"]
-    names += [f"{each}:METHOD" for each in BELIEFS] if sensed else []
+    names += [*(f"{each}:METHOD" for each in BELIEFS), DEEP] if sensed else []
     names += [f"{each}:searchN" for each in PREDICTIONS] if predicted else []
     raise ValueError(unknown_name("baseline", name, names))
 
