@@ -202,7 +202,8 @@ class Sensor:
             # Two uniform numbers give a normal one (G. E. P. Box and M. E. Muller, 1958).
             normal = np.sqrt(-2.0 * np.log(1.0 - first)) * np.cos(2.0 * np.pi * second)
             noisy = np.clip(ranges + self.noise * normal, 0.0, self.range)
-            ranges = np.where((seen < 0) | (third < self.dropped), self.range, noisy)
+            seen = np.where(third < self.dropped, -1, seen)
+            ranges = np.where(seen < 0, self.range, noisy)
         return Readings(ranges, origin[:, None] + ranges[..., None] * rays, seen, origin)
 
     def hidden(self, rotation: Float, origin: Float, obstacles: Obstacles) -> Bool:
@@ -241,14 +242,15 @@ def named_sensor(name: str, arm: Arm, foot: tuple[float, float, float], scale: f
     Raises:
         ValueError: There is no such sensor.
     """
+    hand = arm.hand(arm.home)
+    bearing = math.atan2(hand[1] - foot[1], hand[0] - foot[0])  # where the arm works
     if name == "rays":
-        hand = arm.hand(arm.home)
-        bearing = math.atan2(hand[1] - foot[1], hand[0] - foot[0])
         turn = math.cos(0.5 * bearing), 0.0, 0.0, math.sin(0.5 * bearing)
         return Sensor(position=(foot[0], foot[1], float(hand[2])), quaternion=turn, range=1.5 * scale)
     if name == "camera":
-        eye = np.array(foot) + scale * np.array([-0.35, 0.0, 1.15])
-        target = np.array(foot) + scale * np.array([0.5, 0.0, 0.3])
+        along = np.array([math.cos(bearing), math.sin(bearing), 0.0])
+        eye = np.array(foot) + scale * (-0.35 * along + [0.0, 0.0, 1.15])
+        target = np.array(foot) + scale * (0.5 * along + [0.0, 0.0, 0.3])
         turn = _towards(target - eye)
         place = float(eye[0]), float(eye[1]), float(eye[2])
         return Sensor(

@@ -42,6 +42,10 @@ from viapoint.envs.spaces import Space, space_of
 
 Trigger = Literal["horizon", "target", "course", "clearance", "sight"]
 TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)  # Events that may end a decision before the goal
+TELLING: tuple[Trigger, ...] = (
+    "clearance",
+    "course",
+)  # Those that tell of obstacles, also of ones that a sensor misses
 COURSES = ("turns", "reaches")  # Courses of obstacles that move; the first is the default
 END, STEPS = "end", "steps"  # `decide_at` with one decision, and with one in every control step
 MOST_OBSTACLES = 256  # Greatest number of obstacles in a scene that is given
@@ -176,9 +180,11 @@ class Task:
             raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {timing!r}")
         if "sight" in task.decide_at and sensor is None:
             raise ValueError("decide_at with 'sight' needs a sensor")
-        if "clearance" in task.decide_at and sensor is not None:
+        telling = [each for each in TELLING if each in task.decide_at]
+        if telling and sensor is not None:
             raise ValueError(
-                "decide_at with 'clearance' tells of obstacles that a sensor may not have seen; use 'sight', 'horizon'"
+                f"decide_at with {telling[0]!r} tells of obstacles that a sensor may not have seen; use 'sight', "
+                "'horizon'"
             )
         if task.whole_movement and sensor is not None and sensor.looks > 1:
             raise ValueError(f"looks of the sensor must be 1 with one decision, got {sensor.looks}")
@@ -253,8 +259,8 @@ class Task:
             return self
         changes = self.moving_obstacles or self.n_jumps[1] > 0
         weights = dataclasses.replace(self.weights, progress=0.0)
-        refused = "clearance" if self.sensor else "sight"
-        every = tuple(each for each in TRIGGERS if each != refused)
+        refused = TELLING if self.sensor else ("sight",)
+        every = tuple(each for each in TRIGGERS if each not in refused)
         return dataclasses.replace(self, decide_at=every if changes else END, weights=weights)
 
     @property

@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.arrays import Float, Int
+from viapoint.envs.geometry.clearance import point_clearances
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
 from viapoint.envs.geometry.shapes import IN_TABLES, PLAIN_KINDS
+from viapoint.envs.scenes.sampler import VIEW_MARGIN
 from viapoint.envs.scenes.scene import NEVER, Scenes, check_scenes
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import COURSES, Task
@@ -76,7 +78,7 @@ class FrozenScenes:
             return np.full(self.share.shape, np.nan)
         rotation, origin = task.sensor.pose(task.arm, self.scenes.start)
         hidden = task.sensor.hidden(rotation, origin, self.scenes.obstacles)
-        return np.asarray(hidden.sum(axis=1) / self.scenes.obstacles.present.sum(axis=1))
+        return np.asarray(hidden.sum(axis=1) / np.maximum(self.scenes.obstacles.present.sum(axis=1), 1))
 
     @property
     def sha256(self) -> str:
@@ -268,6 +270,11 @@ def _check_fit(frozen: FrozenScenes, task: Task) -> None:
             f"{frozen.name} holds scenes of an arm of {joints} joints with up to {there.shape[1]} obstacles "
             f"({', '.join(sorted(kinds)) or 'none'}); the task has {len(task.arm.joint_names)} joints and up to {rows} "
             f"obstacles ({', '.join(task.shapes)})"
+        )
+    viewpoint = task.sensor.viewpoint if task.sensor else None
+    if viewpoint and (point_clearances(frozen.scenes.obstacles, viewpoint) < VIEW_MARGIN).any():
+        raise ValueError(
+            f"{frozen.name} holds obstacles nearer than {VIEW_MARGIN} m to the sensor at {viewpoint}"
         )
     changes = frozen.scenes.jumps, frozen.scenes.reach, frozen.scenes.turn_time < NEVER
     if task.whole_movement and any(part.any() for part in changes):

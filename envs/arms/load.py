@@ -144,6 +144,8 @@ def load_arm(
         >>> arm.joint_names[:3], arm.notes[0]
         (('shoulder_pan', 'shoulder_lift', 'elbow'), "tool: 'hand'")
     """
+    if not isinstance(packages, str | Path | Sequence):
+        raise ValueError(f"packages must be a folder or several, got {packages!r}")
     folders = (packages,) if isinstance(packages, str | Path) else tuple(packages)
     written = read_arm(file)
     spec, own_name, urdf = _read(file, folders)

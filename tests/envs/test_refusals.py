@@ -213,7 +213,7 @@ CALLS = [
     ]),
     (lambda change: ve.Task.of(**change), [
         ({"sensor": "rays", "n_obstacles": 0},), ({"decide_at": ["sight"]},),
-        ({"sensor": "hand_rays", "decide_at": ["sight", "clearance"]},),  # which knows what is not seen
+        *(({"sensor": "hand_rays", "decide_at": ["sight", telling]},) for telling in ("clearance", "course")),
     ]),
     (ve.arm_of, [("large",)]),
     (ve.register_arm, [(ve.arm_of("panda"),)]),

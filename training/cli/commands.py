@@ -125,6 +125,8 @@ def _measure_planners(config: EvaluateConfig) -> None:
     faults += [f"{each.set} {each.number}: {each.refused}" for each in refused.itertuples()]
     if faults:
         print(f"problems left out: {len(faults)}", *faults[:MOST_FAULTS], sep="\n  ", file=sys.stderr)
+    if (table.refused != "").all():
+        raise ValueError("no problem is left to measure planners on")
     if config.format == "csv":
         print(table.to_csv(index=False).rstrip())
     elif config.format == "json":
