@@ -83,7 +83,8 @@ def reward_terms(
     later = ~first  # before the first decision nothing was commanded
     clearance = _bounded(after.planned_clearance) - later * _bounded(before.planned_clearance)
     # An arm that is at the goal already has no way to go, and needs no time.
-    length, zero_duration = np.maximum(length, SMALLEST), np.maximum(zero_duration, SHORTEST_DURATION)
+    length = np.maximum(length, SMALLEST)
+    zero_duration = np.maximum(zero_duration, SHORTEST_DURATION)
     cost = straight_jerk_cost(length, zero_duration)  # J_0
     rough = np.log1p(after.jerk_cost / cost) - np.log1p(before.jerk_cost / cost)
     spent = (after.duration - before.duration) / zero_duration

@@ -112,7 +112,8 @@ class Arm:
 
     def nearest_bodies(self, joints: Float) -> str:
         """Return the names of the two bodies that are nearest to one another at joint positions of shape (J,)."""
-        centre, spheres = sphere_centres(self.chain, self.spheres, joints), self.spheres
+        spheres = self.spheres
+        centre = sphere_centres(self.chain, spheres, joints)
 
         def apart(pair: Int) -> float:
             one, other = (slice(spheres.first[group], spheres.first[group + 1]) for group in pair)

@@ -186,7 +186,8 @@ def group_clearance(
     The third result is the normal of the obstacle there. The sphere is -1 if none is nearer than `least`. The arguments
     are those of :func:`obstacle_clearance`.
     """
-    nearest, normal = -1, (0.0, 0.0, 0.0)
+    nearest = -1
+    normal = 0.0, 0.0, 0.0
     ball = spheres.first[group] - 1  # stands for the bounding ball of the group, which comes first
     for sphere in range(ball, spheres.first[group + 1]):
         if sphere == ball:
@@ -208,7 +209,8 @@ def group_clearance(
             place_group(spheres, group, placed)
         elif distance < least:
             least = distance
-            nearest, normal = sphere, (a, b, c)
+            nearest = sphere
+            normal = a, b, c
             if least < floor:
                 break
     return least, nearest, normal
@@ -403,7 +405,8 @@ def movement_clearance(
                     place(chain, spheres, path[k], placed)
                     is_placed = True
                 # First the configuration itself, and then what may be nearer on the way from the one before.
-                time, way, share = begin + k * step, 0.0, 0.0
+                time = begin + k * step
+                way = share = 0.0
                 while share < 1.0:
                     if way > 0.0:
                         _place_between(chain, spheres, path, k, share, between, placed)

@@ -34,7 +34,8 @@ def _for_types(made: Any) -> Any:
     if not hasattr(made, "_compiler"):  # Numba is switched off
         return made
     fold = made._compiler.fold_argument_types
-    type_of, unliteral = cast("Any", typeof), cast("Any", types.unliteral)
+    type_of = cast("Any", typeof)
+    unliteral = cast("Any", types.unliteral)
 
     def fold_to_types(*given: Any) -> tuple[Any, tuple[types.Type, ...]]:
         signature, folded = fold(*given)

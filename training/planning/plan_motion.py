@@ -560,7 +560,8 @@ def _plan(
             best = found
             if best.success or not several:
                 return dataclasses.replace(best, seeds=tried)
-            problem, source = problem._replace(given=best.waypoints[None, 1:-1]), best.source
+            problem = problem._replace(given=best.waypoints[None, 1:-1])
+            source = best.source
         duration *= LONGER
     plan = best or _known(problem, straight, "straight", problem.least)
     ended = "the time limit was reached" if time.perf_counter() >= until else "no free one was found"

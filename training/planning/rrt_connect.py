@@ -92,9 +92,11 @@ def clear_path(
 @compiled
 def _shift(setting: Setting, node: Float, rng: np.random.Generator, target: Float, placed: Placed) -> None:
     """Fill in a target with the tool of a node shifted at random, and turned as before if joints suffice for that."""
-    chain, turn = setting.chain, setting.chain.tool_rotation
+    chain = setting.chain
+    turn = chain.tool_rotation
     joints = len(node)
-    place, axes = np.empty(3), np.empty((3, 3))
+    place = np.empty(3)
+    axes = np.empty((3, 3))
     here = tool_position(chain, node, placed.rotation, placed.origin)
     for i in range(3):
         place[i] = here[i] + rng.uniform(-FAR, FAR)
