@@ -42,10 +42,7 @@ from viapoint.envs.spaces import Space, space_of
 
 Trigger = Literal["horizon", "target", "course", "clearance", "sight"]
 TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)  # Events that may end a decision before the goal
-TELLING: tuple[Trigger, ...] = (
-    "clearance",
-    "course",
-)  # Those that tell of obstacles, also of ones that a sensor misses
+TELLING: tuple[Trigger, ...] = ("clearance", "course")  # Those that also tell of obstacles that are not seen
 COURSES = ("turns", "reaches")  # Courses of obstacles that move; the first is the default
 END, STEPS = "end", "steps"  # `decide_at` with one decision, and with one in every control step
 MOST_OBSTACLES = 256  # Greatest number of obstacles in a scene that is given

@@ -161,7 +161,7 @@ class Config:
         """Check the values."""
         for each in dataclasses.fields(self):
             name, value = each.name, getattr(self, each.name)
-            if "Path" in str(each.type) and value is not None and name != "packages":
+            if "Path" in str(each.type) and "tuple" not in str(each.type) and value is not None:
                 value = named_path(name, value)
             elif str(each.type) == "bool" and not isinstance(value, bool):
                 raise ValueError(f"{name} must be True or False, got {value!r}")
