@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from ._hermite_tables import mode_table
-from ._passage_one_via import attach_root_gradient, nearer_fraction
+from ._passage_one_via import SHORTEST, attach_root_gradient, nearer_fraction
 from ._weighted_solver import fit_modes, mode_weights
 from .array_api import FREE, Array, Floats, Namespace, change_given, like, ordered_sum, to_numpy
 from .trajectory import connect, duration_gradient
@@ -133,7 +133,8 @@ def fractions_by_newton(
 def _starts(cost: PassageCost, guess: Floats, several: bool) -> list[Floats]:
     """Return durations to start from, each (S, N): the best of some guesses, and others."""
     segments, _, count = cost.steps.shape
-    chord = np.sqrt(ordered_sum(cost.steps * cost.steps, 1))
+    # Beside a large motion at the ends, waypoints may be so near to one another that their squared distances vanish.
+    chord = np.maximum(np.sqrt(ordered_sum(cost.steps * cost.steps, 1)), SHORTEST)
     # A movement from rest covers the cube of the time; a smooth path is followed like a straight one.
     guesses = [np.cbrt(chord), _straight_durations(chord)]
     if not np.isnan(guess).all():

@@ -207,7 +207,13 @@ def _load(
         chain = chain_joints(whole, chosen.body, 0 if given["base"] is None else whole.body(given["base"]).id)
         if not chain:
             raise ValueError(f"no joint moves the tool {chosen.name!r}; name another one with tool=")
-        names = _joint_names(arm_joints(whole, chain, notes))
+        names = tuple(arm_joints(whole, chain, notes))
+        if len(names) < MIN_JOINTS:
+            fixed = "".join(f"; {note}" for note in notes if note.startswith("fixed: "))
+            raise ValueError(
+                f"an arm has {MIN_JOINTS} or more joints, and {len(names)} are left of {', '.join(chain)}{fixed}; give "
+                "joints=, or limits of sliding joints in the file"
+            )
         notes.append(f"joints: {', '.join(names)}")
     try:
         numbers = [whole.joint(each).id for each in names]

@@ -142,7 +142,9 @@ LENGTHS = st.floats(-1e6, 1e6, allow_subnormal=False)
 """Coordinates, [m]; relative to the whole path, a subnormal distance is zero."""
 
 
+@pytest.mark.filterwarnings("error:(invalid|divide)")
 @hypothesis.settings(max_examples=60, deadline=None)
+@hypothesis.example(1e-200 * np.arange(8.0).reshape(4, 2) ** 2, 1.0, True)
 @hypothesis.given(
     st.integers(3, 5).flatmap(lambda n: hnp.arrays(float, (n, 2), elements=LENGTHS)),
     st.floats(1e-3, 1e3),
