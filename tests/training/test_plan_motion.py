@@ -142,10 +142,7 @@ REASONS = [
     ({"obstacles": [POST], "duration": 0.3}, "limit"),
     ({"obstacles": [POST], "time_limit": 0.0}, "no time for another one"),
     ({"arm": WEAK, "time_limit": 0.0}, "weight of the arm"),
-    (
-        {"goal": [0.0, -1.7, 0.0, -3.0, 0.0, 0.0, 0.8]},
-        "the arm touches itself at the goal (link5 and gripper)",
-    ),
+    ({"goal": [0.0, -1.7, 0.0, -3.0, 0.0, 0.0, 0.8]}, "touches itself at the goal (link5 and gripper)"),
     ({"velocity": 300.0 * np.eye(7)[0]}, "velocity limit of joint 'joint1'"),
     ({"acceleration": 300.0 * np.eye(7)[0]}, "torque limit of joint 'joint1'"),
 ]
