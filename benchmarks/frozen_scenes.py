@@ -63,8 +63,9 @@ class Maker:
 
     def __init__(self, env_id: str) -> None:
         self.env_id = env_id
-        self.task = registered_task(env_id)
-        self._simulation = SceneSimulation(env_id, TOGETHER)
+        # Shares and solutions are those of plans of the usual range, in whatever range an environment has.
+        self.task = registered_task(env_id, via_range=1.0)
+        self._simulation = SceneSimulation(env_id, TOGETHER, via_range=1.0)
         self._search = GeometrySearch(self.task, 2048, refinements=4, per_round=128)
 
     def numbers(self) -> dict[str, int]:

@@ -5,7 +5,6 @@ python benchmarks/results.py --env viapoint/PandaObstacles-v0 # others keep thei
 python benchmarks/results.py --only agents                    # only shipped agents, searches and planners
 python benchmarks/results.py --only runs                      # only the trainings of benchmarks/sb3.py
 python benchmarks/results.py --only looking                   # only searches and agents that look again on the way
-python benchmarks/results.py --only one                       # only sensed obstacles with one via-point
 python benchmarks/results.py --only reaches                   # only obstacles on reaches of their own
 """
 
@@ -55,16 +54,8 @@ LOOKING: dict[str, dict[str, Any]] = {
     "looks at what is new": {"decide_at": ["sight"]},
 }
 """Decisions of PlanarSensed with rays around the hand, in which points that were seen are remembered."""
-LOOKS, ONE = "PlanarSensed, hand_rays", "PlanarSensed, one via-point"
-"""Names of this variant, and of one look with one via-point, in the file and on the page."""
-SEARCHES = (
-    "points:search512",
-    "fitted:search512",
-    "thick:search512",
-    "cautious512",
-    "seen:search512",
-    "known:search512",
-)
+LOOKS = "PlanarSensed, hand_rays"
+"""Name of this variant in the file and on the page."""
 PREDICTIONS = ("rest:search512", "search512", "reach:search512", "known:search512")
 """Searches with more and more that is known of the courses of obstacles."""
 INTERVALS = {"PlanarMovingObstacles": (0.3, 0.1), "PandaMovingObstacles": (0.5,)}
@@ -105,9 +96,9 @@ class Config:
     """Ids of environments with a shipped agent."""
     n_scenes: int | None = None
     """Number of scenes of each set; default: all of them."""
-    only: Literal["everything", "agents", "runs", "looking", "one", "reaches"] = "everything"
-    """Part that is measured: shipped agents and their baselines, the trainings in `runs`, looking again on the way, one
-    via-point, or obstacles on reaches of their own; other numbers stay."""
+    only: Literal["everything", "agents", "runs", "looking", "reaches"] = "everything"
+    """Part that is measured: shipped agents and their baselines, the trainings in `runs`, looking again on the way,
+    or obstacles on reaches of their own; other numbers stay."""
     runs: Path = Path("runs/sb3")
     """Folder of trainings, which get a row each: those of benchmarks/sb3.py, viaq and viarank with other seeds, such as
     `PlanarSensed-viarank-1`, and viarank with other beliefs, such as `PlanarSensed-fitted`."""
@@ -115,8 +106,6 @@ class Config:
     """Folder of trainings among obstacles on reaches of their own, such as `PlanarMovingObstacles-0` for seed 0."""
     looks: Path = Path("runs/looks")
     """Folder of trainings that look again each 0.3 s, such as `PlanarSensed-0` for seed 0."""
-    one: Path = Path("runs/one")
-    """Folder of trainings with one look and one via-point, named as those in `runs`."""
 
 
 def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
@@ -146,11 +135,6 @@ def rows_of(config: Config, env_id: str, name: str) -> Iterator[dict[str, Any]]:
                 rows += seeds_of(config.looks, short, settings, untrained="horizon" in kwargs["decide_at"])
             for row in rows:
                 yield _numbers(LOOKS, name, f"{row['method']}, {when}", row)
-    if config.only in ("everything", "one") and task.sensor is not None and task.space.of_hand:
-        settings = {**common, "env_kwargs": {"n_via": 1}}
-        rows = evaluate(**settings, baselines=SEARCHES).rows
-        for row in rows + runs_of(config.one, short, settings):
-            yield _numbers(ONE, name, row["method"], row)
     if config.only in ("everything", "runs"):
         for row in runs_of(config.runs, short, common):
             yield _numbers(env_id, name, row["method"], row)
@@ -312,7 +296,7 @@ def draw_method(axes: Axes, name: str, row: dict[str, Any]) -> Any:
 
 def in_order(rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return rows by their tasks, and those of methods that were there before in the place that they had."""
-    tasks = [*SHIPPED_IDS, ONE, LOOKS, *REACHES]
+    tasks = [*SHIPPED_IDS, LOOKS, *REACHES]
     methods = list(dict.fromkeys((row["env"], row["method"]) for row in [*before, *rows]))
     return sorted(rows, key=lambda row: (tasks.index(row["env"]), methods.index((row["env"], row["method"]))))
 

@@ -84,8 +84,8 @@ def train_one(config: Config, task: str, algo: str) -> None:
 
 
 def curves_of(folder: Path) -> list[dict[str, Any]]:
-    """Return the learning curves of all runs as rows."""
-    rows = []
+    """Return the learning curves of all runs as rows, with those in CURVES of other trainings."""
+    rows: list[dict[str, Any]] = []
     for path in sorted(folder.glob("*/learning_curve.jsonl")):
         task, algo, seed = path.parent.name.split("-")
         for line in path.read_text(encoding="utf-8").splitlines():
@@ -93,7 +93,10 @@ def curves_of(folder: Path) -> list[dict[str, Any]]:
             row = {"task": task, "algo": algo, "seed": seed, "decisions": record["decisions"]}
             row["success"] = round(100.0 * record["success"]["rate"], 1)
             rows.append({**row, "seconds": round(record["seconds"])})
-    return rows
+    names = [(row["task"], row["algo"], row["seed"]) for row in rows]
+    with CURVES.open(newline="", encoding="utf-8") as file:
+        kept = [row for row in csv.DictReader(file) if (row["task"], row["algo"], row["seed"]) not in names]
+    return sorted(kept + rows, key=lambda row: (TASKS.index(row["task"]), ALGORITHMS.index(row["algo"])))
 
 
 def draw(rows: list[dict[str, Any]]) -> None:
@@ -105,8 +108,8 @@ def draw(rows: list[dict[str, Any]]) -> None:
         for task, panel in zip(tasks, panels, strict=False):
             for algo in ALGORITHMS:
                 mine = [row for row in rows if row["task"] == task and row["algo"] == algo]
-                decisions = [row["decisions"] / 1000.0 for row in mine]
-                success = [row["success"] for row in mine]
+                decisions = [float(row["decisions"]) / 1000.0 for row in mine]
+                success = [float(row["success"]) for row in mine]
                 style = {**METHOD_STYLES[algo], "markersize": 2.5}
                 panel.plot(decisions, success, label=algo.upper(), **style)
             panel.set_title(task)

@@ -177,7 +177,13 @@ class ActionLayout:
     """
 
     def __init__(
-        self, arm: Arm, space: SpaceName, n_via: int, timing: Timing, duration_range: tuple[float, float]
+        self,
+        arm: Arm,
+        space: SpaceName,
+        n_via: int,
+        timing: Timing,
+        duration_range: tuple[float, float],
+        via_range: float = 1.0,
     ) -> None:
         self.space, self.n_via, self.timing = space, n_via, timing
         self.duration_range = low, high = duration_range
@@ -187,7 +193,7 @@ class ActionLayout:
         self.dimension = len(self.names_of_axes)  # Dimension D of the space
         width = arm.joint_range[:, 1] - arm.joint_range[:, 0]
         offsets = np.minimum(RANGE_SHARE * width, LARGEST_OFFSET)
-        self.via_scale = np.array(HAND_OFFSETS) if in_hand else offsets
+        self.via_scale = via_range * (np.array(HAND_OFFSETS) if in_hand else offsets)
         """Largest offset of each component, shape (D,), [m] or [rad]."""
         limited = np.isfinite(arm.velocity_limit)
         self.rate_limit = np.where(limited, arm.velocity_limit, UNLIMITED_SPEED)  # Velocity limits, [rad/s]

@@ -31,7 +31,7 @@ NAMED: dict[str, dict[str, Any]] = {
         "decide_at": EVENTS,
         "horizon": 0.5,
     },
-    "PlanarSensed": {"sensor": "rays", "n_via": 2},
+    "PlanarSensed": {"sensor": "rays", "n_via": 2, "via_range": 2.0},
     "PandaSensed": {**PANDA_OBSTACLES, "sensor": "camera"},
 }
 TASKS: dict[str, dict[str, Any]] = {

@@ -45,6 +45,7 @@ TRIGGERS: tuple[Trigger, ...] = get_args(Trigger)  # Events that may end a decis
 TELLING: tuple[Trigger, ...] = ("clearance", "course")  # Those that also tell of obstacles that are not seen
 COURSES = ("turns", "reaches")  # Courses of obstacles that move; the first is the default
 END, STEPS = "end", "steps"  # `decide_at` with one decision, and with one in every control step
+MOST_RANGE = 10.0  # Bound of the factor on offsets of via-points
 MOST_OBSTACLES = 256  # Greatest number of obstacles in a scene that is given
 PLANE_SHAPES = ("cylinder", "box")  # Default shapes of obstacles in the plane
 SPACE_SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")  # Default shapes of obstacles in space
@@ -76,6 +77,7 @@ class Task:
     n_via: int
     timing: Timing
     duration_range: tuple[float, float]
+    via_range: float
     n_obstacles: tuple[int, int]
     shapes: tuple[str, ...]
     families: tuple[str, ...]
@@ -99,6 +101,7 @@ class Task:
         n_via: int = 1,
         timing: Timing = "optimal",
         duration_range: tuple[float, float] | None = None,
+        via_range: float = 1.0,
         n_obstacles: int | tuple[int, int] = (1, 5),
         shapes: str | Sequence[str] | None = None,
         families: str | Sequence[str] | None = None,
@@ -157,6 +160,7 @@ class Task:
             n_via=whole_number("n_via", n_via, 0, MOST_VIAS),
             timing=timing,
             duration_range=_checked_durations(space, duration_range),
+            via_range=number_of_at_least("via_range", via_range, 0.1, MOST_RANGE),
             n_obstacles=n_obstacles,
             shapes=kinds,
             families=check_families(names, plane, kinds, n_obstacles[1]),
@@ -221,7 +225,8 @@ class Task:
     @functools.cached_property
     def action(self) -> ActionLayout:
         """Layout of the actions that are movements."""
-        return ActionLayout(self.arm, self.space_name, self.n_via, self.timing, self.duration_range)
+        layout = self.arm, self.space_name, self.n_via, self.timing, self.duration_range, self.via_range
+        return ActionLayout(*layout)
 
     @functools.cached_property
     def steering(self) -> Steering:
@@ -291,8 +296,11 @@ class Task:
         sensor = values.pop("sensor")
         if sensor is not None:
             values["sensor"] = dataclasses.asdict(sensor)
-        if self.courses == COURSES[0]:  # records of frozen scenes were made without it
+        # Records of frozen scenes were made without these two.
+        if self.courses == COURSES[0]:
             del values["courses"]
+        if self.via_range == 1.0:
+            del values["via_range"]
         plain: dict[str, Any] = json.loads(json.dumps(values))  # lists in place of tuples
         return plain
 

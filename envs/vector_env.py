@@ -47,6 +47,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         timing: `optimal` passage times, or `learned` ones as part of the action.
         duration_range: Shortest and longest movement: in hand space [s], in joint space multiples of the shortest
             movement that the velocity limits allow.
+        via_range: Factor on the largest offsets of via-points from the straight line.
         n_obstacles: Number of obstacles, or the fewest and the most; families that are furniture may have fewer.
         shapes: Shapes that obstacles may have; by default cylinders and boxes in the plane, all but meshes and point
             clouds in space.

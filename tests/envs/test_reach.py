@@ -227,3 +227,15 @@ def test_executed_actions_are_those_of_their_plans():
         results.append(env.execute_plan(plan) if by_plan else env.execute_actions(actions))
     same(results[0].info, results[1].info)
     np.testing.assert_allclose(env.task.action.encode(plan), actions, atol=1e-9)
+
+
+@pytest.mark.parametrize("arm", ["planar", "panda"])
+def test_the_range_is_a_factor_on_offsets_of_via_points(arm):
+    usual, wide = (Task.of(arm=arm, n_via=2, via_range=factor).action for factor in (1.0, 2.5))
+    start, goal = np.full(usual.dimension, 0.3), np.full(usual.dimension, 0.1)
+    action = np.random.default_rng(0).uniform(-0.4, 0.4, usual.size)
+    near, far, straight = (
+        each.decode(part, start, goal).waypoints
+        for each, part in ((usual, action), (wide, action), (usual, 0.0 * action))
+    )
+    np.testing.assert_allclose(far - straight, 2.5 * (near - straight), atol=1e-12)

@@ -28,6 +28,7 @@ ANY_ENVIRONMENT = [
     ({"families": 3}, TypeError), ({"families": ()}, ValueError), ({"families": "maze"}, ValueError),
     *(({"n_obstacles": number}, ValueError) for number in (-1, 1.5, True, (3, 2), (40, 50), (0, 257), "many")),
     *(({"n_via": number}, ValueError) for number in (-1, 1.5, 33, 10**9, True)),
+    *(({"via_range": factor}, ValueError) for factor in (0.0, 10.0, np.nan, "far", True)),
     ({"timing": "fast"}, ValueError), ({"margin": -0.1}, ValueError), ({"horizon": 0.0}, ValueError),
     ({"horizon": np.nan}, ValueError), ({"n_jumps": 9}, ValueError), ({"n_jumps": (1, 2, 3)}, ValueError),
     *(({"decide_at": events}, ValueError) for events in ("noon", "target", ("noon",), 3, None, {"target"})),

@@ -44,12 +44,12 @@ from viapoint.training.agents.viaq import (
     outcome_of,
 )
 from viapoint.training.planning.baselines import agent_method
-from viapoint.training.planning.beliefs import Sight
+from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.candidates import best_duration, candidate_actions, sobol_actions
-from viapoint.training.planning.cautious import places_of
+from viapoint.training.planning.cautious import DEPTHS, cleared_depths, places_of
 from viapoint.training.planning.movements import INSTANTS, OUTSIDE
 from viapoint.training.planning.problem import Problem, moves_of
-from viapoint.training.planning.search import INFEASIBLE, plan_clearances, registered_task
+from viapoint.training.planning.search import CLEARANCE_MARGIN, INFEASIBLE, plan_clearances, registered_task
 from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import scenes_for
 
@@ -642,7 +642,9 @@ def test_the_nearest_pairs_are_those_of_the_closest_approach_between_the_instant
 
 @pytest.fixture(scope="module")
 def agent():
-    few = {"explore_candidates": 32, "labels": 16, "batch_size": 48, "policy_kwargs": {"candidates": 64}}
+    # Without caution, success is that of the network alone.
+    own = {"candidates": 64, "caution": 0.0}
+    few = {"explore_candidates": 32, "labels": 16, "batch_size": 48, "policy_kwargs": own}
     env = ViaVecEnv(SENSED, 32, seed=0)
     return ViaRank("ViaRankPolicy", env, seed=0, gradient_steps=8, **few).learn(256)
 
@@ -672,6 +674,34 @@ def test_rounds_of_candidates_never_lower_the_best_value(agent) -> None:
     assert (value.max(axis=1) > first).mean() > 0.5
 
 
+def test_cautious_plans_keep_from_what_may_be_behind_fronts(agent, monkeypatch) -> None:
+    policy, simulation = agent.policy, SceneSimulation(SENSED)
+    observation = simulation.observe(scenes_of(simulation.task, 32, 7))
+    problem = Problem.of_observation(observation, policy.task)
+    cleared = cleared_depths(policy.task, problem, Sight.of(observation, policy.task))
+    depths = []
+    for caution in (0.0, 0.8):
+        monkeypatch.setattr(policy, "caution", caution)
+        depths.append(cleared(policy.decide(observation)[:, None]))
+    assert (depths[1] >= depths[0]).mean() > 0.9
+    assert depths[1].mean() > depths[0].mean() + 0.1
+
+
+def test_a_plan_that_clears_a_depth_clears_lesser_ones() -> None:
+    task = registered_task(SENSED)
+    scenes = scenes_of(task, 16, 3)
+    problem, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (16, 64, task.action.size))
+    cleared = cleared_depths(task, problem, sight)(actions)
+    assert set(np.unique(cleared)) == {0.0, *(DEPTHS["hand"] / DEPTHS["hand"][0])}
+    for depth in DEPTHS["hand"]:
+        belief = problem._replace(obstacles=thick_points(task, sight, depth))
+        clearance = plan_clearances(task, belief, actions, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
+        at_least = cleared * DEPTHS["hand"][0] > depth - 1e-9
+        # Points of a deeper belief are in cubes of their own, so that few plans differ.
+        assert (at_least == (clearance >= CLEARANCE_MARGIN)).mean() > 0.99
+
+
 def test_places_are_those_of_the_movement() -> None:
     task = registered_task(SENSED)
     scenes = scenes_of(task, 4)
@@ -688,12 +718,17 @@ def test_places_are_those_of_the_movement() -> None:
     assert np.array_equal(task.sensor.ray_towards(local), np.flatnonzero(sight.hit[0]))
 
 
-LOOKING = {"sensor": "hand_rays", "decide_at": ["horizon"], "horizon": 0.3}
+# Plans near the straight line are learned sooner.
+LOOKING = {"sensor": "hand_rays", "decide_at": ["horizon"], "horizon": 0.3, "via_range": 1.0}
 
 
 def test_it_learns_to_revise_plans(tmp_path) -> None:
     env = ViaVecEnv(SENSED, 32, seed=0, **LOOKING)
-    small = {"explore_candidates": 24, "labels": 12, "policy_kwargs": {"candidates": 64, "refinements": 0}}
+    small = {
+        "explore_candidates": 24,
+        "labels": 12,
+        "policy_kwargs": {"candidates": 64, "refinements": 0, "caution": 0.0},
+    }
     agent = ViaRank("ViaRankPolicy", env, seed=0, gradient_steps=8, **small).learn(256)
     agent.save(tmp_path / "agent.zip")
     again = ViaRank.load(tmp_path / "agent.zip")

@@ -178,7 +178,7 @@ def _meaning(task: Task) -> dict[str, Any]:
     if task.stepwise:
         parts["control_step"] = task.control_step
     else:
-        parts |= {name: record[name] for name in ("n_via", "timing", "duration_range")}
+        parts |= {name: getattr(task, name) for name in ("n_via", "timing", "duration_range", "via_range")}
     if task.sensor is None:
         parts["shapes"] = record["shapes"]
         parts["greatest n_obstacles"] = task.n_obstacles[1]

@@ -11,7 +11,7 @@ would be right on average, and too sure of those that it chooses.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -29,6 +29,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from viapoint.envs.common.arrays import Float, Observation, Single
+from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes
@@ -43,6 +44,7 @@ from viapoint.training.planning.cautious import (
     DEFAULT_BELIEF,
     OUT_OF_VIEW,
     PRIVILEGED,
+    cleared_depths,
     instants_of,
     places_of,
 )
@@ -54,6 +56,7 @@ from viapoint.training.planning.search import (
 )
 
 EFFORT_WEIGHT = 0.05  # Weight of the reward of a successful plan beside its probability of success
+CAUTION = 0.8  # Weight of the depth behind all fronts that a plan clears, tuned on `validation` scenes
 # Time up to which a contact counts twice as much as later ones, which a revised plan may still avoid, [s]
 SOON = 0.45
 KEEP = 2.0  # Reward by which another plan must be better than the one under way, as each change of plan costs jerk
@@ -83,12 +86,24 @@ class ViaRankPolicy(PlanPolicy):
         refinements: Rounds of candidates around the best ones.
         per_refinement: Candidates of each round.
         refine: Number of best candidates that the planner refines around what is seen; they are ranked, too.
+        caution: Weight of the depth behind all fronts that a plan clears beside its probability of success. What the
+            network learned of the space behind fronts is wrong for obstacles that are unlike those of training.
         belief: Obstacles whose clearance the network sees beside the readings, one of
             :data:`~viapoint.training.planning.cautious.BELIEFS`. With `known` and `seen` the agent decides only where
             the true obstacles are given, as in evaluations.
     """
 
-    OWN = "width", "instants", "nearest", "candidates", "refinements", "per_refinement", "refine", "belief"
+    OWN = (
+        "width",
+        "instants",
+        "nearest",
+        "candidates",
+        "refinements",
+        "per_refinement",
+        "refine",
+        "caution",
+        "belief",
+    )
 
     def __init__(
         self,
@@ -104,6 +119,7 @@ class ViaRankPolicy(PlanPolicy):
         refinements: int = 2,
         per_refinement: int = 128,
         refine: int = 0,
+        caution: float = CAUTION,
         belief: str = DEFAULT_BELIEF,
         **kwargs: Any,
     ) -> None:
@@ -115,6 +131,7 @@ class ViaRankPolicy(PlanPolicy):
         self.refinements = refinements
         self.per_refinement = per_refinement
         self.refine = refine
+        self.caution = caution
         self.belief = belief
         self._check_candidates()
         sensor = self.task.sensor
@@ -124,20 +141,33 @@ class ViaRankPolicy(PlanPolicy):
 
     def _check_setting(self, name: str, value: Any) -> None:
         super()._check_setting(name, value)
+        if name == "caution":
+            number_of_at_least("caution", value, 0.0)
         if name == "belief" and value not in BELIEFS:
             raise ValueError(f"belief must be one of {', '.join(BELIEFS)}, got {value!r}")
 
     @torch.no_grad()
-    def rank(self, problem: Problem, sight: Sight, actions: Numbers) -> Numbers:
-        """Return the ranking criterion of actions of shape (B, H, m), shape (B, H).
+    def success(self, problem: Problem, sight: Sight, actions: Numbers) -> tuple[Numbers, Numbers]:
+        """Return the probability of success of actions of shape (B, H, m), and the reward where they succeed, (B, H).
 
-        It is the probability of success, and EFFORT_WEIGHT times the reward of those that succeed. The problems have
-        the obstacles that are believed to be there.
+        The problems have the obstacles that are believed to be there.
         """
         inputs, worth = sight_inputs(self.task, problem, sight, actions, self.instants, self.nearest)
         # Geometry is computed on the processor, the network may be on another device.
-        success = torch.sigmoid(self.network(inputs.to(self.device))).cpu().numpy()
+        return torch.sigmoid(self.network(inputs.to(self.device))).cpu().numpy(), worth
+
+    def rank(self, problem: Problem, sight: Sight, actions: Numbers) -> Numbers:
+        """Return the probability of success of actions and EFFORT_WEIGHT times the reward of those that succeed."""
+        success, worth = self.success(problem, sight, actions)
         return np.asarray(success + EFFORT_WEIGHT * worth)
+
+    def _cautious(self, problem: Problem, sight: Sight) -> Callable[[Numbers], Numbers]:
+        """Return the criterion of decisions, a function of actions; caution counts where the truth is hidden."""
+        rank = functools.partial(self.rank, problem, sight)
+        if not self.caution or self.belief in PRIVILEGED:
+            return rank
+        cleared = cleared_depths(self.task, problem, sight)
+        return lambda actions: rank(actions) + self.caution * cleared(actions)
 
     def decide(self, observation: Observation) -> Numbers:
         """Return the best actions, shape (B, m), for parts of B observations."""
@@ -174,7 +204,7 @@ class ViaRankPolicy(PlanPolicy):
             rows = slice(first, first + BLOCK)
             some = sight.take(rows)
             there = problem.take(np.arange(len(problem.start))[rows])
-            rank = functools.partial(self.rank, there, some)
+            rank = self._cautious(there, some)
             actions, value = self.proposals(len(there.start), rank)
             if self.refine:
                 top = np.argsort(-value, axis=1, kind="stable")[:, : self.refine]
@@ -183,11 +213,8 @@ class ViaRankPolicy(PlanPolicy):
                 actions = np.concatenate((actions, refined), axis=1)
                 value = np.concatenate((value, rank(refined)), axis=1)
             best = np.arange(len(value)), self.best_within_reach(there, actions, value)
-            taken = actions[best]
-            moves = moves_of(self.task, there, taken[:, None])
-            worth = _worth(self.task, there, taken[:, None], moves)[:, 0]
-            chosen.append(taken)
-            success.append(value[best] - EFFORT_WEIGHT * worth)
+            chosen.append(actions[best])
+            success.append(self.success(there, some, actions[best][:, None])[0][:, 0])
         return np.concatenate(chosen).astype(np.float64), np.concatenate(success).astype(np.float64)
 
     def _check_observation(self, batch: Observation) -> None:
