@@ -32,6 +32,8 @@ PLAN, DONE, REPLACED = 0.0065, 0.0030, 0.0045
 SPACING = 0.02  # Distance of the points of a drawn path, [m]
 # Radius of the points that a sensor has met, twice as much in space, [m], and how many of them are drawn at most
 SEEN, MOST_SEEN = 0.004, 600
+# Radius of the rays that end there, [m], how many of them are drawn at most, and their opacity
+RAY, MOST_RAYS, RAY_OPACITY = 0.0008, 96, 0.35
 # Half lengths of the board that stands for a half-space, [m], and its opacity
 HALF_SPACE_BOARD, GLASSY = (1.0, 1.0, 0.002), 0.4
 BELOW_SURFACE = 0.008  # Depth of this board, [m]: a floor at the height of the table is hidden by it
@@ -148,17 +150,18 @@ def picture_of(task: Task, recorded: Recorded, step: int) -> Picture:
 
 
 def _seen(task: Task, recorded: Recorded, joints: Float, now: float) -> Float:
-    """Return the points that the sensor of a task has met in its last looks until a time, shape (M, 3)."""
+    """Return the rays of a sensor that met something in its last looks until a time, shape (M, 2, 3)."""
     sensor = task.sensor
     if sensor is None:
-        return np.zeros((0, 3))
+        return np.zeros((0, 2, 3))
     # Each plan began with a look.
     times = [0.0, *(began for began, _ in recorded.history if 0.0 < began <= now + 1e-9)]
     looks = np.array(times[-sensor.looks :])
     steps = np.minimum(np.round(looks / task.arm.timestep).astype(np.int64), len(joints) - 1)
     scenes = recorded.scene.take(np.zeros(len(looks), np.int64))
     readings = sensor.read(task.arm, joints[steps], scenes.obstacles_at(looks))
-    return readings.points[readings.seen >= 0]
+    eyes = np.broadcast_to(readings.eye[:, None], readings.points.shape)
+    return np.stack((eyes, readings.points), axis=2)[readings.seen >= 0]
 
 
 class Picture(NamedTuple):
@@ -172,7 +175,12 @@ class Picture(NamedTuple):
     done: Float  # Executed path of the hand so far, shape (T, 3), [m]
     touched: int  # Index into the executed path of the first contact; its length without contact
     replaced: Sequence[Float]  # Paths of plans that were replaced, shape (n, 3) each, [m]
-    seen: Float  # Points that a sensor has met, shape (M, 3), [m]
+    seen: Float  # Rays of a sensor from its eye to what they met, shape (M, 2, 3), [m]
+
+
+def _some(rays: Float, most: int) -> Float:
+    """Return up to so many of the rays, evenly spread."""
+    return rays[:: -(-len(rays) // most) or 1]
 
 
 class SceneView:
@@ -212,12 +220,14 @@ class SceneView:
             self._add_line(self._lowered(picture.planned), PLAN, PALETTE.plan)
         for via in self._lowered(picture.vias):
             self._add_ball(via, 0.011, PALETTE.via)
-        seen = picture.seen[:: -(-len(picture.seen) // MOST_SEEN) or 1].copy()
-        if self._flat and len(seen):  # on top of the obstacles, whose sides the camera hardly sees
+        rays = picture.seen.copy()
+        if self._flat and len(rays):  # on top of the obstacles, whose sides the camera hardly sees
             centre, half = bounding_boxes(picture.obstacles)
-            seen[:, 2] = (centre + half)[0, picture.obstacles.present[0], 2].max()
-        for point in seen:
+            rays[..., 2] = (centre + half)[0, picture.obstacles.present[0], 2].max()
+        for _, point in _some(rays, MOST_SEEN):
             self._add_ball(point, SEEN if self._flat else 2.0 * SEEN, PALETTE.seen)
+        for ray in _some(rays, MOST_RAYS):
+            self._add_tube(*ray, RAY, PALETTE.seen, RAY_OPACITY)
         free = picture.touched
         done = self._lowered(picture.done)
         for part, colour in ((done[: free + 1], PALETTE.executed), (done[free:], PALETTE.contact)):
@@ -308,9 +318,16 @@ class SceneView:
         places = np.linspace(0.0, length[-1], count)
         even = np.stack([np.interp(places, length, column) for column in points.T], axis=-1)
         for first, second in itertools.pairwise(even):
-            geom = self._add(Geom.mjGEOM_CAPSULE, (radius,) * 3, first, colour, GLOWING)
-            mujoco.mjv_connector(geom, Geom.mjGEOM_CAPSULE, radius, first, second)
-            geom.castshadow = False
+            self._add_tube(first, second, radius, colour)
+
+    def _add_tube(
+        self, first: Float, second: Float, radius: float, colour: Colour, opacity: float = 1.0
+    ) -> None:
+        """Add a tube from one point to another, shape (3,), [m], without a shadow."""
+        geom = self._add(Geom.mjGEOM_CAPSULE, (radius,) * 3, first, colour, GLOWING)
+        mujoco.mjv_connector(geom, Geom.mjGEOM_CAPSULE, radius, first, second)
+        geom.rgba[3], geom.transparent = opacity, opacity < 1.0
+        geom.castshadow = False
 
     def _add(self, kind: int, size: Any, centre: Float, colour: Colour, glow: float) -> Any:
         """Add a MuJoCo geom of a size, [m], and return it; where the scene is full, one that is not shown."""

@@ -38,7 +38,8 @@ SPACE = (2.6, -2.0, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), math.radians(38.0
 ORIGIN = (0.0, 0.0, 0.0)  # Place of what is drawn where it is, [m]
 NARROW = 0.75  # Width of a window relative to its height, below which the view is wider
 OPACITY, GHOST = 0.45, 0.16  # Of what hides others, and of the arm at the goal
-POINT = 0.005  # Size of the points that a sensor sees, [m]
+# Size of the points that a sensor sees, thickness of its rays, [m], and how many of these are drawn at most
+POINT, RAY, MOST_RAYS = 0.005, 0.0008, 96
 LARGE = 0.16  # Greatest size of obstacles in space that are not large, [m]
 LOW, TALL = 0.030, 0.060  # Height of obstacles in the plane, [m]: below links, and as tall as links
 GRID, PALE = (214, 214, 218), 0.45  # Colour of the lines on the table, and strength of pale colours
@@ -163,7 +164,9 @@ class View:
         self._rings = self._scene.add_transform_controls("/turn", 0.2, **rings)
         self._rings.on_update(lambda _: act("turn", np.array(self._rings.wxyz)))
         points: Any = {"point_size": POINT, "point_shape": "circle"}
-        self._seen = self._scene.add_point_cloud("/seen", np.zeros((0, 3)), _rgb(PALETTE.seen), **points)
+        yellow = _rgb(PALETTE.seen)
+        self._seen = self._scene.add_point_cloud("/seen", np.zeros((0, 3)), yellow, **points)
+        self._rays = self._scene.add_line_segments("/rays", np.zeros((0, 2, 3)), yellow, thickness=RAY)
 
     def draw(self, state: State) -> None:
         """Draw the scene, the plans and the movement."""
@@ -237,7 +240,7 @@ class View:
             node.wxyz, node.opacity = turn, opacity
 
     def _draw_seen(self, state: State) -> None:
-        """Draw the points that the sensor of the task sees from the start."""
+        """Draw the points that the sensor of the task sees from the start, and some of the rays that meet them."""
         task = self._arena.task
         if task.sensor is not None:
             joints = task.space.joints(state.scene.start)[None]
@@ -246,6 +249,9 @@ class View:
             if self._planar:
                 points[:, 2] = LOW + 0.002  # on top of the obstacles
             self._seen.points = points
+            some = points[:: -(-len(points) // MOST_RAYS) or 1]
+            eye = (*found.eye[0, :2], LOW + 0.002) if self._planar else found.eye[0]
+            self._rays.points = np.stack((np.broadcast_to(eye, some.shape), some), axis=1).astype(np.float32)
 
     def _draw_handle(self, name: str, number: int, place: Float) -> None:
         """Draw a handle, and a line down to the table that shows its place."""
