@@ -60,6 +60,10 @@ def read_urdf(path: Path, packages: Packages, visual: bool = False) -> Urdf:
         raise ValueError(f"{path} is no URDF: its first element is {root.tag!r}, not 'robot'")
     if not root.findall("link"):
         raise ValueError(f"{path} has no links; expand a xacro file first: xacro FILE > arm.urdf")
+    try:
+        _check_tree(root)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from None
     notes: list[str] = []
     assets: dict[str, bytes] = {}
     for name in LEFT_OUT if visual else (*LEFT_OUT, "material"):
@@ -109,6 +113,42 @@ def _root(path: Path) -> ET.Element:
         if "unbound prefix" not in str(error):
             raise ValueError(f"{path} is not XML: {error}") from None
     return ET.fromstring(re.sub(rb"(</?|\s)[\w.-]+:([\w.-]+)(?=[\s=/>])", rb"\1\2", content))
+
+
+def _check_tree(root: ET.Element) -> None:
+    """Check that no name is repeated, and that each link has at most one parent.
+
+    MuJoCo's messages on these do not name the link.
+
+    Raises:
+        ValueError: It is not so, or a joint connects a link that there is not.
+    """
+    for tag in ("link", "joint"):
+        names = [each.get("name", "") for each in root.findall(tag)]
+        for name in dict.fromkeys(names):
+            if names.count(name) > 1:
+                raise ValueError(f"names of {tag}s must differ, got {name!r} {names.count(name)} times")
+    links = {link.get("name") for link in root.findall("link")}
+    above: dict[str, tuple[str, str]] = {}  # Joints, and links before them, by the links that they lead to
+    for joint in root.findall("joint"):
+        name, ends = joint.get("name", ""), {}
+        for end in ("parent", "child"):
+            element = joint.find(end)
+            ends[end] = "" if element is None else element.get("link", "")
+            if ends[end] not in links:
+                raise ValueError(f"the {end} of joint {name!r} must be a link of the file, got {ends[end]!r}")
+        if ends["child"] in above:
+            other, _ = above[ends["child"]]
+            raise ValueError(
+                f"link {ends['child']!r} must be the child of one joint, got {other!r} and {name!r}"
+            )
+        above[ends["child"]] = name, ends["parent"]
+    for link in above:
+        passed = [link]
+        while passed[-1] in above:
+            passed.append(above[passed[-1]][1])
+            if passed[-1] in passed[:-1]:
+                raise ValueError(f"links must be a tree, got a ring: {', '.join(passed)}")
 
 
 def _prepare_joint(joint: ET.Element, notes: list[str]) -> float:

@@ -525,6 +525,22 @@ def test_urdf_files_that_lack_something_are_refused(crane, old, new):
         load_arm(written(crane, (old, new)))
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ('<link name="tool0"/>', '<link name="wrist"/>', "wrist"),
+        ('<joint name="tilt"', '<joint name="turn"', "turn"),
+        ('<parent link="wrist"/>', '<parent link="hand"/>', "hand"),
+        ('<parent link="wrist"/>', "", "mount"),
+        ('<child link="tool0"/>', '<child link="boom"/>', "boom"),
+        ('<parent link="wrist"/><child link="tool0"/>', '<parent link="wrist"/><child link="base"/>', "base"),
+    ],
+)
+def test_links_that_are_no_tree_are_named(crane, old, new, named):
+    with pytest.raises(ValueError, match=f"^crane.urdf: .*{named}"):
+        load_arm(written(crane, (old, new)))
+
+
 @pytest.mark.parametrize(("robot", "note"), [("crane", "those of"), ("ship", "crane.srdf is not used")])
 def test_pairs_of_an_srdf_of_the_same_robot_beside_it_are_not_compared(crane, robot, note):
     path = written(crane)
