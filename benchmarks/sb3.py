@@ -88,15 +88,22 @@ def curves_of(folder: Path) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for path in sorted(folder.glob("*/learning_curve.jsonl")):
         task, algo, seed = path.parent.name.split("-")
+        if algo not in ALGORITHMS:  # other trainings that benchmarks/results.py measures
+            continue
         for line in path.read_text(encoding="utf-8").splitlines():
             record = json.loads(line)
             row = {"task": task, "algo": algo, "seed": seed, "decisions": record["decisions"]}
             row["success"] = round(100.0 * record["success"]["rate"], 1)
             rows.append({**row, "seconds": round(record["seconds"])})
-    names = [(row["task"], row["algo"], row["seed"]) for row in rows]
+    measured = {_training(row) for row in rows}
     with CURVES.open(newline="", encoding="utf-8") as file:
-        kept = [row for row in csv.DictReader(file) if (row["task"], row["algo"], row["seed"]) not in names]
-    return sorted(kept + rows, key=lambda row: (TASKS.index(row["task"]), ALGORITHMS.index(row["algo"])))
+        kept = [row for row in csv.DictReader(file) if _training(row) not in measured]
+    return sorted(kept + rows, key=_training)
+
+
+def _training(row: dict[str, Any]) -> tuple[str, str, str]:
+    """Return task, algorithm and seed of a row."""
+    return row["task"], row["algo"], row["seed"]
 
 
 def draw(rows: list[dict[str, Any]]) -> None:

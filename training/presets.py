@@ -106,7 +106,7 @@ _LOOKING: dict[str, Any] = {
     "gradient_steps": 12,
     "explore_candidates": 32,
     "labels": 16,
-    "policy_kwargs": {"caution": 0.0},
+    "policy_kwargs": {"caution": 0.0, "effort": 0.05},
 }
 REPLANNING_PRESETS = {
     "viaq": _changed(PRESETS["viaq"], _REVISING, n_timesteps=24_000),
@@ -127,6 +127,7 @@ JOINT_SIGHT: dict[str, Any] = {
         "refinements": 0,
         "refine": 4,
         "caution": 0.0,  # it takes half of the time there, and solves no more
+        "effort": 0.05,
     },
 }
 

@@ -209,7 +209,8 @@ CALLS = [
         ("checks", -1), ("checks", 1.5), ("refine", True), ("candidates", 0), ("refinements", 10**9),
     )),
     lambda: setattr(load_agent(SENSED).policy, "belief", "magic"),
-    *(lambda weight=weight: setattr(load_agent(SENSED).policy, "caution", weight) for weight in (-0.1, np.nan)),
+    *(lambda name=name, weight=weight: setattr(load_agent(SENSED).policy, name, weight)
+      for name in ("caution", "effort") for weight in (-0.1, np.nan)),
     lambda: agent_method("agent", SAC("MultiInputPolicy", ViaVecEnv(PLANE, 1), buffer_size=2), 8),
     lambda: evaluate_methods([], load(shipped_path(PLANE), "test"), PLANE),
     lambda: evaluate(PLANE, env=REACH),

@@ -55,8 +55,9 @@ from viapoint.training.planning.search import (
     refined_actions,
 )
 
-EFFORT_WEIGHT = 0.05  # Weight of the reward of a successful plan beside its probability of success
-CAUTION = 0.8  # Weight of the depth behind all fronts that a plan clears, tuned on `validation` scenes
+# Weights of the depth behind all fronts that a plan clears, and of the reward of a plan that succeeds, beside the
+# probability of success. They were tuned on `validation` scenes of the plane, with one look.
+CAUTION, EFFORT = 0.8, 0.4
 # Time up to which a contact counts twice as much as later ones, which a revised plan may still avoid, [s]
 SOON = 0.45
 KEEP = 2.0  # Reward by which another plan must be better than the one under way, as each change of plan costs jerk
@@ -88,6 +89,7 @@ class ViaRankPolicy(PlanPolicy):
         refine: Number of best candidates that the planner refines around what is seen; they are ranked, too.
         caution: Weight of the depth behind all fronts that a plan clears beside its probability of success. What the
             network learned of the space behind fronts is wrong for obstacles that are unlike those of training.
+        effort: Weight of the reward of a plan that succeeds, which is greater for smooth and short ones.
         belief: Obstacles whose clearance the network sees beside the readings, one of
             :data:`~viapoint.training.planning.cautious.BELIEFS`. With `known` and `seen` the agent decides only where
             the true obstacles are given, as in evaluations.
@@ -102,6 +104,7 @@ class ViaRankPolicy(PlanPolicy):
         "per_refinement",
         "refine",
         "caution",
+        "effort",
         "belief",
     )
 
@@ -120,6 +123,7 @@ class ViaRankPolicy(PlanPolicy):
         per_refinement: int = 128,
         refine: int = 0,
         caution: float = CAUTION,
+        effort: float = EFFORT,
         belief: str = DEFAULT_BELIEF,
         **kwargs: Any,
     ) -> None:
@@ -132,6 +136,7 @@ class ViaRankPolicy(PlanPolicy):
         self.per_refinement = per_refinement
         self.refine = refine
         self.caution = caution
+        self.effort = effort
         self.belief = belief
         self._check_candidates()
         sensor = self.task.sensor
@@ -141,8 +146,8 @@ class ViaRankPolicy(PlanPolicy):
 
     def _check_setting(self, name: str, value: Any) -> None:
         super()._check_setting(name, value)
-        if name == "caution":
-            number_of_at_least("caution", value, 0.0)
+        if name in ("caution", "effort"):
+            number_of_at_least(name, value, 0.0)
         if name == "belief" and value not in BELIEFS:
             raise ValueError(f"belief must be one of {', '.join(BELIEFS)}, got {value!r}")
 
@@ -157,9 +162,9 @@ class ViaRankPolicy(PlanPolicy):
         return torch.sigmoid(self.network(inputs.to(self.device))).cpu().numpy(), worth
 
     def rank(self, problem: Problem, sight: Sight, actions: Numbers) -> Numbers:
-        """Return the probability of success of actions and EFFORT_WEIGHT times the reward of those that succeed."""
+        """Return the probability of success of actions, and `effort` times the reward of those that succeed."""
         success, worth = self.success(problem, sight, actions)
-        return np.asarray(success + EFFORT_WEIGHT * worth)
+        return np.asarray(success + self.effort * worth)
 
     def _cautious(self, problem: Problem, sight: Sight) -> Callable[[Numbers], Numbers]:
         """Return the criterion of decisions, a function of actions; caution counts where the truth is hidden."""
@@ -402,7 +407,7 @@ class ViaRank(PlanAlgorithm):
     @torch.no_grad()
     def _chosen(self, inputs: SightInputs, worth: NDArray[Any]) -> NDArray[np.int64]:
         """Return the plans to learn from: the best ones by the present network, and others, shape (B, labels)."""
-        value = torch.sigmoid(self.policy.network(inputs)).cpu().numpy() + EFFORT_WEIGHT * worth
+        value = torch.sigmoid(self.policy.network(inputs)).cpu().numpy() + self.policy.effort * worth
         order = np.argsort(-value, axis=1)
         best = order[:, : self.labels // 2]
         others = np.random.uniform(size=(len(order), order.shape[1] - best.shape[1])).argsort(axis=1)  # noqa: NPY002
