@@ -226,8 +226,8 @@ class SceneView:
             rays[..., 2] = (centre + half)[0, picture.obstacles.present[0], 2].max()
         for _, point in _some(rays, MOST_SEEN):
             self._add_ball(point, SEEN if self._flat else 2.0 * SEEN, PALETTE.seen)
-        for ray in _some(rays, MOST_RAYS):
-            self._add_tube(*ray, RAY, PALETTE.seen, RAY_OPACITY)
+        for eye, point in _some(rays, MOST_RAYS):
+            self._add_tube(eye, point, RAY, PALETTE.seen, RAY_OPACITY)
         free = picture.touched
         done = self._lowered(picture.done)
         for part, colour in ((done[: free + 1], PALETTE.executed), (done[free:], PALETTE.contact)):

@@ -613,6 +613,14 @@ def test_exploration_goes_from_the_best_candidate_to_any(small, temperature, mon
     assert counts[7] == 480 if temperature < 1.0 else counts.min() > 30  # of 60 each
 
 
+def test_observations_may_be_lists():
+    env, agent = gym.make(PLANE), load_agent(PLANE)
+    observation, _ = env.reset(seed=0)
+    expected, _ = agent.predict(observation)
+    found, _ = agent.predict({name: part.tolist() for name, part in observation.items()})
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
 @pytest.mark.parametrize("env_id", [PLANE, PANDA])
 def test_candidates_are_different_allowed_and_begin_with_the_straight_movement(env_id):
     task = registered_task(env_id)

@@ -184,8 +184,9 @@ class PlanPolicy(BasePolicy):
             raise ValueError(f"observation must have the parts {wanted}; got {got}")
         for name, each in observation.items():
             finite_array(name, each, (..., *parts[name].shape))
-        several = is_vectorized_observation(cast(Any, dict(observation)), parts)
-        batch = {name: np.reshape(observation[name], (-1, *box.shape)) for name, box in parts.spaces.items()}
+        arrays = {name: np.asarray(observation[name]) for name in parts.spaces}
+        several = is_vectorized_observation(cast(Any, arrays), parts)
+        batch = {name: arrays[name].reshape(-1, *box.shape) for name, box in parts.spaces.items()}
         if not len(batch[next(iter(batch))]):
             return np.zeros((0, *cast(Any, self.action_space).shape), np.float32), state
         self._check_observation(batch)
