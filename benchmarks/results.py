@@ -262,7 +262,7 @@ def draw(rows: list[dict[str, Any]]) -> None:
             axes.set_title(heading)
             axes.tick_params(labelbottom=True)
             style_axes(axes)
-        axes.set(xscale="log", xlim=(0.5, 200.0), ylim=(-6.0, 108.0), yticks=[0, 50, 100])
+        axes.set(xscale="log", xlim=(0.3, 200.0), ylim=(-6.0, 108.0), yticks=[0, 50, 100])
         axes.set_xticks([1, 10, 100], ["1", "10", "100"])
         for axes in panels:  # what is left holds the legend
             axes.axis("off")

@@ -32,8 +32,9 @@ PLAN, DONE, REPLACED = 0.0065, 0.0030, 0.0045
 SPACING = 0.02  # Distance of the points of a drawn path, [m]
 # Radius of the points that a sensor has met, twice as much in space, [m], and how many of them are drawn at most
 SEEN, MOST_SEEN = 0.004, 600
-# Radius of the rays that end there, [m], how many of them are drawn at most, and their opacity
-RAY, MOST_RAYS, RAY_OPACITY = 0.0008, 96, 0.35
+RAY = 0.0008  # Radius of the rays that end there, [m]
+MOST_RAYS = 96  # How many of them are drawn at most
+RAY_OPACITY = 0.35
 # Half lengths of the board that stands for a half-space, [m], and its opacity
 HALF_SPACE_BOARD, GLASSY = (1.0, 1.0, 0.002), 0.4
 BELOW_SURFACE = 0.008  # Depth of this board, [m]: a floor at the height of the table is hidden by it

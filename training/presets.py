@@ -65,7 +65,7 @@ PRESETS: dict[str, Preset] = {
     ),
     "viarank": Preset(
         policy="ViaRankPolicy",
-        n_timesteps=6_000,  # after more decisions, the predicted success of the best of many plans is worse
+        n_timesteps=6_000,  # more gain nothing
         eval_every=2_000,
         checkpoint_every=6_000,
         hyperparameters={"learning_rate": _falling(2e-3, 2e-5)},

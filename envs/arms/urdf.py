@@ -131,7 +131,8 @@ def _check_tree(root: ET.Element) -> None:
     links = {link.get("name") for link in root.findall("link")}
     above: dict[str, tuple[str, str]] = {}  # Joints, and links before them, by the links that they lead to
     for joint in root.findall("joint"):
-        name, ends = joint.get("name", ""), {}
+        name = joint.get("name", "")
+        ends: dict[str, str] = {}
         for end in ("parent", "child"):
             element = joint.find(end)
             ends[end] = "" if element is None else element.get("link", "")

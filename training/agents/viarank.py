@@ -55,9 +55,9 @@ from viapoint.training.planning.search import (
     refined_actions,
 )
 
-# Weights of the depth behind all fronts that a plan clears, and of the reward of a plan that succeeds, beside the
-# probability of success. They were tuned on `validation` scenes of the plane, with one look.
-CAUTION, EFFORT = 0.8, 0.4
+# Weights beside the probability of success, which were tuned on `validation` scenes of the plane, with one look:
+CAUTION = 0.8  # Weight of the depth behind all fronts that a plan clears
+EFFORT = 0.4  # Weight of the reward of a plan that succeeds
 # Time up to which a contact counts twice as much as later ones, which a revised plan may still avoid, [s]
 SOON = 0.45
 KEEP = 2.0  # Reward by which another plan must be better than the one under way, as each change of plan costs jerk

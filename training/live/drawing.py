@@ -38,8 +38,9 @@ SPACE = (2.6, -2.0, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), math.radians(38.0
 ORIGIN = (0.0, 0.0, 0.0)  # Place of what is drawn where it is, [m]
 NARROW = 0.75  # Width of a window relative to its height, below which the view is wider
 OPACITY, GHOST = 0.45, 0.16  # Of what hides others, and of the arm at the goal
-# Size of the points that a sensor sees, thickness of its rays, [m], and how many of these are drawn at most
-POINT, RAY, MOST_RAYS = 0.005, 0.0008, 96
+POINT = 0.005  # Size of the points that a sensor sees, [m]
+RAY = 0.0008  # Thickness of the rays that meet them, [m]
+MOST_RAYS = 96  # How many of these are drawn at most
 LARGE = 0.16  # Greatest size of obstacles in space that are not large, [m]
 LOW, TALL = 0.030, 0.060  # Height of obstacles in the plane, [m]: below links, and as tall as links
 GRID, PALE = (214, 214, 218), 0.45  # Colour of the lines on the table, and strength of pale colours
