@@ -650,8 +650,8 @@ def test_the_nearest_pairs_are_those_of_the_closest_approach_between_the_instant
 
 @pytest.fixture(scope="module")
 def agent():
-    # Without caution, success is that of the network alone.
-    own = {"candidates": 64, "caution": 0.0}
+    # So success is that of the network alone.
+    own = {"candidates": 64, "caution": 0.0, "effort": 0.05}
     few = {"explore_candidates": 32, "labels": 16, "batch_size": 48, "policy_kwargs": own}
     env = ViaVecEnv(SENSED, 32, seed=0)
     return ViaRank("ViaRankPolicy", env, seed=0, gradient_steps=8, **few).learn(256)
@@ -735,7 +735,7 @@ def test_it_learns_to_revise_plans(tmp_path) -> None:
     small = {
         "explore_candidates": 24,
         "labels": 12,
-        "policy_kwargs": {"candidates": 64, "refinements": 0, "caution": 0.0},
+        "policy_kwargs": {"candidates": 64, "refinements": 0, "caution": 0.0, "effort": 0.05},
     }
     agent = ViaRank("ViaRankPolicy", env, seed=0, gradient_steps=8, **small).learn(256)
     agent.save(tmp_path / "agent.zip")

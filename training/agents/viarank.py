@@ -89,6 +89,7 @@ class ViaRankPolicy(PlanPolicy):
         refine: Number of best candidates that the planner refines around what is seen; they are ranked, too.
         caution: Weight of the depth behind all fronts that a plan clears beside its probability of success. What the
             network learned of the space behind fronts is wrong for obstacles that are unlike those of training.
+            In space, and with looks on the way, 0 is better, and an `effort` of 0.05; `viapoint train` takes them.
         effort: Weight of the reward of a plan that succeeds, which is greater for smooth and short ones.
         belief: Obstacles whose clearance the network sees beside the readings, one of
             :data:`~viapoint.training.planning.cautious.BELIEFS`. With `known` and `seen` the agent decides only where
