@@ -36,7 +36,7 @@ format: $(READY) ## let ruff put the source in order
 	@$(BIN)/ruff format .
 	@$(BIN)/ruff check --fix .
 
-scenes: $(READY) ## make the frozen scenes again and compare them
+scenes: $(READY) ## make the frozen scenes again, and count those that are as they ship
 	@$(BIN)/python benchmarks/frozen_scenes.py --check
 
 versions: $(READY) ## the suite with the oldest versions that are allowed, in an environment of its own
