@@ -58,7 +58,7 @@ def raised_by_constants(value):
 
 def test_constants_and_defaults_compile_no_function_again():
     assert raised_by_constants(1) == 6
-    assert len(raised.overloads) == 1
+    assert len(raised.overloads) <= 1  # none if the caller came from the cache
 
 
 def coal_bodies(shape):
