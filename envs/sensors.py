@@ -32,6 +32,7 @@ MOUNTS = ("world", "hand")  # Frames in which the pose of a sensor may be given
 MOST_RAYS = 65_536  # Greatest number of rays of a sensor
 MOST_LOOKS = 64  # Greatest number of looks that are remembered
 WIDEST_IMAGE = 2.9  # Greatest field of view of an image, [rad]: its rays meet a plane
+VIEW_MARGIN = 0.01  # Least distance of obstacles from a sensor when an episode begins, [m]
 TOUCH = 1e-5  # Distance from a surface at which a ray has met it, [m]
 MOST_STEPS = 100  # Greatest number of steps along a ray towards one obstacle
 
@@ -122,7 +123,7 @@ class Sensor:
         if checked["columns"] * checked["rows"] > MOST_RAYS:
             raise ValueError(f"a sensor must have at most {MOST_RAYS} rays")
         widest = 2.0 * math.pi if checked["rows"] == 1 else WIDEST_IMAGE
-        bounds = {"field_of_view": (1e-3, widest + 1e-9), "range": (1e-3, 100.0)}
+        bounds = {"field_of_view": (1e-3, widest + 1e-9), "range": (2.0 * VIEW_MARGIN, 100.0)}
         bounds |= {"noise": (0.0, 1.0), "dropped": (0.0, 1.0)}
         for name, (least, below) in bounds.items():
             checked[name] = number_of_at_least(f"{name} of the sensor", getattr(self, name), least, below)
@@ -133,11 +134,6 @@ class Sensor:
     def n_rays(self) -> int:
         """Number of rays."""
         return self.columns * self.rows
-
-    @property
-    def viewpoint(self) -> tuple[float, float, float] | None:
-        """Place of the sensor in the world, [m]; None for one that moves."""
-        return self.position if self.mount == "world" else None
 
     @functools.cached_property
     def directions(self) -> Float:
@@ -164,14 +160,28 @@ class Sensor:
         place, _ = forward(arm.chain, joints)
         return tool @ rotation, place + tool @ position
 
-    def sees(self, centre: Float, radius: float) -> bool:
-        """Return True if a ray comes within a ball around a point, shape (3,), [m], or the sensor is on the hand."""
-        if self.mount == "hand":
-            return True
-        rays = self.directions @ frame_matrices(np.array(self.quaternion)).T
-        away = centre - np.array(self.position)
-        way = np.clip(rays @ away, 0.0, self.range)
-        return bool((np.linalg.norm(way[:, None] * rays - away, axis=-1) <= radius).any())
+    def sees(self, arm: Arm, reach: float, heights: tuple[float, float]) -> bool:
+        """Return True if a ray comes to where an arm may meet obstacles: near enough, and between two heights, [m].
+
+        What a hand can meet is within `reach` of the first joint, and within twice as much of itself, [m].
+        """
+        rotation, eye = self.pose(arm, arm.home[None])
+        rays = self.directions @ rotation[0].T
+        on_hand = self.mount == "hand"
+        away = (arm.hand(arm.home) if on_hand else arm.chain.origin[0]) - eye[0]
+        radius = 2.0 * reach if on_hand else reach
+        # The part of each ray that is in the ball around this place
+        middle = rays @ away
+        half_square = radius**2 - away @ away + middle**2
+        half = np.sqrt(np.maximum(half_square, 0.0))
+        first = np.maximum(middle - half, 0.0)
+        last = np.minimum(middle + half, self.range)
+        # The part of it that is between the heights; a level ray is there all the way, or nowhere
+        rise = np.where(np.abs(rays[:, 2]) < 1e-9, 1e-9, rays[:, 2])
+        to_heights = (np.array(heights)[:, None] - eye[0, 2]) / rise
+        first = np.maximum(first, to_heights.min(axis=0))
+        last = np.minimum(last, to_heights.max(axis=0))
+        return bool(((half_square >= 0.0) & (first <= last)).any())
 
     def ray_towards(self, local: Any) -> Any:
         """Return the number of the ray nearest to points, -1 outside the field of view, shape (...), int32.

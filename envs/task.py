@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -143,17 +144,19 @@ class Task:
             )
         families = default_families(plane, kinds, n_obstacles[1]) if families is None else families
         names = names_of("families", families)
-        if isinstance(sensor, str):
-            room = room_of(arm, kinds, n_obstacles, tall=False)
-            sensor = named_sensor(sensor, arm, room.foot, room.scale)
-            if decide_at == END:  # only one look at the beginning
-                sensor = dataclasses.replace(sensor, looks=1)
         if sensor is not None:
-            sensor = record_of("sensor", Sensor, sensor)
             if not n_obstacles[1]:
                 raise ValueError("sensor needs n_obstacles of 1 or more: there is nothing to see")
-            if not sensor.sees(arm.chain.origin[0], farthest_reach(arm)):
-                raise ValueError(f"sensor sees nothing of what the arm {arm.name!r} reaches: {sensor}")
+            room = room_of(arm, kinds, n_obstacles, bool(whole_arm))
+            if isinstance(sensor, str):
+                sensor = named_sensor(sensor, arm, room.foot, room.scale)
+                if decide_at == END:  # only one look at the beginning
+                    sensor = dataclasses.replace(sensor, looks=1)
+            sensor = record_of("sensor", Sensor, sensor)
+            half = room.height if plane else math.inf
+            heights = room.foot[2] - half, room.foot[2] + half
+            if not sensor.sees(arm, farthest_reach(arm), heights):
+                raise ValueError(f"sensor sees no obstacle that the arm {arm.name!r} can meet: {sensor}")
         task = cls(
             arm=arm,
             space_name=space,

@@ -101,13 +101,7 @@ STEP_PRESETS: dict[str, Preset] = {
 REACH_PRESETS = {"viaq": dataclasses.replace(PRESETS["viaq"], n_timesteps=8_000)}
 _REVISING = {"gradient_steps": 6, "next_candidates": 4}
 # Fewer plans of a scene and more updates than for one look, with which it solved 90 in place of 94 % of validation
-# Later looks see what caution is for: with it, 89 in place of 92 %.
-_LOOKING: dict[str, Any] = {
-    "gradient_steps": 12,
-    "explore_candidates": 32,
-    "labels": 16,
-    "policy_kwargs": {"caution": 0.0, "effort": 0.05},
-}
+_LOOKING = {"gradient_steps": 12, "explore_candidates": 32, "labels": 16}
 REPLANNING_PRESETS = {
     "viaq": _changed(PRESETS["viaq"], _REVISING, n_timesteps=24_000),
     "viarank": _changed(PRESETS["viarank"], _LOOKING, n_timesteps=12_000, eval_every=4_000),
@@ -126,8 +120,6 @@ JOINT_SIGHT: dict[str, Any] = {
         "candidates": 128,
         "refinements": 0,
         "refine": 4,
-        "caution": 0.0,  # it takes half of the time there, and solves no more
-        "effort": 0.05,
     },
 }
 

@@ -17,12 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.arrays import Float, Int
-from viapoint.envs.geometry.clearance import point_clearances
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
 from viapoint.envs.geometry.shapes import IN_TABLES, PLAIN_KINDS
-from viapoint.envs.scenes.sampler import VIEW_MARGIN
 from viapoint.envs.scenes.scene import NEVER, Scenes, check_scenes
-from viapoint.envs.sensors import Sensor
+from viapoint.envs.sensors import VIEW_MARGIN, Sensor
 from viapoint.envs.task import COURSES, Task
 
 SHIPPED = Path(str(files("viapoint.training") / "scenes"))  # Sets of the package
@@ -178,7 +176,7 @@ def _eyes_agree(frozen: Sensor | None, wanted: Sensor | None) -> bool:
     """Return True if scenes that were drawn for a sensor fit another one: obstacles keep away from one that rests."""
     if frozen is None or wanted is None:
         return frozen is wanted
-    return wanted.viewpoint in (None, frozen.viewpoint)
+    return wanted.mount == "hand" or (frozen.mount, frozen.position) == ("world", wanted.position)
 
 
 def load(path: Path, name: str = "") -> FrozenScenes:
@@ -271,11 +269,9 @@ def _check_fit(frozen: FrozenScenes, task: Task) -> None:
             f"({', '.join(sorted(kinds)) or 'none'}); the task has {len(task.arm.joint_names)} joints and up to {rows} "
             f"obstacles ({', '.join(task.shapes)})"
         )
-    viewpoint = task.sensor.viewpoint if task.sensor else None
-    if viewpoint and (point_clearances(frozen.scenes.obstacles, viewpoint) < VIEW_MARGIN).any():
-        raise ValueError(
-            f"{frozen.name} holds obstacles nearer than {VIEW_MARGIN} m to the sensor at {viewpoint}"
-        )
+    sensed = task.sensor is not None
+    if sensed and (task.sampler().sensor_clearances(frozen.scenes) < VIEW_MARGIN).any():
+        raise ValueError(f"{frozen.name} holds obstacles nearer than {VIEW_MARGIN} m to the sensor")
     changes = frozen.scenes.jumps, frozen.scenes.reach, frozen.scenes.turn_time < NEVER
     if task.whole_movement and any(part.any() for part in changes):
         raise ValueError(f"{frozen.name} holds scenes that change on the way, and the task has one decision")

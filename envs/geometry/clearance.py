@@ -78,11 +78,11 @@ def point_distance_and_normal(
 
 
 @compiled
-def point_clearances(obstacles: Obstacles, point: tuple[float, float, float]) -> Float:
-    """Return the signed distance of a point from the nearest obstacle of each of N scenes, shape (N,), at most 1 m."""
-    x, y, z = point
+def point_clearances(obstacles: Obstacles, points: Float) -> Float:
+    """Return the signed distance of a point, one of (N, 3), from the nearest obstacle of each scene, at most 1 m."""
     found = np.ones(len(obstacles.kind))
     for scene in range(len(found)):
+        x, y, z = points[scene]
         for row in range(obstacles.kind.shape[1]):
             if obstacles.kind[scene, row] != ABSENT:
                 apart = point_distance_and_normal(obstacles, scene, row, x, y, z, 0.0, 1.0)[0]

@@ -13,7 +13,7 @@ from viapoint.envs.arms.inverse_kinematics import inverse_kinematics, planar_joi
 from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.common.validation import finite_array
-from viapoint.envs.geometry.clearance import FAR, point_clearances, row_clearances
+from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, pack, unpack
 from viapoint.envs.geometry.shapes import (
     ConvexMesh,
@@ -23,8 +23,9 @@ from viapoint.envs.geometry.shapes import (
     registered_name,
 )
 from viapoint.envs.plans import SpaceName
-from viapoint.envs.scenes.sampler import VIEW_MARGIN, SceneSampler
+from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import ENDS, MOST_JUMPS, NEVER, Scenes, check_scenes, resting
+from viapoint.envs.sensors import VIEW_MARGIN
 from viapoint.envs.spaces import space_of
 
 OPTIONS = (*ENDS, "obstacles", "jumps", "turns", "reaches")  # Options of `reset` that give a part of a scene
@@ -73,13 +74,6 @@ def draw_given(
     shapes = _shapes(options["obstacles"], sampler, number) if "obstacles" in options else None
     obstacles = no_obstacles(number, sampler.rows) if shapes is None else pack(shapes, sampler.rows)
     names = [[shape.name for shape in each] for each in shapes or ()]
-    if sampler.viewpoint is not None:
-        apart = point_clearances(obstacles, sampler.viewpoint)
-        if (apart < VIEW_MARGIN).any():
-            raise ValueError(
-                f"options['obstacles'] must be {VIEW_MARGIN} m or more from the sensor at {sampler.viewpoint}, got "
-                f"{apart.min():.3g} m in scene {int(apart.argmin())}"
-            )
     ends = {name: _end(name, options[name], sampler, obstacles) for name in ENDS if name in options}
     home = np.tile(arm.home, (number, 1))
     scenes = resting(ends.get("start", home), ends.get("goal", home), obstacles)
@@ -101,6 +95,14 @@ def draw_given(
         scenes = scenes._replace(turn_velocity=turns[..., 1:].copy())
     # What is wrong with the given parts is said before others are drawn around them.
     check_scenes(scenes, arm, names, tuple(ends))
+    sensor = sampler.task.sensor
+    if sensor is not None and (sensor.mount == "world" or "start" in ends):
+        apart = sampler.sensor_clearances(scenes)
+        if (apart < VIEW_MARGIN).any():
+            raise ValueError(
+                f"options['obstacles'] must be {VIEW_MARGIN} m or more from the sensor, got {apart.min():.3g} m in "
+                f"scene {int(apart.argmin())}"
+            )
     try:
         drawn = sampler(generators, scenes, options)
     except RuntimeError as error:

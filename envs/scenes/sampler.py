@@ -38,6 +38,7 @@ from viapoint.envs.scenes.motions import (
     numbers_of_jumps,
 )
 from viapoint.envs.scenes.scene import ENDS, FARTHEST, Scenes, extents, resting
+from viapoint.envs.sensors import VIEW_MARGIN
 
 if TYPE_CHECKING:
     from viapoint.envs.task import Task
@@ -52,7 +53,6 @@ SHOULDER = 0.333  # Height of joint 2 of the reference arm in space, [m]
 REACH_SAMPLES = 2000  # Configurations among which the reach of an arm is looked for
 # Greatest number of obstacles that are drawn, unless a task asks for more in every scene; more can be given
 MOST_DRAWN = 32
-VIEW_MARGIN = 0.01  # Least distance of obstacles from a sensor that does not move, [m]
 # Layouts that are drawn for a scene at most, and layouts after which another family is tried
 ATTEMPTS, FAMILY_ATTEMPTS = 1000, 50
 
@@ -61,7 +61,7 @@ class SceneSampler:
     """Sampler of the scenes of a task.
 
     Scenes have rows for as many obstacles as the task allows. Obstacles in the plane are in the way of the links, too,
-    if `whole_arm`, and keep away from the place of a sensor that does not move.
+    if `whole_arm`, and keep away from the place of a sensor at the beginning.
     """
 
     def __init__(self, task: Task) -> None:
@@ -71,7 +71,6 @@ class SceneSampler:
         self.rows = most  # Number of rows for obstacles
         most = min(most, max(fewest, MOST_DRAWN))
         self.room = room_of(task.arm, task.shapes, (fewest, most), task.whole_arm)
-        self.viewpoint = None if task.sensor is None else task.sensor.viewpoint  # Place of a still sensor
         self._setting = _setting_of(task, self.plane)
         known = scene_families(self.plane)
         self._builds = [known[name].build for name in task.families]
@@ -113,9 +112,9 @@ class SceneSampler:
             obstacles = draft.scenes.obstacles.take(pending)
             if "obstacles" not in given:  # what is drawn can be given back
                 found &= np.maximum(*extents(obstacles)).max(axis=1, initial=0.0) <= FARTHEST
-            if self.viewpoint is not None:
-                found &= point_clearances(obstacles, self.viewpoint) >= VIEW_MARGIN
             found[found] = self._change(draft, pending[found], generators, given)
+            if self.task.sensor is not None:
+                found &= self.sensor_clearances(draft.scenes.take(pending)) >= VIEW_MARGIN
             pending = pending[~found]
             if not len(pending):
                 return draft.scenes.with_rows(self.rows)
@@ -129,6 +128,12 @@ class SceneSampler:
             f"obstacles was found in {ATTEMPTS} attempts for the arm {self.task.arm.name!r}; allow fewer obstacles or "
             "other families, or give other ends"
         )
+
+    def sensor_clearances(self, scenes: Scenes) -> Float:
+        """Return the distance of the sensor from the nearest obstacle at first, at most 1 m, shape (N,), [m]."""
+        assert self.task.sensor is not None
+        _, eyes = self.task.sensor.pose(self.task.arm, scenes.start)
+        return point_clearances(scenes.obstacles, eyes)
 
     def _draft(self, scenes: Scenes, given: Collection[str]) -> Draft:
         """Return copies of scenes with the given parts, and memory for the others."""

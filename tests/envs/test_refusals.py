@@ -211,6 +211,8 @@ CALLS = [
         ({"mount": "foot"},), ({"looks": 0},),
         ({"looks": 2},),  # an episode of one decision has one look
         ({"position": (0.0, 0.0, 2.0), "quaternion": (0.5**0.5, 0.0, -(0.5**0.5), 0.0)},),  # it sees the sky alone
+        ({"position": (0.0, 0.0, 0.2)},), ({"mount": "hand", "position": (0.0, 0.0, 0.2)},),  # rays above obstacles
+        ({"mount": "hand", "position": (9.0, 0.0, 0.0)},), ({"range": 0.01},),
     ]),
     (lambda change: ve.Task.of(**change), [
         ({"sensor": "rays", "n_obstacles": 0},), ({"decide_at": ["sight"]},),

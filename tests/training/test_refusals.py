@@ -382,6 +382,10 @@ COMMANDS = [
         "searchN",
     ),
     (f"evaluate --env {PLANE} --json /proc/x", "--json /proc/x cannot be written"),
+    (
+        f"evaluate --env {SENSED} --baselines reach:search16 --env-kwargs decide_at=[sight] moving_obstacles=true",
+        "searchN",
+    ),
     (f"evaluate --env {PLANE} --baselines untrained", "untrained needs an agent"),
     (f"evaluate --env {PLANE} --baselines cautious16", "cautious16 needs a task with a sensor"),
     *((f"fit nothing.csv --n-via {numbers}", "--n-via must be") for numbers in ("2 1", "0 1 2", "9", "-1")),

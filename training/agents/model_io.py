@@ -13,6 +13,7 @@ import importlib.metadata
 import inspect
 import json
 import math
+import types
 import typing
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -228,8 +229,10 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
         hint = hints.get(name, Any)
         try:
             check_type(number, hint, collection_check_strategy=CollectionCheckStrategy.ALL_ITEMS)
-        except TypeCheckError as error:
-            raise ValueError(f"{name} has a wrong type: {error}, got {value!r}") from None
+        except TypeCheckError:
+            kinds = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+            wanted = " or ".join(map(inspect.formatannotation, kinds))
+            raise ValueError(f"{name} must be {wanted}, got {value!r}") from None
         if isinstance(number, bool) and bool not in (hint, *typing.get_args(hint)):
             raise ValueError(f"{name} must be a number, got {value!r}")  # a bool counts as an int for Python
         if name == "train_freq" and isinstance(number, tuple):

@@ -223,7 +223,7 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         policy_kwargs: dict[str, Any] | None,
         **kwargs: Any,
     ) -> None:
-        check_arguments(type(self), vars(self))
+        check_arguments(type(self), {**vars(self), "policy_kwargs": policy_kwargs})
         check_arguments(type(self), {name: value for name, value in kwargs.items() if name in LIMITS})
         super().__init__(
             policy,

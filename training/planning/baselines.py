@@ -252,7 +252,7 @@ def make_method(name: str, env_id: str, **kwargs: Any) -> Method:
 def factory(name: str, task: Task) -> Callable[[SceneSimulation], Method]:
     """Return the factory of a baseline for a task; ValueError where there is none."""
     sensed = task.sensor is not None
-    predicted = task.replanning and task.moving_obstacles
+    predicted = task.replanning and task.moving_obstacles and not sensed
     counted = tuple(COUNTED) if sensed else SEARCHES
     if sensed and name == DEEP and not task.replanning:
         return DeepPlanner
