@@ -30,6 +30,8 @@ SHORTEST = 1e-3  # Length of the axis below which a capsule becomes a sphere, [m
 RIM_POINTS = 24
 CUTS = (0.35, 0.5, 0.65)  # Planes that cut a body, as shares of its length along a principal axis
 LEAST_SHARE = 0.3  # Least length along an axis across which a body is cut, as a share of the greatest
+# Corners of a hull above which it is simplified, planes to begin with, and how far it may reach beyond, [m]
+MANY_CORNERS, BEGIN, DETAIL = 500, 50, 1e-3
 # First and last step of the search for the ends, and last one where cuts are compared, as shares of the size
 FIRST_STEP, LAST_STEP, COARSE_STEP = 0.25, 5e-4, 0.05
 # Greatest number of capsules for one geom, and where their excess is at most SMALL, [m]
@@ -60,7 +62,7 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
         ValueError: The geom is of another type, or is flat.
     """
     try:
-        corners, radius, larger = hull_of(model, geom)
+        corners, radius, larger = _simple_hull(model, geom)
         if radius > 0.0:
             return [FittedCapsule(corners, radius, 0.0, np.empty((0, 3)), geom)]
         body = ConvexMesh.hull(corners)
@@ -78,7 +80,7 @@ def cover_geom(model: mujoco.MjModel, geom: int, tolerance: float) -> list[Fitte
 
 def split(model: mujoco.MjModel, capsule: FittedCapsule) -> list[FittedCapsule]:
     """Return two capsules with less excess that together contain what a capsule of :func:`cover_geom` contains."""
-    corners, _, larger = hull_of(model, capsule.geom)
+    corners, _, larger = _simple_hull(model, capsule.geom)
     halves = _best_halves(capsule.corners, ConvexMesh.hull(corners), 0.5 * (capsule.excess - larger))
     return [each._replace(excess=each.excess + larger, geom=capsule.geom) for each in halves]
 
@@ -121,6 +123,35 @@ def hull_of(model: mujoco.MjModel, geom: int) -> tuple[Float, float, float]:
         "a link may have geoms of the types sphere, capsule, cylinder, ellipsoid, box and mesh, not "
         f"{kind.name.removeprefix('mjGEOM_').lower()}"
     )
+
+
+def _simple_hull(model: mujoco.MjModel, geom: int) -> tuple[Float, float, float]:
+    """Return what :func:`hull_of` returns, or the corners of a simpler polytope around the hull if it has many corners.
+
+    Planes of faces are added where the polytope reaches farthest beyond the hull, until that is nowhere over DETAIL.
+    """
+    corners, radius, larger = hull_of(model, geom)
+    if len(corners) <= MANY_CORNERS:
+        return corners, radius, larger
+    hull = convex_hull(corners)
+    corners = corners[hull.vertices]
+    if len(corners) <= MANY_CORNERS:
+        return corners, radius, larger
+    from scipy.spatial import HalfspaceIntersection  # here, because it takes as long as all of the package
+
+    # Normals and negative offsets of planes: those of the box around the hull, which bound the polytope, and of faces
+    box = np.block([[np.eye(3), -corners.max(axis=0)[:, None]], [-np.eye(3), corners.min(axis=0)[:, None]]])
+    planes = np.concatenate((box, hull.equations))
+    chosen = np.concatenate((np.arange(6), np.arange(6, len(planes), len(planes) // BEGIN)))
+    while True:
+        around = HalfspaceIntersection(planes[chosen], corners.mean(axis=0)).intersections
+        highest = np.array([(planes[:, :3] @ point + planes[:, 3]).argmax() for point in around])
+        height = (planes[highest, :3] * around).sum(axis=1) + planes[highest, 3]
+        added = np.setdiff1d(highest[height > DETAIL], chosen)
+        if not added.size:
+            beyond = float(ConvexMesh.hull(corners).distance(around).max())
+            return around, radius, larger + max(beyond, 0.0)
+        chosen = np.concatenate((chosen, added))
 
 
 def _rim(number: int) -> Float:

@@ -109,7 +109,8 @@ def test_clearance_between_configurations_is_that_of_many_more(name, number):
 
 
 GEOMS = """<mujoco>
-  <asset><mesh name="wedge" vertex="0 0 0  .2 0 0  0 .1 0  .2 .1 0  0 0 .1  0 .1 .1"/></asset>
+  <asset><mesh name="wedge" vertex="0 0 0  .2 0 0  0 .1 0  .2 .1 0  0 0 .1  0 .1 .1"/>
+    <mesh name="detailed" builtin="sphere" params="4" scale=".05 .08 .2"/></asset>
   <worldbody>
     <geom type="sphere" size=".05" pos=".1 .2 .3"/>
     <geom type="capsule" size=".04 .1" pos="0 .2 .1" euler="10 20 30"/>
@@ -118,6 +119,7 @@ GEOMS = """<mujoco>
     <geom type="ellipsoid" size=".04 .06 .12" pos=".3 0 0" euler="0 60 10"/>
     <geom type="mesh" mesh="wedge" pos="1 0 0" euler="0 30 10"/>
     <geom type="cylinder" size=".28 .165" pos="2 0 0"/>
+    <geom type="mesh" mesh="detailed"/>
   </worldbody>
 </mujoco>"""
 
@@ -151,7 +153,7 @@ def depth(capsule, points):
 
 
 @pytest.mark.parametrize("tolerance", [0.02, 0.2])
-@pytest.mark.parametrize("geom", range(2, 7))
+@pytest.mark.parametrize("geom", range(2, 8))
 def test_capsules_contain_a_geom_and_reach_no_farther_beyond_it_than_the_tolerance(geom, tolerance):
     model, rng = mujoco.MjModel.from_xml_string(GEOMS), np.random.default_rng(2)
     found = cover_geom(model, geom, tolerance)

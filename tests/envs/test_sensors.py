@@ -95,7 +95,9 @@ def test_a_sensor_at_the_hand_moves_with_it() -> None:
     assert np.allclose(first.ranges, second.ranges, atol=1e-4)
 
 
-@pytest.mark.parametrize("place", [{"position": (0.2, 0.2, 0.0)}, {"mount": "hand", "position": (0.04, 0.0, 0.0)}])
+@pytest.mark.parametrize(
+    "place", [{"position": (0.2, 0.2, 0.0)}, {"mount": "hand", "position": (0.04, 0.0, 0.0)}]
+)
 def test_no_episode_begins_with_the_sensor_in_an_obstacle(place) -> None:
     moving = {"moving_obstacles": True, "decide_at": ["horizon"]}
     task = ve.Task.of(n_obstacles=(4, 6), sensor={"field_of_view": 6.28, "columns": 36, **place}, **moving)
