@@ -96,7 +96,9 @@ class Arm:
                 f"{self.torque_limit[j]:.4g} {effort}, home {self.home[j]:.4g} {unit}"
             )
         lines += self.notes
-        lines += [f"{pair.first} and {pair.second} are not compared: {pair.reason}" for pair in self.left_out]
+        for reason in dict.fromkeys(pair.reason for pair in self.left_out):
+            pairs = [f"{pair.first} and {pair.second}" for pair in self.left_out if pair.reason == reason]
+            lines.append(f"not compared, {reason}: {'; '.join(pairs)}")
         lines.append(f"spheres reach up to {1e3 * self.excess:.1f} mm beyond the geoms")
         return "\n".join(lines)
 
