@@ -36,16 +36,13 @@ from viapoint.training.agents.plan_agent import PlanAlgorithm, PlanPolicy
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.movements import INSTANTS
 from viapoint.training.planning.problem import Numbers, Problem, moves_of
-from viapoint.training.planning.search import INFEASIBLE, best_of, merits, refined_actions
+from viapoint.training.planning.search import best_of, merits, refined_actions
 from viapoint.training.vec_env import ELAPSED
 
 KEEP = 0.1  # Minimum gain of Q for which a running plan is revised
-# Greatest number of proposals that are checked; all further checks are of plans around the best of them
-PROPOSALS = 32
 # Least distance of the via-points of two candidates that are refined, in the action space. Of .2 to 1.8, .5 solved most
 # of the `validation` scenes of PandaObstacles.
 APART = 0.5
-LOCAL_ROUNDS = 4  # Rounds of checks around the best checked plans
 SPARE = 0.2  # Greatest time that is left after a movement, or missing for it, at the input of the critic, [s]
 BLOCK = 64  # Scenes that are decided together
 MOTION_SCALES = (1.0, 0.1)  # Scales of velocity and acceleration at the input of the critic
@@ -179,30 +176,12 @@ class ViaQPolicy(PlanPolicy):
             first = self.best_within_reach(problem, actions, values)
             return np.asarray(actions[np.arange(len(first)), first])
         count = min(max(self.checks, self.refine), values.shape[1])
-        local = max(count - PROPOSALS, 0) if self.checks else 0
-        promising = self._promising(values, count - local)
+        promising = self._promising(values, count)
         checked = np.take_along_axis(actions, promising[..., None], axis=1)
         if self.refine:
             refined = refined_actions(self.task, problem, self._apart(actions, values, self.refine))
             checked = np.concatenate((checked, refined), axis=1)
-        worth = merits(self.task, problem, checked)
-        best = best_of(self.task, problem, checked, worth)
-        # Plans that are not clear have a merit near INFEASIBLE.
-        rows = np.flatnonzero(self.replanning | (worth.max(axis=1) < 0.5 * INFEASIBLE))
-        if local and rows.size:
-            best[rows] = self._improved(problem.take(rows), checked[rows], worth[rows], local)
-        return best
-
-    def _improved(self, problem: Problem, checked: Numbers, worth: Numbers, count: int) -> Numbers:
-        """Return the best of checked actions and of `count` further ones around the best of them, shape (B, m)."""
-        for each in range(LOCAL_ROUNDS):
-            share = (count + each) // LOCAL_ROUNDS
-            if share:
-                top = np.argsort(-worth, axis=1, kind="stable")[:, :4]
-                near = self.around(np.take_along_axis(checked, top[..., None], axis=1), each)[:, :share]
-                checked = np.concatenate((checked, near), axis=1)
-                worth = np.concatenate((worth, merits(self.task, problem, near)), axis=1)
-        return best_of(self.task, problem, checked, worth)
+        return best_of(self.task, problem, checked, merits(self.task, problem, checked))
 
     def _promising(self, values: Numbers, count: int) -> NDArray[np.intp]:
         """Return indices of candidates to check, shape (B, count), for ranking criteria of shape (B, N).
