@@ -101,8 +101,10 @@ def _listed(ids: Iterable[str]) -> str:
     return f"viapoint/NAME-v0, where NAME is one of {names}"
 
 
-ENV = tyro.conf.arg(
-    metavar="ID", help=f"Id of a registered environment: {_listed(ENV_IDS)}; or my_module:my/Task-v0."
+ENV_HELP = f"Id of a registered environment: {_listed(ENV_IDS)}; or my_module:my/Task-v0."
+ENV = tyro.conf.arg(metavar="ID", help=ENV_HELP)
+ENV_OF_ARM = tyro.conf.arg(
+    metavar="ID", help=ENV_HELP, help_behavior_hint=f"(default: {DEFAULT_ENV}, or one for --arm)"
 )
 AGENT = tyro.conf.arg(
     metavar="AGENT", help=f"Run folder, model folder, or id of a shipped agent: {_listed(SHIPPED_IDS)}."
@@ -165,7 +167,7 @@ class Config:
                 value = named_path(name, value)
             elif str(each.type) == "bool" and not isinstance(value, bool):
                 raise ValueError(f"{name} must be True or False, got {value!r}")
-            elif name == "env" and isinstance(value, str):
+            elif name == "env" and isinstance(value, str) and value != each.default:
                 value = check_registered(value)
             elif str(each.type) == "NamedValues":
                 value = _plain(name, value)
@@ -193,7 +195,8 @@ class TrainConfig(Config):
         ('runs/PandaObstacles-v0-viaq-1', 16000)
     """
 
-    env: Annotated[str, ENV] = DEFAULT_ENV  #: Id of the environment.
+    env: Annotated[str, ENV_OF_ARM] = ""
+    """Id of the environment; by default viapoint/PlanarObstacles-v0, or with `arm` one for this arm."""
     arm: Annotated[str | None, ARM] = None
     """Arm, which becomes one of the arguments of the environment; the usual environment is then one for any arm."""
     algo: Algorithm | None = None
@@ -219,8 +222,8 @@ class TrainConfig(Config):
             raise ValueError(f"env must be the id of an environment, got {self.env!r}")
         if self.algo is not None and self.algo not in get_args(Algorithm):
             raise ValueError(f"algo must be one of {', '.join(get_args(Algorithm))}, got {self.algo!r}")
-        if self.arm is not None:
-            env, argument = env_of_arm(self.arm, None if self.env == DEFAULT_ENV else self.env)
+        if self.arm is not None or not self.env:
+            env, argument = env_of_arm(self.arm or "planar", self.env or None)
             object.__setattr__(self, "env", env)
             object.__setattr__(self, "env_kwargs", {**self.env_kwargs, **_plain("arm", argument)})
             object.__setattr__(self, "arm", None)

@@ -13,7 +13,7 @@ import signal
 import numpy as np
 import pytest
 import torch
-from helpers import MOVING, PLANE, STEP
+from helpers import MOVING, PANDA, PLANE, STEP
 from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -253,6 +253,19 @@ class Heard(BaseCallback):
 
     def _on_training_end(self):
         self.ended += 1
+
+
+@pytest.mark.parametrize(
+    ("given", "env_id", "arm"),
+    [
+        ({}, PLANE, "planar"),
+        ({"arm": "panda"}, PANDA, "panda"),
+        ({"arm": "panda", "env": PLANE}, PLANE, "panda"),
+    ],
+)
+def test_an_environment_that_is_named_keeps_its_id_with_any_arm(given, env_id, arm):
+    config = TrainConfig(**given)
+    assert (config.env, config.task.arm.name) == (env_id, arm)
 
 
 def test_a_run_keeps_its_settings_when_the_presets_change(tmp_path, monkeypatch):
