@@ -1,6 +1,6 @@
 """Least-cost trajectories through given points at given times: a banded linear system for the knot states.
 
-With the cost 1/2 sum_s s^T W s / h^(2m-1) of the segments (see `_hermite_tables`), a zero gradient with
+With the cost 1/2 sum_s s^T W s / h^(2m-1) of the segments (see `_polynomial`), a zero gradient with
 respect to the unknown derivatives y at the knots is
 
     A y = b,                                                                                        (1)
@@ -22,7 +22,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ._hermite_tables import coefficient_table, energy_table, stiffness_table
+from ._polynomial import coefficient_table, energy_table, stiffness_table
 from ._weighted_solver import rounding_slack, weighted_coefficients
 from .array_api import (
     FREE,
@@ -174,7 +174,7 @@ def _banded_coefficients(
         lengths = lengths.reshape(-1).tolist()  # Python floats: the same bits, without an array's overhead
     states = _solve_states(order, lengths, xp.moveaxis(steps, -2, 0), states)
     rest = 0.0 * steps[..., 0, :]
-    # Rows of s = (x0, V0_1, ..., D, V1_1, ...), see Eq. 1 of _hermite_tables; V_i = h^i x^(i).
+    # Rows of s = (x0, V0_1, ..., D, V1_1, ...), see Eq. 1 of _polynomial; V_i = h^i x^(i).
     first, last = [waypoints[..., :-1, :]], [steps]
     power = length = durations[..., None]
     for i in range(order - 1):

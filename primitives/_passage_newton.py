@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 
-from ._hermite_tables import mode_table
 from ._passage_one_via import SHORTEST, attach_root_gradient, nearer_fraction
+from ._polynomial import mode_table
 from ._weighted_solver import fit_modes, mode_weights
 from .array_api import FREE, Array, Floats, Namespace, change_given, like, ordered_sum, to_numpy
 from .trajectory import connect, duration_gradient

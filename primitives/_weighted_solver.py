@@ -5,7 +5,7 @@ the square of the ratio of the durations. Here the cost of a segment stays a sum
 
     phi = 1/2 sum_i w_i |r_i|^2,   r_i = q_i / h^(m-1),   w_i = (2 i + 1) / h,                      (1)
 
-with the Legendre modes q = P s of `_hermite_tables`. Unknowns are eliminated from its rows by rotations without
+with the Legendre modes q = P s of `_polynomial`. Unknowns are eliminated from its rows by rotations without
 square roots (Gentleman 1973, Least squares computations by Givens transformations without square roots). Two rows
 y + x.z and c y + x'.z, of weights w and w', become
 
@@ -38,7 +38,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ._hermite_tables import mode_table, series_table
+from ._polynomial import mode_table, series_table
 from .array_api import FREE, Array, Namespace, change_given
 
 Entry: TypeAlias = Any  # An array or a Python float

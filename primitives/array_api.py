@@ -248,16 +248,19 @@ def like(xp: Namespace, values: np.ndarray[Any, Any], other: Array) -> Array:
     return xp.asarray(values, dtype=other.dtype, device=other.device)
 
 
-def largest_exponent(xp: Namespace, dtype: Any) -> int:
-    """Return the largest n for which 2^n and 2^-n are both normal numbers of the dtype and of a double."""
-    return math.frexp(min(float(xp.finfo(dtype).max), sys.float_info.max))[1] - 2
+def unit_factors(xp: Namespace, array: Array, axis: int | tuple[int, ...] = -1) -> Array:
+    """Return powers of two that scale an array to a size of about 1 along the axes, which they keep with size 1.
 
-
-def unit_factors(xp: Namespace, array: Array) -> Array:
-    """Return powers of two (..., 1) that scale vectors (..., D) to a size of about 1.
-
-    Squares of the scaled vectors neither over- nor underflow, and multiplication by a power of two is exact.
+    Squares of the scaled array neither over- nor underflow, and multiplication by a power of two is exact.
     """
-    limit = largest_exponent(xp, array.dtype)
-    exponent = np.clip(np.frexp(np.abs(to_numpy(array)).max(axis=-1, keepdims=True))[1], -limit, limit)
+    size = np.abs(to_numpy(array)).max(axis=axis, keepdims=True)
+    # The largest n for which 2^n and 2^-n are both normal numbers of the dtype and of a double
+    limit = math.frexp(min(float(xp.finfo(array.dtype).max), sys.float_info.max))[1] - 2
+    exponent = np.clip(np.frexp(size)[1], -limit, limit)
     return like(xp, np.ldexp(1.0, -exponent), array)
+
+
+def vector_length(xp: Namespace, vectors: Array) -> Array:
+    """Return the Euclidean norm of the last axis, without over- or underflow of squares."""
+    factors = unit_factors(xp, vectors)
+    return xp.linalg.vector_norm(vectors * factors, axis=-1) / factors[..., 0]

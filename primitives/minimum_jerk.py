@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from ._hermite_tables import ORDERS
 from .array_api import (
     FREE,
     Array,
@@ -25,6 +24,8 @@ from .array_api import (
 from .trajectory import Trajectory, connect
 
 Ends = dict[str, Boundary]  # The four boundary values by name, in the order of END_NAMES
+
+ORDERS = (2, 3, 4)
 
 # Distance of waypoints that count as equal, in units of the rounding of their greatest coordinate.
 _EQUAL = 64.0
