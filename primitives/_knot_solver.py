@@ -30,6 +30,8 @@ from .array_api import (
     Namespace,
     broadcast_to,
     change_given,
+    change_time_unit,
+    flat_batch,
     is_given,
     like,
     to_numpy,
@@ -41,7 +43,7 @@ Entry: TypeAlias = Any  # An array or a Python float
 # states[k][i - 1] = i-th time derivative at knot k: an array, None for zero, FREE for unknown
 States: TypeAlias = list[list[Any]]
 
-Nodes: TypeAlias = dict[tuple[int, int], int]  # Row of each unknown states[k][i] in Eq. 1, by (k, i).
+Node: TypeAlias = tuple[int, int]  # Unknown states[k][i] by (k, i), in the order of the rows of Eq. 1
 
 # Power of the machine epsilon that is the least ratio of two durations of a movement for the normal equations. Their
 # relative error is about epsilon times the square of the inverse ratio: below 1e-10, in single precision 1e-4.
@@ -56,14 +58,9 @@ _SHORT, _LONG = 1e-3, 1e3
 
 def _solve_states(order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States) -> States:
     """Return the states with every FREE derivative computed, from durations and steps of the segments."""
-    nodes: Nodes = {}
-    for k, state in enumerate(states):
-        for i, value in enumerate(state):
-            if value is FREE:
-                nodes[k, i] = len(nodes)
-    upper, values = _assemble(order, durations, steps, states, nodes)
+    upper, values = _assemble(order, durations, steps, states)
     # Elimination without pivoting is stable, as A is positive definite.
-    for p, row in enumerate(upper):
+    for p, row in upper.items():
         pivot = row[p]
         for q in [q for q in row if q > p]:
             factor = row[q] / pivot
@@ -71,48 +68,44 @@ def _solve_states(order: int, durations: Sequence[Entry], steps: Sequence[Array]
             for r in [r for r in row if r >= q]:
                 entry = factor * row[r]
                 upper[q][r] = upper[q][r] - entry if r in upper[q] else -entry
-    for p in reversed(range(len(values))):
+    solved = list(map(list, states))
+    for p in reversed(upper):
         for q, entry in upper[p].items():
             if q > p:
                 values[p] = values[p] - entry * values[q]
         values[p] = values[p] / upper[p][p]
-    solved = list(map(list, states))
-    for (k, i), value in zip(nodes, values, strict=True):
-        solved[k][i] = value
+        solved[p[0]][p[1]] = values[p]
     return solved
 
 
 def _assemble(
-    order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States, nodes: Nodes
-) -> tuple[list[dict[int, Entry]], list[Array]]:
+    order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States
+) -> tuple[dict[Node, dict[Node, Entry]], dict[Node, Array]]:
     """Return the upper half of A and the right side b of Eq. 1.
 
     A segment adds W_ab h^(i + j + 2 - (2m - 1)) to the entry of the unknowns x^(i+1), x^(j+1) at its ends,
     since its data are V_i = h^i x^(i). Its step D and given derivatives go to the right side.
     """
     table = stiffness_table(order)
-    upper: list[dict[int, Entry]] = [{} for _ in nodes]
-    right: list[Any] = [None] * len(nodes)
+    upper: dict[Node, dict[Node, Entry]] = {}
+    right: dict[Node, Array] = {}
     for s, (duration, step) in enumerate(zip(durations, steps, strict=True)):
         # 1, 1/h, 1/h^2, ...; index = exponent
         powers = [1.0, *accumulate(repeat(1.0 / duration, 2 * order - 2), operator.mul)]
         local = list(product((s, s + 1), range(order - 1)))
-        for a, node in enumerate(local):
-            p = nodes.get(node)
-            if p is None:
+        for p, (loads, *weights) in zip(local, table[1:], strict=True):
+            if states[p[0]][p[1]] is not FREE:
                 continue
-            load = -table[a + 1][0] * powers[2 * order - 2 - node[1]] * step
-            for b, other in enumerate(local):
-                weight = table[a + 1][b + 1]
-                q = nodes.get(other)
-                if q is None:
-                    value = states[other[0]][other[1]]
-                    if value is not None:
-                        load = load - weight * powers[2 * order - 3 - node[1] - other[1]] * value
-                elif q >= p:
-                    entry = weight * powers[2 * order - 3 - node[1] - other[1]]
-                    upper[p][q] = upper[p][q] + entry if q in upper[p] else entry
-            right[p] = load if right[p] is None else right[p] + load
+            row = upper.setdefault(p, {})
+            load = -loads * powers[2 * order - 2 - p[1]] * step
+            for q, weight in zip(local, weights, strict=True):
+                value = states[q[0]][q[1]]
+                if value is FREE and q >= p:
+                    entry = weight * powers[2 * order - 3 - p[1] - q[1]]
+                    row[q] = row[q] + entry if q in row else entry
+                elif is_given(value):
+                    load = load - weight * powers[2 * order - 3 - p[1] - q[1]] * value
+            right[p] = right[p] + load if p in right else load
     return upper, right
 
 
@@ -128,32 +121,21 @@ def least_cost_coefficients(
     eps = float(xp.finfo(durations.dtype).eps)
     if not _is_extreme(to_numpy(durations), eps).any():
         return _banded_coefficients(xp, order, waypoints, durations, states)
-    *batch, knots, dimension = waypoints.shape
-    count = int(np.prod(batch, dtype=int))
-    if not count:
-        return like(xp, np.zeros((*batch, 2 * order, segments, dimension)), waypoints)
-    flat_points = xp.reshape(waypoints, (count, knots, dimension))
-    flat_durations = xp.reshape(broadcast_to(xp, durations, (*batch, segments)), (count, segments))
-
-    def flat(value: Array) -> Array:
-        full = broadcast_to(xp, value, (*batch, value.shape[-1]))
-        return xp.reshape(full, (count, value.shape[-1]))
-
-    flat_states = [change_given(flat, state) for state in states]
-    numbers = to_numpy(flat_durations)
+    batch = waypoints.shape[:-2]
+    points = flat_batch(xp, waypoints, batch, 2)
+    durations = flat_batch(xp, durations, batch, 1)
+    states = [change_given(lambda value: flat_batch(xp, value, batch, 1), state) for state in states]
+    numbers = to_numpy(durations)
     empty = numbers <= 0
     positive = np.where(empty, numbers.max(axis=-1, keepdims=True), numbers)
     kinds = np.column_stack([empty, _is_extreme(positive, eps)])
-
-    parts, members = [], []
+    result = like(xp, np.zeros((len(points), 2 * order, segments, points.shape[-1])), waypoints)
     for kind in np.unique(kinds, axis=0):  # movements with the same empty segments are solved together
         where = np.flatnonzero((kinds == kind).all(axis=1))
-        chosen = [change_given(operator.itemgetter(where), state) for state in flat_states]
-        group = (flat_points[where], flat_durations[where], chosen)
-        parts.append(_connect_kind(xp, order, *group, kind[:-1], bool(kind[-1])))
-        members.append(where)
-    joined = xp.concat(parts, axis=0)[np.argsort(np.concatenate(members))]
-    return xp.reshape(joined, (*batch, *joined.shape[1:]))
+        chosen = [change_given(operator.itemgetter(where), state) for state in states]
+        extreme = bool(kind[-1])
+        result[where] = _connect_kind(xp, order, points[where], durations[where], chosen, kind[:-1], extreme)
+    return xp.reshape(result, (*batch, *result.shape[1:]))
 
 
 def _is_extreme(durations: Any, eps: float) -> Any:
@@ -166,7 +148,9 @@ def _banded_coefficients(
 ) -> Array:
     """Return the coefficients (..., 2m, S, D) by the normal equations."""
     if 0 not in durations.shape and not (durations.min() >= _SHORT and durations.max() <= _LONG):
-        durations, states = _rescaled(xp, durations, states)
+        scale = unit_factors(xp, durations)
+        durations = durations * scale
+        states = [change_time_unit(state, 1.0 / scale) for state in states]  # exact, as powers of two are
     segments = waypoints.shape[-2] - 1
     steps = waypoints[..., 1:, :] - waypoints[..., :-1, :]
     lengths = xp.moveaxis(durations[..., None], -2, 0)
@@ -193,19 +177,6 @@ def _banded_coefficients(
     return xp.reshape(coefficients, (*batch, 2 * order, segments, rest.shape[-1]))
 
 
-def _rescaled(xp: Namespace, durations: Array, states: States) -> tuple[Array, States]:
-    """Return durations of about 1 and the states in their unit, a power of two: x^(i) / scale^i is exact."""
-    scale = unit_factors(xp, durations)
-    scaled: States = []
-    for state in states:
-        row, factor = [], xp.ones_like(scale)
-        for value in state:
-            factor = factor / scale
-            row.append(value * factor if is_given(value) else value)
-        scaled.append(row)
-    return durations * scale, scaled
-
-
 def _weighted_coefficients(
     xp: Namespace, order: int, waypoints: Array, durations: Array, states: States
 ) -> Array:
@@ -219,7 +190,7 @@ def _weighted_coefficients(
     pace = to_numpy(total)[:, None]
     ends = []
     for state in (states[0], states[-1]):
-        ends.append([to_numpy(v) * pace ** (i + 1) if is_given(v) else v for i, v in enumerate(state)])
+        ends.append(change_time_unit(change_given(to_numpy, state), pace))
     slack = like(xp, rounding_slack(points, ends), durations)
     for _ in range(2 * order - 1):
         slack = slack * total
@@ -245,20 +216,13 @@ def _connect_kind(
 ) -> Array:
     """Return the coefficients where every item has the same empty segments; an empty one is a constant."""
     full = np.flatnonzero(~empty).tolist()
-    points = waypoints[..., None, :-1, :]
-    still = xp.concat([points, *[0.0 * points] * (2 * order - 1)], axis=-3)
+    points = waypoints[:, None, :-1]
+    result = xp.concat([points, *[0.0 * points] * (2 * order - 1)], axis=1)
     if not full:
-        return still
+        return result
     # Keep the start and the end of every full segment; merged knots share one state, the goal's at the end.
     kept = [0, *(s + 1 for s in full[:-1]), len(empty)]
     chosen = [states[k] for k in kept]
-    points = xp.stack([waypoints[..., k, :] for k in kept], axis=-2)
-    lengths = xp.stack([durations[..., s] for s in full], axis=-1)
     solve = _weighted_coefficients if extreme else _banded_coefficients
-    solved = solve(xp, order, points, lengths, chosen)
-    if len(full) == len(empty):
-        return solved
-    columns = list(xp.moveaxis(still, -2, 0))
-    for k, s in enumerate(full):
-        columns[s] = solved[..., k, :]
-    return xp.stack(columns, axis=-2)
+    result[:, :, full] = solve(xp, order, waypoints[:, kept], durations[:, full], chosen)
+    return result

@@ -63,6 +63,16 @@ def change_given(function: Callable[[Array], Array], values: Iterable[Boundary])
     return [function(value) if is_given(value) else value for value in values]
 
 
+def change_time_unit(state: Iterable[Boundary], unit: Array) -> list[Boundary]:
+    """Return first, second, ... derivatives in another unit of time (..., 1), of which arrays change; see above."""
+    changed: list[Boundary] = []
+    power = unit
+    for value in state:
+        changed.append(value * power if is_given(value) else value)
+        power = power * unit
+    return changed
+
+
 def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> tuple[Namespace, list[Any]]:
     """Convert arguments by name to one array library and one floating dtype; return it and them, required ones first.
 
@@ -219,6 +229,13 @@ def as_number(value: Any) -> float:
 def broadcast_to(xp: Namespace, array: Array, shape: tuple[int, ...]) -> Array:
     """Broadcast an array, without the overhead of a call if it has the shape already."""
     return array if tuple(array.shape) == tuple(shape) else xp.broadcast_to(array, shape)
+
+
+def flat_batch(xp: Namespace, array: Array, batch: Sequence[int], own: int) -> Array:
+    """Return an array with its full batch in one axis; the last `own` axes stay."""
+    shape = tuple(array.shape[len(array.shape) - own :])
+    full = broadcast_to(xp, array, (*batch, *shape))
+    return xp.reshape(full, (math.prod(batch), *shape))
 
 
 def ordered_sum(array: Any, axis: int = 0) -> Any:

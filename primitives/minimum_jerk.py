@@ -16,6 +16,7 @@ from .array_api import (
     as_floats,
     broadcast_batch,
     broadcast_to,
+    change_time_unit,
     is_given,
     leading_shape,
     require,
@@ -257,5 +258,4 @@ def knot_states(order: int, ends: Ends, vias: int = 0) -> list[list[Any]]:
 def unit_time_ends(ends: Sequence[Boundary], duration: Array) -> list[Any]:
     """Return the values of END_NAMES in unit time, V = v T and A = a T^2; None and FREE stay."""
     time = duration[..., None]
-    powers = time, time * time, time, time * time
-    return [value * power if is_given(value) else value for value, power in zip(ends, powers, strict=True)]
+    return change_time_unit(ends[:2], time) + change_time_unit(ends[2:], time)

@@ -20,6 +20,7 @@ from .array_api import (
     broadcast_batch,
     broadcast_to,
     change_given,
+    flat_batch,
     like,
     ordered_sum,
     to_numpy,
@@ -106,10 +107,7 @@ def passage_durations(
 
 def _flat(array: Array, batch: tuple[int, ...], own: int) -> Any:
     """Return NumPy float64 with the full batch in one axis; the last `own` axes stay."""
-    array = array if isinstance(array, np.ndarray) else to_numpy(array)
-    numbers = array.astype(np.float64, copy=False)
-    shape = numbers.shape[numbers.ndim - own :] if own else ()
-    return np.broadcast_to(numbers, (*batch, *shape)).reshape(-1, *shape)
+    return flat_batch(np, to_numpy(array).astype(np.float64, copy=False), batch, own)
 
 
 def _fractions(points: Any, ends: list[Any], eps: float) -> Any:
