@@ -23,7 +23,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ._polynomial import coefficient_table, energy_table, stiffness_table
-from ._weighted_solver import rounding_slack, weighted_coefficients
+from ._weighted_solver import Entry, Unknown, rounding_slack, weighted_coefficients
 from .array_api import (
     FREE,
     Array,
@@ -38,12 +38,8 @@ from .array_api import (
     unit_factors,
 )
 
-Entry: TypeAlias = Any  # An array or a Python float
-
 # states[k][i - 1] = i-th time derivative at knot k: an array, None for zero, FREE for unknown
 States: TypeAlias = list[list[Any]]
-
-Node: TypeAlias = tuple[int, int]  # Unknown states[k][i] by (k, i), in the order of the rows of Eq. 1
 
 # Power of the machine epsilon that is the least ratio of two durations of a movement for the normal equations. Their
 # relative error is about epsilon times the square of the inverse ratio: below 1e-10, in single precision 1e-4.
@@ -80,15 +76,15 @@ def _solve_states(order: int, durations: Sequence[Entry], steps: Sequence[Array]
 
 def _assemble(
     order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States
-) -> tuple[dict[Node, dict[Node, Entry]], dict[Node, Array]]:
+) -> tuple[dict[Unknown, dict[Unknown, Entry]], dict[Unknown, Array]]:
     """Return the upper half of A and the right side b of Eq. 1.
 
     A segment adds W_ab h^(i + j + 2 - (2m - 1)) to the entry of the unknowns x^(i+1), x^(j+1) at its ends,
     since its data are V_i = h^i x^(i). Its step D and given derivatives go to the right side.
     """
     table = stiffness_table(order)
-    upper: dict[Node, dict[Node, Entry]] = {}
-    right: dict[Node, Array] = {}
+    upper: dict[Unknown, dict[Unknown, Entry]] = {}
+    right: dict[Unknown, Array] = {}
     for s, (duration, step) in enumerate(zip(durations, steps, strict=True)):
         # 1, 1/h, 1/h^2, ...; index = exponent
         powers = [1.0, *accumulate(repeat(1.0 / duration, 2 * order - 2), operator.mul)]

@@ -43,7 +43,9 @@ from .array_api import FREE, Array, Namespace, change_given
 
 Entry: TypeAlias = Any  # An array or a Python float
 
-Column: TypeAlias = tuple[int, int]  # Unknown states[k][i], by (k, i)
+Unknown: TypeAlias = tuple[
+    int, int
+]  # Derivative states[k][i] by (k, i), ordered like the columns of a system
 
 # Tolerance of waypoints, relative to their greatest coordinate.
 _ROUNDING = 64.0 * 2.0**-52
@@ -60,7 +62,7 @@ class _Row:
     """Weighted residual r = sum_j entries_j y_j + rest."""
 
     weight: Entry
-    entries: dict[Column, Entry]
+    entries: dict[Unknown, Entry]
     rest: Array
     residual: Array = None
 
@@ -100,11 +102,11 @@ def fit_modes(
     that of Eq. 4. Returned are the states with every FREE replaced, and r_0 ... r_(m-1) per segment, (D, N) each.
     """
     origins = _origins(xp, lengths, steps, states)
-    unknown: list[list[Column]] = []
+    unknown: list[list[Unknown]] = []
     for k, state in enumerate(states):
         unknown.append([(k, i) for i, value in enumerate(state) if value is FREE])
     rows: list[list[_Row]] = []
-    pivots: dict[Column, _Row] = {}  # In the order of elimination
+    pivots: dict[Unknown, _Row] = {}  # In the order of elimination
     remaining: list[_Row] = []
     rotations: list[Rotation] = []
     for s in range(len(steps)):
@@ -119,7 +121,7 @@ def fit_modes(
             active.remove(pivots[column])
         remaining += active
     solved = [list(state) for state in states]
-    values: dict[Column, Array] = {}
+    values: dict[Unknown, Array] = {}
     for column, row in reversed(pivots.items()):
         value = -row.rest
         for other, entry in row.entries.items():
@@ -139,7 +141,7 @@ def fit_modes(
     return solved, [[row.residual for row in segment] for segment in rows]
 
 
-def _origins(xp: Namespace, lengths: Array, steps: Array, states: Any) -> dict[Column, Array]:
+def _origins(xp: Namespace, lengths: Array, steps: Array, states: Any) -> dict[Unknown, Array]:
     """Return the values from which unknown velocities are measured: the mean velocity of the shorter neighbour.
 
     The velocities at both ends of a short segment are large compared with their difference. A mean that is far
@@ -159,7 +161,7 @@ def _origins(xp: Namespace, lengths: Array, steps: Array, states: Any) -> dict[C
 
 
 def _segment_rows(
-    order: int, s: int, length: Array, step: Array, states: Any, origins: dict[Column, Array], slack: Array
+    order: int, s: int, length: Array, step: Array, states: Any, origins: dict[Unknown, Array], slack: Array
 ) -> list[_Row]:
     """Return the rows of the modes r of segment s."""
     rate = 1.0 / length
@@ -188,7 +190,7 @@ def _segment_rows(
     return rows
 
 
-def _eliminate(rows: list[_Row], column: Column, rotations: list[Rotation]) -> _Row:
+def _eliminate(rows: list[_Row], column: Unknown, rotations: list[Rotation]) -> _Row:
     """Rotate the rows so that only one of them has an entry in the column, and return it, with 1 there (implied)."""
     pivot, *others = [row for row in rows if column in row.entries]
     own = pivot.entries.pop(column)

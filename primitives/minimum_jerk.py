@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -84,7 +84,7 @@ def point_to_point(
     shape = (*broadcast_batch(**shapes, goal=goal_shape, **end_shapes(ends, dimension)), dimension)
     waypoints = xp.stack([broadcast_to(xp, start, shape), broadcast_to(xp, goal, shape)], axis=-2)
     check_durations("duration", duration[..., None], waypoints, ends)
-    return connect(xp, order, waypoints, duration[..., None], knot_states(order, ends))
+    return connect(xp, order, waypoints, duration[..., None], knot_states(order, ends.values()))
 
 
 def through(
@@ -139,7 +139,7 @@ def through(
     batch = broadcast_batch(**shapes)
     waypoints = broadcast_to(xp, waypoints, (*batch, knots, dimension))
     check_durations("durations", durations, waypoints, ends)
-    states = knot_states(order, ends, knots - 2)
+    states = knot_states(order, ends.values(), knots - 2)
     if via_velocities is not None:
         for k in range(knots - 2):
             states[k + 1][0] = via_velocities[..., k, :]
@@ -243,12 +243,12 @@ def check_durations(name: str, durations: Array, waypoints: Array, ends: Ends) -
     require(positive.any(axis=-1) | ~moves, name, 1.0 * moves, "must not be 0 for a movement whose ends move")
 
 
-def knot_states(order: int, ends: Ends, vias: int = 0) -> list[list[Any]]:
-    """Return the m - 1 derivatives at every knot: given at the ends, FREE at via-points.
+def knot_states(order: int, ends: Iterable[Boundary], vias: int = 0) -> list[list[Any]]:
+    """Return the m - 1 derivatives at every knot: the values of END_NAMES at the ends, FREE at via-points.
 
     Order 4 (snap) has the jerk zero at both ends.
     """
-    values = list(ends.values())
+    values = list(ends)
     states = [[*values[:2], None][: order - 1]]
     for _ in range(vias):
         states.append([FREE] * (order - 1))
