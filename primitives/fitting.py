@@ -239,10 +239,6 @@ def _checked(time_name: str, time: Any, name: str, position: Any, fewest: int) -
         raise ValueError(f"{error}{advice}") from None
     batch = leading_shape(name, position, None, None)
     count, dimension = position.shape[-2:]
-    if time.ndim and time.shape[-1] != count:
-        raise ValueError(
-            f"{time_name} and {name} must have as many samples as one another, got {time.shape[-1]} and {count}"
-        )
     batch = broadcast_batch(**{name: batch, time_name: leading_shape(time_name, time, count)})
     if count < fewest:
         most = (fewest - 5) // 2
@@ -303,11 +299,10 @@ def _theta(knots: Floats, free_ends: bool) -> Floats:
     """Return the parameters of knots (S, K + 2), the inverse of `_knots`; no segment may be a shortest one."""
     onset, end = knots[:, :1], knots[:, -1:]
     inner = np.log(np.diff(knots) / (end - onset) - _SHORTEST)
-    if not free_ends:
-        return inner[:, :-1] - inner[:, -1:]
     outer = np.hstack([onset + _BEYOND, end - onset, 1.0 + _BEYOND - end]) / (1.0 + 2.0 * _BEYOND)
     outer = np.log(outer - _LEAST)
-    return np.hstack([inner[:, :-1] - inner[:, -1:], outer[:, :-1] - outer[:, -1:]])
+    theta: Floats = np.hstack([inner[:, :-1] - inner[:, -1:], outer[:, :-1] - outer[:, -1:]])
+    return theta if free_ends else theta[:, :-2]
 
 
 def _residuals(knots: Floats, time: Floats, position: Floats) -> Floats:

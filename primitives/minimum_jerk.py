@@ -200,17 +200,15 @@ def check_order(order: int, start_acceleration: Boundary, goal_acceleration: Bou
     """Raise ValueError for an unknown order, or for order 2 with boundary accelerations."""
     if not isinstance(order, int | np.integer) or order not in ORDERS:
         raise ValueError(f"order must be 2 (acceleration), 3 (jerk) or 4 (snap), got {order!r}")
-    given = {"start_acceleration": start_acceleration, "goal_acceleration": goal_acceleration}
-    for name, value in given.items():
-        if order == 2 and is_given(value):
-            raise ValueError(f"{name} cannot be given for order 2: least acceleration leaves it open")
+    if order == 2 and (is_given(start_acceleration) or is_given(goal_acceleration)):
+        raise ValueError("no acceleration can be given for order 2: least acceleration leaves it open")
 
 
 def end_shapes(ends: Mapping[str, Boundary], dimension: int) -> dict[str, tuple[int, ...]]:
     """Return the leading shapes of the given boundary values; raise ValueError if a last axis is not D."""
     shapes = {}
     for name, value in ends.items():
-        if value is not None and value is not FREE:
+        if is_given(value):
             shapes[name] = leading_shape(name, value, dimension)
     return shapes
 

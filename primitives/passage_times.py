@@ -193,7 +193,7 @@ def _fractions(points: Any, ends: list[Any], eps: float) -> Any:
 
 
 def _solve(points: Any, ends: list[Any]) -> Any:
-    """Return fractions (N, S) where neighbouring waypoints differ; all ends are None for movements from rest to rest."""
+    """Return fractions (N, S) where neighbouring waypoints differ; the ends are all None from rest to rest."""
     count, knots, _ = points.shape
     if knots == 2:
         return np.ones((count, 1))

@@ -113,8 +113,7 @@ class Trajectory:
     @property
     def namespace(self) -> Namespace:
         """Array API functions of the arrays."""
-        coefficients = self.coefficients  # NumPy, by far the most frequent, without a call
-        return np if isinstance(coefficients, np.ndarray) else namespace_of(coefficients)
+        return namespace_of(self.coefficients)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -311,19 +310,20 @@ class Trajectory:
             scale: (...,) factor, default one.
         """
         named = {"rotation": rotation, "translation": translation, "scale": scale}
-        xp, moved = self.namespace, self.coefficients
         rotation, translation, scale = self.floats(named)
+        xp, moved = self.namespace, self.coefficients
+        shapes = {"trajectory": self.batch_shape}
         if rotation is not None:
-            shape = leading_shape("rotation", rotation, None, self.dimension)
-            broadcast_batch(trajectory=self.batch_shape, rotation=shape)
+            shapes["rotation"] = leading_shape("rotation", rotation, None, self.dimension)
+            broadcast_batch(**shapes)
             moved = xp.matmul(moved, rotation[..., None, :, :].mT)
         if scale is not None:
-            broadcast_batch(trajectory=self.batch_shape, scale=tuple(scale.shape))
+            shapes["scale"] = tuple(scale.shape)
+            broadcast_batch(**shapes)
             moved = moved * scale[..., None, None, None]
         if translation is not None:
-            shape = leading_shape("translation", translation, moved.shape[-1])
-            batch = broadcast_batch(trajectory=tuple(moved.shape[:-3]), translation=shape)
-            moved = broadcast_to(xp, moved, (*batch, *moved.shape[-3:]))
+            shapes["translation"] = leading_shape("translation", translation, moved.shape[-1])
+            moved = broadcast_to(xp, moved, (*broadcast_batch(**shapes), *moved.shape[-3:]))
             first = moved[..., :1, :, :] + translation[..., None, None, :]
             moved = xp.concat([first, moved[..., 1:, :, :]], axis=-3)
         return Trajectory(moved, self.durations, self.order, self.starts, self.rates, self.end)
@@ -392,10 +392,8 @@ def minimum_duration(
             allowed = f"a number, (..., 1) or (..., {trajectory.dimension})"
             raise ValueError(f"{name} must be {allowed}, got shape {tuple(limit.shape)}")
         broadcast_batch(trajectory=trajectory.batch_shape, **{name: tuple(limit.shape[:-1])})
-        if limit.ndim == 0:
-            excess = trajectory.peak(nu) / limit
-        elif limit.shape[-1] == 1:
-            excess = trajectory.peak(nu) / limit[..., 0]
+        if limit.ndim == 0 or limit.shape[-1] == 1:
+            excess = trajectory.peak(nu) / xp.reshape(limit, limit.shape[:-1])
         else:
             extrema = trajectory.extrema(nu)
             excess = xp.max(xp.maximum(-extrema.minimum, extrema.maximum) / limit, axis=-1)
