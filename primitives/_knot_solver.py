@@ -16,7 +16,7 @@ durations. So an item of a batch gives the same bits as alone, which LAPACK does
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import accumulate, product, repeat
 from typing import Any, TypeAlias
 
@@ -27,6 +27,7 @@ from ._weighted_solver import Entry, Unknown, rounding_slack, weighted_coefficie
 from .array_api import (
     FREE,
     Array,
+    Boundary,
     Namespace,
     broadcast_to,
     change_given,
@@ -50,6 +51,18 @@ _MISS = 1e-9
 _GAIN = 1e-8
 # Durations [s] between which no power of them over- or underflows, even in single precision; others are scaled.
 _SHORT, _LONG = 1e-3, 1e3
+
+
+def knot_states(order: int, ends: Iterable[Boundary], vias: int = 0) -> States:
+    """Return the m - 1 derivatives at every knot: the values of END_NAMES at the ends, FREE at via-points.
+
+    Order 4 (snap) has the jerk zero at both ends.
+    """
+    values = list(ends)
+    states = [[*values[:2], None][: order - 1]]
+    for _ in range(vias):
+        states.append([FREE] * (order - 1))
+    return [*states, [*values[2:], None][: order - 1]]
 
 
 def _solve_states(order: int, durations: Sequence[Entry], steps: Sequence[Array], states: States) -> States:

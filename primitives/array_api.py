@@ -48,6 +48,13 @@ FREE: Final = Free.FREE
 # A given boundary value, None for rest (zero), or FREE
 Boundary: TypeAlias = Array | Literal[Free.FREE] | None
 
+Ends: TypeAlias = dict[str, Boundary]  # The four boundary values by name, in the order of END_NAMES
+
+END_NAMES = ("start_velocity", "start_acceleration", "goal_velocity", "goal_acceleration")
+
+# Distance of waypoints that count as equal, in units of the rounding of their greatest coordinate.
+_EQUAL = 64.0
+
 _PLAIN = (np.ndarray, float, int, list, tuple, np.generic)
 
 _MAY_BE_FREE = ("goal_velocity", "goal_acceleration")
@@ -73,6 +80,12 @@ def change_time_unit(state: Iterable[Boundary], unit: Array) -> list[Boundary]:
     return changed
 
 
+def unit_time_ends(ends: Sequence[Boundary], duration: Array) -> list[Any]:
+    """Return the values of END_NAMES in unit time, V = v T and A = a T^2; None and FREE stay."""
+    time = duration[..., None]
+    return change_time_unit(ends[:2], time) + change_time_unit(ends[2:], time)
+
+
 def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> tuple[Namespace, list[Any]]:
     """Convert arguments by name to one array library and one floating dtype; return it and them, required ones first.
 
@@ -94,6 +107,21 @@ def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> 
         if array is not None and array is not FREE and not (finite := xp.isfinite(array)).all():
             require(finite, name, array, "must be finite")
     return xp, arrays
+
+
+def read_arguments(
+    ends: tuple[Boundary, Boundary, Boundary, Boundary],
+    optional: Mapping[str, Any] | None = None,
+    /,
+    **required: Any,
+) -> tuple[Namespace, list[Any], Ends]:
+    """Convert the arguments of a movement to one library and dtype, see `as_floats`.
+
+    `ends` are the values of END_NAMES. They are returned by name, after the namespace and the other arrays.
+    """
+    named = dict(zip(END_NAMES, ends, strict=True))
+    xp, arrays = as_floats({**(optional or {}), **named}, **required)
+    return xp, arrays[:-4], dict(zip(END_NAMES, arrays[-4:], strict=True))
 
 
 def namespace_of(array: Array) -> Namespace:
@@ -198,6 +226,43 @@ def broadcast_batch(**shapes: tuple[int, ...]) -> tuple[int, ...]:
     except ValueError:
         listed = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
         raise ValueError(f"leading dimensions do not broadcast: {listed}") from None
+
+
+def end_shapes(ends: Mapping[str, Boundary], dimension: int) -> dict[str, tuple[int, ...]]:
+    """Return the leading shapes of the given boundary values; raise ValueError if a last axis is not D."""
+    shapes = {}
+    for name, value in ends.items():
+        if is_given(value):
+            shapes[name] = leading_shape(name, value, dimension)
+    return shapes
+
+
+def waypoint_shapes(waypoints: Array, ends: Ends) -> dict[str, tuple[int, ...]]:
+    """Return the leading shapes of waypoints and of boundary values, or raise ValueError."""
+    shape = leading_shape("waypoints", waypoints, None, None)
+    if waypoints.shape[-2] < 2:
+        raise ValueError("waypoints must hold start and goal, got one point")
+    return {"waypoints": shape, **end_shapes(ends, waypoints.shape[-1])}
+
+
+def check_durations(name: str, durations: Array, waypoints: Array, ends: Ends) -> None:
+    """Raise ValueError for durations (..., S) below 0, and for 0 between waypoints (..., S + 1, D) that differ.
+
+    All durations of a movement may be 0 only if its ends are at rest.
+    """
+    if (durations > 0).all():
+        return
+    require(durations >= 0, name, durations, "must not be negative")
+    points, numbers = to_numpy(waypoints), to_numpy(durations)
+    positive = np.broadcast_to(numbers > 0, (*points.shape[:-2], numbers.shape[-1]))
+    rounding = _EQUAL * np.finfo(points.dtype).eps * np.abs(points).max(axis=(-2, -1), initial=0.0)
+    equal = np.abs(np.diff(points, axis=-2)).max(axis=-1) <= rounding[..., None]
+    require(positive | equal, name, 1.0 * positive, "may be 0 only between equal waypoints")
+    moves = np.zeros(positive.shape[:-1], dtype=bool)
+    for value in ends.values():
+        if is_given(value):
+            moves = moves | (to_numpy(value) != 0).any(axis=-1)
+    require(positive.any(axis=-1) | ~moves, name, 1.0 * moves, "must not be 0 for a movement whose ends move")
 
 
 def is_whole(value: Any) -> bool:

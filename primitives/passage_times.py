@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from ._knot_solver import knot_states
 from ._passage_one_via import (
     SHORTEST,
     attach_root_gradient,
@@ -49,13 +50,16 @@ from .array_api import (
     broadcast_batch,
     broadcast_to,
     change_given,
+    check_durations,
     flat_batch,
     like,
     ordered_sum,
+    read_arguments,
     to_numpy,
     unit_factors,
+    unit_time_ends,
+    waypoint_shapes,
 )
-from .minimum_jerk import check_durations, knot_states, read_arguments, unit_time_ends, waypoint_shapes
 from .trajectory import connect, duration_gradient
 
 # Fraction of the duration below which a segment is dropped in lower than double precision, which it would overflow.
