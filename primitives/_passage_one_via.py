@@ -163,7 +163,7 @@ class _Expansion:
         miss: (N, D, 6) coefficients of r in u.
         powers: p and q.
         factor: coefficients of g in u.
-        slack: (N,) tolerance of the waypoints, see `_weighted_solver`.
+        slack: (N,) tolerance of the waypoints, see `_knot_solver`.
     """
 
     miss: Floats

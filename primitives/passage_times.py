@@ -15,8 +15,8 @@ with respect to the log-durations z vanishes. One more Newton step with a consta
 
 has the value z* and the derivative dz/dp = -H^-1 dg/dp. So no iteration is unrolled.
 
-With the states at the via-points eliminated, J(h) is the least sum of the segments' costs phi (Eq. 1 of
-`_weighted_solver`). By the envelope theorem dJ/dh is the derivative of phi at fixed states: with r = q / h^2,
+With the states at the via-points eliminated, J(h) is the least sum of the segments' costs phi (Eq. 2 of
+`_knot_solver`). By the envelope theorem dJ/dh is the derivative of phi at fixed states: with r = q / h^2,
 
     h phi_h = sum_i w_i (r_i . p_i + 1/2 e_i |r_i|^2),   p = h dr/dh,   e = h w'(h) / w.             (2)
 """
@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from ._knot_solver import knot_states
+from ._knot_solver import fit_modes, knot_states, mode_weights, rounding_slack
 from ._passage_one_via import (
     SHORTEST,
     attach_root_gradient,
@@ -40,7 +40,6 @@ from ._passage_one_via import (
     nearer_fraction,
 )
 from ._polynomial import differentiate, evaluate, mode_table
-from ._weighted_solver import fit_modes, mode_weights, rounding_slack
 from .array_api import (
     FREE,
     Array,
@@ -287,7 +286,7 @@ class _PassageCost:
     Attributes:
         steps: (S, D, N) differences of the waypoints.
         ends: velocity and acceleration at start and goal in unit time: (D, N), None for zero, FREE (goal only).
-        slack: (N,) tolerance of the waypoints, see `_weighted_solver`.
+        slack: (N,) tolerance of the waypoints, see `_knot_solver`.
     """
 
     steps: Floats
