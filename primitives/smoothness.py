@@ -224,8 +224,9 @@ def _speed_events(trajectory: Trajectory, sign: float) -> SpeedEvents:
     require_trajectory(trajectory)
     xp = trajectory.namespace
     times = _turning_times(trajectory)
-    before, after = _speed_trend(trajectory, times)
-    found = (sign * before < 0) & (sign * after > 0)
+    trend = sign * _speed_trend(trajectory, times)
+    found = (trend[..., :-1] < 0) & (trend[..., 1:] > 0)
+    times = times[..., 1:-1]
     count = int(found.sum(axis=-1).max(initial=0))
     order = np.argsort(~found, axis=-1, kind="stable")[..., :count]
     place = np.take_along_axis(times, order, axis=-1)
@@ -248,8 +249,8 @@ def _turning_times(trajectory: Trajectory) -> Any:
     return np.sort(times, axis=-1)
 
 
-def _speed_trend(trajectory: Trajectory, times: Any) -> tuple[Any, Any]:
-    """Return -1 or 1 where the speed falls or rises before and after each of `times`; 0 outside the movement."""
+def _speed_trend(trajectory: Trajectory, times: Any) -> Any:
+    """Return -1 or 1 where the speed falls or rises between neighbours of `times`, 0 before it changes at all."""
     middle = (times[..., 1:] + times[..., :-1]) / 2
     sampled = trajectory.sample(like(trajectory.namespace, middle, trajectory.coefficients), (1, 2))
     velocity, acceleration = (to_numpy(each) for each in sampled)
@@ -263,5 +264,4 @@ def _speed_trend(trajectory: Trajectory, times: Any) -> tuple[Any, Any]:
     trend = np.where(wide & (np.abs(rate) > noise), np.sign(rate), 0.0)
     for i in range(1, trend.shape[-1]):
         trend[..., i] = np.where(trend[..., i] == 0, trend[..., i - 1], trend[..., i])
-    edge = np.zeros((*trend.shape[:-1], 1))
-    return np.concatenate([edge, trend], axis=-1), np.concatenate([trend, edge], axis=-1)
+    return trend
