@@ -338,7 +338,7 @@ def unit_factors(xp: Namespace, array: Array, axis: int | tuple[int, ...] = -1) 
     size = np.abs(to_numpy(array)).max(axis=axis, keepdims=True)
     # The largest n for which 2^n and 2^-n are both normal numbers of the dtype and of a double
     limit = math.frexp(min(float(xp.finfo(array.dtype).max), sys.float_info.max))[1] - 2
-    exponent = np.clip(np.frexp(size)[1], -limit, limit)
+    exponent = np.minimum(np.maximum(np.frexp(size)[1], -limit), limit)
     return like(xp, np.ldexp(1.0, -exponent), array)
 
 
