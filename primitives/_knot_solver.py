@@ -194,11 +194,19 @@ def least_cost_coefficients(
     positive = np.where(empty, numbers.max(axis=-1, keepdims=True), numbers)
     kinds = np.column_stack([empty, _is_extreme(positive, eps)])
     result = like(xp, np.zeros((len(points), 2 * order, segments, points.shape[-1])), waypoints)
+    result[:, 0] = points[:, :-1]  # an empty segment is a constant
     for kind in np.unique(kinds, axis=0):  # movements with the same empty segments are solved together
         where = np.flatnonzero((kinds == kind).all(axis=1))
-        chosen = [change_given(operator.itemgetter(where), state) for state in states]
-        extreme = bool(kind[-1])
-        result[where] = _connect_kind(xp, order, points[where], durations[where], chosen, kind[:-1], extreme)
+        full = np.flatnonzero(~kind[:-1]).tolist()
+        if not full:
+            continue
+        # Keep the start and the end of every full segment; merged knots share one state, the goal's at the end.
+        kept = [0, *(s + 1 for s in full[:-1]), segments]
+        chosen = [change_given(operator.itemgetter(where), states[k]) for k in kept]
+        solve = _weighted_coefficients if kind[-1] else _banded_coefficients
+        part = result[where]
+        part[:, :, full] = solve(xp, order, points[where][:, kept], durations[where][:, full], chosen)
+        result[where] = part
     return xp.reshape(result, (*batch, *result.shape[1:]))
 
 
@@ -239,23 +247,6 @@ def _banded_coefficients(
     data = xp.reshape(data, (*batch, 2 * order, segments * data.shape[-1]))
     coefficients = xp.matmul(like(xp, coefficient_table(order), data), data)
     return xp.reshape(coefficients, (*batch, 2 * order, segments, rest.shape[-1]))
-
-
-def _connect_kind(
-    xp: Namespace, order: int, waypoints: Array, durations: Array, states: States, empty: Any, extreme: bool
-) -> Array:
-    """Return the coefficients where every item has the same empty segments; an empty one is a constant."""
-    full = np.flatnonzero(~empty).tolist()
-    points = waypoints[:, None, :-1]
-    result = xp.concat([points, *[0.0 * points] * (2 * order - 1)], axis=1)
-    if not full:
-        return result
-    # Keep the start and the end of every full segment; merged knots share one state, the goal's at the end.
-    kept = [0, *(s + 1 for s in full[:-1]), len(empty)]
-    chosen = [states[k] for k in kept]
-    solve = _weighted_coefficients if extreme else _banded_coefficients
-    result[:, :, full] = solve(xp, order, waypoints[:, kept], durations[:, full], chosen)
-    return result
 
 
 def _weighted_coefficients(

@@ -115,7 +115,11 @@ def dimensionless_jerk(trajectory: Trajectory) -> Array:
         204.8
     """
     require_trajectory(trajectory)
-    xp, trajectory = trajectory.namespace, _unit_sized(trajectory)
+    xp, batch = trajectory.namespace, trajectory.batch_shape
+    if 0 not in batch:  # scaled by powers of two, which is exact, to a size and a duration of about 1
+        size = unit_factors(xp, xp.reshape(trajectory.coefficients, (*batch, -1)))[..., 0]
+        pace = unit_factors(xp, trajectory.end)[..., 0]
+        trajectory = trajectory.transformed(scale=size).stretched(trajectory.duration * pace)
     duration, peak = trajectory.duration, trajectory.peak(1)
     with np.errstate(all="ignore"):
         jerk = trajectory.energy(3) * duration * duration * duration
@@ -185,16 +189,6 @@ def spectral_arc_length(trajectory: Trajectory, *, cutoff: float = 10.0, thresho
     rise = spectrum[..., 1:] - spectrum[..., :-1]
     lengths = -xp.sum(used * xp.sqrt(width * width + rise * rise), axis=-1)
     return lengths if lengths.dtype == dtype else xp.astype(lengths, dtype)
-
-
-def _unit_sized(trajectory: Trajectory) -> Trajectory:
-    """Return the movements scaled by powers of two, which is exact, to a size and a duration of about 1."""
-    xp, t = trajectory.namespace, trajectory
-    if 0 in t.batch_shape:
-        return t
-    size = unit_factors(xp, xp.reshape(t.coefficients, (*t.batch_shape, -1)))[..., 0]
-    pace = unit_factors(xp, t.end)[..., 0]
-    return t.transformed(scale=size).stretched(t.duration * pace)
 
 
 def speed_valleys(trajectory: Trajectory) -> SpeedEvents:
