@@ -71,7 +71,7 @@ def change_given(function: Callable[[Array], Array], values: Iterable[Boundary])
 
 
 def change_time_unit(state: Iterable[Boundary], unit: Array) -> list[Boundary]:
-    """Return first, second, ... derivatives in another unit of time (..., 1), of which arrays change; see above."""
+    """Return the first, second, ... derivatives times unit (..., 1), unit^2, ...; None and FREE stay."""
     changed: list[Boundary] = []
     power = unit
     for value in state:
