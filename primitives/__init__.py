@@ -6,9 +6,8 @@ kind. Units are metres and seconds.
 
 from .array_api import FREE
 from .fitting import ViaPointFit, fit_via_points
-from .minimum_jerk import minimum_jerk_coefficients, point_to_point, through
+from .minimum_jerk import minimum_jerk_coefficients, point_to_point, retarget, through
 from .passage_times import passage_durations
-from .retargeting import retarget
 from .smoothness import (
     SpeedEvents,
     curvature,

@@ -163,7 +163,7 @@ class _Expansion:
         miss: (N, D, 6) coefficients of r in u.
         powers: p and q.
         factor: coefficients of g in u.
-        slack: (N,) tolerance of the waypoints, see `_weighted_solver`.
+        slack: (N,) tolerance of the waypoints, see `_knot_solver`.
     """
 
     miss: Floats
@@ -219,11 +219,9 @@ class _Expansion:
         return u, np.abs(step) < _CONVERGED_STEP * u
 
     def near_roots(self) -> tuple[Floats, Floats]:
-        """Return the roots in the nearer part of the movement, (N, n) ascending, and the excess there."""
+        """Return candidates (N, n), and the excess there, infinite but at roots in the nearer part of the movement."""
         u, is_root = self.polished(_candidates_on_every_scale(self.stationary()))
-        excess = np.where((is_root | (u <= SHORTEST)) & (u <= _OVERLAP), self.excess(u), np.inf)
-        order = np.argsort(u, axis=-1, kind="stable")
-        return np.take_along_axis(u, order, axis=-1), np.take_along_axis(excess, order, axis=-1)
+        return u, np.where((is_root | (u <= SHORTEST)) & (u <= _OVERLAP), self.excess(u), np.inf)
 
 
 def fractions_moving(points: Floats, ends: list[Any], slack: Floats) -> Floats:
@@ -235,8 +233,8 @@ def fractions_moving(points: Floats, ends: list[Any], slack: Floats) -> Floats:
     expansion, cost = _expand(points, ends, slack, from_goal=False)
     stationary = expansion.stationary()
     u = root_candidates(stationary)
-    best = _earliest(u, expansion.excess(u), cost)
-    fractions = np.stack([best, 1.0 - best], axis=-1)
+    fractions = _earliest(np.stack([u, 1.0 - u], axis=-1), expansion.excess(u), cost)
+    best = fractions[:, 0]
     # Rounding of the coefficients of F may spoil the root, or hide one near an end.
     slope = np.abs(evaluate(differentiate(stationary), best)) * np.minimum(best, 1.0 - best)
     noise = np.finfo(np.float64).eps * evaluate(np.abs(stationary), best) + np.abs(evaluate(stationary, best))
@@ -267,14 +265,12 @@ def _candidates_on_every_scale(polynomial: Floats) -> Floats:
 
 def _from_both_ends(points: Floats, ends: list[Any], slack: Floats, cost: Floats) -> Floats:
     """Return the fractions (N, 2) from the roots in expansions around both ends."""
-    (before, early), (after, late) = (
-        _expand(points, ends, slack, from_goal=from_goal)[0].near_roots() for from_goal in (False, True)
-    )
-    after, late = after[:, ::-1], late[:, ::-1]  # in the order of time
-    fractions = np.concatenate(
-        [np.stack([before, 1.0 - before], axis=-1), np.stack([1.0 - after, after], axis=-1)], axis=1
-    )
-    return _earliest(fractions, np.concatenate([early, late], axis=1), cost)
+    before, excess_before = _expand(points, ends, slack, from_goal=False)[0].near_roots()
+    after, excess_after = _expand(points, ends, slack, from_goal=True)[0].near_roots()
+    early = np.stack([before, 1.0 - before], axis=-1)
+    late = np.stack([1.0 - after, after], axis=-1)
+    excess = np.concatenate([excess_before, excess_after], axis=1)
+    return _earliest(np.concatenate([early, late], axis=1), excess, cost)
 
 
 def _expand(points: Floats, ends: list[Any], slack: Floats, *, from_goal: bool) -> tuple[_Expansion, Floats]:
@@ -298,9 +294,10 @@ def _expand(points: Floats, ends: list[Any], slack: Floats, *, from_goal: bool) 
     return _Expansion(miss, powers, g, slack), free.cost()
 
 
-def _earliest(choices: Floats, excess: Floats, cost: Floats) -> Floats:
-    """Return the choice (N, n, ...) of least excess, the first among those equal up to rounding."""
+def _earliest(fractions: Floats, excess: Floats, cost: Floats) -> Floats:
+    """Return the fractions (N, 2), of candidates (N, n, 2), of least excess; of equals up to rounding the earliest."""
     least = excess.min(axis=-1, keepdims=True)
-    first = np.argmax(excess <= least + 1e-12 * (least + cost[:, None]), axis=-1)
-    best: Floats = choices[np.arange(len(choices)), first]
+    is_least = excess <= least + 1e-12 * (least + cost[:, None])
+    first = np.argmin(np.where(is_least, fractions[..., 0], np.inf), axis=-1)
+    best: Floats = fractions[np.arange(len(fractions)), first]
     return best

@@ -48,6 +48,13 @@ FREE: Final = Free.FREE
 # A given boundary value, None for rest (zero), or FREE
 Boundary: TypeAlias = Array | Literal[Free.FREE] | None
 
+Ends: TypeAlias = dict[str, Boundary]  # The four boundary values by name, in the order of END_NAMES
+
+END_NAMES = ("start_velocity", "start_acceleration", "goal_velocity", "goal_acceleration")
+
+# Distance of waypoints that count as equal, in units of the rounding of their greatest coordinate.
+_EQUAL = 64.0
+
 _PLAIN = (np.ndarray, float, int, list, tuple, np.generic)
 
 _MAY_BE_FREE = ("goal_velocity", "goal_acceleration")
@@ -61,6 +68,22 @@ def is_given(value: Boundary) -> TypeGuard[Array]:
 def change_given(function: Callable[[Array], Array], values: Iterable[Boundary]) -> list[Boundary]:
     """Return boundary values of which arrays are changed by a function; None and FREE stay."""
     return [function(value) if is_given(value) else value for value in values]
+
+
+def change_time_unit(state: Iterable[Boundary], unit: Array) -> list[Boundary]:
+    """Return the first, second, ... derivatives times unit (..., 1), unit^2, ...; None and FREE stay."""
+    changed: list[Boundary] = []
+    power = unit
+    for value in state:
+        changed.append(value * power if is_given(value) else value)
+        power = power * unit
+    return changed
+
+
+def unit_time_ends(ends: Sequence[Boundary], duration: Array) -> list[Any]:
+    """Return the values of END_NAMES in unit time, V = v T and A = a T^2; None and FREE stay."""
+    time = duration[..., None]
+    return change_time_unit(ends[:2], time) + change_time_unit(ends[2:], time)
 
 
 def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> tuple[Namespace, list[Any]]:
@@ -84,6 +107,21 @@ def as_floats(optional: Mapping[str, Any] | None = None, /, **required: Any) -> 
         if array is not None and array is not FREE and not (finite := xp.isfinite(array)).all():
             require(finite, name, array, "must be finite")
     return xp, arrays
+
+
+def read_arguments(
+    ends: tuple[Boundary, Boundary, Boundary, Boundary],
+    optional: Mapping[str, Any] | None = None,
+    /,
+    **required: Any,
+) -> tuple[Namespace, list[Any], Ends]:
+    """Convert the arguments of a movement to one library and dtype, see `as_floats`.
+
+    `ends` are the values of END_NAMES. They are returned by name, after the namespace and the other arrays.
+    """
+    named = dict(zip(END_NAMES, ends, strict=True))
+    xp, arrays = as_floats({**(optional or {}), **named}, **required)
+    return xp, arrays[:-4], dict(zip(END_NAMES, arrays[-4:], strict=True))
 
 
 def namespace_of(array: Array) -> Namespace:
@@ -190,6 +228,43 @@ def broadcast_batch(**shapes: tuple[int, ...]) -> tuple[int, ...]:
         raise ValueError(f"leading dimensions do not broadcast: {listed}") from None
 
 
+def end_shapes(ends: Mapping[str, Boundary], dimension: int) -> dict[str, tuple[int, ...]]:
+    """Return the leading shapes of the given boundary values; raise ValueError if a last axis is not D."""
+    shapes = {}
+    for name, value in ends.items():
+        if is_given(value):
+            shapes[name] = leading_shape(name, value, dimension)
+    return shapes
+
+
+def waypoint_shapes(waypoints: Array, ends: Ends) -> dict[str, tuple[int, ...]]:
+    """Return the leading shapes of waypoints and of boundary values, or raise ValueError."""
+    shape = leading_shape("waypoints", waypoints, None, None)
+    if waypoints.shape[-2] < 2:
+        raise ValueError("waypoints must hold start and goal, got one point")
+    return {"waypoints": shape, **end_shapes(ends, waypoints.shape[-1])}
+
+
+def check_durations(name: str, durations: Array, waypoints: Array, ends: Ends) -> None:
+    """Raise ValueError for durations (..., S) below 0, and for 0 between waypoints (..., S + 1, D) that differ.
+
+    All durations of a movement may be 0 only if its ends are at rest.
+    """
+    if (durations > 0).all():
+        return
+    require(durations >= 0, name, durations, "must not be negative")
+    points, numbers = to_numpy(waypoints), to_numpy(durations)
+    positive = np.broadcast_to(numbers > 0, (*points.shape[:-2], numbers.shape[-1]))
+    rounding = _EQUAL * np.finfo(points.dtype).eps * np.abs(points).max(axis=(-2, -1), initial=0.0)
+    equal = np.abs(np.diff(points, axis=-2)).max(axis=-1) <= rounding[..., None]
+    require(positive | equal, name, 1.0 * positive, "may be 0 only between equal waypoints")
+    moves = np.zeros(positive.shape[:-1], dtype=bool)
+    for value in ends.values():
+        if is_given(value):
+            moves = moves | (to_numpy(value) != 0).any(axis=-1)
+    require(positive.any(axis=-1) | ~moves, name, 1.0 * moves, "must not be 0 for a movement whose ends move")
+
+
 def is_whole(value: Any) -> bool:
     """Return True for an integer of at least 0 (not for a bool)."""
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= 0
@@ -221,6 +296,13 @@ def broadcast_to(xp: Namespace, array: Array, shape: tuple[int, ...]) -> Array:
     return array if tuple(array.shape) == tuple(shape) else xp.broadcast_to(array, shape)
 
 
+def flat_batch(xp: Namespace, array: Array, batch: Sequence[int], own: int) -> Array:
+    """Return an array with its full batch in one axis; the last `own` axes stay."""
+    shape = tuple(array.shape[len(array.shape) - own :])
+    full = broadcast_to(xp, array, (*batch, *shape))
+    return xp.reshape(full, (math.prod(batch), *shape))
+
+
 def ordered_sum(array: Any, axis: int = 0) -> Any:
     """Sum a NumPy array along one axis from first to last.
 
@@ -248,16 +330,19 @@ def like(xp: Namespace, values: np.ndarray[Any, Any], other: Array) -> Array:
     return xp.asarray(values, dtype=other.dtype, device=other.device)
 
 
-def largest_exponent(xp: Namespace, dtype: Any) -> int:
-    """Return the largest n for which 2^n and 2^-n are both normal numbers of the dtype and of a double."""
-    return math.frexp(min(float(xp.finfo(dtype).max), sys.float_info.max))[1] - 2
+def unit_factors(xp: Namespace, array: Array, axis: int | tuple[int, ...] = -1) -> Array:
+    """Return powers of two that scale an array to a size of about 1 along the axes, which they keep with size 1.
 
-
-def unit_factors(xp: Namespace, array: Array) -> Array:
-    """Return powers of two (..., 1) that scale vectors (..., D) to a size of about 1.
-
-    Squares of the scaled vectors neither over- nor underflow, and multiplication by a power of two is exact.
+    Squares of the scaled array neither over- nor underflow, and multiplication by a power of two is exact.
     """
-    limit = largest_exponent(xp, array.dtype)
-    exponent = np.clip(np.frexp(np.abs(to_numpy(array)).max(axis=-1, keepdims=True))[1], -limit, limit)
+    size = np.abs(to_numpy(array)).max(axis=axis, keepdims=True)
+    # The largest n for which 2^n and 2^-n are both normal numbers of the dtype and of a double
+    limit = math.frexp(min(float(xp.finfo(array.dtype).max), sys.float_info.max))[1] - 2
+    exponent = np.minimum(np.maximum(np.frexp(size)[1], -limit), limit)
     return like(xp, np.ldexp(1.0, -exponent), array)
+
+
+def vector_length(xp: Namespace, vectors: Array) -> Array:
+    """Return the Euclidean norm of the last axis, without over- or underflow of squares."""
+    factors = unit_factors(xp, vectors)
+    return xp.linalg.vector_norm(vectors * factors, axis=-1) / factors[..., 0]

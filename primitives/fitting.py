@@ -24,6 +24,7 @@ from .array_api import (
     Floats,
     as_floats,
     broadcast_batch,
+    flat_batch,
     is_whole,
     leading_shape,
     like,
@@ -238,11 +239,7 @@ def _checked(time_name: str, time: Any, name: str, position: Any, fewest: int) -
         advice = "; leave out samples that were not measured" if "finite" in str(error) else ""
         raise ValueError(f"{error}{advice}") from None
     batch = leading_shape(name, position, None, None)
-    count, dimension = position.shape[-2:]
-    if time.ndim and time.shape[-1] != count:
-        raise ValueError(
-            f"{time_name} and {name} must have as many samples as one another, got {time.shape[-1]} and {count}"
-        )
+    count = position.shape[-2]
     batch = broadcast_batch(**{name: batch, time_name: leading_shape(time_name, time, count)})
     if count < fewest:
         most = (fewest - 5) // 2
@@ -253,9 +250,8 @@ def _checked(time_name: str, time: Any, name: str, position: Any, fewest: int) -
         )
     if 0 in batch:
         raise ValueError(f"{name} must hold one movement or more, got shape {tuple(position.shape)}")
-    times = np.broadcast_to(to_numpy(time).astype(float), (*batch, count)).reshape(-1, count)
-    places = np.broadcast_to(to_numpy(position).astype(float), (*batch, count, dimension))
-    places = places.reshape(-1, count, dimension)
+    times = flat_batch(np, to_numpy(time).astype(float), batch, 1)
+    places = flat_batch(np, to_numpy(position).astype(float), batch, 2)
     ascending = np.diff(times, prepend=-np.inf) > 0
     order = "must ascend: sort the samples, and keep one of equal times"
     require(ascending.reshape(*batch, count), time_name, times.reshape(*batch, count), order)
@@ -303,11 +299,10 @@ def _theta(knots: Floats, free_ends: bool) -> Floats:
     """Return the parameters of knots (S, K + 2), the inverse of `_knots`; no segment may be a shortest one."""
     onset, end = knots[:, :1], knots[:, -1:]
     inner = np.log(np.diff(knots) / (end - onset) - _SHORTEST)
-    if not free_ends:
-        return inner[:, :-1] - inner[:, -1:]
     outer = np.hstack([onset + _BEYOND, end - onset, 1.0 + _BEYOND - end]) / (1.0 + 2.0 * _BEYOND)
     outer = np.log(outer - _LEAST)
-    return np.hstack([inner[:, :-1] - inner[:, -1:], outer[:, :-1] - outer[:, -1:]])
+    theta: Floats = np.hstack([inner[:, :-1] - inner[:, -1:], outer[:, :-1] - outer[:, -1:]])
+    return theta if free_ends else theta[:, :-2]
 
 
 def _residuals(knots: Floats, time: Floats, position: Floats) -> Floats:

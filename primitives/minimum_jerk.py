@@ -1,35 +1,34 @@
-"""Minimum-jerk trajectories between two states and through via-points at given times, and checks of their arguments."""
+"""Minimum-jerk movements between two states, through via-points at given times, and on from another movement."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ._hermite_tables import ORDERS
+from ._knot_solver import knot_states
 from .array_api import (
+    END_NAMES,
     FREE,
     Array,
     Boundary,
-    Namespace,
     as_floats,
+    as_number,
     broadcast_batch,
     broadcast_to,
+    check_durations,
+    end_shapes,
     is_given,
     leading_shape,
+    read_arguments,
     require,
-    to_numpy,
+    waypoint_shapes,
 )
-from .trajectory import Trajectory, connect
+from .passage_times import passage_durations
+from .trajectory import Trajectory, connect, require_trajectory
 
-Ends = dict[str, Boundary]  # The four boundary values by name, in the order of END_NAMES
-
-# Distance of waypoints that count as equal, in units of the rounding of their greatest coordinate.
-_EQUAL = 64.0
-
-END_NAMES = ("start_velocity", "start_acceleration", "goal_velocity", "goal_acceleration")
+ORDERS = (2, 3, 4)
 
 
 def point_to_point(
@@ -82,7 +81,7 @@ def point_to_point(
     shape = (*broadcast_batch(**shapes, goal=goal_shape, **end_shapes(ends, dimension)), dimension)
     waypoints = xp.stack([broadcast_to(xp, start, shape), broadcast_to(xp, goal, shape)], axis=-2)
     check_durations("duration", duration[..., None], waypoints, ends)
-    return connect(xp, order, waypoints, duration[..., None], knot_states(order, ends))
+    return connect(xp, order, waypoints, duration[..., None], knot_states(order, ends.values()))
 
 
 def through(
@@ -137,7 +136,7 @@ def through(
     batch = broadcast_batch(**shapes)
     waypoints = broadcast_to(xp, waypoints, (*batch, knots, dimension))
     check_durations("durations", durations, waypoints, ends)
-    states = knot_states(order, ends, knots - 2)
+    states = knot_states(order, ends.values(), knots - 2)
     if via_velocities is not None:
         for k in range(knots - 2):
             states[k + 1][0] = via_velocities[..., k, :]
@@ -179,82 +178,113 @@ def minimum_jerk_coefficients(
     return xp.concat([unit[..., 0, :], dx0, ddx0 / 2, *upper], axis=-1)
 
 
-def read_arguments(
-    ends: tuple[Boundary, Boundary, Boundary, Boundary],
-    optional: Mapping[str, Any] | None = None,
-    /,
-    **required: Any,
-) -> tuple[Namespace, list[Any], Ends]:
-    """Convert the arguments of a movement to one library and dtype, see `as_floats`.
-
-    `ends` are the values of END_NAMES. They are returned by name, after the namespace and the other arrays.
-    """
-    named = dict(zip(END_NAMES, ends, strict=True))
-    xp, arrays = as_floats({**(optional or {}), **named}, **required)
-    return xp, arrays[:-4], dict(zip(END_NAMES, arrays[-4:], strict=True))
-
-
 def check_order(order: int, start_acceleration: Boundary, goal_acceleration: Boundary) -> None:
     """Raise ValueError for an unknown order, or for order 2 with boundary accelerations."""
     if not isinstance(order, int | np.integer) or order not in ORDERS:
         raise ValueError(f"order must be 2 (acceleration), 3 (jerk) or 4 (snap), got {order!r}")
-    given = {"start_acceleration": start_acceleration, "goal_acceleration": goal_acceleration}
-    for name, value in given.items():
-        if order == 2 and is_given(value):
-            raise ValueError(f"{name} cannot be given for order 2: least acceleration leaves it open")
+    if order == 2 and (is_given(start_acceleration) or is_given(goal_acceleration)):
+        raise ValueError("no acceleration can be given for order 2: least acceleration leaves it open")
 
 
-def end_shapes(ends: Mapping[str, Boundary], dimension: int) -> dict[str, tuple[int, ...]]:
-    """Return the leading shapes of the given boundary values; raise ValueError if a last axis is not D."""
-    shapes = {}
-    for name, value in ends.items():
-        if value is not None and value is not FREE:
-            shapes[name] = leading_shape(name, value, dimension)
-    return shapes
+def retarget(
+    trajectory: Trajectory,
+    time: Array,
+    goal: Array,
+    arrival: Array,
+    *,
+    via: Array | None = None,
+    goal_velocity: Boundary = None,
+    goal_acceleration: Boundary = None,
+    freeze: float = 0.0,
+) -> Trajectory:
+    """Return a movement that continues another one from `time` on, towards a new goal.
 
+    It has the least jerk from the position, velocity and acceleration of the old movement at `time` (Eqs. 25
+    to 27 of the minimum-jerk primer). It may be retargeted again.
 
-def waypoint_shapes(waypoints: Array, ends: Ends) -> dict[str, tuple[int, ...]]:
-    """Return the leading shapes of waypoints and of boundary values, or raise ValueError."""
-    shape = leading_shape("waypoints", waypoints, None, None)
-    if waypoints.shape[-2] < 2:
-        raise ValueError("waypoints must hold start and goal, got one point")
-    return {"waypoints": shape, **end_shapes(ends, waypoints.shape[-1])}
+    It is the rest of the old movement if no via-point is left to pass and goal, arrival, goal velocity and goal
+    acceleration are the old ones. A via-point of the old movement that still lies ahead is dropped unless it is
+    given again as `via`. A single one whose passage time was free is then passed as before.
 
+    Args:
+        trajectory: the movement under way, of order 3.
+        time: (...,) present time on the trajectory's clock [s].
+        goal: (..., D) new goal [m].
+        arrival: (...,) new time of arrival on the trajectory's clock [s].
+        via: (..., D) the one via-point of the new movement, passed at its free passage time [m]; (K, D) makes a batch
+            of K movements.
+        goal_velocity: (..., D) [m/s]; None = zero, FREE = the value of least cost.
+        goal_acceleration: (..., D) [m/s^2]; likewise.
+        freeze: remaining time to the old arrival [s] below which the old goal, arrival and final state are
+            kept, whatever the arguments say, and all via-points are dropped. Near arrival an error of the state
+            becomes a jerk of 60 dx / R^3 + 36 dv / R^2 + 9 da / R, where R is the remaining time.
 
-def check_durations(name: str, durations: Array, waypoints: Array, ends: Ends) -> None:
-    """Raise ValueError for durations (..., S) below 0, and for 0 between waypoints (..., S + 1, D) that differ.
+    Returns:
+        The movement from `time` on; its own clock starts at 0.
 
-    All durations of a movement may be 0 only if its ends are at rest.
+    Raises:
+        ValueError: time lies before the start or not before the old or the new arrival; freeze is negative
+            or not finite; an argument is not finite or has a wrong shape.
+
+    Example:
+        >>> from viapoint.primitives import point_to_point, retarget
+        >>> reach = point_to_point([0.0, 0.0], [0.3, 0.0], 0.8)
+        >>> turned = retarget(reach, 0.3, [0.2, 0.2], 1.0)
+        >>> float(turned.duration), bool((abs(turned(0.0, 1) - reach(0.3, 1)) < 1e-12).all())
+        (0.7, True)
     """
-    if (durations > 0).all():
-        return
-    require(durations >= 0, name, durations, "must not be negative")
-    points, numbers = to_numpy(waypoints), to_numpy(durations)
-    positive = np.broadcast_to(numbers > 0, (*points.shape[:-2], numbers.shape[-1]))
-    rounding = _EQUAL * np.finfo(points.dtype).eps * np.abs(points).max(axis=(-2, -1), initial=0.0)
-    equal = np.abs(np.diff(points, axis=-2)).max(axis=-1) <= rounding[..., None]
-    require(positive | equal, name, 1.0 * positive, "may be 0 only between equal waypoints")
-    moves = np.zeros(positive.shape[:-1], dtype=bool)
-    for value in ends.values():
-        if is_given(value):
-            moves = moves | (to_numpy(value) != 0).any(axis=-1)
-    require(positive.any(axis=-1) | ~moves, name, 1.0 * moves, "must not be 0 for a movement whose ends move")
+    require_trajectory(trajectory)
+    named = {"goal_velocity": goal_velocity, "goal_acceleration": goal_acceleration}
+    if trajectory.order != 3:
+        raise ValueError(f"trajectory must have order 3 to be continued, got order {trajectory.order}")
+    if not 0 <= as_number(freeze) < math.inf:
+        raise ValueError(f"freeze must be a finite number of at least 0, got {freeze!r}")
+    arrays = trajectory.floats({"via": via, **named}, widest=True, time=time, goal=goal, arrival=arrival)
+    xp, (time, goal, arrival, via, *ends) = trajectory.namespace, arrays
+    targets = {"goal": goal, **dict(zip(named, ends, strict=True))}
+    points = targets if via is None else {**targets, "via": via}
+    batch = broadcast_batch(
+        trajectory=trajectory.batch_shape,
+        time=tuple(time.shape),
+        arrival=tuple(arrival.shape),
+        **end_shapes(points, trajectory.dimension),
+    )
+    time = broadcast_to(xp, time, batch)
+    arrival = broadcast_to(xp, arrival, batch)
+    end = broadcast_to(xp, trajectory.duration, batch)
+    require(time >= 0, "time", time, "must not be negative")
+    under_way = (time < end) | ((time <= 0) & (end <= 0))
+    require(under_way, "time", time, "must lie before the end of the movement")
+    if freeze > 0:
+        frozen = end - time < freeze
+        arrival = xp.where(frozen, end, arrival)
+        targets, via = _keep_old_target(trajectory, frozen, targets, via)
+    require(arrival > time, "arrival", arrival, "must lie after time")
+    position, *motion = (value[..., 0, :] for value in trajectory.sample(time[..., None], (0, 1, 2)))
+    goal, *final = targets.values()
+    states: dict[str, Any] = dict(zip(END_NAMES, (*motion, *final), strict=True))
+    passed = [position, goal] if via is None else [position, via, goal]
+    shape = (*batch, trajectory.dimension)
+    waypoints = xp.stack([broadcast_to(xp, point, shape) for point in passed], axis=-2)
+    remaining = arrival - time
+    durations = remaining[..., None] if via is None else passage_durations(waypoints, remaining, **states)
+    return through(waypoints, durations, **states)
 
 
-def knot_states(order: int, ends: Ends, vias: int = 0) -> list[list[Any]]:
-    """Return the m - 1 derivatives at every knot: given at the ends, FREE at via-points.
-
-    Order 4 (snap) has the jerk zero at both ends.
-    """
-    values = list(ends.values())
-    states = [[*values[:2], None][: order - 1]]
-    for _ in range(vias):
-        states.append([FREE] * (order - 1))
-    return [*states, [*values[2:], None][: order - 1]]
-
-
-def unit_time_ends(ends: Sequence[Boundary], duration: Array) -> list[Any]:
-    """Return the values of END_NAMES in unit time, V = v T and A = a T^2; None and FREE stay."""
-    time = duration[..., None]
-    powers = time, time * time, time, time * time
-    return [value * power if is_given(value) else value for value, power in zip(ends, powers, strict=True)]
+def _keep_old_target(
+    trajectory: Trajectory, frozen: Array, targets: dict[str, Any], via: Array | None
+) -> tuple[dict[str, Any], Array | None]:
+    """Return targets and via-point, with the old final state as the target of frozen movements."""
+    xp, shape = trajectory.namespace, (*frozen.shape, trajectory.dimension)
+    old = trajectory.sample(trajectory.duration[..., None], (0, 1, 2))
+    mixed: dict[str, Any] = {}
+    for (name, value), end in zip(targets.items(), old, strict=True):
+        if value is FREE:
+            raise ValueError(f"{name} cannot be FREE together with freeze, which fixes the final state")
+        end = broadcast_to(xp, end[..., 0, :], shape)
+        value = xp.zeros_like(end) if value is None else broadcast_to(xp, value, shape)
+        mixed[name] = xp.where(frozen[..., None], end, value)
+    if via is not None:
+        # A via-point that equals the goal gets the duration 0 and is dropped.
+        via = xp.where(frozen[..., None], mixed["goal"], broadcast_to(xp, via, shape))
+    return mixed, via

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ._polynomial import differentiate, multiply, root_candidates, unit_size
-from .array_api import Array, Namespace, as_number, like, to_numpy, unit_factors
-from .trajectory import Trajectory, require_trajectory
+from ._polynomial import differentiate, multiply, root_candidates
+from .array_api import Array, Namespace, as_number, like, to_numpy, unit_factors, vector_length
+from .trajectory import Trajectory, require_trajectory, unit_polynomials
 
 # Number of speed samples for the spectral arc length, for any duration: far beyond a movement's bandwidth.
 _SPECTRUM_SAMPLES = 1000
@@ -53,13 +53,7 @@ def speed(trajectory: Trajectory, time: Array) -> Array:
         [0.0, 0.9375, 0.0]
     """
     require_trajectory(trajectory)
-    return _length(trajectory.namespace, trajectory(time, 1))
-
-
-def _length(xp: Namespace, vectors: Array) -> Array:
-    """Return the Euclidean norm of the last axis, without over- or underflow of squares."""
-    factors = unit_factors(xp, vectors)
-    return xp.linalg.vector_norm(vectors * factors, axis=-1) / factors[..., 0]
+    return vector_length(trajectory.namespace, trajectory(time, 1))
 
 
 def curvature(trajectory: Trajectory, time: Array) -> Array:
@@ -121,7 +115,11 @@ def dimensionless_jerk(trajectory: Trajectory) -> Array:
         204.8
     """
     require_trajectory(trajectory)
-    xp, trajectory = trajectory.namespace, _unit_sized(trajectory)
+    xp, batch = trajectory.namespace, trajectory.batch_shape
+    if 0 not in batch:  # scaled by powers of two, which is exact, to a size and a duration of about 1
+        size = unit_factors(xp, xp.reshape(trajectory.coefficients, (*batch, -1)))[..., 0]
+        pace = unit_factors(xp, trajectory.end)[..., 0]
+        trajectory = trajectory.transformed(scale=size).stretched(trajectory.duration * pace)
     duration, peak = trajectory.duration, trajectory.peak(1)
     with np.errstate(all="ignore"):
         jerk = trajectory.energy(3) * duration * duration * duration
@@ -175,7 +173,7 @@ def spectral_arc_length(trajectory: Trajectory, *, cutoff: float = 10.0, thresho
     if 0 in trajectory.batch_shape:  # not all libraries transform empty batches
         return 0.0 * trajectory.duration
     velocity = trajectory.sample(_SPECTRUM_SAMPLES + 1, 1)[0][..., :-1, :]
-    speeds = _length(xp, velocity)
+    speeds = vector_length(xp, velocity)
     if xp is not np and dtype.itemsize < 4:  # torch has no Fourier transform of half precision
         speeds = xp.astype(speeds, xp.float32)
     spectrum = xp.abs(xp.fft.rfft(speeds, n=_PADDED, axis=-1))
@@ -191,16 +189,6 @@ def spectral_arc_length(trajectory: Trajectory, *, cutoff: float = 10.0, thresho
     rise = spectrum[..., 1:] - spectrum[..., :-1]
     lengths = -xp.sum(used * xp.sqrt(width * width + rise * rise), axis=-1)
     return lengths if lengths.dtype == dtype else xp.astype(lengths, dtype)
-
-
-def _unit_sized(trajectory: Trajectory) -> Trajectory:
-    """Return the movements scaled by powers of two, which is exact, to a size and a duration of about 1."""
-    xp, t = trajectory.namespace, trajectory
-    if 0 in t.batch_shape:
-        return t
-    size = unit_factors(xp, xp.reshape(t.coefficients, (*t.batch_shape, -1)))[..., 0]
-    pace = unit_factors(xp, t.end)[..., 0]
-    return t.transformed(scale=size).stretched(t.duration * pace)
 
 
 def speed_valleys(trajectory: Trajectory) -> SpeedEvents:
@@ -230,8 +218,9 @@ def _speed_events(trajectory: Trajectory, sign: float) -> SpeedEvents:
     require_trajectory(trajectory)
     xp = trajectory.namespace
     times = _turning_times(trajectory)
-    before, after = _speed_trend(trajectory, times)
-    found = (sign * before < 0) & (sign * after > 0)
+    trend = sign * _speed_trend(trajectory, times)
+    found = (trend[..., :-1] < 0) & (trend[..., 1:] > 0)
+    times = times[..., 1:-1]
     count = int(found.sum(axis=-1).max(initial=0))
     order = np.argsort(~found, axis=-1, kind="stable")[..., :count]
     place = np.take_along_axis(times, order, axis=-1)
@@ -244,8 +233,7 @@ def _speed_events(trajectory: Trajectory, sign: float) -> SpeedEvents:
 
 def _turning_times(trajectory: Trajectory) -> Any:
     """Return all times (..., Q), ascending, at which the speed may be extreme: roots of v . a, and knots."""
-    coefficients = np.moveaxis(to_numpy(trajectory.coefficients).astype(float), -3, -1)  # (..., S, D, 2m)
-    velocity = differentiate(unit_size(coefficients, (-3, -2, -1))[0])
+    velocity = differentiate(unit_polynomials(trajectory.coefficients))
     power = multiply(velocity, differentiate(velocity)).sum(axis=-2)
     u = root_candidates(power)
     knots = to_numpy(trajectory.knots)
@@ -255,11 +243,13 @@ def _turning_times(trajectory: Trajectory) -> Any:
     return np.sort(times, axis=-1)
 
 
-def _speed_trend(trajectory: Trajectory, times: Any) -> tuple[Any, Any]:
-    """Return -1 or 1 where the speed falls or rises before and after each of `times`; 0 outside the movement."""
+def _speed_trend(trajectory: Trajectory, times: Any) -> Any:
+    """Return -1 or 1 where the speed falls or rises between neighbours of `times`, 0 before it changes at all."""
     middle = (times[..., 1:] + times[..., :-1]) / 2
     sampled = trajectory.sample(like(trajectory.namespace, middle, trajectory.coefficients), (1, 2))
-    velocity, acceleration = (unit_size(to_numpy(value), (-2, -1))[0] for value in sampled)
+    velocity, acceleration = (to_numpy(each) for each in sampled)
+    velocity = velocity * unit_factors(np, velocity, (-2, -1))
+    acceleration = acceleration * unit_factors(np, acceleration, (-2, -1))
     rate = (velocity * acceleration).sum(axis=-1)
     size = np.abs(velocity).max(axis=(-2, -1)) * np.abs(acceleration).max(axis=(-2, -1))
     wide = np.diff(times, axis=-1) > 1e-9 * times[..., -1:]  # only noise between two copies of one root
@@ -268,5 +258,4 @@ def _speed_trend(trajectory: Trajectory, times: Any) -> tuple[Any, Any]:
     trend = np.where(wide & (np.abs(rate) > noise), np.sign(rate), 0.0)
     for i in range(1, trend.shape[-1]):
         trend[..., i] = np.where(trend[..., i] == 0, trend[..., i - 1], trend[..., i])
-    edge = np.zeros((*trend.shape[:-1], 1))
-    return np.concatenate([edge, trend], axis=-1), np.concatenate([trend, edge], axis=-1)
+    return trend

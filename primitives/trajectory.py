@@ -13,9 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from ._hermite_tables import derivative_factors, energy_table
 from ._knot_solver import States, least_cost_coefficients
-from ._polynomial import differentiate, evaluate, multiply, root_candidates, unit_size
+from ._polynomial import (
+    derivative_factors,
+    differentiate,
+    energy_table,
+    evaluate,
+    multiply,
+    root_candidates,
+)
 from .array_api import (
     Array,
     Floats,
@@ -23,13 +29,14 @@ from .array_api import (
     as_floats,
     broadcast_batch,
     broadcast_to,
-    largest_exponent,
     leading_shape,
     like,
     namespace_of,
     ordered_sum,
     require,
     to_numpy,
+    unit_factors,
+    vector_length,
     whole_orders,
 )
 
@@ -106,8 +113,7 @@ class Trajectory:
     @property
     def namespace(self) -> Namespace:
         """Array API functions of the arrays."""
-        coefficients = self.coefficients  # NumPy, by far the most frequent, without a call
-        return np if isinstance(coefficients, np.ndarray) else namespace_of(coefficients)
+        return namespace_of(self.coefficients)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -227,26 +233,20 @@ class Trajectory:
     def extrema(self, nu: int = 0) -> Extrema:
         """Return the least and greatest nu-th derivative per axis, with their times; at a jump, both sides count."""
         coefficients = self._finite_derivative(nu)
-        polynomials, _ = _polynomials(coefficients)
+        polynomials = unit_polynomials(coefficients)
         u = _with_ends(root_candidates(differentiate(polynomials)))
         values = evaluate(polynomials[..., None, :], u)
-        low = _read(self, coefficients, _best(self, u, -values))
-        high = _read(self, coefficients, _best(self, u, values))
-        return Extrema(*low, *high)
+        return Extrema(*self._at_best(coefficients, u, -values), *self._at_best(coefficients, u, values))
 
     def peak(self, nu: int = 0) -> Array:
         """Return (...,) the largest Euclidean norm of the nu-th derivative [m/s^nu]; ValueError if it overflows."""
-        xp, coefficients = self.namespace, self._finite_derivative(nu)
-        polynomials, exponent = _polynomials(coefficients)
+        coefficients = self._finite_derivative(nu)
+        polynomials = unit_polynomials(coefficients)
         square = ordered_sum(multiply(polynomials, polynomials), -2)
-        change = ordered_sum(multiply(polynomials, differentiate(polynomials)), -2)
-        u = _with_ends(root_candidates(change))  # the roots of x . dx/du
+        u = _with_ends(root_candidates(differentiate(square)))
         score = evaluate(square[..., None, :], u)
-        values, _ = _read(self, coefficients, _best(self, u[..., None, :], score[..., None, :]))
-        limit = largest_exponent(xp, values.dtype)
-        exponent = np.clip(exponent, -limit, limit)
-        down, up = (like(xp, np.ldexp(1.0, sign * exponent), values) for sign in (-1, 1))
-        return xp.linalg.vector_norm(values * down, axis=-1) * up[..., 0]
+        values, _ = self._at_best(coefficients, u[..., None, :], score[..., None, :])
+        return vector_length(self.namespace, values)
 
     def _finite_derivative(self, nu: int) -> Array:
         """Return the coefficients of the nu-th derivative, or raise ValueError if it overflows."""
@@ -261,6 +261,26 @@ class Trajectory:
                 f"lasts {shortest:g} s"
             )
         return coefficients
+
+    def _at_best(self, coefficients: Array, u: Floats, score: Floats) -> tuple[Array, Array]:
+        """Return the values (..., D) of polynomials at the best of candidates u, the earliest of equals, and the times.
+
+        Candidates and scores are (..., S, D, P), for each axis its own; or (..., S, 1, P), one for all axes.
+        """
+        xp, (powers, segments, _) = self.namespace, coefficients.shape[-3:]
+        durations = to_numpy(self.durations)[..., None, None]
+        times = to_numpy(self.starts)[..., None, None] + u * durations
+        score = np.where(durations > 0, score, -np.inf)
+        places = np.swapaxes(np.stack([u, times, score]), -3, -2)  # (3, ..., D, S, P)
+        places = places.reshape(*places.shape[:-2], segments * u.shape[-1])
+        best = np.argmax(places[2], axis=-1)
+        u, time, _ = np.take_along_axis(places, best[None, ..., None], axis=-1)[..., 0]
+        segment = best // score.shape[-1]
+        chosen = segment[..., None, None, :] == np.arange(segments)[:, None]  # (..., 1, S, D or 1)
+        basis = chosen * u[..., None, None, :] ** np.arange(powers)[:, None, None]
+        values = xp.sum(xp.sum(like(xp, basis, coefficients) * coefficients, axis=-2), axis=-2)
+        time = np.minimum(time, to_numpy(self.end))  # no rounding past the end
+        return values, like(xp, time, coefficients)
 
     def stretched(self, duration: Array) -> Trajectory:
         """Return the movement along the same path with time scaled to a new duration (...,) [s], 0 where none moves."""
@@ -290,62 +310,35 @@ class Trajectory:
             scale: (...,) factor, default one.
         """
         named = {"rotation": rotation, "translation": translation, "scale": scale}
-        xp, moved = self.namespace, self.coefficients
         rotation, translation, scale = self.floats(named)
+        xp, moved = self.namespace, self.coefficients
+        shapes = {"trajectory": self.batch_shape}
         if rotation is not None:
-            shape = leading_shape("rotation", rotation, None, self.dimension)
-            broadcast_batch(trajectory=self.batch_shape, rotation=shape)
+            shapes["rotation"] = leading_shape("rotation", rotation, None, self.dimension)
+            broadcast_batch(**shapes)
             moved = xp.matmul(moved, rotation[..., None, :, :].mT)
         if scale is not None:
-            broadcast_batch(trajectory=self.batch_shape, scale=tuple(scale.shape))
+            shapes["scale"] = tuple(scale.shape)
+            broadcast_batch(**shapes)
             moved = moved * scale[..., None, None, None]
         if translation is not None:
-            shape = leading_shape("translation", translation, moved.shape[-1])
-            batch = broadcast_batch(trajectory=tuple(moved.shape[:-3]), translation=shape)
-            moved = broadcast_to(xp, moved, (*batch, *moved.shape[-3:]))
+            shapes["translation"] = leading_shape("translation", translation, moved.shape[-1])
+            moved = broadcast_to(xp, moved, (*broadcast_batch(**shapes), *moved.shape[-3:]))
             first = moved[..., :1, :, :] + translation[..., None, None, :]
             moved = xp.concat([first, moved[..., 1:, :, :]], axis=-3)
         return Trajectory(moved, self.durations, self.order, self.starts, self.rates, self.end)
 
 
-def _polynomials(coefficients: Array) -> tuple[Floats, Any]:
-    """Return the coefficients as (..., S, D, n) NumPy float64, of unit size, and the exponent (..., 1)."""
-    numbers, exponent = unit_size(to_numpy(coefficients).astype(np.float64), (-3, -2, -1))
-    return np.ascontiguousarray(np.moveaxis(numbers, -3, -1)), exponent[..., 0, 0]
+def unit_polynomials(coefficients: Array) -> Floats:
+    """Return coefficients (..., n, S, D) as (..., S, D, n) NumPy float64, of a size of about 1."""
+    numbers = np.moveaxis(to_numpy(coefficients).astype(np.float64), -3, -1)
+    return np.ascontiguousarray(numbers * unit_factors(np, numbers, (-3, -2, -1)))
 
 
 def _with_ends(u: Floats) -> Floats:
     """Return the points with 0 before and 1 after them."""
     edge = np.zeros((*u.shape[:-1], 1))
     return np.concatenate([edge, u, edge + 1.0], axis=-1)
-
-
-def _best(trajectory: Trajectory, u: Floats, score: Floats) -> tuple[Any, Floats]:
-    """Return segment and unit time, (..., D) each, of the best of candidates (..., S, D, P): the earliest of equals."""
-    empty = to_numpy(trajectory.rates) <= 0
-    score = np.where(empty[..., None, None], -np.inf, score)
-    u, score = np.swapaxes(u, -3, -2), np.swapaxes(score, -3, -2)  # (..., D, S, P)
-    count = u.shape[-1]
-    u, score = (np.reshape(a, (*a.shape[:-2], a.shape[-2] * count)) for a in (u, score))
-    chosen = np.argmax(score, axis=-1)
-    return chosen // count, np.take_along_axis(u, chosen[..., None], axis=-1)[..., 0]
-
-
-def _read(trajectory: Trajectory, coefficients: Array, place: tuple[Any, Floats]) -> tuple[Array, Array]:
-    """Return the value (..., D) of axis d at place d (or of all axes at the one place), and the time."""
-    segment, u = place
-    xp, (powers, segments, _) = trajectory.namespace, coefficients.shape[-3:]
-    chosen = segment[..., None, None, :] == np.arange(segments)[:, None]  # (..., 1, S, D or 1)
-    basis = chosen * u[..., None, None, :] ** np.arange(powers)[:, None, None]
-    values = xp.sum(xp.sum(like(xp, basis, coefficients) * coefficients, axis=-2), axis=-2)
-    starts = to_numpy(trajectory.starts)
-    rates = to_numpy(trajectory.rates)
-    spans = np.where(rates > 0, 1.0 / np.where(rates > 0, rates, 1.0), 0.0)
-    shape = (*segment.shape[:-1], segments)
-    start = np.take_along_axis(np.broadcast_to(starts, shape), segment, axis=-1)
-    span = np.take_along_axis(np.broadcast_to(spans, shape), segment, axis=-1)
-    time = np.minimum(start + u * span, to_numpy(trajectory.end))  # no rounding past the end
-    return values, like(xp, time, coefficients)
 
 
 def require_trajectory(value: object) -> None:
@@ -399,10 +392,8 @@ def minimum_duration(
             allowed = f"a number, (..., 1) or (..., {trajectory.dimension})"
             raise ValueError(f"{name} must be {allowed}, got shape {tuple(limit.shape)}")
         broadcast_batch(trajectory=trajectory.batch_shape, **{name: tuple(limit.shape[:-1])})
-        if limit.ndim == 0:
-            excess = trajectory.peak(nu) / limit
-        elif limit.shape[-1] == 1:
-            excess = trajectory.peak(nu) / limit[..., 0]
+        if limit.ndim == 0 or limit.shape[-1] == 1:
+            excess = trajectory.peak(nu) / xp.reshape(limit, limit.shape[:-1])
         else:
             extrema = trajectory.extrema(nu)
             excess = xp.max(xp.maximum(-extrema.minimum, extrema.maximum) / limit, axis=-1)

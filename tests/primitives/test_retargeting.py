@@ -76,20 +76,13 @@ def test_the_final_state_is_rest_unless_it_is_given_again(ends):
     np.testing.assert_allclose(new.sample([0.2], (1, 2)), 0.0, atol=1e-10)
 
 
-def test_freeze_keeps_goal_arrival_and_final_state_but_no_via_point():
-    old = moving_through_a_via_point(ENDS[1])
-    frozen = retarget(old, 0.2, [3.0, 3.0], 1.2, via=[2.0, 0.0], freeze=0.9)
-    expected = retarget(old, 0.2, [1.0, 0.0], 1.0, **ENDS[1])
-    time = np.linspace(0, 0.8, 30)
-    np.testing.assert_allclose(frozen(time), expected(time), atol=1e-12)
-
-
-def test_freeze_keeps_the_old_target_near_arrival():
-    old = point_to_point(np.zeros((2, 2)), np.ones((2, 2)), 1.0)
-    now = np.array([0.5, 0.95])
-    new = retarget(old, now, [3.0, 3.0], 1.2, via=[2.0, 0.0], freeze=0.1)
-    np.testing.assert_allclose(new.duration, [0.7, 0.05], atol=1e-15)
-    ends = new(new.duration[:, None])[:, 0]
-    np.testing.assert_allclose(ends, [[3.0, 3.0], [1.0, 1.0]], atol=1e-12)
-    time = np.linspace(0, 0.05, 9)
-    np.testing.assert_allclose(new(time)[1], old(0.95 + time)[1], atol=1e-11)
+@pytest.mark.parametrize("ends", ENDS[:2])
+def test_freeze_keeps_goal_arrival_and_final_state_but_no_via_point_of_those_near_arrival(ends):
+    old, now, via = moving_through_a_via_point(ends), np.array([0.05, 0.2, 0.95]), [2.0, 0.0]
+    new = retarget(old, now, [3.0, 3.0], 1.2, via=via, freeze=0.9)
+    np.testing.assert_allclose(new.duration, [1.15, 0.8, 0.05], atol=1e-15)
+    expected = [retarget(old, now[0], [3.0, 3.0], 1.2, via=via)]
+    expected += [retarget(old, each, [1.0, 0.0], 1.0, **ends) for each in now[1:]]
+    for i, movement in enumerate(expected):
+        for found, wanted in zip(new.sample(30), movement.sample(30), strict=True):
+            np.testing.assert_allclose(found[i], wanted, atol=1e-9)
