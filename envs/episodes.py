@@ -11,16 +11,24 @@ import numpy as np
 from viapoint.envs.arms.kinematics import slowdowns
 from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict, norm, put, take
 from viapoint.envs.events import NEVER, Event, EventPredictor, next_step
-from viapoint.envs.executor import CONTROL_STRIDE, Executor, Piece, blocks
+from viapoint.envs.executor import CONTROL_STRIDE, Executor, Piece, Simulator, blocks
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
 from viapoint.envs.outcome import SETTLING, Outcome, Rollout, relative_jerk, straight_jerk_cost
-from viapoint.envs.plans import MAX_START_OFFSET, Motion, Movements, Plan, jerk_cost_between
-from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed
+from viapoint.envs.plans import (
+    MAX_START_OFFSET,
+    Motion,
+    Movements,
+    NominalPlan,
+    Plan,
+    jerk_cost_between,
+    nominal_plan,
+    revise,
+    timed,
+)
 from viapoint.envs.rewards import reward_terms
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes, resting
 from viapoint.envs.sensors import Looks
-from viapoint.envs.simulator import Simulator
 from viapoint.envs.task import Task
 
 LIMIT_INSTANTS = 64  # Instants at which the limits of a plan are checked

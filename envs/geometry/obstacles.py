@@ -9,8 +9,14 @@ import numpy as np
 
 from viapoint.envs.common.arrays import Bool, Float, Int, frame_matrices
 from viapoint.envs.common.mujoco_check import mujoco
-from viapoint.envs.geometry.clouds import Clouds, join_clouds, split_clouds
-from viapoint.envs.geometry.meshes import Meshes, join_meshes, split_meshes
+from viapoint.envs.geometry.meshes import (
+    Clouds,
+    Meshes,
+    join_clouds,
+    join_meshes,
+    split_clouds,
+    split_meshes,
+)
 from viapoint.envs.geometry.shapes import (
     ABSENT,
     BOX,

@@ -18,9 +18,19 @@ import numpy as np
 from viapoint.envs.common.arrays import Float, frame_matrices, frozen, quaternion_to
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, unit_quaternion
-from viapoint.envs.geometry.clouds import Clouds, build_cloud, cloud_distance, join_clouds
 from viapoint.envs.geometry.compiled import TINY, Vector, inlined, kernel
-from viapoint.envs.geometry.meshes import FAR, Meshes, build_mesh, convex_hull, join_meshes, mesh_distance
+from viapoint.envs.geometry.meshes import (
+    FAR,
+    Clouds,
+    Meshes,
+    build_cloud,
+    build_mesh,
+    cloud_distance,
+    convex_hull,
+    join_clouds,
+    join_meshes,
+    mesh_distance,
+)
 
 # Kinds of obstacles; the number of a kind is its place in this table
 KINDS = ("sphere", "capsule", "cylinder", "box", "half_space", "convex_mesh", "point_cloud")

@@ -11,8 +11,7 @@ from viapoint import primitives
 from viapoint.envs.arms.kinematics import LIMIT_SHARE, slowdowns
 from viapoint.envs.events import FORESIGHT, LOOK, Event
 from viapoint.envs.outcome import SETTLING
-from viapoint.envs.plans import Plan
-from viapoint.envs.replanning import least_remaining
+from viapoint.envs.plans import Plan, least_remaining
 
 IDS = (JUMPS, MOVING, PANDA_MOVING)
 DT = 0.002

@@ -14,7 +14,7 @@ import numpy as np
 from viapoint.envs.common.arrays import Float, Observation, norm
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
-from viapoint.envs.scenes.motions import REACH_LENGTH, REACH_TIME
+from viapoint.envs.scenes.sampler import REACH_LENGTH, REACH_TIME
 from viapoint.envs.scenes.scene import CHORD, Scenes, reached
 from viapoint.training.planning.problem import Problem
 from viapoint.training.rollout import Outcomes, SceneSimulation
