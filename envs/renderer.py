@@ -26,8 +26,8 @@ from viapoint.envs.common.arrays import Float, Frame, Int, norm
 from viapoint.envs.common.palette import PALETTE, Colour
 from viapoint.envs.common.validation import whole_number
 from viapoint.envs.episodes import Episodes, Recorded
-from viapoint.envs.executor import Simulator
 from viapoint.envs.geometry.obstacles import Obstacles, bounding_boxes
+from viapoint.envs.simulator import Simulator
 from viapoint.envs.task import Task
 
 MAX_SIDE = 8192  # Longest side of a supersampled picture, in pixels; OpenGL may not support larger ones

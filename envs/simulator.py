@@ -1,4 +1,4 @@
-"""Execution of references: MuJoCo's batch engine, controls, and the metrics of what came of it."""
+"""MuJoCo's batch engine with one arm and obstacles in each simulation, and metrics of what was executed."""
 
 from __future__ import annotations
 
@@ -11,17 +11,14 @@ from mujoco import batch
 
 from viapoint.envs.arms.arm import WAITING, Arm
 from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position
-from viapoint.envs.common.arrays import Bool, Float, Int, put
+from viapoint.envs.common.arrays import Bool, Float, Int
 from viapoint.envs.geometry.clearance import (
-    FAR,
     Placed,
     bounds_memory,
     fastest,
-    memory,
     movement_clearance,
     obstacle_clearance,
     place,
-    row_clearances,
     travel,
 )
 from viapoint.envs.geometry.compiled import compiled
@@ -37,10 +34,7 @@ from viapoint.envs.geometry.obstacles import (
     quaternions_of,
 )
 from viapoint.envs.geometry.shapes import IN_TABLES
-from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Rollout, Tolerance
-from viapoint.envs.plans import Motion
-from viapoint.envs.scenes.scene import Scenes
-from viapoint.envs.task import Task
+from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Tolerance
 
 # Parts of a control sequence with moving obstacles: controls, then the obstacles' positions
 MOVING = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
@@ -48,11 +42,6 @@ MOST_BETWEEN = 64  # Greatest number of states between two physics steps that ar
 BLOCK, SIMILAR = 32, 1.1
 """Greatest number of movements that are executed together, few enough for the processor's cache, and the greatest
 length of one relative to another: all run as long as the longest one."""
-CONTROL_STRIDE = 4  # Physics steps between two computed torques; those in between are interpolated linearly
-
-# Numbers of physics steps, joint positions [rad] and references after each, and contacts before it, in pieces of an
-# episode
-Piece = tuple[Int, Float, Float, Bool]
 
 
 class Simulator:
@@ -174,85 +163,6 @@ class Simulator:
         data.mocap_quat[:] = self.batch.bind("mocap_quat")[sim].reshape(-1, 4)
 
 
-class Executor:
-    """Executor of references of a task in the simulations of one thread."""
-
-    def __init__(self, simulator: Simulator, task: Task) -> None:
-        self.simulator, self.space, self.tolerance = simulator, task.space, task.tolerance
-        self._resumes = not task.whole_movement
-        arm, number = simulator.arm, len(simulator.batch.state)
-        home, far = np.tile(arm.home, (number, 1)), np.full(number, FAR)
-        self.state = EpisodeState.at_rest(home, arm.hand(home), far, far)  # Metrics of the running episodes
-        self.past: list[list[Piece]] = [[] for _ in range(number)]  # Records of the running episodes
-        self._placed = memory(arm.chain, arm.spheres)
-
-    def begin(self, rows: Int, joints: Float, obstacles: Obstacles) -> None:
-        """Start episodes at rest at joint positions, shape (n, J), among the obstacles of n scenes."""
-        arm = self.simulator.arm
-        self.simulator.place(rows, joints, obstacles)
-        apart, own = row_clearances(arm.chain, arm.spheres, joints, obstacles, FAR)
-        nearest = apart.min(axis=1, initial=FAR)
-        put(self.state, rows, EpisodeState.at_rest(joints, arm.hand(joints), nearest, own))
-        for row in rows:
-            self.past[row] = []
-
-    def still(self, step: int, joints: Float) -> Piece:
-        """Return the record of one physics step at rest at joint positions, shape (1, J)."""
-        return np.array([step]), joints.copy(), self.space.coordinates(joints), np.zeros(1, bool)
-
-    def rollout(self, pieces: Sequence[Piece], scene: Scenes) -> Rollout:
-        """Return an episode that was recorded in pieces, in its scene; without a piece, the arm is at the start."""
-        arm = self.simulator.arm
-        parts = zip(*(pieces or [self.still(1, scene.start)]), strict=True)
-        steps, joints, planned, contact = (np.concatenate(part) for part in parts)
-        time = np.asarray(self.simulator.timestep * steps)
-        every = scene.take(np.zeros(len(time), np.int64)).obstacles_at(time)
-        apart, _ = row_clearances(arm.chain, arm.spheres, joints, every, FAR)
-        return Rollout(time, planned, joints, arm.hand(joints), contact, apart.min(axis=1, initial=FAR))
-
-    def run(
-        self, rows: Int, steps: Int, obstacles: Obstacles, goal: Float, motion: Motion, moving: bool
-    ) -> None:
-        """Execute references in n episodes of :func:`blocks` and add what comes of it to their metrics.
-
-        An episode stops at its first contact. Obstacles keep their velocities.
-
-        Args:
-            rows: Episodes in increasing order, shape (n,).
-            steps: Physics steps of each, 1 or more, shape (n,).
-            obstacles: Obstacles of these episodes at their present places.
-            goal: Goals in coordinates of the space, shape (n, D).
-            motion: References from now on, for CONTROL_STRIDE steps more than the longest episode has.
-            moving: True if obstacles move.
-        """
-        simulator, arm, placed = self.simulator, self.simulator.arm, self._placed
-        timestep, number = simulator.timestep, int(steps.max())
-        path, rates, accelerations = self.space.joint_motion(motion)
-        controls = arm.controls(path, rates, accelerations, CONTROL_STRIDE)[:, :number]
-        centres = None
-        if moving:
-            time = timestep * np.arange(number)[:, None, None]
-            centres = obstacles.centre[:, None] + time * obstacles.velocity[:, None]
-        joints, contact, unstable = simulator.rollout(rows, controls, steps, centres, resume=self._resumes)
-        executed = arm.chain, arm.spheres, arm.reach, joints, contact, steps, obstacles, timestep, placed
-        # Contacts between two physics steps
-        for i, k, states in _risky_steps(*executed, simulator.thinnest):
-            if not contact[i, : k + 1].any():
-                times = timestep * np.arange(k + 1, k + 3)[:, None, None]
-                places = obstacles.centre[i] + times * obstacles.velocity[i]
-                ends = joints[i, k : k + 2]
-                contact[i, k + 1] = simulator.touches_between(int(rows[i]), ends, places, states)
-        begin = self.state.steps[rows]
-        wanted = motion.position, path, goal, self.tolerance, self.space.of_hand
-        done = _measure(*executed, *wanted, arm.joint_range, self.state, rows)
-        for i, row in enumerate(rows):
-            end = done[i]
-            steps_done = begin[i] + np.arange(1, end + 1)
-            piece = steps_done, joints[i, :end], motion.position[i, 1 : end + 1], contact[i, :end]
-            self.past[row].append(piece)
-        self.state.unstable[rows] |= unstable
-
-
 def blocks(steps: Int) -> Iterator[Int]:
     """Yield the indices of episodes of similar lengths, shape (n,), which are executed together."""
     order = np.argsort(steps, kind="stable")
@@ -295,7 +205,7 @@ def _thinnest(obstacles: Obstacles, scene: int) -> float:
 
 
 @compiled
-def _risky_steps(
+def risky_steps(
     chain: Chain,
     spheres: Spheres,
     reach: Float,
@@ -311,7 +221,7 @@ def _risky_steps(
 
     Bodies move by more than half their thickness in these steps, from a state without contact to another, and both
     clearances together are less than the way: otherwise no state between them can be in contact. `thinnest` is half the
-    thickness of the thinnest part of the arm, [m]; the other arguments are those of :func:`_measure`.
+    thickness of the thinnest part of the arm, [m]; the other arguments are those of :func:`measure`.
     """
     found = [(0, 0, 0) for _ in range(0)]
     if obstacles.kind.shape[1] == 0:
@@ -335,7 +245,7 @@ def _risky_steps(
 
 
 @compiled
-def _measure(
+def measure(
     chain: Chain,
     spheres: Spheres,
     reach: Float,
