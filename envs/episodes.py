@@ -353,7 +353,8 @@ class Episodes:
     def _run(self, rows: Int, steps: Int, motion: Motion) -> None:
         """Execute references in n episodes of :func:`blocks`, each for its own number of steps, 1 or more.
 
-        An episode stops at its first contact. Obstacles keep their velocities.
+        An episode stops at its first contact. Obstacles keep their velocities. The references begin now, and go on for
+        CONTROL_STRIDE steps more than the longest episode has.
         """
         state, task, simulator = self.metrics, self.task, self.simulator
         arm, timestep, number = task.arm, simulator.timestep, int(steps.max())

@@ -349,3 +349,7 @@ def split_clouds(clouds: Clouds) -> list[Clouds]:
         node = np.array([0, len(boxes)])
         found.append(Clouds(points, clouds.radius[i : i + 1], first, node, boxes))
     return found
+
+
+NO_MESHES = join_meshes([])
+NO_CLOUDS = join_clouds([])

@@ -21,14 +21,14 @@ from viapoint.envs.common.validation import as_real_array, finite_array, number_
 from viapoint.envs.geometry.compiled import TINY, Vector, inlined, kernel
 from viapoint.envs.geometry.meshes import (
     FAR,
+    NO_CLOUDS,
+    NO_MESHES,
     Clouds,
     Meshes,
     build_cloud,
     build_mesh,
     cloud_distance,
     convex_hull,
-    join_clouds,
-    join_meshes,
     mesh_distance,
 )
 
@@ -233,7 +233,7 @@ class Shape:
         if (radius < 0.0).any():
             raise ValueError(f"radius must be 0 or greater, got {radius.min()}")
         local = (points.reshape(-1, 3) - self.position) @ self.rotation
-        tables = self.mesh or join_meshes([]), self.cloud or join_clouds([])
+        tables = self.mesh or NO_MESHES, self.cloud or NO_CLOUDS
         found = np.empty(len(local))
         _distances(self.number, self.packed_size, *tables, local, found)
         return found.reshape(points.shape[:-1]) - radius
