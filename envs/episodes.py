@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,9 +36,12 @@ from viapoint.envs.rewards import reward_terms
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes, resting
 from viapoint.envs.sensors import Looks
-from viapoint.envs.simulator import Simulator, blocks, measure, risky_steps
+from viapoint.envs.simulator import Simulator, measure, risky_steps
 from viapoint.envs.task import Task
 
+BLOCK, SIMILAR = 32, 1.1
+"""Greatest number of movements that are executed together, few enough for the processor's cache, and the greatest
+length of one relative to another: all run as long as the longest one."""
 CONTROL_STRIDE = 4  # Physics steps between two computed torques; those in between are interpolated linearly
 LIMIT_INSTANTS = 64  # Instants at which the limits of a plan are checked
 PROLONGED, ENOUGH = 6, 1.0  # Greatest number of prolongations of a plan in motion, and remaining factor
@@ -345,13 +348,13 @@ class Episodes:
                 return
             now = state.steps[rows]
             steps = np.minimum(last[rows], next_step(turns[rows], now)) - now
-            for some in blocks(steps):
+            for some in _blocks(steps):
                 block, number = rows[some], steps[some]
                 # A few steps more than needed, so that no control depends on the longest movement of the block.
                 self._run(block, number, references(block, int(number.max()) + CONTROL_STRIDE))
 
     def _run(self, rows: Int, steps: Int, motion: Motion) -> None:
-        """Execute references in n episodes of :func:`blocks`, each for its own number of steps, 1 or more.
+        """Execute references in n episodes of :func:`_blocks`, each for its own number of steps, 1 or more.
 
         An episode stops at its first contact. Obstacles keep their velocities. The references begin now, and go on for
         CONTROL_STRIDE steps more than the longest episode has.
@@ -530,3 +533,15 @@ class Episodes:
             self._past[row] = [self._still(now.steps[row], now.joints[[row]])]
         if self.looks is not None:
             self.looks = Looks(*state["looks"])
+
+
+def _blocks(steps: Int) -> Iterator[Int]:
+    """Yield the indices of episodes of similar lengths, shape (n,), which are executed together."""
+    order = np.argsort(steps, kind="stable")
+    length = steps[order]
+    first = 0
+    while first < len(order):
+        similar = int(np.searchsorted(length, SIMILAR * length[first], side="right"))
+        last = min(similar, first + BLOCK)
+        yield np.sort(order[first:last])
+        first = last

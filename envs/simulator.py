@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -39,9 +39,6 @@ from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Tolerance
 # Parts of a control sequence with moving obstacles: controls, then the obstacles' positions
 MOVING = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 MOST_BETWEEN = 64  # Greatest number of states between two physics steps that are checked for contact
-BLOCK, SIMILAR = 32, 1.1
-"""Greatest number of movements that are executed together, few enough for the processor's cache, and the greatest
-length of one relative to another: all run as long as the longest one."""
 
 
 class Simulator:
@@ -161,18 +158,6 @@ class Simulator:
         places = np.where(self._present[sim][:, None], centres + self._offset[sim], WAITING)
         data.mocap_pos[:] = places
         data.mocap_quat[:] = self.batch.bind("mocap_quat")[sim].reshape(-1, 4)
-
-
-def blocks(steps: Int) -> Iterator[Int]:
-    """Yield the indices of episodes of similar lengths, shape (n,), which are executed together."""
-    order = np.argsort(steps, kind="stable")
-    length = steps[order]
-    first = 0
-    while first < len(order):
-        similar = int(np.searchsorted(length, SIMILAR * length[first], side="right"))
-        last = min(similar, first + BLOCK)
-        yield np.sort(order[first:last])
-        first = last
 
 
 def _thinnest_geom(model: mujoco.MjModel) -> float:
