@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,24 +11,47 @@ import numpy as np
 from viapoint.envs.arms.kinematics import slowdowns
 from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict, norm, put, take
 from viapoint.envs.events import NEVER, Event, EventPredictor, next_step
-from viapoint.envs.executor import CONTROL_STRIDE, Executor, Piece, blocks
+from viapoint.envs.geometry.clearance import FAR, memory, row_clearances
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
-from viapoint.envs.outcome import SETTLING, Outcome, Rollout, relative_jerk, straight_jerk_cost
-from viapoint.envs.plans import MAX_START_OFFSET, Motion, Movements, Plan, jerk_cost_between
-from viapoint.envs.replanning import NominalPlan, nominal_plan, revise, timed
+from viapoint.envs.outcome import (
+    SETTLING,
+    EpisodeState,
+    Outcome,
+    Rollout,
+    relative_jerk,
+    straight_jerk_cost,
+)
+from viapoint.envs.plans import (
+    MAX_START_OFFSET,
+    Motion,
+    Movements,
+    NominalPlan,
+    Plan,
+    jerk_cost_between,
+    nominal_plan,
+    revise,
+    timed,
+)
 from viapoint.envs.rewards import reward_terms
 from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes, resting
 from viapoint.envs.sensors import Looks
-from viapoint.envs.simulator import Simulator
+from viapoint.envs.simulator import Simulator, measure, risky_steps
 from viapoint.envs.task import Task
 
+BLOCK, SIMILAR = 32, 1.1
+"""Greatest number of movements that are executed together, few enough for the processor's cache, and the greatest
+length of one relative to another: all run as long as the longest one."""
+CONTROL_STRIDE = 4  # Physics steps between two computed torques; those in between are interpolated linearly
 LIMIT_INSTANTS = 64  # Instants at which the limits of a plan are checked
 PROLONGED, ENOUGH = 6, 1.0  # Greatest number of prolongations of a plan in motion, and remaining factor
 MOST_PROLONGED = 1.5
 """Greatest factor each time. Longer plans in motion swing out and need more: the factors would grow without bound."""
 
 History = list[tuple[float, Plan]]  # Plans of an episode with the times at which they began, [s]
+# Numbers of physics steps, joint positions [rad] and references after each, and contacts before it, in pieces of an
+# episode
+Piece = tuple[Int, Float, Float, Bool]
 # Function of rows and a number of steps T that returns references from now on, shape (n, T + 1, D) each
 References = Callable[[Int, int], Motion]
 
@@ -65,15 +88,18 @@ class Episodes:
         self.simulator = Simulator(
             task.arm, n_obstacles=task.observation.n_rows, num_envs=number, meshes=meshes
         )
-        self.executor = Executor(self.simulator, task)
-        home = np.tile(task.arm.home, (number, 1))
+        home, far = np.tile(task.arm.home, (number, 1)), np.full(number, FAR)
+        self.metrics = EpisodeState.at_rest(home, task.arm.hand(home), far, far)
+        """Metrics of the running episodes."""
         self.scenes = resting(home, home.copy(), no_obstacles(number, task.observation.n_rows))
         """Scenes of the running episodes."""
         self.history: list[History] = [[] for _ in range(number)]  # Plans of the running episodes
+        self._past: list[list[Piece]] = [[] for _ in range(number)]  # and their physics steps
         self._finished: tuple[Int, Scenes, list[tuple[History, list[Piece]]]] | None = None
         """Rows, scenes and records of the episodes before the running ones; None if they are not kept."""
         self._moving = False
         self._events = EventPredictor(task)
+        self._placed = memory(task.arm.chain, task.arm.spheres)
         self._start = np.zeros((number, task.space.dimension))
         self._zero_duration = np.ones(number)
         points = task.n_via + 2
@@ -98,7 +124,7 @@ class Episodes:
     @property
     def time(self) -> Float:
         """Time since the start of each episode, shape (n,), [s]."""
-        return np.asarray(self.executor.state.steps * self.simulator.timestep)
+        return np.asarray(self.metrics.steps * self.simulator.timestep)
 
     def start(self, rows: Int, scenes: Scenes, *, keep: bool = False) -> None:
         """Start episodes at indices (n,) with the arms at rest at the start and the obstacles in place.
@@ -107,16 +133,20 @@ class Episodes:
         """
         self._finished = None
         if keep:
-            records = [(self.history[row], self.executor.past[row]) for row in rows]
+            records = [(self.history[row], self._past[row]) for row in rows]
             self._finished = rows, self.scenes.take(rows), records
         if not keep and len(rows) == len(self.begun):
             self.last_plan = None
         self.scenes = self.scenes.put(rows, scenes)
         moving = self.scenes.obstacles.velocity, self.scenes.turn_velocity, self.scenes.reach
         self._moving = any(part.any() for part in moving)
-        self.executor.begin(rows, scenes.start, scenes.obstacles_at(np.zeros(len(rows))))
-        space = self.task.space
-        start = space.coordinates(scenes.start)
+        arm, space, joints = self.task.arm, self.task.space, scenes.start
+        obstacles = scenes.obstacles_at(np.zeros(len(rows)))
+        self.simulator.place(rows, joints, obstacles)
+        apart, own = row_clearances(arm.chain, arm.spheres, joints, obstacles, FAR)
+        nearest = apart.min(axis=1, initial=FAR)
+        put(self.metrics, rows, EpisodeState.at_rest(joints, arm.hand(joints), nearest, own))
+        start = space.coordinates(joints)
         goal = space.coordinates(scenes.goal)
         self._start[rows] = start
         self._zero_duration[rows] = self.task.action.zero_duration(start, goal)
@@ -127,6 +157,7 @@ class Episodes:
         put(self._motion, rows, Motion.at_rest(start))
         for row in rows:
             self.history[row] = []
+            self._past[row] = []
         if self.looks is not None and self.task.sensor is not None:
             put(self.looks, rows, Looks.none(self.task.sensor, len(rows)))
             self._look(rows)
@@ -135,7 +166,7 @@ class Episodes:
         """Look with the sensor at the present scenes of some episodes."""
         if self.looks is not None and self.task.sensor is not None:
             obstacles = self.scenes.take(rows).obstacles_at(self.time[rows])
-            joints = self.executor.state.joints[rows]
+            joints = self.metrics.joints[rows]
             self.looks.add(rows, self.task.sensor, self.task.arm, joints, obstacles)
 
     def goals(self, time: Float) -> Float:
@@ -145,13 +176,13 @@ class Episodes:
     @property
     def nominal(self) -> NominalPlan:
         """Plans that a zero action leads to, and the present references."""
-        since = (self.executor.state.steps - self._began) * self.simulator.timestep
+        since = (self.metrics.steps - self._began) * self.simulator.timestep
         goal = self.goals(self.time)
         return nominal_plan(self.task.action, self.plan, np.asarray(since), self.begun, self._start, goal)
 
     def observe(self) -> Observation:
         """Return the present observations."""
-        state, task, time = self.executor.state, self.task, self.time
+        state, task, time = self.metrics, self.task, self.time
         goal = self.scenes.goals(time)
         goals = goal, task.arm.hand(goal)
         nominal = self.nominal if task.replanning else None
@@ -202,19 +233,31 @@ class Episodes:
         """Return the running episode of one environment; where it has not moved yet, the one before if it is kept."""
         scene = self.scenes.take([row])
         history = self.history[row]
-        pieces = self.executor.past[row]
-        if not self.executor.state.steps[row] and self._finished is not None:
+        pieces = self._past[row]
+        if not self.metrics.steps[row] and self._finished is not None:
             rows, scenes, records = self._finished
             for i in np.flatnonzero(rows == row):
                 scene = scenes.take([i])
                 history, pieces = records[i]
-        return Recorded(scene, history, self.executor.rollout(pieces, scene))
+        if not pieces:
+            pieces = [self._still(1, scene.start)]
+        steps, joints, planned, contact = map(np.concatenate, zip(*pieces, strict=True))
+        time = np.asarray(self.simulator.timestep * steps)
+        every = scene.take(np.zeros(len(time), np.int64)).obstacles_at(time)
+        arm = self.task.arm
+        apart, _ = row_clearances(arm.chain, arm.spheres, joints, every, FAR)
+        clearance = apart.min(axis=1, initial=FAR)
+        return Recorded(scene, history, Rollout(time, planned, joints, arm.hand(joints), contact, clearance))
+
+    def _still(self, step: int, joints: Float) -> Piece:
+        """Return the record of one physics step at rest at joint positions, shape (1, J)."""
+        return np.array([step]), joints.copy(), self.task.space.coordinates(joints), np.zeros(1, bool)
 
     # Decisions that are plans
 
     def _follow(self, plan: Plan, revised: Bool, active: Bool) -> Decision:
         """Follow plans, new ones where they were revised, until the decisions end."""
-        state, scenes = self.executor.state, self.scenes
+        state, scenes = self.metrics, self.scenes
         first = ~self.begun
         before = self._outcome(np.zeros(len(first), bool))
         begin = state.steps.copy()
@@ -234,7 +277,7 @@ class Episodes:
         """
         if not rows.size:
             return
-        state, given = self.executor.state, plan
+        state, given = self.metrics, plan
         plan, movements, stretch, within, inside = self._within_limits(plan.take(rows))
         state.reachable[rows] &= inside  # the arm does not start on a plan that leaves the reach
         adopted = within | ~self.begun[rows]
@@ -297,7 +340,7 @@ class Episodes:
 
     def _run_until(self, last: Int, references: References) -> None:
         """Run the episodes until a physics step each; obstacles keep their velocity in every piece of it."""
-        state, timestep = self.executor.state, self.simulator.timestep
+        state = self.metrics
         turns = self._events.steps(self.scenes.course_times())
         while True:
             rows = np.flatnonzero((state.steps < last) & (state.first_contact < 0) & ~state.unstable)
@@ -305,18 +348,61 @@ class Episodes:
                 return
             now = state.steps[rows]
             steps = np.minimum(last[rows], next_step(turns[rows], now)) - now
-            for some in blocks(steps):
-                block, number, begin = rows[some], steps[some], now[some]
-                scenes = self.scenes.take(block)
-                obstacles = scenes.obstacles_at(np.asarray(begin * timestep))
-                goal = self.task.space.coordinates(scenes.goals(np.asarray((begin + number) * timestep)))
+            for some in _blocks(steps):
+                block, number = rows[some], steps[some]
                 # A few steps more than needed, so that no control depends on the longest movement of the block.
-                motion = references(block, int(number.max()) + CONTROL_STRIDE)
-                self.executor.run(block, number, obstacles, goal, motion, self._moving)
+                self._run(block, number, references(block, int(number.max()) + CONTROL_STRIDE))
+
+    def _run(self, rows: Int, steps: Int, motion: Motion) -> None:
+        """Execute references in n episodes of :func:`_blocks`, each for its own number of steps, 1 or more.
+
+        An episode stops at its first contact. Obstacles keep their velocities. The references begin now, and go on for
+        CONTROL_STRIDE steps more than the longest episode has.
+        """
+        state, task, simulator = self.metrics, self.task, self.simulator
+        arm, timestep, number = task.arm, simulator.timestep, int(steps.max())
+        scenes, begin = self.scenes.take(rows), state.steps[rows]
+        obstacles = scenes.obstacles_at(np.asarray(begin * timestep))
+        goal = task.space.coordinates(scenes.goals(np.asarray((begin + steps) * timestep)))
+        path, rates, accelerations = task.space.joint_motion(motion)
+        controls = arm.controls(path, rates, accelerations, CONTROL_STRIDE)[:, :number]
+        centres = None
+        if self._moving:
+            time = timestep * np.arange(number)[:, None, None]
+            centres = obstacles.centre[:, None] + time * obstacles.velocity[:, None]
+        resume = not task.whole_movement
+        joints, contact, unstable = simulator.rollout(rows, controls, steps, centres, resume=resume)
+        executed = (
+            arm.chain,
+            arm.spheres,
+            arm.reach,
+            joints,
+            contact,
+            steps,
+            obstacles,
+            timestep,
+            self._placed,
+        )
+        # Contacts between two physics steps
+        for i, k, states in risky_steps(*executed, simulator.thinnest):
+            if not contact[i, : k + 1].any():
+                times = timestep * np.arange(k + 1, k + 3)[:, None, None]
+                places = obstacles.centre[i] + times * obstacles.velocity[i]
+                ends = joints[i, k : k + 2]
+                contact[i, k + 1] = simulator.touches_between(int(rows[i]), ends, places, states)
+        wanted = motion.position, path, goal, task.tolerance, task.space.of_hand
+        done = measure(*executed, *wanted, arm.joint_range, state, rows)
+        for i, row in enumerate(rows):
+            end = done[i]
+            numbers = begin[i] + np.arange(1, end + 1)
+            self._past[row].append(
+                (numbers, joints[i, :end], motion.position[i, 1 : end + 1], contact[i, :end])
+            )
+        state.unstable[rows] |= unstable
 
     def _references(self, rows: Int, number: int) -> Motion:
         """Return references of plans from now on, shape (n, T + 1, D) each."""
-        since = (self.executor.state.steps - self._began)[rows]
+        since = (self.metrics.steps - self._began)[rows]
         times = np.asarray(self.simulator.timestep * (since[:, None] + np.arange(number + 1)))
         return take(self._movements, rows).sample(times)
 
@@ -324,7 +410,7 @@ class Episodes:
 
     def _steer(self, wanted: Float, active: Bool) -> Decision:
         """Follow velocities for one control step; where the references leave the reach, the arm stays."""
-        task, state = self.task, self.executor.state
+        task, state = self.task, self.metrics
         steering, first = task.steering, state.steps == 0
         before = self._outcome(np.zeros(len(first), bool))
         begin = state.steps.copy()
@@ -357,7 +443,7 @@ class Episodes:
 
     def _decision(self, before: Outcome, begin: Int, first: Bool, final: Bool, event: Int) -> Decision:
         """Return the results of a decision that ended with an event, if nothing went wrong."""
-        state, task = self.executor.state, self.task
+        state, task = self.metrics, self.task
         event = np.where(state.first_contact >= 0, Event.CONTACT, event)
         event = np.where(state.reachable, event, Event.REACH)
         event = np.where(state.unstable, Event.UNSTABLE, event)
@@ -379,7 +465,7 @@ class Episodes:
 
     def _outcome(self, final: Bool) -> Outcome:
         """Return the metrics so far, where `final` is True for arms that have arrived at their last goal."""
-        state, task, timestep = self.executor.state, self.task, self.simulator.timestep
+        state, task, timestep = self.metrics, self.task, self.simulator.timestep
         time, touched = self.time, state.first_contact >= 0
         goal = self.goals(time)
         here = state.hand[:, :2] if task.space.of_hand else state.joints
@@ -424,7 +510,7 @@ class Episodes:
     def state(self) -> dict[str, Any]:
         """Return the state of the running episodes for :meth:`restore`; scenes and films of the past are not part."""
         return {
-            "metrics": as_dict(self.executor.state),
+            "metrics": as_dict(self.metrics),
             "plan": as_dict(self.plan),
             "motion": as_dict(self._motion),
             "began": self._began.copy(),
@@ -436,14 +522,26 @@ class Episodes:
     def restore(self, state: Mapping[str, Any], scenes: Scenes) -> None:
         """Continue from a state of environments of the same task and number, and their scenes."""
         self.start(np.arange(len(self.begun)), scenes)
-        put(self.executor.state, slice(None), from_dict(self.executor.state, state["metrics"]))
+        put(self.metrics, slice(None), from_dict(self.metrics, state["metrics"]))
         self.plan = from_dict(self.plan, state["plan"])
         self._movements = Movements.of(self.plan)
         put(self._motion, slice(None), from_dict(self._motion, state["motion"]))
         self._began[:], self.begun[:] = state["began"], state["begun"]
         self.simulator.batch.state[:] = state["physics"]
-        now = self.executor.state
+        now = self.metrics
         for row in np.flatnonzero(now.steps):  # records begin here, at the present time
-            self.executor.past[row] = [self.executor.still(now.steps[row], now.joints[[row]])]
+            self._past[row] = [self._still(now.steps[row], now.joints[[row]])]
         if self.looks is not None:
             self.looks = Looks(*state["looks"])
+
+
+def _blocks(steps: Int) -> Iterator[Int]:
+    """Yield the indices of episodes of similar lengths, shape (n,), which are executed together."""
+    order = np.argsort(steps, kind="stable")
+    length = steps[order]
+    first = 0
+    while first < len(order):
+        similar = int(np.searchsorted(length, SIMILAR * length[first], side="right"))
+        last = min(similar, first + BLOCK)
+        yield np.sort(order[first:last])
+        first = last

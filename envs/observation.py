@@ -10,8 +10,7 @@ from gymnasium import spaces
 
 from viapoint.envs.common.arrays import Float, Observation
 from viapoint.envs.geometry.obstacles import POSE_SIZE, Obstacles, observation_rows
-from viapoint.envs.plans import Motion
-from viapoint.envs.replanning import NominalPlan
+from viapoint.envs.plans import Motion, NominalPlan
 from viapoint.envs.scenes.scene import FARTHEST, FASTEST
 from viapoint.envs.sensors import Looks
 

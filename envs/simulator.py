@@ -1,4 +1,4 @@
-"""MuJoCo's batch engine with one arm and obstacles of any place, size and shape in each simulation."""
+"""MuJoCo's batch engine with one arm and obstacles in each simulation, and metrics of what was executed."""
 
 from __future__ import annotations
 
@@ -10,8 +10,31 @@ import numpy as np
 from mujoco import batch
 
 from viapoint.envs.arms.arm import WAITING, Arm
+from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position
 from viapoint.envs.common.arrays import Bool, Float, Int
-from viapoint.envs.geometry.obstacles import MESH, Obstacles, geom_fields, geom_meshes, quaternions_of
+from viapoint.envs.geometry.clearance import (
+    Placed,
+    bounds_memory,
+    fastest,
+    movement_clearance,
+    obstacle_clearance,
+    place,
+    travel,
+)
+from viapoint.envs.geometry.compiled import compiled
+from viapoint.envs.geometry.obstacles import (
+    ABSENT,
+    BOX,
+    CYLINDER,
+    HALF_SPACE,
+    MESH,
+    Obstacles,
+    geom_fields,
+    geom_meshes,
+    quaternions_of,
+)
+from viapoint.envs.geometry.shapes import IN_TABLES
+from viapoint.envs.outcome import LIMIT_TOLERANCE, EpisodeState, Tolerance
 
 # Parts of a control sequence with moving obstacles: controls, then the obstacles' positions
 MOVING = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
@@ -147,3 +170,147 @@ def _thinnest_geom(model: mujoco.MjModel) -> float:
         is_round = geom.type[0] in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
         thin = min(thin, float(geom.size[0] if is_round else model.geom_aabb[i, 3:].min()))
     return thin
+
+
+@compiled
+def _thinnest(obstacles: Obstacles, scene: int) -> float:
+    """Return half the thickness of the thinnest obstacle of a scene, [m]; that of a mesh is not known and counts 0."""
+    thin = 1.0
+    for row in range(obstacles.kind.shape[1]):
+        kind = obstacles.kind[scene, row]
+        if kind in (ABSENT, HALF_SPACE):
+            continue
+        half = obstacles.size[scene, row, 0]
+        if kind in (BOX, CYLINDER):
+            half = min(half, obstacles.size[scene, row, 1])
+        if kind == BOX:
+            half = min(half, obstacles.size[scene, row, 2])
+        thin = min(thin, 0.0 if kind in IN_TABLES else half)
+    return thin
+
+
+@compiled
+def risky_steps(
+    chain: Chain,
+    spheres: Spheres,
+    reach: Float,
+    joints: Float,
+    contact: Bool,
+    steps: Int,
+    obstacles: Obstacles,
+    timestep: float,
+    placed: Placed,
+    thinnest: float,
+) -> list[tuple[int, int, int]]:
+    """Return steps in which the arm may have passed through something thin: scene, step, and states to look at.
+
+    Bodies move by more than half their thickness in these steps, from a state without contact to another, and both
+    clearances together are less than the way: otherwise no state between them can be in contact. `thinnest` is half the
+    thickness of the thinnest part of the arm, [m]; the other arguments are those of :func:`measure`.
+    """
+    found = [(0, 0, 0) for _ in range(0)]
+    if obstacles.kind.shape[1] == 0:
+        return found
+    for scene in range(len(joints)):
+        thin = thinnest + _thinnest(obstacles, scene)
+        drift = timestep * fastest(obstacles, scene)
+        path = joints[scene]
+        for k in range(steps[scene] - 1):
+            way = travel(reach, path[k], path[k + 1]) + drift
+            if way <= 0.5 * thin or contact[scene, k] or contact[scene, k + 1]:
+                continue
+            apart = 0.0
+            for state in (k, k + 1):
+                place(chain, spheres, path[state], placed)
+                time = timestep * (state + 1)
+                apart += obstacle_clearance(spheres, placed, obstacles, scene, time, way, -way)
+            if apart < way:  # so a state between may be in contact
+                found.append((scene, k, int(min(2.0 * way / thin, MOST_BETWEEN))))
+    return found
+
+
+@compiled
+def measure(
+    chain: Chain,
+    spheres: Spheres,
+    reach: Float,
+    joints: Float,
+    contact: Bool,
+    steps: Int,
+    obstacles: Obstacles,
+    timestep: float,
+    placed: Placed,
+    planned: Float,
+    path: Float,
+    goal: Float,
+    tolerance: Tolerance,
+    of_hand: bool,
+    joint_range: Float,
+    state: EpisodeState,
+    rows: Int,
+) -> Int:
+    """Add executed segments to the metrics of n episodes, and return how many of their steps count, shape (n,).
+
+    Joint positions after each step, (n, T, J), and contacts before it, (n, T), are those of the simulation. The
+    references, (n, T + 1 or more, D), and the joint positions that belong to them begin before the first step. Each
+    episode has its own number of steps. At rest, the arm is slow and near its goal, shape (n, D), as the tolerance
+    tells; the metrics in `state` are changed at `rows`.
+    """
+    found = np.empty_like(steps)
+    bounds = bounds_memory(chain, spheres, False)
+    for scene in range(len(rows)):
+        row = rows[scene]
+        executed = joints[scene]
+        begin, end = state.steps[row], steps[scene]
+        for k in range(end):
+            if contact[scene, k]:
+                # The state before this step is the last one that counts.
+                if state.first_contact[row] < 0:
+                    state.first_contact[row] = begin + k
+                end = k + 1
+                break
+        hand = state.hand[row]
+        before = state.joints[row]
+        speed = 0.0
+        for k in range(end):
+            now = tool_position(chain, executed[k], placed.rotation, placed.origin)
+            moved = 0.0
+            for axis in range(3):
+                moved += (now[axis] - hand[axis]) ** 2
+                hand[axis] = now[axis]
+            moved = np.sqrt(moved)
+            state.path_length[row] += moved
+            state.peak_speed[row] = max(state.peak_speed[row], moved / timestep)
+            away, square, greatest, rate = 0.0, 0.0, 0.0, 0.0
+            for d in range(goal.shape[1]):
+                here = now[d] if of_hand else executed[k, d]
+                error = here - goal[scene, d]
+                away += (here - planned[scene, k + 1, d]) ** 2
+                square += error * error
+                greatest = max(greatest, abs(error))
+            for j in range(executed.shape[1]):
+                rate = max(rate, abs(executed[k, j] - before[j]) / timestep)
+                before[j] = executed[k, j]
+                low = joint_range[j, 0] - LIMIT_TOLERANCE
+                high = joint_range[j, 1] + LIMIT_TOLERANCE
+                if executed[k, j] < low or executed[k, j] > high:
+                    state.within[row] = False
+            state.deviation[row] += away
+            error = np.sqrt(square) if of_hand else greatest
+            speed = moved / timestep if of_hand else rate
+            resting = speed < tolerance.speed and error < tolerance.goal
+            state.rest[row] = state.rest[row] + 1 if resting else 0
+        state.last_speed[row] = speed
+        state.steps[row] = begin + end
+        # Clearance of what was done, and of what was commanded
+        body = chain, spheres, reach
+        done = movement_clearance(
+            *body, executed[:end], obstacles, scene, timestep, timestep, placed, bounds, 0.0
+        )
+        state.min_clearance[row] = min(state.min_clearance[row], done[0])
+        state.self_clearance[row] = min(state.self_clearance[row], done[1])
+        wanted = path[scene, : steps[scene] + 1]
+        command = movement_clearance(*body, wanted, obstacles, scene, 0.0, timestep, placed, bounds, 0.0)
+        state.planned_clearance[row] = min(state.planned_clearance[row], command[0], command[1])
+        found[scene] = end
+    return found

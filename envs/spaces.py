@@ -62,7 +62,9 @@ class HandPlane(Space):
 
     def joint_motion(self, motion: Motion) -> Motion:
         """Return the motion of the joints that moves the hand."""
-        return Motion(*planar_motion(self.arm, *motion))
+        flat = [np.ascontiguousarray(part.reshape(-1, 2)) for part in motion]
+        found = planar_motion(self.arm.chain, self.arm.joint_range, *flat)
+        return Motion(*(part.reshape(motion.position.shape) for part in found))
 
     def inside(self, coordinates: Float) -> Bool:
         """Return True where the hand reaches the coordinates with joints within their ranges."""

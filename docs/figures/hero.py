@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from viapoint.envs import Box, Capsule, Cylinder, Shape, arm_of
 from viapoint.envs.common.arrays import Float, Frame
 from viapoint.envs.episodes import Episodes
-from viapoint.envs.gl import Canvas
-from viapoint.envs.renderer import SceneView, frame_steps, picture_of
+from viapoint.envs.renderer import Canvas, SceneView, frame_steps, picture_of
 from viapoint.training import MotionPlan, plan_motion
 from viapoint.training.planning.motion_plan import execute_plans
 

@@ -195,10 +195,10 @@ def planar_solutions(chain: Chain, joint_range: Float, places: Float) -> tuple[F
 
 
 @compiled
-def _planar_motion(
+def planar_motion(
     chain: Chain, joint_range: Float, position: Float, velocity: Float, acceleration: Float
 ) -> tuple[Float, Float, Float]:
-    """Return joints, rates and accelerations for N states of the hand.
+    """Return joints, rates and accelerations for N states of the hand in the plane, shape (N, 2) each.
 
     With unit vectors u along the links and n across them, the velocity is l1 a1' n1 + l2 a2' n2 for the angles a of the
     links in the world, and n1 . u2 = sin(a2 - a1), so its components along u2 and u1 give the rates. Accelerations
@@ -238,16 +238,6 @@ def planar_joints(arm: Arm, places: Any) -> Float:
     places = np.asarray(places, dtype=np.float64)
     joints, _ = planar_solutions(arm.chain, arm.joint_range, places.reshape(-1, 2))
     return joints.reshape(places.shape)
-
-
-def planar_motion(
-    arm: Arm, position: Float, velocity: Float, acceleration: Float
-) -> tuple[Float, Float, Float]:
-    """Return joint positions, rates and accelerations for motions of the hand in the plane, shape (..., 2) each."""
-    flat = [np.ascontiguousarray(part.reshape(-1, 2)) for part in (position, velocity, acceleration)]
-    joints, rates, changes = _planar_motion(arm.chain, arm.joint_range, *flat)
-    shape = position.shape
-    return joints.reshape(shape), rates.reshape(shape), changes.reshape(shape)
 
 
 def unwound(arm: Arm, joints: Float, near: Float) -> Float:

@@ -9,8 +9,16 @@ import numpy as np
 
 from viapoint.envs.common.arrays import Bool, Float, Int, frame_matrices
 from viapoint.envs.common.mujoco_check import mujoco
-from viapoint.envs.geometry.clouds import Clouds, join_clouds, split_clouds
-from viapoint.envs.geometry.meshes import Meshes, join_meshes, split_meshes
+from viapoint.envs.geometry.meshes import (
+    NO_CLOUDS,
+    NO_MESHES,
+    Clouds,
+    Meshes,
+    join_clouds,
+    join_meshes,
+    split_clouds,
+    split_meshes,
+)
 from viapoint.envs.geometry.shapes import (
     ABSENT,
     BOX,
@@ -44,9 +52,6 @@ EXTENT = 1.0  # Half length of the cube that stands for a half-space in observat
 # Matrices of bounding boxes by kind, see :attr:`Shape.box`
 BOXES = np.array([shape.box for shape in SHAPES], np.float64)
 GEOMS = np.array([shape.geom for shape in SHAPES])  # MuJoCo's geoms by kind
-
-NO_MESHES = join_meshes([])
-NO_CLOUDS = join_clouds([])
 
 Table = TypeVar("Table", Meshes, Clouds)
 
@@ -248,8 +253,9 @@ def bounding_boxes(obstacles: Obstacles) -> tuple[Float, Float]:
 
 def _mesh_boxes(meshes: Meshes) -> Float:
     """Return the least and greatest corner of meshes, shape (M, 2, 3), [m]."""
-    corners = [each.corners.reshape(-1, 3) for each in split_meshes(meshes)]
-    return np.array([(each.min(axis=0), each.max(axis=0)) for each in corners])
+    low = np.minimum.reduceat(meshes.corners.min(axis=1), meshes.first[:-1])
+    high = np.maximum.reduceat(meshes.corners.max(axis=1), meshes.first[:-1])
+    return np.stack((low, high), axis=1)
 
 
 def _cloud_boxes(clouds: Clouds) -> Float:

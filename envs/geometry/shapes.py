@@ -18,9 +18,19 @@ import numpy as np
 from viapoint.envs.common.arrays import Float, frame_matrices, frozen, quaternion_to
 from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, unit_quaternion
-from viapoint.envs.geometry.clouds import Clouds, build_cloud, cloud_distance, join_clouds
 from viapoint.envs.geometry.compiled import TINY, Vector, inlined, kernel
-from viapoint.envs.geometry.meshes import FAR, Meshes, build_mesh, convex_hull, join_meshes, mesh_distance
+from viapoint.envs.geometry.meshes import (
+    FAR,
+    NO_CLOUDS,
+    NO_MESHES,
+    Clouds,
+    Meshes,
+    build_cloud,
+    build_mesh,
+    cloud_distance,
+    convex_hull,
+    mesh_distance,
+)
 
 # Kinds of obstacles; the number of a kind is its place in this table
 KINDS = ("sphere", "capsule", "cylinder", "box", "half_space", "convex_mesh", "point_cloud")
@@ -223,7 +233,7 @@ class Shape:
         if (radius < 0.0).any():
             raise ValueError(f"radius must be 0 or greater, got {radius.min()}")
         local = (points.reshape(-1, 3) - self.position) @ self.rotation
-        tables = self.mesh or join_meshes([]), self.cloud or join_clouds([])
+        tables = self.mesh or NO_MESHES, self.cloud or NO_CLOUDS
         found = np.empty(len(local))
         _distances(self.number, self.packed_size, *tables, local, found)
         return found.reshape(points.shape[:-1]) - radius

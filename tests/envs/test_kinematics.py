@@ -138,7 +138,7 @@ def test_the_closed_form_moves_the_hand_as_it_should():
     np.testing.assert_allclose(planar_joints(arm, hand[:, :2]), position, atol=1e-9)
     rng = np.random.default_rng(1)
     velocity, acceleration = rng.normal(size=(2, 200, 2))
-    joints, rates, changes = planar_motion(arm, hand[:, :2], velocity, acceleration)
+    joints, rates, changes = planar_motion(arm.chain, arm.joint_range, hand[:, :2], velocity, acceleration)
     step = 1e-5
     ahead = planar_joints(arm, hand[:, :2] + step * velocity + 0.5 * step**2 * acceleration)
     behind = planar_joints(arm, hand[:, :2] - step * velocity + 0.5 * step**2 * acceleration)

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from helpers import JUMPS, PANDA, PLANE, SENSED, WHOLE, play, post
 
-from viapoint.envs import Box, HalfSpace, RecordMovements, Sphere, arm_of, gl, renderer
-from viapoint.envs.gl import GLUnavailableError
+from viapoint.envs import Box, HalfSpace, RecordMovements, Sphere, arm_of, renderer
+from viapoint.envs.renderer import GLUnavailableError
 
 DRAWN = {
     "start": [-0.1, 0.25],
@@ -187,7 +187,7 @@ def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
 
     class Window:
         def __init__(self, model, width, height, title):
-            self.scene = mujoco.MjvScene(model, gl.MAX_GEOMS)
+            self.scene = mujoco.MjvScene(model, renderer.MAX_GEOMS)
 
         def draw(self):
             shown.append(self.scene.ngeom)
@@ -291,7 +291,7 @@ def test_without_opengl_the_error_says_what_to_install(monkeypatch, made):
         return made
 
     monkeypatch.setenv("MUJOCO_GL", "glfw")
-    monkeypatch.setattr(gl.gl_context, "GLContext", context)
+    monkeypatch.setattr(renderer.gl_context, "GLContext", context)
     env = gym.make(PLANE, render_mode="rgb_array")
     env.reset(seed=0)
     with pytest.raises(GLUnavailableError, match=r"apt-get install libegl1 libgl1.*MUJOCO_GL"):

@@ -11,8 +11,7 @@ from viapoint import primitives
 from viapoint.envs.arms.kinematics import LIMIT_SHARE, slowdowns
 from viapoint.envs.events import FORESIGHT, LOOK, Event
 from viapoint.envs.outcome import SETTLING
-from viapoint.envs.plans import Plan
-from viapoint.envs.replanning import least_remaining
+from viapoint.envs.plans import Plan, least_remaining
 
 IDS = (JUMPS, MOVING, PANDA_MOVING)
 DT = 0.002
@@ -31,7 +30,7 @@ def states(plan, time):
 @pytest.mark.parametrize("env_id", [PLANE, PANDA, "viapoint/PlanarWholeArm-v0"])
 @pytest.mark.parametrize("number", [1, 5])
 def test_one_decision_is_a_whole_movement_bit_for_bit(env_id, number):
-    """The executor that goes on until the next decision, without events before the goal."""
+    """The execution that goes on until the next decision, without events before the goal."""
     results = []
     for decide_at in ("end", ()):
         env = gym.make_vec(env_id, num_envs=number, decide_at=decide_at, threads=1).unwrapped

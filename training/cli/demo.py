@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 
-from viapoint.envs.gl import GLUnavailableError
+from viapoint.envs.renderer import GLUnavailableError
 from viapoint.training import report
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.agents.model_io import untrained

@@ -13,8 +13,7 @@ from viapoint.envs.geometry.clearance import Placed, place
 from viapoint.envs.geometry.compiled import compiled, inlined, inner
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
-from viapoint.envs.plans import SHORTEST_DURATION, turned
-from viapoint.envs.replanning import NEARBY, least_remaining
+from viapoint.envs.plans import NEARBY, SHORTEST_DURATION, least_remaining, turned
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.task import Task
 from viapoint.training.planning.beliefs import Sight, thick_points
@@ -145,7 +144,7 @@ def place_at(
 
 
 def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = False) -> Moves:
-    """Return the plans of actions of shape (B, H, m), as :func:`~viapoint.envs.replanning.revise` has them.
+    """Return the plans of actions of shape (B, H, m), as :func:`~viapoint.envs.plans.revise` has them.
 
     Their passage times are the best of a table. With `exact`, plans from rest have those of the environment, and more
     instants.
