@@ -19,6 +19,7 @@ from helpers import (
     post,
     same,
     same_scenes,
+    scenes_of,
 )
 
 import viapoint.envs as ve
@@ -32,10 +33,6 @@ from viapoint.envs.scenes.scene import NEVER, check_scenes
 
 REACHING = {"courses": "reaches"}
 HOUSE = ve.Box((0.3, 0.3, 0.3), position=(0.3, 0.0, 0.5), name="house")
-
-
-def generators(number, seed=0):
-    return [np.random.default_rng(seed + i) for i in range(number)]
 
 
 @pytest.fixture(scope="module")
@@ -74,10 +71,10 @@ def test_ends_are_free_and_the_straight_movement_is_not(env_id, kwargs):
 
 @pytest.mark.parametrize("env_id", [PLANE, MOVING, PANDA, PANDA_MOVING])
 def test_a_scene_depends_on_its_generator_alone(env_id):
-    sampler = gym.make(env_id).unwrapped.task.sampler()
-    together = sampler(generators(6))
+    task = gym.make(env_id).unwrapped.task
+    together = scenes_of(task, 6)
     for i in (0, 5):
-        same_scenes(sampler(generators(1, i)), together.take([i]))
+        same_scenes(task.sampler()([np.random.default_rng((0, i))]), together.take([i]))
     same_scenes(ve.Scenes.together([together.take([0, 1]), together.take([2, 3, 4, 5])]), together)
 
 
@@ -195,7 +192,7 @@ def test_where_nothing_fits_the_random_generator_stays_as_it_was():
 
 def test_changes_are_drawn_and_applied_in_time():
     task = gym.make(PANDA_MOVING).unwrapped.task
-    scenes = task.sampler()(generators(12))
+    scenes = scenes_of(task, 12)
     velocity, turns = scenes.obstacles.velocity, scenes.turn_time
     present = scenes.obstacles.present
     assert (np.linalg.norm(velocity[present], axis=-1) > 0.0).mean() > 0.5
@@ -225,22 +222,6 @@ def test_reaches_of_obstacles_are_minimum_jerk_movements(env_id):
             moved = reach(np.clip(time - begin, 0.0, duration)) - reach(np.clip(-begin, 0.0, duration))
             place = scenes.obstacles.centre[0, row] + moved
             np.testing.assert_allclose(every.centre[:, row], place, atol=1e-3)
-
-
-def test_obstacles_reach_in_the_physics():
-    """An obstacle that comes from far away meets the straight movement as soon as the sum says it does."""
-    way, duration, begin = np.array([0.0, -0.4, 0.0]), 0.8, 0.02
-    options = {**ENDS, "obstacles": [post(-0.1, 0.6, 0.03)], "reaches": [[begin, duration, *way]]}
-    env = gym.make(MOVING, **REACHING, decide_at=()).unwrapped
-    env.reset(seed=0, options=options)
-    info = env.step(np.zeros(env.action_space.shape, np.float32))[4]
-    rollout = env.last_rollout
-    reach = primitives.point_to_point(np.zeros(3), way, duration)
-    post_place = np.array([-0.1, 0.6, 0.0]) + reach(np.clip(rollout.time - begin, 0.0, duration))
-    radius = env.task.arm.spheres.radius[-1]
-    apart = np.linalg.norm((rollout.hand - post_place)[:, :2], axis=-1) - 0.03 - radius
-    assert info["collision"]
-    assert info["first_contact_time"] == pytest.approx(rollout.time[int((apart < 0.0).argmax())], abs=0.01)
 
 
 ALL = KINDS[:5]

@@ -66,25 +66,11 @@ def weights(model):
 
 
 @pytest.mark.parametrize(
-    "env",
-    [
-        PLANE,
-        lambda: gym.make(PLANE),
-        lambda: VecNormalize(make_vec_env(PLANE, 2), norm_obs=False),
-    ],
-)
-def test_any_environment_of_sb3_will_do(env):
-    model = model_on(env() if callable(env) else env).learn(20)
-    assert model._n_updates > 0
-    assert torch.isfinite(weights(model)).all()
-    model.get_env().close()
-
-
-@pytest.mark.parametrize(
     "make",
     [
         lambda: ViaVecEnv(PLANE, 4, n_obstacles=2),
         lambda: make_vec_env(PLANE, 4, env_kwargs={"n_obstacles": 2}),
+        lambda: VecNormalize(make_vec_env(PLANE, 4, env_kwargs={"n_obstacles": 2}), norm_obs=False),
     ],
 )
 def test_the_algorithm_is_used_as_those_of_stable_baselines(make, tmp_path):
