@@ -10,7 +10,6 @@ from helpers import check_contact_implies_overlap, configuration_clearances, lea
 from viapoint.envs.arms.capsule_fit import cover_geom, hull_of
 from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.arms.registry import arm_of
-from viapoint.envs.arms.spheres import grouped
 from viapoint.envs.geometry.clearance import (
     FAR,
     RESOLUTION,
@@ -166,13 +165,6 @@ def test_capsules_contain_a_geom_and_reach_no_farther_beyond_it_than_the_toleran
     for each in found:
         farthest = max(body.distance(end + each.radius * ball).max() for end in each.ends)
         assert each.excess - larger - 1.5e-3 <= farthest <= each.excess - larger <= tolerance - larger
-
-
-def test_bounding_balls_are_hardly_larger_than_the_smallest_ones():
-    corners = np.array(list(np.ndindex(2, 2, 2))) * (0.2, 0.4, 0.4) + 1.0
-    spheres = grouped([corners], [np.full(8, 0.05)], [1], [])
-    np.testing.assert_allclose(spheres.ball_centre[0], (1.1, 1.2, 1.2), atol=1e-3)
-    assert 0.35 - 1e-12 < spheres.ball_radius[0] < 0.351
 
 
 def test_spheres_and_capsules_of_a_file_stay_as_they_are():

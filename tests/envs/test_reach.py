@@ -8,44 +8,9 @@ from helpers import ENDS, GOAL, PANDA, PLANE, START, WALL, given, post, random_s
 from viapoint.envs import Box, HalfSpace, Task
 from viapoint.envs.geometry.obstacles import pack
 from viapoint.envs.outcome import TOLERANCES
-from viapoint.envs.plans import Plan
 from viapoint.envs.scenes.scene import resting
 
 SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")
-
-
-def through(env, via, duration=0.85):
-    """Return the action whose movement passes `via`."""
-    waypoints = np.stack((START, via, GOAL))
-    return env.task.action.encode(Plan(waypoints, np.full(2, duration / 2))).astype(np.float32)
-
-
-def test_a_straight_movement_with_nothing_in_the_way_succeeds():
-    env, _ = given()
-    _, reward, *_, info = env.step(np.zeros(3, np.float32))
-    assert info["is_success"]
-    assert info["jerk_ratio"] == pytest.approx(1.0, abs=1e-9)
-    assert info["path_length"] == pytest.approx(0.4, abs=1e-3)
-    assert info["peak_speed"] == pytest.approx(1.875 * 0.4 / info["duration"], rel=2e-3)
-    assert info["jerk_cost"] == pytest.approx(360.0 * 0.4**2 / info["duration"] ** 5, rel=1e-9)
-    assert (info["first_contact_time"], info["min_clearance"]) == (-1.0, 1.0)
-    assert reward > 0.5
-
-
-def test_rewards_are_ordered_as_a_person_would_order_them():
-    """Smooth way round, wide way round, crash; only a plan out of reach does not start."""
-    outcomes = []
-    for via in ((-0.1, 0.54), (-0.1, 0.58), None):
-        env, _ = given(obstacles=[WALL])
-        action = np.zeros(3, np.float32) if via is None else through(env, np.array(via))
-        _, reward, *_, info = env.step(action)
-        outcomes.append((reward, info["is_success"], info["collision"]))
-        if via is not None:
-            np.testing.assert_allclose(env.last_plan.waypoints[1], via, atol=1e-6)
-    rewards = [each[0] for each in outcomes]
-    assert rewards == sorted(rewards, reverse=True)
-    assert [each[1:] for each in outcomes] == [(True, False), (True, False), (False, True)]
-    assert 0.2 < info["first_contact_time"] < info["duration"]
 
 
 def test_a_plan_out_of_reach_is_a_failed_movement_that_does_not_start():
@@ -131,9 +96,10 @@ def test_a_longer_duration_is_a_longer_movement_in_joint_space(arm):
 
 
 def test_the_rollout_is_the_movement_that_info_tells_of():
-    env, _ = given(obstacles=[WALL])
-    *_, info = env.step(through(env, np.array([-0.1, 0.54])))
+    env, _ = given(obstacles=[post(-0.1, 0.25)])
+    *_, info = env.step(np.array([0.1, 0.3, 0.0], np.float32))
     rollout = env.last_rollout
+    assert info["is_success"]
     assert np.linalg.norm(rollout.hand[-1, :2] - GOAL) == pytest.approx(info["goal_error"])
     assert info["goal_error"] < TOLERANCES["hand"].goal
     assert rollout.clearance.min() == pytest.approx(info["min_clearance"])
@@ -141,18 +107,6 @@ def test_the_rollout_is_the_movement_that_info_tells_of():
     assert np.sqrt((error**2).mean()) == pytest.approx(info["tracking_error"])
     assert info["tracking_error"] < 2e-3
     assert len(rollout.time) == env.physics_steps
-
-
-def test_joints_track_references_within_a_milliradian_and_succeed_at_the_medium_duration():
-    env = gym.make_vec("viapoint/PandaReach-v0", num_envs=24).unwrapped
-    env.reset(seed=0)
-    *_, info = env.step(np.zeros(env.action_space.shape))
-    free = ~info["collision"]
-    assert free.mean() > 0.7
-    assert info["is_success"][free].all()
-    assert (info["tracking_error"][free] < 1e-3).all()
-    for rollout, moved in zip(env.last_rollout, free, strict=True):
-        assert not moved or np.abs(rollout.joints - rollout.planned).max() < 1e-3
 
 
 def test_components_beyond_one_are_clipped():
@@ -172,6 +126,12 @@ def test_zero_actions_are_straight_minimum_jerk_movements(n_via, timing, space):
     across = rollout.planned - rollout.planned[0]
     across -= np.outer(across @ line, line) / (line @ line)
     assert np.abs(across).max() < 1e-9
+    distance, duration = np.linalg.norm(line), info["duration"]
+    assert info["jerk_cost"] == pytest.approx(360.0 * distance**2 / duration**5, rel=1e-5)
+    assert (info["first_contact_time"], info["min_clearance"]) == (-1.0, 1.0)
+    if space == "hand":
+        assert info["path_length"] == pytest.approx(distance, abs=1e-3)
+        assert info["peak_speed"] == pytest.approx(1.875 * distance / duration, rel=2e-3)
 
 
 @pytest.mark.parametrize("env_id", [PLANE, "viapoint/PlanarWholeArm-v0", PANDA])

@@ -27,14 +27,6 @@ from viapoint.training.scene_sets import BANDS, drawn
 ZEROS = np.zeros((40, 3))
 
 
-@pytest.fixture(scope="module")
-def solutions(small_scenes):
-    """Actions of a search in the small scenes, most of which succeed."""
-    simulation = SceneSimulation(PLANE, 40, threads=1)
-    search = make_method("search64", PLANE)
-    return search.decide(simulation.observe(small_scenes.scenes), small_scenes.scenes)
-
-
 class Given:
     """Decides what it is told, and remembers what it was shown."""
 
@@ -54,10 +46,12 @@ def run(methods, scenes, **kwargs):
     return evaluate_methods(methods, scenes, PLANE, **settings)
 
 
-def test_every_method_meets_the_same_scenes(small_scenes, solutions):
+def test_every_method_meets_the_same_scenes(small_scenes):
+    simulation = SceneSimulation(PLANE, 8, threads=1)
+    observation = simulation.observe(small_scenes.scenes)
+    solutions = make_method("search64", PLANE).decide(observation, small_scenes.scenes)
     methods = [Given("a", ZEROS), Given("b", solutions)]
     evaluation = run(methods, small_scenes, batch=16)  # results do not depend on the batch
-    simulation = SceneSimulation(PLANE, 8, threads=1)
     hands = simulation.task.arm.hand(small_scenes.scenes.goal)
     for method in methods:
         assert [len(goals) for goals in method.goals] == [16, 16, 8]

@@ -3,13 +3,12 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import JUMPS, MOVING, PANDA, PANDA_MOVING, PLANE, REACH, WHOLE
+from helpers import MOVING, PANDA, PANDA_MOVING, PLANE, REACH, WHOLE
 
 from viapoint import primitives
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
 from viapoint.training import GeometrySearch
 from viapoint.training.planning import search as search_module
-from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.movements import INSTANTS, OUTSIDE, table_with
 from viapoint.training.planning.problem import Problem, moves_of, worth_of
 from viapoint.training.planning.search import (
@@ -19,8 +18,6 @@ from viapoint.training.planning.search import (
     plan_clearances,
     refined_actions,
 )
-from viapoint.training.rollout import SceneSimulation
-from viapoint.training.scene_sets import scenes_for
 
 AMONG_OBSTACLES = (PLANE, WHOLE, PANDA)
 
@@ -139,26 +136,6 @@ def test_a_decision_depends_on_its_scene_alone(env_id):
     batch, _ = search.predict(observation, deterministic=True)
     np.testing.assert_array_equal(batch, together.astype(np.float32))
     assert (np.abs(together) <= 1.0).all()
-
-
-@pytest.mark.parametrize(
-    ("env_id", "name", "number", "least"),
-    [
-        ("viapoint/PandaReach-v0", "search16", 100, 0.95),
-        (WHOLE, "search512", 100, 0.85),
-        (PANDA, "search512", 100, 0.85),
-        (JUMPS, "search64", 30, 0.95),
-        (MOVING, "search512", 40, 0.9),
-        ("viapoint/PandaMovingObstacles-v0", "search64", 16, 0.7),
-    ],
-)
-def test_the_search_succeeds(env_id, name, number, least):
-    simulation = SceneSimulation(env_id, number, threads=1)
-    every = scenes_for("validation", simulation.task).scenes
-    scenes = every.take(np.linspace(0, len(every.start) - 1, number).astype(int))
-    method = make_method(name, env_id)
-    done = simulation.play(method, scenes, method.decide(simulation.observe(scenes), scenes))
-    assert done["is_success"].mean() >= least
 
 
 def test_exactly_the_stated_number_of_plans_is_checked(monkeypatch):

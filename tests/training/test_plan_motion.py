@@ -11,20 +11,7 @@ import pytest
 from helpers import PANDA as PANDA_TASK
 from helpers import PLANE, UR5E, WHOLE, scenes_of
 
-from viapoint.envs import (
-    Box,
-    Capsule,
-    ConvexMesh,
-    Cylinder,
-    Plan,
-    PointCloud,
-    Pose,
-    Sphere,
-    Task,
-    arm_of,
-    load_arm,
-    obstacles_to_json,
-)
+import viapoint.envs as ve
 from viapoint.envs.arms.kinematics import link_poses, torques
 from viapoint.envs.geometry.clearance import memory, row_clearances
 from viapoint.envs.geometry.obstacles import pack, unpack
@@ -33,38 +20,29 @@ from viapoint.envs.spaces import space_of
 from viapoint.training import UnsafePlanError, plan_motion, plan_motions, read_motion, write_motion
 from viapoint.training.cli.entry import main
 from viapoint.training.evaluation import evaluate_methods
-from viapoint.training.planning import ompl_paths, refine
+from viapoint.training.planning import movements, ompl_paths, refine
 from viapoint.training.planning import plan_motion as module
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.benchmark import DATA, benchmark_panda, benchmark_problems, read_problems
 from viapoint.training.planning.motion_plan import execute_plans
-from viapoint.training.planning.movements import (
-    FINE_INSTANTS,
-    OUTSIDE,
-    Movement,
-    arm_setting,
-    fine_table,
-    movement_table,
-    table_with,
-)
 from viapoint.training.planning.rrt_connect import _shift, clear_path, points_on
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import BANDS, load, scenes_for, shipped_path
 
-PANDA = arm_of("panda")
+PANDA = ve.arm_of("panda")
 GOAL = PANDA.home + np.array([0.8, 0.5, 0.0, 0.6, 0.0, 0.3, 0.0])
-POST = Box((0.05, 0.05, 0.4), position=(0.5, 0.15, 0.4))
+POST = ve.Box((0.05, 0.05, 0.4), position=(0.5, 0.15, 0.4))
 """Obstacle in the way from home to GOAL."""
-BAR = Box((0.01, 0.05, 0.04), position=(-0.05, 0.35, 0.0))
+BAR = ve.Box((0.01, 0.05, 0.04), position=(-0.05, 0.35, 0.0))
 """Obstacle in the way of the hand of the arm in the plane."""
-WALL = [Box((0.02, 2.0, 2.0), position=(0.45, 0.2, 0.0), quaternion=(0.924, 0.0, 0.0, 0.383))]
+WALL = [ve.Box((0.02, 2.0, 2.0), position=(0.45, 0.2, 0.0), quaternion=(0.924, 0.0, 0.0, 0.383))]
 """Obstacle that nothing leads around; the goal is inside it."""
 
 
 def drawn(n: int, **kwargs):
     """Problems of drawn scenes: task, starts, goals and obstacles."""
-    task = Task.of(**kwargs)
+    task = ve.Task.of(**kwargs)
     scenes = scenes_of(task, n, 3)
     ends = task.space.coordinates(scenes.start), task.space.coordinates(scenes.goal)
     return task, *ends, [scenes.obstacles.take([i]) for i in range(n)]
@@ -84,22 +62,23 @@ def test_successful_plans_succeed_in_physics(kwargs) -> None:
     assert np.abs(outcome.planned_clearance - [plan.clearance for plan in good]).max() < 2e-3
 
 
-def test_plans_keep_the_limits_and_use_them() -> None:
-    plan = plan_motion(PANDA, PANDA.home, GOAL, [POST])
-    motion = plan.joints(rate=1000)
-    shares = np.abs(motion.velocity) / PANDA.velocity_limit, np.abs(motion.torque) / PANDA.torque_limit
-    assert 0.9 < max(share.max() for share in shares) <= 1.0
-    assert np.allclose(motion.position[[0, -1]], [PANDA.home, GOAL])
-    assert np.allclose(motion.velocity[[0, -1]], 0.0, atol=1e-9)
-    rates = np.gradient(motion.position, motion.time, axis=0)
-    assert np.allclose(rates[5:-5], motion.velocity[5:-5], atol=1e-3)
-
-
-def test_what_is_free_stays_straight() -> None:
-    plan = plan_motion(PANDA, PANDA.home, GOAL, time_limit=0.0)
-    assert (plan.success, plan.source, plan.seeds) == (True, "straight", 0)
-    assert plan.jerk == pytest.approx(1.0)
-    assert len(plan.durations) == 1
+def test_straight_movements_use_their_limits_and_keep_them() -> None:
+    # Also at the very end, where the torque of a quick movement changes most.
+    arm, rng = ve.load_arm(UR5E), np.random.default_rng(0)
+    for _ in range(60):
+        start, goal = rng.uniform(-2.0, 2.0, (2, 6))
+        plan = plan_motion(arm, start, goal, time_limit=0.0)
+        assert (plan.source, len(plan.durations)) == ("straight", 1)
+        assert plan.jerk == pytest.approx(1.0)
+        motion = plan.joints(2000, force=True)
+        assert np.allclose(motion.position[[0, -1]], [start, goal])
+        assert np.allclose(motion.velocity[[0, -1]], 0.0, atol=1e-9)
+        rates = np.gradient(motion.position, motion.time, axis=0)
+        assert np.allclose(rates[5:-5], motion.velocity[5:-5], atol=1e-3)
+        velocity = (np.abs(motion.velocity) / arm.velocity_limit).max()
+        torque = (np.abs(motion.torque) / arm.torque_limit).max()
+        assert np.allclose(plan.limits, (velocity, torque), atol=3e-3)
+        assert 0.9 < max(velocity, torque) <= 1.0
 
 
 @pytest.mark.parametrize(
@@ -125,16 +104,16 @@ ENCLOSED = {
     "arm": "planar",
     "start": (-0.2, 0.3),
     "goal": (0.2, 0.3),
-    "obstacles": [Box((a, b, 0.04), position=(x, y, 0.0)) for a, b, x, y in SIDES],
+    "obstacles": [ve.Box((a, b, 0.04), position=(x, y, 0.0)) for a, b, x, y in SIDES],
     "ompl": False,
     "time_limit": 2.0,
 }
 REASONS = [
     ({**ENCLOSED, "seeds": 0}, "from 1 seed"),
     ({**ENCLOSED, "seeds": 1}, "from 2 seeds"),
-    ({"obstacles": [POST, Sphere(0.1, position=PANDA.hand(GOAL))]}, "goal is in contact with obstacle 1"),
+    ({"obstacles": [POST, ve.Sphere(0.1, position=PANDA.hand(GOAL))]}, "goal is in contact with obstacle 1"),
     (
-        {"margin": 0.1, "obstacles": [POST, Sphere(0.1, position=PANDA.hand(PANDA.home), name="ball")]},
+        {"margin": 0.1, "obstacles": [POST, ve.Sphere(0.1, position=PANDA.hand(PANDA.home), name="ball")]},
         "obstacle 1 'ball'",
     ),
     ({"goal": GOAL + 9.0 * np.eye(7)[2]}, "joint 'joint3' must be from -2.897 to 2.897"),
@@ -156,7 +135,7 @@ def test_the_reason_of_a_plan_without_success_is_told(arguments, reason) -> None
 
 
 def test_the_shortest_duration_of_a_pose_is_that_of_its_best_configuration() -> None:
-    given = PANDA, PANDA.home, Pose((0.5, 0.3, 0.4))
+    given = PANDA, PANDA.home, ve.Pose((0.5, 0.3, 0.4))
     best = plan_motion(*given).duration
     told = re.search(r"shortest duration is ([0-9.]+) s", plan_motion(*given, duration=0.5 * best).reason)
     assert float(told[1]) <= best + 0.01
@@ -206,30 +185,28 @@ def test_movements_in_motion_use_all_of_their_limits_and_nothing_more() -> None:
 
 def test_a_plan_that_leaves_the_joint_limits_has_no_success() -> None:
     beyond = np.stack((PANDA.home, PANDA.joint_range[:, 1] + 0.1, GOAL))
-    plan = Plan.at_rest(beyond, np.array([2.0, 2.0]))
+    plan = ve.Plan.at_rest(beyond, np.array([2.0, 2.0]))
     known = module.checked_motion(PANDA, "joints", plan, pack([[]]), "given")
-    assert (known.success, known.clearance) == (False, OUTSIDE)
+    assert (known.success, known.clearance) == (False, movements.OUTSIDE)
 
 
 def objective(setting, table, row, start, offsets, scene, aim, gradient):
     """Compute the objective of the refinement, and its gradient by as many coordinates as there is room for."""
     work = refine._work(setting, len(offsets), len(start), scene)
-    movement = Movement(table, row, np.ascontiguousarray(start), offsets, 1.0)
+    movement = movements.Movement(table, row, np.ascontiguousarray(start), offsets, 1.0)
     hessian = np.empty((len(gradient), len(gradient)))
     return refine._assemble(movement, aim, 360.0, np.inf, hessian, gradient, work)[0]
 
 
 def test_nothing_is_refined_further_after_the_time_limit() -> None:
-    line = GOAL - PANDA.home
-    fixed = np.concatenate((line[None], np.zeros((2, 7))))
-    seeds = np.tile(np.linspace(0.0, line, 4)[1:-1], (4, 1, 1))
-    bounds = np.full((2, 2, 7), [[[-np.inf]], [[np.inf]]])
-    given = (
-        arm_setting(PANDA, False, pack([[POST]])), movement_table(2), fine_table(2), PANDA.home, fixed, seeds, bounds,
-        2.0, pack([[POST]]), 0.001, refine.unit_of_jerk(line, False), 1.0, 4,
-    )  # fmt: skip
-    tried, found = refine.refine_seeds(*given, np.inf)
-    few, first = refine.refine_seeds(*given, 0.0)
+    still, tables = np.zeros(7), (movements.movement_table(2), movements.fine_table(2))
+    problem = module._Problem(
+        PANDA, space_of(PANDA, "joints"), PANDA.home, still, still, GOAL, pack([[POST]])
+    )
+    seeds = np.tile(np.linspace(0.0, GOAL - PANDA.home, 4)[1:-1], (4, 1, 1))
+    given = problem, problem.setting(), 0.001, tables, seeds, 2.0
+    tried, found = module._refined(*given, np.inf, enough=4)
+    few, first = module._refined(*given, 0.0, enough=4)
     assert (tried, few) == (4, 1)
     assert found.cost[0] < first.cost[0] < np.inf  # it is free, and not polished
 
@@ -237,7 +214,7 @@ def test_nothing_is_refined_further_after_the_time_limit() -> None:
 def test_parts_of_the_arm_that_nothing_comes_near_change_no_plan(monkeypatch) -> None:
     task, starts, goals, obstacles = drawn(8, arm="planar")
     # A bar at the height of the links, which pass above the others
-    high = Box((0.03, 0.03, 0.02), position=(0.0, 0.15, 0.15))
+    high = ve.Box((0.03, 0.03, 0.02), position=(0.0, 0.15, 0.15))
     scenes = [pack([[*unpack(each, 0), high]]) for each in obstacles[:4]] + obstacles[4:]
     given = task.arm, starts, goals, scenes
     plans = plan_motions(*given, ompl=False)
@@ -248,11 +225,7 @@ def test_parts_of_the_arm_that_nothing_comes_near_change_no_plan(monkeypatch) ->
         assert plan.clearance == pytest.approx(other.clearance, abs=1e-5)
 
 
-def test_poses_and_several_goals() -> None:
-    pose = Pose(position=(0.45, 0.35, 0.35), quaternion=(0.0, 1.0, 0.0, 0.0))
-    plan = plan_motion(PANDA, PANDA.home, pose, [POST])
-    assert plan.success
-    assert np.allclose(PANDA.hand(plan.waypoints[-1]), pose.position, atol=1e-5)
+def test_of_several_goals_the_cheapest_is_taken() -> None:
     far = GOAL + 1.5 * np.eye(7)[4]
     several = plan_motion(PANDA, PANDA.home, [far, GOAL], [POST])
     assert np.array_equal(several.waypoints[-1], GOAL)
@@ -260,12 +233,12 @@ def test_poses_and_several_goals() -> None:
 
 def test_goals_of_continuous_joints_are_taken_modulo_a_turn() -> None:
     text = UR5E.read_text().replace(' range="-6.2832 6.2832"', ' limited="false"')
-    arm = load_arm(text, velocity_limit=3.0)
+    arm = ve.load_arm(text, velocity_limit=3.0)
     assert arm.continuous == arm.joint_names
     goal = arm.home + 0.5
     plan = plan_motion(arm, arm.home, goal + 2.0 * np.pi * np.array([1, -1, 0, 2, 0, 0]))
     assert np.allclose(plan.waypoints[-1], goal)
-    wide = load_arm(text, velocity_limit=3.0, home=arm.home, joint_range=[(-6.0, 6.0)] * 6)
+    wide = ve.load_arm(text, velocity_limit=3.0, home=arm.home, joint_range=[(-6.0, 6.0)] * 6)
     assert wide.continuous == arm.joint_names
     start = arm.home + 3.0 * np.eye(6)[0]
     for each, way in ((wide, 2.0 * np.pi - 6.0), (arm, -6.0)):
@@ -274,7 +247,7 @@ def test_goals_of_continuous_joints_are_taken_modulo_a_turn() -> None:
 
 
 def test_a_start_that_is_the_goal_is_a_plan() -> None:
-    for arm, place in ((PANDA, PANDA.home), (arm_of("planar"), (0.0, 0.4))):
+    for arm, place in ((PANDA, PANDA.home), (ve.arm_of("planar"), (0.0, 0.4))):
         plan = plan_motion(arm, place, place)
         assert (plan.success, plan.jerk, *plan.execute().jerk_ratio) == (True, 1.0, 1.0)
         assert plan.duration > 0.0
@@ -293,13 +266,6 @@ def test_short_movements_succeed_in_physics() -> None:
     assert outcome.is_success.all()
 
 
-def test_given_seeds_come_first() -> None:
-    found = plan_motion(PANDA, PANDA.home, GOAL, [POST])
-    again = plan_motion(PANDA, PANDA.home, GOAL, [POST], seeds=found.waypoints[None, 1:-1])
-    assert (again.source, again.seeds) == ("given", 1)
-    assert again.jerk <= 1.05 * found.jerk
-
-
 def test_results_depend_on_neither_threads_nor_the_form_of_obstacles() -> None:
     task, starts, goals, obstacles = drawn(6, arm="panda")
     several = np.random.default_rng(5).spawn(6)  # problems of a batch share no generator
@@ -316,8 +282,8 @@ def test_results_depend_on_neither_threads_nor_the_form_of_obstacles() -> None:
 
 def test_within_bounds_no_allowed_direction_is_better() -> None:
     """Where refinement ends, the gradient vanishes, or points out of the bounds (Karush-Kuhn-Tucker)."""
-    table, scene = movement_table(2), pack([[]])
-    setting = arm_setting(PANDA, False, scene)
+    table, scene = movements.movement_table(2), pack([[]])
+    setting = movements.arm_setting(PANDA, False, scene)
     aim = refine.Aim(clearance=0.0, jerk=1.0, gain=0.0)
     generator = np.random.default_rng(0)
     line = GOAL - PANDA.home
@@ -326,7 +292,7 @@ def test_within_bounds_no_allowed_direction_is_better() -> None:
         offsets = np.concatenate((generator.uniform(-0.5, 0.5, (2, 7)), [line], np.zeros((2, 7))))
         low = offsets[:2] - generator.uniform(0.0, 0.3, (2, 7))
         high = offsets[:2] + generator.uniform(0.0, 0.3, (2, 7))
-        movement = Movement(table, 0, PANDA.home, offsets, 1.0)
+        movement = movements.Movement(table, 0, PANDA.home, offsets, 1.0)
         work = refine._work(setting, 5, 7, scene)
         row = refine._refine(movement, np.stack((low, high)), aim, 360.0, work)
         assert ((offsets[:2] >= low) & (offsets[:2] <= high)).all()
@@ -341,7 +307,10 @@ def test_within_bounds_no_allowed_direction_is_better() -> None:
 def test_gradient_of_the_objective(kwargs) -> None:
     task, starts, goals, obstacles = drawn(5, **kwargs)
     aim = refine.SEED._replace(clearance=0.2)  # many residuals
-    setting, table = arm_setting(task.arm, task.space.of_hand, pack([[]])), movement_table(2)
+    setting, table = (
+        movements.arm_setting(task.arm, task.space.of_hand, pack([[]])),
+        movements.movement_table(2),
+    )
     dimension = task.space.dimension
     generator = np.random.default_rng(0)
     gradient, measured = np.empty((2, 2 * dimension))
@@ -364,14 +333,9 @@ def test_gradient_of_the_objective(kwargs) -> None:
 
 
 REFUSED = [
-    ({"goal": Pose((2.0, 0.0, 0.5))}, "cannot be reached"),
+    ({"goal": ve.Pose((2.0, 0.0, 0.5))}, "cannot be reached"),
     ({"start": PANDA.home[:6]}, r"shape \(7,\)"),
-    ({"start": PANDA.home * np.nan}, "finite"),
-    ({"start": None}, "real numbers"),
-    ({"goal": "home"}, "real numbers"),
     ({"goal": {"place": (0.5, 0.2, 0.4)}}, "position"),
-    ({"goal": [Pose((0.5, 0.2, 0.4)), None]}, "position"),
-    ({"obstacles": [{"shape": "blob"}]}, "blob"),
     ({"obstacles": 5}, "obstacles must be"),
 ]
 UNSOLVED = {"goal": GOAL + 9.0 * np.eye(7)[2]}, "outside the limits"
@@ -399,11 +363,11 @@ def test_a_batch_goes_on_after_problems_that_are_refused(tmp_path) -> None:
     for use in uses:
         with pytest.raises(UnsafePlanError, match="no movement"):
             use()
-    assert plan_motion(PANDA, PANDA.home, [Pose((2.0, 0.0, 0.5)), Pose((0.5, 0.2, 0.4))]).success
+    assert plan_motion(PANDA, PANDA.home, [ve.Pose((2.0, 0.0, 0.5)), ve.Pose((0.5, 0.2, 0.4))]).success
 
 
 def test_numbers_of_other_types_compile_nothing_anew() -> None:
-    wall = Box((0.1, 0.1, 0.3), position=(0.5, 0.15, 0.3))
+    wall = ve.Box((0.1, 0.1, 0.3), position=(0.5, 0.15, 0.3))
     expected = plan_motion(PANDA, PANDA.home, GOAL, [wall], duration=2.0, margin=0.0)
     known = len(module.refine_seeds.signatures)
     plan = plan_motion(PANDA, PANDA.home, GOAL, [wall], duration=np.uint8(2), margin=np.float32(0.0))
@@ -414,9 +378,9 @@ def test_numbers_of_other_types_compile_nothing_anew() -> None:
 def test_a_pose_is_reached_by_any_of_its_free_configurations() -> None:
     """The nearest ten of 55 touch the boards."""
     place = np.array([0.54, 0.33, 0.42])
-    boards = [Box((0.15, 0.15, 0.02), position=place + np.array([0.0, 0.0, 0.155]))]
-    boards.append(Box((0.02, 0.15, 0.1), position=place + np.array([0.12, 0.0, 0.0])))
-    plan = plan_motion(PANDA, PANDA.home, Pose(place), boards)
+    boards = [ve.Box((0.15, 0.15, 0.02), position=place + np.array([0.0, 0.0, 0.155]))]
+    boards.append(ve.Box((0.02, 0.15, 0.1), position=place + np.array([0.12, 0.0, 0.0])))
+    plan = plan_motion(PANDA, PANDA.home, ve.Pose(place), boards)
     assert plan.success
     assert np.allclose(PANDA.hand(plan.waypoints[-1]), place, atol=1e-4)
 
@@ -440,33 +404,38 @@ THIN = """<mujoco><compiler angle="radian"/><worldbody><body name="upper" pos="0
 
 
 def test_nothing_thin_is_passed_through_between_two_instants() -> None:
-    arm = load_arm(THIN, velocity_limit=6.0, name="thin")
+    arm = ve.load_arm(THIN, velocity_limit=6.0, name="thin")
     for angle in np.linspace(-1.5, 1.5, 9):
         for distance in (0.5, 1.0, 1.4):
             place = distance * np.cos(angle), distance * np.sin(angle), 0.3
-            post = Cylinder(0.001, 0.2, position=place)
+            post = ve.Cylinder(0.001, 0.2, position=place)
             plan = plan_motion(arm, [-2.9, 0.0], [2.9, 0.0], [post], time_limit=0.0)
             assert not plan.success
             assert plan.clearance < -0.001
 
 
 POINTS, PLACE, LOW = np.random.default_rng(0).normal(0.0, 0.04, (30, 3)), (0.5, 0.15, 0.4), (-0.05, 0.37, 0.0)
+SURFACE = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 3))
+SURFACE[np.arange(200), np.arange(200) % 3] = 1.0
 TO_THE_GOAL = np.array((-0.18, 0.24, 0.0))
 
 
 @pytest.mark.parametrize(
     ("arm", "obstacle"),
     [
-        ("panda", ConvexMesh.hull(POINTS, position=PLACE)),
-        ("panda", PointCloud(POINTS, 0.01, position=PLACE)),
+        ("panda", ve.ConvexMesh.hull(POINTS, position=PLACE)),
+        ("panda", ve.PointCloud(SURFACE * POST.size, 0.02, position=POST.position)),
         # It starts out of the way, and crosses the straight movement; where it will be later is free now.
-        ("panda", Sphere(0.1, position=(0.75, 0.15, 0.5), velocity=(-0.3, 0.0, 0.0))),
-        ("planar", Sphere(0.02, position=LOW)),
-        ("planar", Capsule(0.02, 0.05, position=LOW)),
-        ("planar", PointCloud([LOW], 0.02)),
+        ("panda", ve.Sphere(0.1, position=(0.75, 0.15, 0.5), velocity=(-0.3, 0.0, 0.0))),
+        ("planar", ve.Sphere(0.02, position=LOW)),
+        ("planar", ve.Capsule(0.02, 0.05, position=LOW)),
+        ("planar", ve.PointCloud([LOW], 0.02)),
         # The movement waits or hurries where it crosses the goal after so many seconds.
         *(
-            ("planar", Sphere(0.05, position=(0.1, 0.4, 0.0) - seconds * TO_THE_GOAL, velocity=TO_THE_GOAL))
+            (
+                "planar",
+                ve.Sphere(0.05, position=(0.1, 0.4, 0.0) - seconds * TO_THE_GOAL, velocity=TO_THE_GOAL),
+            )
             for seconds in (1.0, 1.25, 1.5, 1.75)
         ),
     ],
@@ -484,7 +453,7 @@ def test_no_obstacle_comes_while_the_arm_settles(speed) -> None:
     end = plan_motion("planar", start, goal).duration
     for late in (0.02, 0.05, 0.08):  # when it would be at the goal after the straight movement, [s]
         place = (0.1 + 0.05 + speed * (end + late), 0.4, 0.0)
-        post = Cylinder(0.025, 0.04, position=place, velocity=(-speed, 0.0, 0.0))
+        post = ve.Cylinder(0.025, 0.04, position=place, velocity=(-speed, 0.0, 0.0))
         plan = plan_motion("planar", start, goal, [post])
         assert not plan.success or plan.execute().is_success.all()
 
@@ -513,18 +482,6 @@ def test_the_smoothest_of_enough_free_movements_is_taken() -> None:
     one, best = (plan_motion(PANDA, PANDA.home, GOAL, [POST], enough=enough) for enough in (1, 30))
     assert best.seeds > one.seeds
     assert best.jerk <= one.jerk
-
-
-def test_limits_are_those_of_a_dense_movement() -> None:
-    # Also at the very end, where the torque of a quick movement changes most.
-    arm, rng = load_arm(UR5E), np.random.default_rng(0)
-    for _ in range(60):
-        start, goal = rng.uniform(-2.0, 2.0, (2, 6))
-        plan = plan_motion(arm, start, goal, time_limit=0.0)
-        motion = plan.joints(2000, force=True)
-        velocity = (np.abs(motion.velocity) / arm.velocity_limit).max()
-        torque = (np.abs(motion.torque) / arm.torque_limit).max()
-        assert np.allclose(plan.limits, (velocity, torque), atol=3e-3)
 
 
 @pytest.mark.parametrize("file", ["plan.csv", "plan.yaml"])
@@ -558,22 +515,22 @@ def test_files_of_other_forms_are_refused(tmp_path) -> None:
 
 def test_command_line_plans_and_measures(tmp_path, capsys, failed) -> None:
     scene = tmp_path / "scene.json"
-    scene.write_text(obstacles_to_json([POST]))
+    scene.write_text(ve.obstacles_to_json([POST]))
     words = ["plan", "--scene", str(scene), "--goal", *map(str, GOAL), "--out", str(tmp_path / "plan.csv")]
     main(words)
     assert "success" in capsys.readouterr().out
     assert np.allclose(read_motion(tmp_path / "plan.csv")[1].position[-1], GOAL)
-    scene.write_text("\ufeff" + obstacles_to_json([POST]))  # as editors of Windows do
+    scene.write_text("\ufeff" + ve.obstacles_to_json([POST]))  # as editors of Windows do
     main(words)
     foreign = tmp_path / "foreign.csv"
     foreign.write_text("time,x\n0,1\n")
     for refused in (foreign, tmp_path, foreign / "plan.csv"):
         failed(*words[:-1], refused)
     assert foreign.read_text() == "time,x\n0,1\n"
-    scene.write_text(obstacles_to_json(WALL))
+    scene.write_text(ve.obstacles_to_json(WALL))
     assert "no plan is safe" in failed(*words, "--time-limit", 0)
     scene.write_text(
-        f'{{"format": "viapoint-scene", "obstacles": {obstacles_to_json([POST])}, "reaches": [[0, 1, 0.1, 0, 0]]}}'
+        f'{{"format": "viapoint-scene", "obstacles": {ve.obstacles_to_json([POST])}, "reaches": [[0, 1, 0.1, 0, 0]]}}'
     )
     assert "has reaches" in failed(*words)
     scene.write_text('{"format": "viapoint-scene", "env": "viapoint/PlanarReach-v0", "start": [0.1, 0.4]}')
@@ -653,7 +610,7 @@ def test_problems_are_read_from_the_original_files(tmp_path) -> None:
 
 
 def test_planners_are_measured_on_problems_of_another_arm(tmp_path, capsys, failed) -> None:
-    arm = load_arm(UR5E)
+    arm = ve.load_arm(UR5E)
     box = {"primitives": [{"type": "box", "dimensions": [0.1, 0.1, 0.4]}]}
     box["primitive_poses"] = [{"position": [0.5, 0.3, 0.2], "orientation": NO_TURN}]
     write_problem(tmp_path / "box_ur5e", 1, [box], arm.joint_names, arm.home, arm.home + 0.2)
@@ -674,17 +631,6 @@ def test_narrow_passages_that_a_search_finds_are_planned() -> None:
     each = [hard.obstacles.take([i]) for i in range(len(start))]
     plans = plan_motions(task.arm, start, goal, each, space="hand", time_limit=10.0)
     assert sum(plan.success for plan in plans) >= len(plans) - 2
-
-
-def test_points_of_an_obstacle_are_planned_around_like_the_obstacle() -> None:
-    # Distances of point clouds are cut off at a limit; a rounding error there made every movement count as in contact.
-    surface = np.random.default_rng(0).uniform(-1.0, 1.0, (3000, 3))
-    surface[np.arange(3000), np.random.default_rng(1).integers(0, 3, 3000)] = 1.0
-    cloud = PointCloud(surface * POST.size + POST.position, radius=0.01)
-    plan = plan_motion(PANDA, PANDA.home, GOAL, [cloud], ompl=False)
-    assert plan.success
-    assert plan.seeds < 50
-    assert plan.clearance > 0.0
 
 
 def test_without_the_library_its_extra_is_named(monkeypatch):
@@ -760,7 +706,7 @@ def test_movements_along_paths_are_smoother_than_those_through_their_points() ->
     path = clear_path(given.setting(), ends, obstacles, 0.001, np.random.default_rng(0), 20.0)
     points = points_on(path, 12)
     durations = np.sqrt(np.linalg.norm(np.diff(points, axis=0), axis=1))
-    table = table_with((durations / durations.sum())[None], FINE_INSTANTS)
+    table = movements.table_with((durations / durations.sum())[None], movements.FINE_INSTANTS)
     _, _, cost = module._moved(given, 0.0, table, points[1:-1], 1.0, np.inf)
     # Through the points themselves, it has 1,000 times this unit.
     assert cost < 30.0 * refine.unit_of_jerk(ends[1] - ends[0], False)
@@ -769,9 +715,9 @@ def test_movements_along_paths_are_smoother_than_those_through_their_points() ->
 LIFT = """<mujoco><worldbody><body name="carriage"><joint name="lift" type="slide" axis="0 0 1" range="0 0.5"/>
 <geom size="0.02" mass="1"/><body name="arm"><joint name="turn" axis="0 0 1" range="-90 90"/>
 <geom type="capsule" fromto="0.05 0 0.1 0.4 0 0.1" size="0.02"/></body></body></worldbody></mujoco>"""
-LIFTED = load_arm(LIFT, name="lift", torque_limit=100.0, velocity_limit=1.0)
+LIFTED = ve.load_arm(LIFT, name="lift", torque_limit=100.0, velocity_limit=1.0)
 """Arm that turns and is lifted, 0.1 m above its base."""
-FENCE, CEILING = (Box((0.2, 0.02, 0.2), position=(0.3, 0.0, height)) for height in (0.1, 0.7))
+FENCE, CEILING = (ve.Box((0.2, 0.02, 0.2), position=(0.3, 0.0, height)) for height in (0.1, 0.7))
 """Obstacles below and above which the arm cannot pass; it can between them."""
 
 
@@ -782,7 +728,7 @@ def test_a_path_of_trees_is_clear_between_its_ends(arm):
     if len(arm.joint_names) > 2:
         problem = next(each for each in benchmark_problems() if each.name == "cage 1")
         ends, shapes = np.stack((problem.start, problem.goal)), problem.obstacles
-    obstacles, setting = pack([shapes]), arm_setting(arm, False, pack([shapes]))
+    obstacles, setting = pack([shapes]), movements.arm_setting(arm, False, pack([shapes]))
     path, again = (
         clear_path(setting, ends, obstacles, 0.002, np.random.default_rng(5), 20.0) for _ in range(2)
     )
@@ -794,7 +740,7 @@ def test_a_path_of_trees_is_clear_between_its_ends(arm):
     between = np.concatenate([one + shares * (other - one) for one, other in itertools.pairwise(path)])
     rows, own = row_clearances(arm.chain, arm.spheres, between, obstacles.take([0] * len(between)), 1.0)
     assert min(own.min(), rows.min()) > -0.002
-    wall = Box((0.01, 2.0, 2.0), position=(0.25, 0.0, 0.0), quaternion=(0.707, 0.0, 0.0, 0.707))
+    wall = ve.Box((0.01, 2.0, 2.0), position=(0.25, 0.0, 0.0), quaternion=(0.707, 0.0, 0.0, 0.707))
     rng = np.random.default_rng(5)
     assert not len(clear_path(setting, ends, pack([[*shapes, wall]]), 0.002, rng, 0.1))
 
@@ -802,7 +748,7 @@ def test_a_path_of_trees_is_clear_between_its_ends(arm):
 def test_some_targets_of_trees_shift_the_tool_and_leave_it_turned_as_it_is():
     """At the limits of the joints, the tool comes as near as it can."""
     arm, rng = benchmark_panda(), np.random.default_rng(0)
-    setting, placed = arm_setting(arm, False, pack([[]])), memory(arm.chain, arm.spheres)
+    setting, placed = movements.arm_setting(arm, False, pack([[]])), memory(arm.chain, arm.spheres)
     joints = np.tile(arm.home, (21, 1))
     for target in joints[1:]:
         _shift(setting, arm.home, rng, target, placed)
@@ -818,10 +764,10 @@ def test_a_seed_that_is_free_is_not_lost(monkeypatch):
     arm = benchmark_panda()
     problem = next(each for each in benchmark_problems() if each.name == "table_under_pick 3")
     ends, obstacles = np.stack((problem.start, problem.goal)), pack([problem.obstacles])
-    setting, rng = arm_setting(arm, False, obstacles, room=-1e-5), np.random.default_rng(22)
+    setting, rng = movements.arm_setting(arm, False, obstacles, room=-1e-5), np.random.default_rng(22)
     path = clear_path(setting, ends, obstacles, 0.001, rng, 20.0)
     plan = plan_motion(arm, *ends, obstacles, n_via=3, seeds=points_on(path, 3)[None, 1:-1])
-    assert (plan.success, plan.source) == (True, "given")
+    assert (plan.success, plan.source, plan.seeds) == (True, "given", 1)
 
 
 def test_points_lie_on_the_path_and_keep_its_corners():

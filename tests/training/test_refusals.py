@@ -242,6 +242,8 @@ CALLS = [
     lambda: agent().plan((-0.2, 0.3), (0.1, 0.4), [Sphere(0.01, position=(0.5, 0.1 * i, 0.0)) for i in range(9)]),
     lambda: revising().plan((-0.2, 0.3), (0.1, 0.4)),
     lambda: revising(policy_kwargs={"refine": 4}),
+    lambda: revising(policy_kwargs={"candidate": 8}),
+    lambda: revising(gradient_steps=0),
     lambda: agent_method("agent", revising(), refine=4),
     lambda: agent().learn(8),  # loaded for decisions
     lambda: predicted(wind=np.zeros(2)),
@@ -273,6 +275,7 @@ CALLS = [
     lambda: ViaRank("ViaRankPolicy", VecNormalize(ViaVecEnv(SENSED, 2))),
     *(lambda changes=changes: moved(**changes) for changes in (
         {"start": PANDA_ARM.home[:6]}, {"goal": np.full(7, np.nan)}, {"goal": Pose((2.0, 0.0, 0.3))},
+        {"start": None}, {"goal": "home"}, {"goal": [Pose((0.5, 0.2, 0.4)), None]},
         {"goal": {"position": (0.4, 0.3, 0.4), "angle": 3.0}}, {"arm": "robot"}, {"space": "hand"},
         {"n_via": 4}, {"seeds": -1}, {"seeds": np.zeros((2, 3, 7))}, {"margin": -0.1}, {"rng": -1},
         {"time_limit": np.nan}, {"duration": 0.0}, {"velocity": np.zeros(3)},
