@@ -1,8 +1,15 @@
-"""Claims of the paper with their computed numbers and expected ranges."""
+"""Claims of the paper with their computed numbers and expected ranges.
+
+The table `claims.csv` holds what is known before anything is computed: row, text, figure, statement of the paper, and
+ranges of the numbers on the model and on the simulated arm.
+"""
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass
+from fractions import Fraction
+from importlib.resources import files
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -11,19 +18,13 @@ Range: TypeAlias = tuple[float, float]  # Least and greatest value that a number
 Number: TypeAlias = tuple[Any, Range]  # Computed number and its expected range
 
 
-def near(value: float, tolerance: float) -> Range:
-    """Return the range around a value."""
-    return value - tolerance, value + tolerance
+def read_table(name: str) -> dict[str, dict[str, str]]:
+    """Return the lines of a CSV file beside this module by their first entries."""
+    text = (files(__package__) / name).read_text(encoding="utf-8")
+    return {next(iter(line.values())): line for line in csv.DictReader(text.splitlines())}
 
 
-def at_most(value: float) -> Range:
-    """Return the range up to a value."""
-    return -np.inf, value
-
-
-def at_least(value: float) -> Range:
-    """Return the range from a value on."""
-    return value, np.inf
+TABLE = read_table("claims.csv")
 
 
 @dataclass(frozen=True)
@@ -59,3 +60,41 @@ class Claim:
             record[f"{name}_expected"] = [float(end) if np.isfinite(end) else None for end in ends] or None
         record["deviation_mm"] = None if self.deviation is None else float(self.deviation)
         return {**record, "verdict": self.verdict}
+
+
+def claim(
+    key: str, model: Any = None, arm: Any = None, deviation: Any = None, *, expected: Any = None, **words: Any
+) -> Claim:
+    """Return a claim of the table with its numbers.
+
+    Args:
+        key: Key of its line.
+        model: Number on the model.
+        arm: Number on the simulated arm.
+        deviation: Greatest distance of the simulated hand from the plan, [mm].
+        expected: Centre of the range of the model's number, where the table has a tolerance alone.
+        **words: Values of the placeholders in its text.
+    """
+    line = TABLE[key]
+    return Claim(
+        row=int(line["row"]),
+        claim=line["claim"].format(**words),
+        figure=line["figure"],
+        paper=line["paper"],
+        model=None if model is None else (model, _range(line["model"], expected)),
+        arm=None if arm is None else (arm, _range(line["arm"], model)),
+        deviation=deviation,
+        unit=line["unit"],
+    )
+
+
+def _range(cell: str, centre: float) -> Range:
+    """Return a range that is written as `<= 1`, `>= 1`, `1 ± 0.1`, or `± 0.1` around a centre."""
+    if cell.startswith("<="):
+        return -np.inf, float(cell[2:])
+    if cell.startswith(">="):
+        return float(cell[2:]), np.inf
+    middle, _, tolerance = cell.partition("±")
+    if middle:
+        centre = float(Fraction(middle))
+    return centre - float(tolerance), centre + float(tolerance)

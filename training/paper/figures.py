@@ -202,9 +202,9 @@ def _finish(axes: Any, duration: float) -> None:
     axes[0, 1].legend(loc="upper right")
 
 
-def pair(first: Any, second: Any, texts: Any) -> Figure:
-    """Draw two movements side by side, on the model and on the simulated arm; they are arguments of `curved`."""
-    figure, axes = _two_movements(5, 14.0, [f"A   {texts[0]}", f"B   {texts[1]}"])
+def pair(left: str, first: Any, right: str, second: Any) -> Figure:
+    """Draw two movements side by side, on the model and on the arm: their titles, and arguments of `curved`."""
+    figure, axes = _two_movements(5, 14.0, [f"A   {left}", f"B   {right}"])
     plans = [curved(*first), curved(*second)]
     for ax, movement in zip(axes.T, plans, strict=True):
         motion = simulate(movement)
