@@ -11,7 +11,6 @@ import json
 import random
 import zipfile
 from collections import deque
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
+from torch.utils._pytree import tree_map, tree_map_only
 
 from viapoint.envs.arms.registry import ARM_FILES
 from viapoint.envs.arms.stored import COPY
@@ -59,7 +59,7 @@ def write_checkpoint(model: BaseAlgorithm, path: Path, seconds: float) -> None:
     }
     buffer: Any = getattr(model, "replay_buffer", None)  # a rollout buffer is empty between two collections
     if buffer is not None:
-        filled = _mapped(_buffer_arrays(buffer), np.ndarray, lambda array: array[: buffer.size()])
+        filled = tree_map_only(np.ndarray, lambda array: array[: buffer.size()], _buffer_arrays(buffer))
         arrays["buffer"] = {"pos": buffer.pos, "full": buffer.full, "arrays": filled}
     state = {
         "format": FORMAT,
@@ -67,7 +67,7 @@ def write_checkpoint(model: BaseAlgorithm, path: Path, seconds: float) -> None:
         "parameters": model.get_parameters(),
         "variables": {name: variable.detach() for name, variable in _variables(model).items()},
         "torch_random": torch.get_rng_state(),
-        "arrays": _mapped(arrays, (np.ndarray, np.generic), _to_torch),
+        "arrays": tree_map_only((np.ndarray, np.generic), _to_torch, arrays),
         "extra": {"seconds": seconds},
     }
     content = io.BytesIO()
@@ -88,7 +88,7 @@ def read_checkpoint(model: BaseAlgorithm, path: Path) -> float:
     if others:
         raise BadFileError(path, f"is of another model: {', '.join(others)}{written}")
     try:
-        _restore(model, state, _mapped(state["arrays"], torch.Tensor, torch.Tensor.numpy))
+        _restore(model, state, tree_map_only(torch.Tensor, torch.Tensor.numpy, state["arrays"]))
         return float(state["extra"]["seconds"])
     except Exception as error:  # of a library, for content that does not fit the model
         reason = f"does not fit the model ({type(error).__name__}: {error})"
@@ -137,7 +137,7 @@ def _restore(model: BaseAlgorithm, state: dict[str, Any], arrays: dict[str, Any]
         setattr(model, name, deque(arrays["recent"][name], maxlen=model._stats_window_size))
     buffer: Any = getattr(model, "replay_buffer", None)
     if buffer is not None:
-        _fill(_buffer_arrays(buffer), arrays["buffer"]["arrays"])
+        tree_map(_fill, _buffer_arrays(buffer), arrays["buffer"]["arrays"])
         buffer.pos = arrays["buffer"]["pos"]
         buffer.full = arrays["buffer"]["full"]
     env: Any = model.get_env()
@@ -159,13 +159,10 @@ def _buffer_arrays(buffer: Any) -> dict[str, Any]:
     return {name: each for name, each in vars(buffer).items() if isinstance(each, np.ndarray | dict)}
 
 
-def _fill(arrays: Any, saved: Any) -> None:
-    """Set the first rows of arrays, which may lie in dictionaries, to saved ones."""
-    if isinstance(arrays, np.ndarray):
-        arrays[: len(saved)] = saved
-    elif isinstance(arrays, dict):
-        for name, each in arrays.items():
-            _fill(each, saved[name])
+def _fill(array: Any, saved: Any) -> None:
+    """Set the first rows of an array to saved ones; other attributes of a buffer are the same in all."""
+    if isinstance(array, np.ndarray):
+        array[: len(saved)] = saved
 
 
 def _to_torch(value: Any) -> Any:
@@ -173,14 +170,3 @@ def _to_torch(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     return torch.from_numpy(np.require(value, requirements=["C", "W"]))
-
-
-def _mapped(value: Any, kind: Any, function: Callable[[Any], Any]) -> Any:
-    """Return nested values with a function applied to those of a kind."""
-    if isinstance(value, kind):
-        return function(value)
-    if isinstance(value, Mapping):
-        return {name: _mapped(each, kind, function) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return type(value)(_mapped(each, kind, function) for each in value)
-    return value

@@ -31,9 +31,9 @@ from viapoint.training import files
 from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
 from viapoint.training.agents.model_io import check_arguments, check_hyperparameters, load_model, untrained
 from viapoint.training.checks import check_env_kwargs, check_folder, check_whole, named_path, unknown_name
+from viapoint.training.cli.doctor import explain_import_error
 from viapoint.training.configs import StudyConfig, TrainConfig
 from viapoint.training.evaluation import evaluate_methods
-from viapoint.training.extras import explain_import_error
 from viapoint.training.planning.baselines import Method, agent_method, factory, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plots import success_of_rows

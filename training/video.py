@@ -24,7 +24,7 @@ from viapoint.envs.renderer import EpisodeRenderer
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.files import MARK, write_figure
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
-from viapoint.training.rollout import Decide
+from viapoint.training.rollout import Decide, play_episodes
 
 CAPTION = 48  # Height of the caption below the picture, [pixels]
 BLOCK = 16  # Encoders need sides that are multiples of this, [pixels]
@@ -121,11 +121,8 @@ def play(env: gym.Env[Any, Any], scene: Scenes, decide: Decide) -> dict[str, Any
     """Simulate an episode of an environment in one scene, and return the info of its last decision."""
     batch: Any = env.unwrapped.batch  # type: ignore[attr-defined]
     observation = batch.begin(scene)
-    while True:
-        decision = batch.execute_actions(decide(observation, scene))
-        observation = decision.observation
-        if decision.terminated[0] or decision.truncated[0]:
-            return {name: value[0] for name, value in decision.info.items()}
+    outcomes = play_episodes(batch, scene, decide(observation, scene), decide)
+    return {name: value[0] for name, value in outcomes.items()}
 
 
 def _with_captions(given: Any, left: str, info: Any, fps: float, told: str = "") -> Iterator[Frame]:

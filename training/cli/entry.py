@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from viapoint.training.cli import doctor
-from viapoint.training.extras import explain_import_error
+from viapoint.training.cli.doctor import explain_import_error
 
 if TYPE_CHECKING:
     from viapoint.training.configs import TrainConfig
