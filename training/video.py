@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import textwrap
 import uuid
@@ -78,30 +79,29 @@ def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
     path.parent.mkdir(parents=True, exist_ok=True)
     full = OSError(f"the encoder could not write {path}: is there room on the disk?")
     part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part.mp4")
-    count, writer = 0, None
+    frames = iter(frames)
+    first = next(frames)
+    height, width = first.shape[:2]
+    writer = imageio_ffmpeg.write_frames(
+        str(part), (width, height), fps=SPEED * fps, codec="libx264", quality=None, bitrate=None,
+        output_params=["-crf", "20", "-movflags", "+faststart", "-metadata", f"comment={MARK.decode()}"],
+        macro_block_size=1, ffmpeg_log_level="error",
+    )  # fmt: skip
+    count = 0
     try:
-        for frame in frames:
-            if writer is None:
-                height, width = frame.shape[:2]
-                writer = imageio_ffmpeg.write_frames(
-                    str(part), (width, height), fps=SPEED * fps, codec="libx264", quality=None, bitrate=None,
-                    output_params=["-crf", "20", "-movflags", "+faststart", "-metadata", f"comment={MARK.decode()}"],
-                    macro_block_size=1, ffmpeg_log_level="error",
-                )  # fmt: skip
-                writer.send(None)  # the generator opens the file
+        writer.send(None)  # the generator opens the file
+        for frame in itertools.chain([first], frames):
             try:
                 writer.send(np.ascontiguousarray(frame))
             except OSError:
                 raise full from None
             count += 1
-        if writer is not None:
-            writer.close()  # the file is complete now, if the encoder has not failed, which it does not tell
+        writer.close()  # the file is complete now, if the encoder has not failed, which it does not tell
         if MARK not in part.read_bytes():
             raise full
         os.replace(part, path)
     finally:
-        if writer is not None:
-            writer.close()
+        writer.close()
         part.unlink(missing_ok=True)  # what is left of a film that failed
     return count
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from viapoint.training.cli import entry as cli
-from viapoint.training.paper import obstacles, run
-from viapoint.training.paper.claim import Claim
+from viapoint.training.paper import Claim, obstacles, run
 from viapoint.training.paper.double_step import double_step, excess_cost
 from viapoint.training.paper.movements import construction, via_waypoints
 from viapoint.training.paper.run import DRAWINGS, ROWS

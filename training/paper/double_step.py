@@ -26,7 +26,7 @@ from scipy.interpolate import BPoly
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.plans import Motion
 from viapoint.primitives import Trajectory, minimum_jerk_coefficients, point_to_point, retarget
-from viapoint.training.paper.claim import Claim, claim
+from viapoint.training.paper import Claim, claim
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, instants, straight, track
 
 STEP_DURATION = 0.7  # Duration of the first movement and of the second one, [s]

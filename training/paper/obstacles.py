@@ -16,8 +16,7 @@ from viapoint.envs.scenes.scene import resting
 from viapoint.primitives import speed_valleys
 from viapoint.training import GeometrySearch, load_agent
 from viapoint.training.checks import DEFAULT_ENV
-from viapoint.training.paper import movements
-from viapoint.training.paper.claim import Claim, claim
+from viapoint.training.paper import Claim, claim, movements
 from viapoint.training.paper.movements import PLANE, TARGETS, Profile, SimulatedMovements, simulate
 from viapoint.training.paper.one_via import slow_and_fast
 from viapoint.training.planning.baselines import Method, agent_method

@@ -15,8 +15,7 @@ from sympy.abc import tau as tau1
 
 from viapoint.envs.common.arrays import Float
 from viapoint.primitives import Trajectory, speed_valleys
-from viapoint.training.paper import movements
-from viapoint.training.paper.claim import Claim, claim
+from viapoint.training.paper import Claim, claim, movements
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, curved, passage_share, simulate
 
 

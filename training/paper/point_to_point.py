@@ -13,8 +13,7 @@ from viapoint import primitives
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.plans import Motion
 from viapoint.primitives import FREE, Trajectory, minimum_duration, point_to_point, through
-from viapoint.training.paper import movements
-from viapoint.training.paper.claim import Claim, claim
+from viapoint.training.paper import Claim, claim, movements
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, minimum_jerk_through, simulate
 
 # Ends of the straight movements of Figs. 3 and 4, shape (3, 2, 2), [m].

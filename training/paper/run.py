@@ -18,8 +18,16 @@ from matplotlib.figure import Figure
 from viapoint.training.configs import PaperConfig
 from viapoint.training.evaluation import one_thread
 from viapoint.training.files import MARK, check_ours, versions, write_bytes, write_figure, write_json
-from viapoint.training.paper import double_step, figures, obstacles, one_via, point_to_point
-from viapoint.training.paper.claim import Claim, Number, read_table
+from viapoint.training.paper import (
+    Claim,
+    Number,
+    double_step,
+    figures,
+    obstacles,
+    one_via,
+    point_to_point,
+    read_table,
+)
 from viapoint.training.paper.one_via import ENDS, FAST, SLOW, THREE_POINTS
 from viapoint.training.plots import STYLE
 from viapoint.training.report import progress_bar
