@@ -18,13 +18,9 @@ Range: TypeAlias = tuple[float, float]  # Least and greatest value that a number
 Number: TypeAlias = tuple[Any, Range]  # Computed number and its expected range
 
 
-def read_table(name: str) -> dict[str, dict[str, str]]:
-    """Return the lines of a CSV file beside this module by their first entries."""
-    text = (files(__package__) / name).read_text(encoding="utf-8")
-    return {next(iter(line.values())): line for line in csv.DictReader(text.splitlines())}
-
-
-TABLE = read_table("claims.csv")
+TABLE = {}  # Lines of the table by their keys
+for _line in csv.DictReader((files(__package__) / "claims.csv").read_text(encoding="utf-8").splitlines()):
+    TABLE[_line["key"]] = _line
 
 
 @dataclass(frozen=True)

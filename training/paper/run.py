@@ -26,9 +26,7 @@ from viapoint.training.paper import (
     obstacles,
     one_via,
     point_to_point,
-    read_table,
 )
-from viapoint.training.paper.one_via import ENDS, FAST, SLOW, THREE_POINTS
 from viapoint.training.plots import STYLE
 from viapoint.training.report import progress_bar
 
@@ -50,30 +48,19 @@ ROWS: dict[int, tuple[str, Callable[..., list[Claim]]]] = {
 }
 
 
-# Functions of the figures by their file names, in the order of the paper
+# Functions of the figures by their file names
 DRAWINGS: dict[str, Callable[..., Figure]] = {
     "fig01_model": figures.model,
     "fig03_straight": figures.straight_movements,
     "fig04_joints": figures.joints,
-    "fig05_height": partial(
-        figures.pair, "$d_3$ = 0.52", (*ENDS, 0.5, -0.52), "$d_3$ = 0.35", (*ENDS, 0.5, -0.35)
-    ),
-    "fig06_place": partial(
-        figures.pair, "$d_1$ = 0.3", (*ENDS, 0.3, -0.45), "$d_1$ = 0.7", (*ENDS, 0.7, -0.45)
-    ),
-    "fig07_turned": partial(
-        figures.pair, "$T_2$ to $T_5$", ("T2", "T5", 0.35, 0.5), "$T_3$ to $T_6$", ("T3", "T6", 0.65, -0.5)
-    ),
     "fig08_obstacles": figures.around_lights,
     "fig10_isochrony": figures.isochrony,
-    "fig11_scaling": partial(
-        figures.pair, f"{SLOW} s", (*ENDS, *THREE_POINTS, SLOW), f"{FAST} s", (*ENDS, *THREE_POINTS, FAST)
-    ),
     "valleys": figures.valleys,
     "alternatives": figures.orders_and_spaces,
     "limits": figures.limits,
     "double_step": figures.paths_and_speeds,
     "double_step_jerk": figures.comparison,
+    **{name: partial(figures.pair, name) for name in figures.PAIRS},
 }
 # Functions of them that take the movements around obstacles
 AROUND_LIGHTS = (obstacles.obstacle_claims, figures.around_lights, figures.isochrony)
@@ -90,11 +77,10 @@ def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], dict[Path, st
     for _, compute in progress_bar(iterable=ROWS.values(), desc="rows"):
         claims += result_of(compute)
     pictures = {}
-    captions = read_table("figures.csv")
-    for name, draw in progress_bar(iterable=DRAWINGS.items(), desc="figures"):
+    for name, about in progress_bar(iterable=figures.FIGURES.items(), desc="figures"):
         with matplotlib.style.context(STYLE):
-            figure = result_of(draw)
-            pictures[write_figure(out / f"{name}.png", figure)] = captions[name]["caption"]
+            figure = result_of(DRAWINGS[name])
+            pictures[write_figure(out / f"{name}.png", figure)] = about["caption"]
             figure.set_layout_engine("none")  # the same layout for both files, computed once
             write_figure(out / f"{name}.svg", figure)
     return claims, pictures
