@@ -36,10 +36,10 @@ def relative_peak(speed: Float, peak: float) -> float:
 
 
 def bow(position: Float) -> Float:
-    """Return the greatest distance of paths (..., T, 2) from their chord, relative to its length, shape (...,)."""
+    """Return the greatest distance of paths (..., T, 2) from their chord, [%] of its length, shape (...,)."""
     points = np.broadcast_arrays(position[..., :1, :], position, position[..., -1:, :])
     _, height = movements.construction(np.stack(points, axis=-2))
-    return np.asarray(height.max(axis=-1))
+    return np.asarray(100 * height.max(axis=-1))
 
 
 def point_to_point_claims() -> list[Claim]:
@@ -54,7 +54,7 @@ def point_to_point_claims() -> list[Claim]:
     skew, arm_skew = (100 * np.abs(each - each[:, ::-1]).max() / each.max() for each in (speed, arm_speed))
     worst = motion.worst
     return [
-        claim("straight", 100 * bow(movement.sample(401, 0)[0]).max(), 100 * bow(motion.hand).max(), worst),
+        claim("straight", bow(movement.sample(401, 0)[0]).max(), bow(motion.hand).max(), worst),
         claim("peak", peak, arm_peak, worst),
         claim("subjects", (peak - 1.805) / 0.153, (arm_peak - 1.805) / 0.153, worst),
         claim("symmetry", skew, arm_skew, worst),
@@ -173,10 +173,8 @@ def _joint_space_claims() -> list[Claim]:
     placed = joint_space(same_movement_elsewhere()[0].sample(2, 0)[0])
     bows, arm_bows = bow(placed.planned), bow(placed.hand)
     return [
-        claim(
-            "joint jerk", 100 * bow(of_joints.planned).max(), 100 * bow(of_joints.hand).max(), of_joints.worst
-        ),
-        claim("hand jerk", 100 * bow(of_hand.planned).max(), 100 * bow(of_hand.hand).max(), of_hand.worst),
+        claim("joint jerk", bow(of_joints.planned).max(), bow(of_joints.hand).max(), of_joints.worst),
+        claim("hand jerk", bow(of_hand.planned).max(), bow(of_hand.hand).max(), of_hand.worst),
         claim("bow and place", bows.max() / bows.min(), arm_bows.max() / arm_bows.min(), placed.worst),
     ]
 
