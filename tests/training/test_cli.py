@@ -26,8 +26,16 @@ from viapoint.training import GeometrySearch, Run, TrainConfig, evaluate, load_a
 from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
 from viapoint.training.cli import demo, doctor
 from viapoint.training.cli import entry as cli
-from viapoint.training.configs import DemoConfig, EvaluateConfig, from_words, to_words
-from viapoint.training.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
+from viapoint.training.configs import (
+    PRESETS,
+    REACH_PRESETS,
+    REPLANNING_PRESETS,
+    STEP_PRESETS,
+    DemoConfig,
+    EvaluateConfig,
+    from_words,
+    to_words,
+)
 from viapoint.training.trainer import RunCallback, TrainingStoppedError
 from viapoint.training.video import gallery, record_video
 

@@ -17,10 +17,10 @@ from viapoint.envs import scene_from_json, scene_to_json
 from viapoint.training import GeometrySearch, ViaVecEnv, evaluate, evaluation, report
 from viapoint.training.agents.agent import PPO
 from viapoint.training.agents.model_io import build
+from viapoint.training.configs import STEP_PRESETS
 from viapoint.training.evaluation import SLOW_DECISION, MethodResult, evaluate_methods
 from viapoint.training.planning.baselines import StepAgentMethod, Straight, agent_method, make_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.presets import STEP_PRESETS
 from viapoint.training.rollout import SceneSimulation, whole_task
 from viapoint.training.scene_sets import BANDS, drawn
 
