@@ -168,7 +168,10 @@ _SETTINGS = parse_yaml((files("viapoint.training") / "presets.yaml").read_bytes(
 
 def _presets(kind: str) -> dict[str, Preset]:
     """Return the presets of a kind of tasks by the names of algorithms."""
-    return {algo: Preset(**fields) for algo, fields in _SETTINGS[kind].items()}
+    presets = {}
+    for algo, fields in _SETTINGS[kind].items():
+        presets[algo] = Preset(**fields)
+    return presets
 
 
 PRESETS = _presets("one decision")

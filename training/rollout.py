@@ -25,14 +25,18 @@ class SceneSimulation:
     """Simulation of episodes in given scenes, up to `num_envs` at a time; `kwargs` are arguments of the environment."""
 
     def __init__(self, env_id: str, num_envs: int = 512, **kwargs: Any) -> None:
-        self.env_id, self.kwargs = env_id, kwargs
+        self.env_id = env_id
+        self.kwargs = kwargs
         self._capacity = num_envs
         self._envs: dict[int, ReachVectorEnv] = {}
         self.task = registered_task(env_id, **kwargs)
 
     def observe(self, scenes: Scenes) -> Observation:
         """Return first observations in N scenes."""
-        return joined([seen for _, _, seen in self._begun(scenes)])
+        pieces = []
+        for _, _, seen in self._begun(scenes):
+            pieces.append(seen)
+        return joined(pieces)
 
     def __call__(self, scenes: Scenes, actions: Float, decide: Decide | None = None) -> Outcomes:
         """Simulate one episode in each of N scenes, from first actions (N, m); later ones are decided, or zero."""
@@ -74,7 +78,10 @@ class SceneSimulation:
 
 def joined(pieces: Sequence[Mapping[str, NDArray[Any]]]) -> Outcomes:
     """Return arrays by name, joined over batches."""
-    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+    arrays = {}
+    for name in pieces[0]:
+        arrays[name] = np.concatenate([piece[name] for piece in pieces])
+    return arrays
 
 
 def play_episodes(
@@ -84,7 +91,8 @@ def play_episodes(
     number = len(first)
     actions = np.array(first, dtype=np.float64)
     running = np.ones(number, dtype=bool)
-    reward, decisions = np.zeros(number), np.zeros(number)
+    reward = np.zeros(number)
+    decisions = np.zeros(number)
     last: Outcomes = {}
     while running.any():
         now = running.copy()

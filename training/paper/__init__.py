@@ -39,8 +39,12 @@ class Claim:
     @property
     def holds(self) -> bool:
         """True if every number is in its expected range, which NaN never is."""
-        numbers = [number for number in (self.model, self.arm) if number is not None]
-        return all(low <= value <= high for value, (low, high) in numbers)
+        for number in (self.model, self.arm):
+            if number is not None:
+                value, (low, high) = number
+                if not low <= value <= high:
+                    return False
+        return True
 
     @property
     def verdict(self) -> str:

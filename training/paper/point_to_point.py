@@ -171,7 +171,8 @@ def _joint_space_claims() -> list[Claim]:
     of_joints = joint_space(DIAGONALS)
     of_hand = simulate(diagonals())
     placed = joint_space(same_movement_elsewhere()[0].sample(2, 0)[0])
-    bows, arm_bows = bow(placed.planned), bow(placed.hand)
+    bows = bow(placed.planned)
+    arm_bows = bow(placed.hand)
     return [
         claim("joint jerk", bow(of_joints.planned).max(), bow(of_joints.hand).max(), of_joints.worst),
         claim("hand jerk", bow(of_hand.planned).max(), bow(of_hand.hand).max(), of_hand.worst),
