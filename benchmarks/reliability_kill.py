@@ -25,10 +25,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from viapoint.training.checkpoints import read_state
 from viapoint.training.configs import TrainConfig
 from viapoint.training.files import UNFINISHED, read_arrays
-from viapoint.training.runs import Run
+from viapoint.training.runs import Run, read_state
 
 ENV = "viapoint/PlanarObstacles-v0"
 OFF_POLICY: dict[str, Any] = {

@@ -22,10 +22,11 @@ Outcomes = dict[str, NDArray[Any]]
 
 
 class SceneSimulation:
-    """Simulation of episodes in given scenes, `num_envs` at a time; `kwargs` are arguments of the environment."""
+    """Simulation of episodes in given scenes, up to `num_envs` at a time; `kwargs` are arguments of the environment."""
 
     def __init__(self, env_id: str, num_envs: int = 512, **kwargs: Any) -> None:
-        self.env_id, self.kwargs = env_id, kwargs
+        self.env_id = env_id
+        self.kwargs = kwargs
         self._capacity = num_envs
         self._envs: dict[int, ReachVectorEnv] = {}
         self.task = registered_task(env_id, **kwargs)
@@ -33,15 +34,15 @@ class SceneSimulation:
     def observe(self, scenes: Scenes) -> Observation:
         """Return first observations in N scenes."""
         pieces = []
-        for rows, _, _, seen in self._begun(scenes):
-            pieces.append({name: part[: len(rows)] for name, part in seen.items()})
+        for _, _, seen in self._begun(scenes):
+            pieces.append(seen)
         return joined(pieces)
 
     def __call__(self, scenes: Scenes, actions: Float, decide: Decide | None = None) -> Outcomes:
         """Simulate one episode in each of N scenes, from first actions (N, m); later ones are decided, or zero."""
         pieces = []
-        for rows, _, env, _ in self._begun(scenes):
-            pieces.append(_episodes(env, scenes.take(rows), actions[rows], decide))
+        for rows, env, _ in self._begun(scenes):
+            pieces.append(play_episodes(env, scenes.take(rows), actions[rows], decide))
         return joined(pieces)
 
     def play(self, method: Any, scenes: Scenes, decisions: Float) -> Outcomes:
@@ -54,10 +55,9 @@ class SceneSimulation:
     def execute_plan(self, scenes: Scenes, plan: Plan) -> Outcomes:
         """Simulate one plan in each of N scenes, N at least 1; plans may have any number of via-points."""
         pieces = []
-        for rows, filled, env, _ in self._begun(scenes):
-            decision = env.execute_plan(plan.take(filled))
-            outcomes = {**decision.info, "reward": decision.reward}
-            pieces.append({name: values[: len(rows)] for name, values in outcomes.items()})
+        for rows, env, _ in self._begun(scenes):
+            decision = env.execute_plan(plan.take(rows))
+            pieces.append({**decision.info, "reward": decision.reward})
         return joined(pieces)
 
     def close(self) -> None:
@@ -65,45 +65,42 @@ class SceneSimulation:
         for env in self._envs.values():
             env.close()
 
-    def _begun(self, scenes: Scenes) -> Iterator[tuple[Int, Int, ReachVectorEnv, Observation]]:
-        """Start groups of scenes, each in the smallest vector environment that takes it.
-
-        Yields the rows of a group, the same rows with the last one repeated for environments that are left over, the
-        vector environment, and its first observations.
-        """
-        number = len(scenes.start)
-        for first in range(0, number, self._capacity):
-            rows = np.arange(first, min(first + self._capacity, number))
-            sizes = [1, min(64, self._capacity), self._capacity]  # each has an environment, made once
-            size = next(each for each in sizes if each >= len(rows))
-            if size not in self._envs:
-                made: Any = gym.make_vec(self.env_id, num_envs=size, **self.kwargs)
-                self._envs[size] = made.unwrapped
-            env = self._envs[size]
-            filled = np.minimum(first + np.arange(size), rows[-1])
-            yield rows, filled, env, env.begin(scenes.take(filled))
+    def _begun(self, scenes: Scenes) -> Iterator[tuple[Int, ReachVectorEnv, Observation]]:
+        """Start groups of scenes; yield their rows, a vector environment of as many copies, and observations."""
+        for first in range(0, len(scenes.start), self._capacity):
+            rows = np.arange(first, min(first + self._capacity, len(scenes.start)))
+            if len(rows) not in self._envs:
+                made: Any = gym.make_vec(self.env_id, num_envs=len(rows), **self.kwargs)
+                self._envs[len(rows)] = made.unwrapped
+            env = self._envs[len(rows)]
+            yield rows, env, env.begin(scenes.take(rows))
 
 
 def joined(pieces: Sequence[Mapping[str, NDArray[Any]]]) -> Outcomes:
     """Return arrays by name, joined over batches."""
-    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+    arrays = {}
+    for name in pieces[0]:
+        arrays[name] = np.concatenate([piece[name] for piece in pieces])
+    return arrays
 
 
-def _episodes(env: ReachVectorEnv, scenes: Scenes, first: Float, decide: Decide | None) -> Outcomes:
-    """Play one episode in each scene; environments beyond them do not take part."""
+def play_episodes(
+    env: ReachVectorEnv, scenes: Scenes, first: Float, decide: Decide | None = None
+) -> Outcomes:
+    """Play one episode in each scene, which have begun, from first actions (N, m); later ones are decided, or zero."""
     number = len(first)
-    actions = np.zeros((env.num_envs, first.shape[1]))
-    actions[:number] = first
-    running = np.arange(env.num_envs) < number
-    reward, decisions = np.zeros(number), np.zeros(number)
+    actions = np.array(first, dtype=np.float64)
+    running = np.ones(number, dtype=bool)
+    reward = np.zeros(number)
+    decisions = np.zeros(number)
     last: Outcomes = {}
     while running.any():
-        now = running[:number].copy()
+        now = running.copy()
         decision = env.execute_actions(actions, running)
-        reward += np.where(now, decision.reward[:number], 0.0)
+        reward += np.where(now, decision.reward, 0.0)
         decisions += now
         for name, values in decision.info.items():
-            last[name] = np.where(now, values[:number], last.get(name, values[:number]))
+            last[name] = np.where(now, values, last.get(name, values))
         running &= ~(decision.terminated | decision.truncated)  # which must not go on
         actions[:] = 0.0  # which keeps the plan under way
         rows = np.flatnonzero(running)

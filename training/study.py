@@ -31,16 +31,15 @@ from viapoint.training import files
 from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
 from viapoint.training.agents.model_io import check_arguments, check_hyperparameters, load_model, untrained
 from viapoint.training.checks import check_env_kwargs, check_folder, check_whole, named_path, unknown_name
+from viapoint.training.cli.doctor import explain_import_error
 from viapoint.training.configs import StudyConfig, TrainConfig
-from viapoint.training.evaluation import evaluate_methods
-from viapoint.training.extras import explain_import_error
+from viapoint.training.evaluation import across_seeds, evaluate_methods, wilson
 from viapoint.training.planning.baselines import Method, agent_method, factory, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plots import success_of_rows
 from viapoint.training.rollout import whole_task
 from viapoint.training.runs import Run
 from viapoint.training.scene_sets import SEEDS, SETS, FrozenScenes, scenes_for, shipped_set
-from viapoint.training.statistics import across_seeds, wilson
 from viapoint.training.trainer import train_or_resume
 
 Values = Mapping[str, Any]
@@ -415,11 +414,7 @@ def run_study(
             raise files.BadFileError(folder, "holds something else than a study; name another folder")
         files.write_json(mark, {"viapoint": "study", "name": study.name})
     missing = [trial for trial in study.trials if not _finished_record(trial, folder)]
-    searches = []
-    for search in study.searches:
-        best = search.folder(folder) / "best.json"
-        if not best.is_file() or files.read_json(best).get("key") != search.key:
-            searches.append(search)
+    searches = [search for search in study.searches if not _finished_record(search, folder)]
     failed = []
     if missing or searches:
         told(
@@ -468,8 +463,8 @@ def _run_trial(trial: Trial, out: Path) -> Record:
 
 
 def _finished_record(trial: Trial, out: Path) -> Record:
-    """Return the record of a trial that is complete, otherwise an empty one; that of other settings is obsolete."""
-    path = trial.folder(out) / "result.json"
+    """Return the record of a trial or search that is complete, otherwise {}; that of other settings is obsolete."""
+    path = trial.folder(out) / ("best.json" if trial.parameters else "result.json")
     record = files.read_json(path) if path.is_file() else {}
     return record if record.get("asked") == _asked(trial) else {}
 
@@ -528,7 +523,8 @@ def _asked(trial: Trial) -> Record:
     """Return what identifies a trial as plain values."""
     plain: Record = files.as_plain(trial)
     plain["scenes"] = {name: frozen.sha256 for name, frozen in _sets(trial).items()}
-    del plain["parameters"], plain["trials"], plain["first"]  # of searches
+    if not trial.parameters:
+        del plain["parameters"], plain["trials"], plain["first"]  # of searches
     return plain
 
 
@@ -671,8 +667,9 @@ def _write_search(search: Trial, results: Any, folder: Path) -> str:
     best = table.to_dict("records")[0]
     chosen = search.config(folder, {path: best[path] for path in search.parameters})
     config = dataclasses.replace(chosen, out=None)
-    record = {"viapoint": "search", "key": search.key, "success": best["success"], "command": config.command}
-    files.write_json(search.folder(folder) / "best.json", {**record, "training": files.as_plain(config)})
+    record = {"viapoint": "search", "success": best["success"], "command": config.command}
+    record |= {"asked": _asked(search), "training": files.as_plain(config)}
+    files.write_json(search.folder(folder) / "best.json", record)
     return f"best of {search.row}, {100.0 * best['success']:.1f} %: {config.command}"
 
 

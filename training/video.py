@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import textwrap
 import uuid
@@ -24,7 +25,7 @@ from viapoint.envs.renderer import EpisodeRenderer
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.files import MARK, write_figure
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
-from viapoint.training.rollout import Decide
+from viapoint.training.rollout import Decide, play_episodes
 
 CAPTION = 48  # Height of the caption below the picture, [pixels]
 BLOCK = 16  # Encoders need sides that are multiples of this, [pixels]
@@ -78,30 +79,29 @@ def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
     path.parent.mkdir(parents=True, exist_ok=True)
     full = OSError(f"the encoder could not write {path}: is there room on the disk?")
     part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part.mp4")
-    count, writer = 0, None
+    frames = iter(frames)
+    first = next(frames)
+    height, width = first.shape[:2]
+    writer = imageio_ffmpeg.write_frames(
+        str(part), (width, height), fps=SPEED * fps, codec="libx264", quality=None, bitrate=None,
+        output_params=["-crf", "20", "-movflags", "+faststart", "-metadata", f"comment={MARK.decode()}"],
+        macro_block_size=1, ffmpeg_log_level="error",
+    )  # fmt: skip
+    count = 0
     try:
-        for frame in frames:
-            if writer is None:
-                height, width = frame.shape[:2]
-                writer = imageio_ffmpeg.write_frames(
-                    str(part), (width, height), fps=SPEED * fps, codec="libx264", quality=None, bitrate=None,
-                    output_params=["-crf", "20", "-movflags", "+faststart", "-metadata", f"comment={MARK.decode()}"],
-                    macro_block_size=1, ffmpeg_log_level="error",
-                )  # fmt: skip
-                writer.send(None)  # the generator opens the file
+        writer.send(None)  # the generator opens the file
+        for frame in itertools.chain([first], frames):
             try:
                 writer.send(np.ascontiguousarray(frame))
             except OSError:
                 raise full from None
             count += 1
-        if writer is not None:
-            writer.close()  # the file is complete now, if the encoder has not failed, which it does not tell
+        writer.close()  # the file is complete now, if the encoder has not failed, which it does not tell
         if MARK not in part.read_bytes():
             raise full
         os.replace(part, path)
     finally:
-        if writer is not None:
-            writer.close()
+        writer.close()
         part.unlink(missing_ok=True)  # what is left of a film that failed
     return count
 
@@ -121,11 +121,8 @@ def play(env: gym.Env[Any, Any], scene: Scenes, decide: Decide) -> dict[str, Any
     """Simulate an episode of an environment in one scene, and return the info of its last decision."""
     batch: Any = env.unwrapped.batch  # type: ignore[attr-defined]
     observation = batch.begin(scene)
-    while True:
-        decision = batch.execute_actions(decide(observation, scene))
-        observation = decision.observation
-        if decision.terminated[0] or decision.truncated[0]:
-            return {name: value[0] for name, value in decision.info.items()}
+    outcomes = play_episodes(batch, scene, decide(observation, scene), decide)
+    return {name: value[0] for name, value in outcomes.items()}
 
 
 def _with_captions(given: Any, left: str, info: Any, fps: float, told: str = "") -> Iterator[Frame]:

@@ -22,12 +22,11 @@ from matplotlib.image import imread
 from PIL import Image
 
 from viapoint.primitives import fit_via_points, through
-from viapoint.training import GeometrySearch, Run, TrainConfig, evaluate, load_agent
+from viapoint.training import GeometrySearch, Run, TrainConfig, configs, evaluate, load_agent
 from viapoint.training.agents.model_io import ALGORITHMS, check_hyperparameters
 from viapoint.training.cli import demo, doctor
 from viapoint.training.cli import entry as cli
 from viapoint.training.configs import DemoConfig, EvaluateConfig, from_words, to_words
-from viapoint.training.presets import PRESETS, REACH_PRESETS, REPLANNING_PRESETS, STEP_PRESETS
 from viapoint.training.trainer import RunCallback, TrainingStoppedError
 from viapoint.training.video import record_video
 
@@ -202,8 +201,9 @@ def test_a_short_training_begins_to_learn_in_proportion(algo):
 
 
 def test_every_algorithm_has_presets_that_fit():
-    assert set(PRESETS) == set(ALGORITHMS)
-    for presets in (PRESETS, STEP_PRESETS, REACH_PRESETS, REPLANNING_PRESETS):
+    assert set(configs.PRESETS) == set(ALGORITHMS)
+    kinds = configs.PRESETS, configs.STEP_PRESETS, configs.REACH_PRESETS, configs.REPLANNING_PRESETS
+    for presets in kinds:
         for algo, preset in presets.items():
             assert preset.policy in ALGORITHMS[algo].policy_aliases
             check_hyperparameters(algo, preset.hyperparameters)

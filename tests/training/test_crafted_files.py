@@ -19,9 +19,9 @@ from viapoint.envs.plans import MOST_VIAS
 from viapoint.envs.task import MOST_OBSTACLES
 from viapoint.training import Run, load_agent
 from viapoint.training.agents.model_io import build, load_model, save_model
-from viapoint.training.checkpoints import read_checkpoint, read_state, write_checkpoint
+from viapoint.training.configs import PRESETS
 from viapoint.training.files import BadFileError
-from viapoint.training.presets import PRESETS
+from viapoint.training.runs import read_checkpoint, read_state, write_checkpoint
 
 RECORD, WEIGHTS = "model.json", "weights.safetensors"
 SMALL = {"learning_starts": 8, "batch_size": 8, "buffer_size": 64, "policy_kwargs": {"net_arch": [8]}}

@@ -14,13 +14,13 @@ from helpers import MOVING, PLANE, REACH, STEP, scenes_of
 from stable_baselines3.common.vec_env import VecNormalize
 
 from viapoint.envs import scene_from_json, scene_to_json
-from viapoint.training import GeometrySearch, ViaVecEnv, evaluate, report, statistics
+from viapoint.training import GeometrySearch, ViaVecEnv, evaluate, evaluation, report
 from viapoint.training.agents.agent import PPO
 from viapoint.training.agents.model_io import build
+from viapoint.training.configs import STEP_PRESETS
 from viapoint.training.evaluation import SLOW_DECISION, MethodResult, evaluate_methods
 from viapoint.training.planning.baselines import StepAgentMethod, Straight, agent_method, make_method
 from viapoint.training.planning.search import registered_task
-from viapoint.training.presets import STEP_PRESETS
 from viapoint.training.rollout import SceneSimulation, whole_task
 from viapoint.training.scene_sets import BANDS, drawn
 
@@ -250,28 +250,28 @@ def test_fewer_scenes_than_asked_for_are_told(small_scenes, capsys):
 
 def test_wilson_equals_published_values():
     # Newcombe 1998, Stat. Med. 17, 857-872, table I, method 3
-    assert statistics.wilson(81, 263) == pytest.approx((81 / 263, 0.2553, 0.3662), abs=5e-5)
+    assert evaluation.wilson(81, 263) == pytest.approx((81 / 263, 0.2553, 0.3662), abs=5e-5)
 
 
 def test_mcnemar_counts_scenes_in_which_one_alone_succeeds():
     first, second = np.random.default_rng(0).random((2, 80)) < [[0.7], [0.5]]
-    result = statistics.mcnemar(first, second)
+    result = evaluation.mcnemar(first, second)
     assert result["difference"] == pytest.approx(first.mean() - second.mean())
     alone = (first & ~second).sum(), (second & ~first).sum()
     assert (result["only_first"], result["only_second"]) == alone
-    assert list(statistics.mcnemar(first, first).values()) == [0.0, 0, 0, 1.0]
-    assert statistics.mcnemar([True] * 5, [False] * 5)["p_value"] == pytest.approx(2 / 2**5)
+    assert list(evaluation.mcnemar(first, first).values()) == [0.0, 0, 0, 1.0]
+    assert evaluation.mcnemar([True] * 5, [False] * 5)["p_value"] == pytest.approx(2 / 2**5)
 
 
 def test_across_seeds_draws_whole_agents():
     """Three agents, each the same in all scenes: all 27 draws of three of them can be written down."""
     rates = np.array([0.2, 0.5, 0.6])
     scores = np.repeat(rates[:, None], 40, axis=1)
-    interval = statistics.across_seeds(scores, np.zeros(40), np.random.default_rng(0), samples=20_000)
+    interval = evaluation.across_seeds(scores, np.zeros(40), np.random.default_rng(0), samples=20_000)
     draws = sorted(np.mean(each) for each in itertools.product(rates, repeat=3))
     # One draw of 27 is more than 2.5 %.
     assert interval == pytest.approx((rates.mean(), draws[0], draws[-1]))
-    trimmed = statistics.across_seeds(
+    trimmed = evaluation.across_seeds(
         np.array([[0.0], [0.5], [0.6], [0.7], [1.0]]), [0], np.random.default_rng(0)
     )
     assert trimmed[0] == pytest.approx(0.6)
@@ -279,13 +279,13 @@ def test_across_seeds_draws_whole_agents():
 
 def test_across_seeds_draws_scenes_within_their_strata():
     success = np.random.default_rng(0).random(400) < 0.7
-    _, low, high = statistics.across_seeds(
+    _, low, high = evaluation.across_seeds(
         success[None], np.zeros(400), np.random.default_rng(1), samples=4000
     )
     half = 1.96 * math.sqrt(success.mean() * (1 - success.mean()) / 400)
     assert high - low == pytest.approx(2 * half, rel=0.1)
     score = np.where(success, 0.9, 0.2)
-    known = statistics.across_seeds(score[None], success, np.random.default_rng(1))
+    known = evaluation.across_seeds(score[None], success, np.random.default_rng(1))
     assert known == pytest.approx((score.mean(),) * 3)  # within a stratum all are alike
 
 
@@ -296,7 +296,7 @@ def test_across_seeds_covers_the_truth():
     for _ in range(100):
         worth, ease = generator.normal(1.0, 0.5, (8, 1)), generator.normal(0.0, 1.0, (1, 100))
         scores = generator.normal(size=(8, 100)) < worth + ease
-        _, low, high = statistics.across_seeds(scores, np.zeros(100), generator, samples=200)
+        _, low, high = evaluation.across_seeds(scores, np.zeros(100), generator, samples=200)
         truth = NormalDist().cdf(1.0 / math.sqrt(1.0 + 0.25 + 1.0))
         covered += low <= truth <= high
     assert covered >= 85
@@ -305,8 +305,8 @@ def test_across_seeds_covers_the_truth():
 @pytest.mark.parametrize("solved", [0, 5, 20])
 def test_across_seeds_without_any_spread_is_wilsons(solved):
     strata = np.arange(20) < solved
-    interval = statistics.across_seeds(np.tile(strata, (3, 1)), strata, np.random.default_rng(0))
-    assert interval == statistics.wilson(solved, 20)
+    interval = evaluation.across_seeds(np.tile(strata, (3, 1)), strata, np.random.default_rng(0))
+    assert interval == evaluation.wilson(solved, 20)
 
 
 REACHING = {"courses": "reaches"}

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from viapoint.training.cli import entry as cli
-from viapoint.training.paper import obstacles, run
-from viapoint.training.paper.claim import Claim, at_least, at_most, near
+from viapoint.training.paper import Claim, obstacles, run
 from viapoint.training.paper.double_step import double_step, excess_cost
 from viapoint.training.paper.movements import construction, via_waypoints
 from viapoint.training.paper.run import DRAWINGS, ROWS
@@ -73,12 +72,12 @@ def test_the_guide_says_what_the_command_computes(made):
     [(1.0, 2.0, True), (1.2, 2.0, False), (1.0, 1.9, False), (np.nan, 2.0, False), (1.0, np.nan, False)],
 )
 def test_a_claim_holds_where_every_number_is_as_promised(model, arm, holds):
-    claim = Claim(1, "x", model=(model, near(1.0, 0.1)), arm=(arm, at_least(2.0)))
+    claim = Claim(1, "x", model=(model, (0.9, 1.1)), arm=(arm, (2.0, np.inf)))
     assert claim.holds == holds
 
 
 def test_a_failed_claim_ends_the_command_with_code_1(tmp_path, monkeypatch, capsys):
-    claims = [Claim(1, "too much", model=(2.0, at_most(1.0)))]
+    claims = [Claim(1, "too much", model=(2.0, (-np.inf, 1.0)))]
     monkeypatch.setattr(run, "reproduce", lambda *_: (claims, {}))
     with pytest.raises(SystemExit) as end:
         cli.main(["paper", "--out", str(tmp_path)])

@@ -26,10 +26,10 @@ from viapoint.training import (
     ViaRank,
     ViaVecEnv,
     evaluate,
+    evaluation,
     load_agent,
     plan_motion,
     plan_motions,
-    statistics,
     train,
 )
 from viapoint.training.agents.agent import SAC, find_model
@@ -292,7 +292,7 @@ CALLS = [
     *(lambda env_id=env_id: scenes_for(load(shipped_path(env_id), "validation"), Task.of()) for env_id in CHANGING),
     *(lambda name=name: evaluate(env=PLANE, baselines=["straight"], scenes=load(shipped_path(name), "test"))
       for name in (PANDA, *CHANGING)),
-    *(lambda successes=successes: statistics.wilson(successes, 4) for successes in (5, -1)),
+    *(lambda successes=successes: evaluation.wilson(successes, 4) for successes in (5, -1)),
 ]  # fmt: skip
 
 

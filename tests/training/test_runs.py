@@ -20,10 +20,9 @@ from viapoint.training.agents.agent import find_model
 from viapoint.training.agents.model_io import build, describe, load_model, save_model, weights
 from viapoint.training.cli import demo
 from viapoint.training.cli import entry as cli
-from viapoint.training.configs import DemoConfig, PaperConfig
+from viapoint.training.configs import PRESETS, DemoConfig, PaperConfig
 from viapoint.training.files import BadFileError
 from viapoint.training.paper import run as paper
-from viapoint.training.presets import PRESETS
 
 
 def new(algo, env, **hyperparameters):

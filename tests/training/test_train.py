@@ -19,12 +19,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from viapoint.training import Run, TrainConfig, ViaVecEnv, train, trainer
 from viapoint.training.agents.model_io import load_model
-from viapoint.training.checkpoints import read_state
 from viapoint.training.cli import entry as cli
+from viapoint.training.configs import PRESETS
 from viapoint.training.evaluation import evaluate_methods
 from viapoint.training.files import BadFileError, read_arrays
 from viapoint.training.planning.baselines import agent_method
-from viapoint.training.presets import PRESETS
+from viapoint.training.runs import read_state
 from viapoint.training.scene_sets import scenes_for
 from viapoint.training.trainer import TrainingFailedError, TrainingStoppedError
 

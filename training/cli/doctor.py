@@ -9,7 +9,11 @@ ENV = "import gymnasium as g, viapoint.envs as v; e = g.make(v.ENV_IDS[1], rende
 STEP = ENV + "print(f'{e.step(0 * e.action_space.sample())[4][\"duration\"]:.3f} s of movement')"
 AGENT = "from viapoint.training import load_agent; print(load_agent('viapoint/PlanarObstacles-v0').env_id)"
 EXTRAS = "from importlib.util import find_spec as f; print(*(n if f(n) else f'(no {{n}}: extra {{e}})' for n, e in {}))"
-PACKAGES = {"torch": "training", "ompl": "planning", "viser": "live", "minari": "minari", "ray": "study"}
+# Packages that are imported where they are needed, and their extras; others belong to `training`
+PACKAGES = {
+    "torch": "training", "ompl": "planning", "viser": "live", "mjviser": "live", "minari": "minari",
+    "ray": "study", "optuna": "study",
+}  # fmt: skip
 CHECKS = {  # Script that fails, or prints what it found, and remedy, by the name of what is checked
     "packages": (VERSIONS.format("numpy, gymnasium, mujoco, numba"), "pip install . in a clone"),
     "MuJoCo": (STEP, "pip install 'mujoco>=4'"),
@@ -38,3 +42,14 @@ def outcome(script: str) -> tuple[bool, str]:
         return False, f"no answer within {LIMIT:.0f} s"
     said = (done.stderr if done.returncode else done.stdout).strip()
     return not done.returncode, (said or f"ended with code {done.returncode}").splitlines()[-1]
+
+
+def explain_import_error(error: ImportError, subject: str = "the command") -> str:
+    """Return one line on a failed import of `subject`: what to install if a package is missing."""
+    missing = (error.name or "").partition(".")[0]
+    if isinstance(error, ModuleNotFoundError) and missing not in ("", "viapoint"):
+        extra = PACKAGES.get(missing, "training")
+        return (
+            f"{subject} needs the extra `{extra}` (not installed: {missing}): pip install 'viapoint[{extra}]'"
+        )
+    return f"{type(error).__name__}: {' '.join(str(error).split())} (viapoint doctor says more)"

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from viapoint.training.cli import doctor
-from viapoint.training.extras import explain_import_error
+from viapoint.training.cli.doctor import explain_import_error
 
 if TYPE_CHECKING:
     from viapoint.training.configs import TrainConfig
@@ -126,17 +126,16 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
 
 def _agent_first(options: Sequence[str]) -> list[str]:
     """Return options with the agent at the front, a word by its place, which --agent NAME or --agent=NAME may name."""
-    for place, word in enumerate(options):
-        flag, equals, name = word.partition("=")
-        if flag != "--agent":
-            continue
-        rest = options[place + 1 :]
-        if not equals:
-            name, *rest = rest or [""]
-        if not name or name.startswith("-"):
-            raise ValueError("--agent needs a name: a run folder, a model folder or the id of an environment")
-        return [name, *options[:place], *rest]
-    return list(options)
+    words: list[str] = []
+    for word in options:
+        words += word.split("=", 1) if word.startswith("--agent=") else [word]
+    if "--agent" not in words:
+        return words
+    place = words.index("--agent")
+    name = words[place + 1 : place + 2]
+    if name in ([], [""]) or name[0].startswith("-"):
+        raise ValueError("--agent needs a name: a run folder, a model folder or the id of an environment")
+    return [*name, *words[:place], *words[place + 2 :]]
 
 
 def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:

@@ -26,7 +26,7 @@ from scipy.interpolate import BPoly
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.plans import Motion
 from viapoint.primitives import Trajectory, minimum_jerk_coefficients, point_to_point, retarget
-from viapoint.training.paper.claim import Claim, at_least, at_most, near
+from viapoint.training.paper import Claim, claim
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, instants, straight, track
 
 STEP_DURATION = 0.7  # Duration of the first movement and of the second one, [s]
@@ -120,14 +120,10 @@ def double_step_claims() -> list[Claim]:
     same = double_step(0.3, remaining=STEP_DURATION - 0.3)
     alike = simulate_double(same)
     claims = [
-        Claim(13, "Both continue position, velocity and acceleration at the revision: greatest jump, relative to the "
-              "peak of each", model=(max(_jump(each) for each in every), at_most(1e-12))),
-        Claim(13, "Arrival as planned at first (revised at 300 ms, due at 700 ms): distance between sum and plan",
-              model=(1e3 * greatest_distance(same), at_most(1e-9)), arm=(_hands_apart(alike), at_most(1e-6)),
-              deviation=alike.worst, unit="mm"),
-        Claim(13, "Revised at 200 ms towards 100 second targets: what the sum costs beyond the plan, relative spread",
-              model=(_spread(), at_most(1e-9))),
-    ]  # fmt: skip
+        claim("continuity", max(_jump(each) for each in every)),
+        claim("arrival", 1e3 * greatest_distance(same), _hands_apart(alike), alike.worst),
+        claim("any target", _spread()),
+    ]
     for each in every:
         claims += _claims_at(each)
     return claims
@@ -135,7 +131,7 @@ def double_step_claims() -> list[Claim]:
 
 def _claims_at(movement: DoubleStep) -> list[Claim]:
     """Return the claims of one moment of revision; the second movement takes as long as the first."""
-    when = f"Revised at {1e3 * movement.moment:.0f} ms"
+    ms = 1e3 * movement.moment
     planned = movement.cost("planned")
     expected = 1.0 + excess_cost(movement) / planned
     distance = 1e3 * greatest_distance(movement)
@@ -144,14 +140,10 @@ def _claims_at(movement: DoubleStep) -> list[Claim]:
     motion = simulate_double(movement)
     arm = motion.speed().max(axis=1)
     return [
-        Claim(13, f"{when}: jerk cost of the sum / of the plan, from there on",
-              model=(movement.cost("superposed") / planned, near(expected, 1e-9))),
-        Claim(13, f"{when}: peak speed of the sum / of the plan", model=(found, at_least(1.0 - 1e-12)),
-              arm=(arm[0] / arm[1], near(found, 0.01)), deviation=motion.worst),
-        Claim(13, f"{when}: greatest distance between sum and plan, the same for a jump to T2",
-              model=(distance, near(to_T2, 1e-9)), arm=(_hands_apart(motion), near(distance, 1.0)),
-              deviation=motion.worst, unit="mm"),
-    ]  # fmt: skip
+        claim("cost of the sum", movement.cost("superposed") / planned, ms=ms, expected=expected),
+        claim("peak of the sum", found, arm[0] / arm[1], motion.worst, ms=ms),
+        claim("distance of the sum", distance, _hands_apart(motion), motion.worst, ms=ms, expected=to_T2),
+    ]
 
 
 def _hands_apart(motion: SimulatedMovements) -> float:
@@ -192,15 +184,11 @@ def replanning_claims() -> list[Claim]:
     motion = simulate_double(movement)
     missed = 1e3 * np.linalg.norm(motion.hand[1, -1] - TARGETS["T5"])
     return [
-        Claim(11, "Quintic from 1,000 random boundary values, T from 1 ms to 1000 s: greatest relative error at the "
-              "ends", "primer", "Eqs. 16 to 24", (_boundary_error(), at_most(1e-12))),
-        Claim(11, "Replanned 200 times on the way, target unchanged: distance from the one plan", "primer",
-              "Eqs. 25 to 27", (1e3 * _replanned(200), at_most(1e-9)), unit="mm"),
-        Claim(11, "Target and arrival change on the way: jump of position, velocity, acceleration, relative", "primer",
-              "smooth", (_jump(movement), at_most(1e-12))),
-        Claim(11, "The same against a fresh solution from that state (arm: distance from the new target at the end)",
-              "primer", "the same", (apart, at_most(1e-9)), (missed, at_most(1.0)), motion.deviation[1], "mm"),
-    ]  # fmt: skip
+        claim("boundary values", _boundary_error()),
+        claim("replanned", 1e3 * _replanned(200)),
+        claim("smooth", _jump(movement)),
+        claim("fresh solution", apart, missed, motion.deviation[1]),
+    ]
 
 
 def _boundary_error() -> float:

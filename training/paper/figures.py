@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+import itertools
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from viapoint import primitives
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.common.palette import PALETTE
 from viapoint.envs.geometry.obstacles import unpack
+from viapoint.training.files import parse_yaml
 from viapoint.training.paper import double_step, movements, one_via, point_to_point
 from viapoint.training.paper.movements import TARGETS, Profile, curved, passage_share, simulate, straight
 from viapoint.training.paper.obstacles import ObstacleMovements, features
@@ -37,19 +39,31 @@ GREY = PALETTE.start
 JOINTS = (("shoulder $S$", SECOND), ("elbow $E$", THIRD))
 
 
-def sheet(
-    rows: int, columns: int, height: float, titles: Sequence[str] = "ABCDEFGH", **options: Any
-) -> tuple[Figure, Any]:
-    """Return a figure of one column and `height` centimetres, and its titled axes, shape (rows, columns)."""
-    figure = Figure(figsize=(COLUMN / 2.54, height / 2.54))
-    axes = figure.subplots(rows, columns, squeeze=False, **options)
-    for ax, title in zip(axes.flat, titles, strict=False):
-        ax.set_title(title)
+FIGURES: dict[str, Any] = parse_yaml((files(__package__) / "figures.yaml").read_bytes())["figures"]
+# Arguments of `curved` for figures of two movements
+PAIRS: dict[str, Any] = {
+    "fig05_height": ((*ENDS, 0.5, -0.52), (*ENDS, 0.5, -0.35)),
+    "fig06_place": ((*ENDS, 0.3, -0.45), (*ENDS, 0.7, -0.45)),
+    "fig07_turned": (("T2", "T5", 0.35, 0.5), ("T3", "T6", 0.65, -0.5)),
+    "fig11_scaling": (
+        (*ENDS, *one_via.THREE_POINTS, one_via.SLOW),
+        (*ENDS, *one_via.THREE_POINTS, one_via.FAST),
+    ),
+}
+
+
+def sheet(name: str, **options: Any) -> tuple[Figure, Any]:
+    """Return a figure of one column and its axes, shape (rows, columns), with the settings in `figures.yaml`."""
+    rows = FIGURES[name]["rows"]
+    figure = Figure(figsize=(COLUMN / 2.54, FIGURES[name]["height"] / 2.54))
+    axes = figure.subplots(len(rows), len(rows[0]), squeeze=False, **options)
+    for ax, settings in zip(axes.flat, itertools.chain(*rows), strict=True):
+        ax.set(**settings)
     return figure, axes
 
 
-def plane(ax: Axes, *, names: tuple[str, ...] = tuple(TARGETS)) -> None:
-    """Draw the horizontal plane with the paper's targets, in centimetres."""
+def targets(ax: Axes, *, names: tuple[str, ...] = tuple(TARGETS)) -> None:
+    """Draw the paper's targets in the horizontal plane, in centimetres."""
     for name in names:
         x, y = 100.0 * TARGETS[name]
         ax.plot(x, y, "o", color="white", markeredgecolor=GREY, markersize=5.0, markeredgewidth=0.8, zorder=1)
@@ -59,8 +73,6 @@ def plane(ax: Axes, *, names: tuple[str, ...] = tuple(TARGETS)) -> None:
             ha="center", va="top" if low else "bottom", color=GREY, zorder=4,
             path_effects=[withStroke(linewidth=1.5, foreground="white")],
         )  # fmt: skip
-    ax.set(aspect="equal", xlim=(-39.0, 15.0), ylim=(15.0, 71.0))
-    ax.set(xlabel="$x$ [cm]", ylabel="$y$ [cm]", xticks=[-30, -15, 0], yticks=[20, 40, 60])
 
 
 def path(ax: Axes, position: Any, **style: Any) -> None:
@@ -86,15 +98,14 @@ def zero(ax: Axes) -> None:
 
 def model() -> Figure:
     """Draw Fig. 1: a straight and a curved movement of the model."""
-    figure, axes = sheet(3, 2, 10.5, ("A", "", "B"))
+    figure, axes = sheet("fig01_model")
     first = straight("T2", "T5", 1.0)
     second = curved(*ENDS, *one_via.EXAMPLE)
     for ax, movement in ((axes[0], first), (axes[1], second)):
         (profile,) = movements.model_profiles(movement)
-        plane(ax[0])
+        targets(ax[0])
         path(ax[0], profile.position, zorder=2.1, **MODEL)
         ax[1].plot(profile.time, profile.speed / profile.speed.max(), **MODEL)
-        ax[1].set(ylabel="speed / peak", ylim=(0, 1.08))
     via = second(float(second.knots[1]))
     _dot(axes[1, 0], via)
     # The construction of d1, d2 and d3, in centimetres
@@ -108,80 +119,64 @@ def model() -> Figure:
     label("$d_3$", (x + 1.0, y + 4.0), ha="left", va="center")
     axes[2, 0].plot(profile.time, profile.curvature, **MODEL)
     axes[2, 0].axvline(profile.valley[0], color="0.6", linewidth=0.7, linestyle=":")
-    axes[2, 0].set(ylabel="curvature [1/m]", ylim=(0, 1.15 * profile.bend[1]))
+    axes[2, 0].set_ylim(0, 1.15 * profile.bend[1])
     for values, name, colour in zip(profile.velocity.T, ("$V_x$", "$V_y$"), (SECOND, THIRD), strict=True):
         axes[2, 1].plot(profile.time, values, color=colour, label=name, linewidth=1.6)
-    axes[2, 1].set(ylabel="velocity [m/s]", ylim=(-0.7, 1.5))
     zero(axes[2, 1])
     axes[2, 1].legend(loc="upper right", handlelength=1.2)
-    for ax in (axes[0, 1], axes[1, 1], axes[2, 0], axes[2, 1]):
-        ax.set(xlabel="$t/t_f$", xlim=(0, 1), xticks=[0, 0.5, 1], xticklabels=["0", "0.5", "1"])
     return figure
 
 
 def straight_movements() -> Figure:
     """Draw Fig. 3: two straight movements on the model and on the simulated arm."""
-    figure, axes = sheet(4, 2, 12.5, ("A   $T_3$ to $T_6$", "B   $T_1$ to $T_4$"))
+    figure, axes = sheet("fig03_straight")
     time = np.linspace(0.0, DURATION, 401)
     movement = diagonals()
     motion = simulate(movement)
     planned = movement(time, 2)
     reached = motion.derivative(motion.derivative(motion.hand))
     for row, ax in enumerate(axes.T):
-        plane(ax[0])
+        targets(ax[0])
         paths(ax[0], motion.planned[row], motion.hand[row])
         ax[1].plot(time, primitives.speed(movement, time)[row], label="model", **MODEL)
         ax[1].plot(motion.time, motion.speed()[row], label="simulated arm", **ARM)
-        ax[1].set(xlim=(0, 0.9), ylim=(0, 1.5))
         for each, axis in ((ax[2], 1), (ax[3], 0)):
             each.plot(time, planned[row, :, axis], **MODEL)
             each.plot(motion.time, reached[row, :, axis], **ARM)
-            each.set(xlim=(0, 0.9), ylim=(-4.2, 4.2))
             zero(each)
-        ax[3].set_xlabel("$t$ [s]")
-    texts = ("speed [m/s]", r"$\ddot{y}$ [m/s²]", r"$\ddot{x}$ [m/s²]")
-    for ax, text in zip(axes[1:, 0], texts, strict=True):
-        ax.set_ylabel(text)
     axes[1, 1].legend(loc="upper right")
     return figure
 
 
 def joints() -> Figure:
     """Draw Fig. 4: joint angles, velocities and torques of two movements."""
-    titles = ("A   $T_3$ to $T_6$", "B   $T_2$ to $T_5$")
-    figure, axes = sheet(3, 2, 10.0, titles, sharex=True, sharey="row")
+    figure, axes = sheet("fig04_joints", sharex=True, sharey="row")
     movement = diagonals()
     motion = simulate(movement)
     time = np.linspace(0.0, DURATION, 401)
     angles, rates, _ = map(np.degrees, movements.joint_motion(movement))
     reached = np.degrees(motion.joints)
     quantities = (
-        (r"$\theta$ [deg]", angles, reached),
-        (r"$\dot{\theta}$ [deg/s]", rates, motion.derivative(reached)),
-        ("torque [N m]", movements.required_torque(movement), motion.torque),
+        (angles, reached),
+        (rates, motion.derivative(reached)),
+        (movements.required_torque(movement), motion.torque),
     )
     within = np.flatnonzero(motion.time[:-1] <= DURATION)
-    for pair_of_axes, (text, model, arm) in zip(axes, quantities, strict=True):
-        pair_of_axes[0].set_ylabel(text)
+    for pair_of_axes, (model, arm) in zip(axes, quantities, strict=True):
         for ax, row in zip(pair_of_axes, (0, 2), strict=True):
             for joint, (name, colour) in enumerate(JOINTS):
                 ax.plot(time, model[row, :, joint], color=colour, linewidth=2.0, label=name)
                 ax.plot(motion.time[within], arm[row, within, joint], **ARM)
             zero(ax)
-    for ax in axes[2]:
-        ax.set(xlabel="$t$ [s]", xlim=(0, DURATION))
     axes[0, 0].legend(loc="upper left", handlelength=1.2)
-    axes[0, 0].set_ylim(-10, 215)
     return figure
 
 
-def _two_movements(rows: int, height: float, titles: Sequence[str]) -> tuple[Figure, Any]:
+def _two_movements(name: str) -> tuple[Figure, Any]:
     """Return a sheet for the paths of two movements and for `profiles`, with one scale in each row of these."""
-    figure, axes = sheet(rows, 2, height, titles)
-    texts = ("speed [m/s]", "curvature [1/m]", "$V_x$ [m/s]", "$V_y$ [m/s]")
-    for row, text in zip(axes[1:], texts, strict=False):
-        row[1].sharey(row[0])
-        row[0].set_ylabel(text)
+    figure, axes = sheet(name)
+    for left, right in axes[1:]:
+        right.sharey(left)
     return figure, axes
 
 
@@ -202,14 +197,14 @@ def _finish(axes: Any, duration: float) -> None:
     axes[0, 1].legend(loc="upper right")
 
 
-def pair(first: Any, second: Any, texts: Any) -> Figure:
-    """Draw two movements side by side, on the model and on the simulated arm; they are arguments of `curved`."""
-    figure, axes = _two_movements(5, 14.0, [f"A   {texts[0]}", f"B   {texts[1]}"])
-    plans = [curved(*first), curved(*second)]
+def pair(name: str) -> Figure:
+    """Draw two movements of PAIRS side by side, on the model and on the simulated arm."""
+    figure, axes = _two_movements(name)
+    plans = [curved(*each) for each in PAIRS[name]]
     for ax, movement in zip(axes.T, plans, strict=True):
         motion = simulate(movement)
         passage = float(movement.knots[1])
-        plane(ax[0])
+        targets(ax[0])
         paths(ax[0], motion.planned[0], motion.hand[0])
         _dot(ax[0], movement(passage))
         (model,) = movements.model_profiles(movement)
@@ -219,14 +214,13 @@ def pair(first: Any, second: Any, texts: Any) -> Figure:
             each.axvline(passage, color=THIRD, linewidth=0.7, linestyle=":")
         for each in ax[3:]:
             zero(each)
-        ax[4].set_xlabel("$t$ [s]")
     _finish(axes[1:], max(float(each.duration) for each in plans))
     return figure
 
 
 def around_lights(avoidance: ObstacleMovements) -> Figure:
     """Draw Fig. 8: two movements around rows of lights, and the model through their points of greatest curvature."""
-    figure, axes = _two_movements(3, 10.5, "AB")
+    figure, axes = _two_movements("fig08_obstacles")
     depth = np.array([each.valley[1] for each in avoidance.profiles])
     for ax, row in zip(axes.T, np.argsort(depth)[[0, len(depth) // 2]].tolist(), strict=True):
         profile, (start, *_, goal) = avoidance.profiles[row], avoidance.plan.waypoints[row]
@@ -236,7 +230,7 @@ def around_lights(avoidance: ObstacleMovements) -> Figure:
         (lights,) = unpack(avoidance.scenes.obstacles, row)
         away = lights.distance(np.array([[*place, 0.0] for place in TARGETS.values()]))
         clear = [name for name, distance in zip(TARGETS, away, strict=True) if distance > COVERED]
-        plane(ax[0], names=tuple(clear))  # labels of the others would lie on the lights
+        targets(ax[0], names=tuple(clear))  # labels of the others would lie on the lights
         paths(ax[0], model.position, profile.position)
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * lights.packed_size[:2]
         outline = corners @ lights.rotation[:2, :2].T + lights.position[:2]
@@ -244,14 +238,13 @@ def around_lights(avoidance: ObstacleMovements) -> Figure:
         _dot(ax[0], via)
         profiles(ax[1:], model, profile, 1.0)
         ax[1].plot([], [], label="via-point", **VIA)
-        ax[2].set_xlabel("$t/t_f$")
     _finish(axes[1:], 1.0)
     return figure
 
 
 def valleys() -> Figure:
     """Draw the region with a speed valley, and its distance in time from the curvature peak."""
-    figure, axes = sheet(1, 2, 4.6)
+    figure, axes = sheet("valleys")
     region, late = axes[0]
     alongs = np.linspace(0.05, 0.95, 37)
     heights = np.linspace(0.4, 1.0, 25)
@@ -261,11 +254,9 @@ def valleys() -> Figure:
     label("9/32", (0.5, 9 / 32), xytext=(0, -8), textcoords="offset points")
     label("two peaks, one valley", (0.5, 0.46))
     label("one peak", (0.5, 0.2))
-    region.set(xlabel="$d_1/(d_1+d_2)$", ylabel="$d_3/(d_1+d_2)$", ylim=(0.1, 0.55), xlim=(0, 1))
     for along, colour in ((0.3, PALETTE.plan), (0.4, THIRD), (0.5, PALETTE.executed)):
         family = movements.model_profiles(curved(*ENDS, along, -heights))
         late.plot(heights, [100 * (p.bend[0] - p.valley[0]) for p in family], color=colour, label=f"{along}")
-    late.set(xlabel="$d_3/(d_1+d_2)$", ylabel="curvature peak\nminus valley [% of $t_f$]", xlim=(0.4, 1.0))
     late.legend(title="$d_1/(d_1+d_2)$")
     return figure
 
@@ -281,7 +272,7 @@ SUBJECTS = ((-0.004, 0.02), (-0.0006, 0.017))  # Mean and s.d. of residuals in F
 
 def isochrony(avoidance: ObstacleMovements) -> Figure:
     """Draw Fig. 10: passage times and their residuals on the simulated arm."""
-    figure, axes = sheet(2, 2, 8.4)
+    figure, axes = sheet("fig10_isochrony")
     (over_place, place_residual), (over_height, height_residual) = axes
     alongs = np.linspace(0.001, 0.999, 400)
     heights = np.linspace(0.02, 1.0, 200)
@@ -302,14 +293,9 @@ def isochrony(avoidance: ObstacleMovements) -> Figure:
         over_height.plot(one_via.LENGTHS, arm, **DOTS)
         model = passage_share(curved(*ENDS, along, -one_via.LENGTHS))
         height_residual.plot(one_via.LENGTHS, arm - model, **DOTS)
-    texts = ("$d_1/(d_1+d_2)$", "$d_3/(d_1+d_2)$")
-    for row, text, (mean, deviation) in zip(axes, texts, SUBJECTS, strict=True):
-        row[0].set(xlabel=text, ylabel="$t_1/(t_1+t_2)$", xlim=(0, 1))
-        row[1].set(xlabel=text, ylabel="residual", xlim=(0, 1), ylim=(-0.04, 0.04))
-        row[1].axhspan(mean - deviation, mean + deviation, color="0.92", zorder=0)
-        row[1].axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
-    over_place.set_ylim(0.2, 0.8)
-    over_height.set_ylim(0.2, 0.55)
+    for ax, (mean, deviation) in zip(axes[:, 1], SUBJECTS, strict=True):
+        ax.axhspan(mean - deviation, mean + deviation, color="0.92", zorder=0)
+        ax.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
     height_residual.annotate("grey band:\nsubjects, mean ± s.d.", (0.02, -0.037), fontsize=5.8)
     small = {"title_fontsize": 6.0, "handlelength": 1.2}
     over_place.legend(title="$d_3/(d_1+d_2)$", loc="upper left", **small)
@@ -320,7 +306,7 @@ def isochrony(avoidance: ObstacleMovements) -> Figure:
 
 def orders_and_spaces() -> Figure:
     """Draw speed and acceleration of the three orders, and hand paths of minimum joint jerk."""
-    figure, axes = sheet(2, 2, 8.4)
+    figure, axes = sheet("alternatives")
     time = np.linspace(0.0, 1.0, 401)
     for order, colour, width in ((2, THIRD, 1.2), (3, PALETTE.plan, 2.2), (4, SECOND, 1.2)):
         movement = straight("T1", "T4", 1.0, order=order)
@@ -329,13 +315,11 @@ def orders_and_spaces() -> Figure:
             ax.plot(time, movement(time, nu)[:, 0] / 0.4, **style)
     axes[0, 0].axhspan(1.805 - 0.153, 1.805 + 0.153, color="0.9", zorder=0)
     axes[0, 0].annotate("peak of\nsubjects", (0.02, 1.8), fontsize=5.5, va="center")
-    axes[0, 0].set(ylabel="speed / mean speed", xlabel="$t/t_f$", xlim=(0, 1), ylim=(0, 2.4))
-    axes[0, 1].set(ylabel="acceleration $t_f^2/A$", xlabel="$t/t_f$", xlim=(0, 1), ylim=(-9, 27))
     zero(axes[0, 1])
     axes[0, 1].legend(title="least", loc="upper right", handlelength=1.2)
     motions = (simulate(diagonals()), point_to_point.joint_space(DIAGONALS))
     for ax, motion in zip(axes[1], motions, strict=True):
-        plane(ax)
+        targets(ax)
         for planned, hand in zip(motion.planned, motion.hand, strict=True):
             paths(ax, planned, hand)
     return figure
@@ -343,16 +327,13 @@ def orders_and_spaces() -> Figure:
 
 def limits() -> Figure:
     """Draw a repetitive movement, and torques at the limit and beyond."""
-    figure, axes = sheet(2, 2, 8.0)
+    figure, axes = sheet("limits")
     (repetitive, both), torques = axes
     motion = simulate(point_to_point.swings())
     cycles = np.linspace(3.0, 5.0, 201)
     speed = motion.speed()[0] * (point_to_point.SWING / point_to_point.LENGTHS[0])
     repetitive.plot(motion.time / point_to_point.SWING, speed, **MODEL, label="least jerk, arm")
     repetitive.plot(cycles, np.pi / 2 * np.abs(np.sin(np.pi * cycles)), label="sinusoid", **ARM)
-    repetitive.set(
-        xlabel="half cycles", ylabel="speed / mean speed", xlim=(0, point_to_point.SWINGS), ylim=(0, 2.5)
-    )
     repetitive.legend(loc="upper right", ncols=1)
     fastest = point_to_point.torque_limited()
     for ax, factor, dashes in zip(torques, (1.0, point_to_point.HURRY), ("-", (0, (2, 1))), strict=True):
@@ -363,10 +344,8 @@ def limits() -> Figure:
             ax.plot(1e3 * motion.time[:-1], motion.torque[0, :, joint], color=colour, label=name)
             for sign in (-1, 1):
                 ax.axhline(sign * limit, color=colour, linewidth=0.6, linestyle=":")
-        ax.set(xlabel="$t$ [ms]", xlim=(0, 250), ylim=(-75, 120))
-    torques[0].set_ylabel("torque [N m]")
     torques[0].legend(loc="upper right", handlelength=1.2)
-    plane(both, names=("T3", "T6"))
+    targets(both, names=("T3", "T6"))
     both.annotate("at the\nlimit", (-16.0, 38.0), ha="right", fontsize=6.0)
     both.annotate(f"in {point_to_point.HURRY} of\nthe time", (-4.0, 46.0), fontsize=6.0)
     return figure
@@ -381,12 +360,12 @@ NOW: dict[str, Any] = {"color": THIRD, "linewidth": 0.8}  # Style of the moment 
 def paths_and_speeds() -> Figure:
     """Draw hand paths and speeds for four moments of revision."""
     moments = double_step.MOMENTS
-    figure, axes = sheet(len(moments), 2, 12.0, width_ratios=(1.25, 1.0), sharex="col", sharey="col")
+    figure, axes = sheet("double_step", width_ratios=(1.25, 1.0), sharex="col", sharey="col")
     for (left, right), moment in zip(axes, moments, strict=True):
         movement = double_step.double_step(moment)
         motion = double_step.simulate_double(movement)
         time = np.linspace(0.0, movement.arrival, 601)
-        plane(left, names=double_step.NAMES)
+        targets(left, names=double_step.NAMES)
         path(left, movement.planned(time), **MODEL)
         path(left, motion.hand[1], **ARM)
         path(left, movement.superposed(time), **SUM)
@@ -400,11 +379,6 @@ def paths_and_speeds() -> Figure:
             label = None if begins else "its parts"
             right.plot(begins + own, primitives.speed(each, own), label=label, **PART)
         right.axvline(moment, **NOW)
-        left.set(xlim=(-36.0, 13.0), ylim=(36.0, 63.0), yticks=[40, 50, 60], xlabel="")
-        right.set(xlim=(0.0, 1.05), xticks=[0.0, 0.5, 1.0], ylim=(0.0, 1.2), yticks=[0.0, 0.5, 1.0])
-        right.set_ylabel("speed [m/s]")
-    axes[-1, 0].set_xlabel("$x$ [cm]")
-    axes[-1, 1].set_xlabel("$t$ [s]")
     lines, names = axes[0, 1].get_legend_handles_labels()
     figure.legend(lines, names, loc="outside upper center", ncols=4, handlelength=1.8, columnspacing=1.4)
     return figure
@@ -412,7 +386,7 @@ def paths_and_speeds() -> Figure:
 
 def comparison() -> Figure:
     """Draw the cost of the sum and its distance from the plan against the moment of revision."""
-    figure, axes = sheet(2, 2, 8.4)
+    figure, axes = sheet("double_step_jerk")
     (jerk, cost), (distance, peaks) = axes
     movement = double_step.double_step(0.2)
     time = np.linspace(0.0, movement.arrival, 1_801)
@@ -420,9 +394,6 @@ def comparison() -> Figure:
     jerk.plot(time, movement.superposed(time, 3)[:, 0], **SUM, label="sum")
     jerk.axvline(movement.moment, **NOW)
     zero(jerk)
-    jerk.set(
-        xlabel="$t$ [s]", ylabel="jerk along $x$ [m/s$^3$]", xlim=(0.0, movement.arrival), ylim=(-80.0, 125.0)
-    )
     jerk.legend(loc="upper right", handlelength=1.4)
     usual = double_step.STEP_DURATION
     moments = np.linspace(0.005, usual - 0.02, 60)
@@ -437,11 +408,6 @@ def comparison() -> Figure:
                 peaks.plot(moments, [double_step.peak_speed(each, way) for each in every], **line, label=name)
             peaks.axhline(every[0].first.peak(1), color=SECOND, linewidth=0.8, linestyle=":", label="no jump")
     cost.axhline(1.0, color="0.6", linewidth=0.6, linestyle=":", zorder=0)
-    cost.set(ylabel="jerk cost, sum / plan", ylim=(0.0, 14.0), yticks=[1, 5, 10])
     cost.legend(title="second movement", loc="upper right", handlelength=1.2)
-    distance.set(ylabel="greatest distance [cm]", ylim=(0.0, 15.0), yticks=[0, 5, 10, 15])
-    peaks.set(ylabel="peak speed [m/s]", ylim=(0.6, 1.2))
     peaks.legend(loc="lower right", handlelength=1.2)
-    for ax in (cost, distance, peaks):
-        ax.set(xlabel="revised at [s]", xlim=(0.0, usual))
     return figure

@@ -16,8 +16,7 @@ from viapoint.envs.scenes.scene import resting
 from viapoint.primitives import speed_valleys
 from viapoint.training import GeometrySearch, load_agent
 from viapoint.training.checks import DEFAULT_ENV
-from viapoint.training.paper import movements
-from viapoint.training.paper.claim import Claim, Range, at_least, at_most, near
+from viapoint.training.paper import Claim, claim, movements
 from viapoint.training.paper.movements import PLANE, TARGETS, Profile, SimulatedMovements, simulate
 from viapoint.training.paper.one_via import slow_and_fast
 from viapoint.training.planning.baselines import Method, agent_method
@@ -26,6 +25,19 @@ from viapoint.training.rollout import SceneSimulation
 LENGTHS = (0.15, 0.2, 0.25)  # Lengths of the rows of lights, [m]; the paper's were up to 25 cm
 RADII = (0.008, 0.02)  # Half widths of the rows of lights, [m]
 SHIFTS = ((0.0, 0.0), (-0.05, 0.02), (0.05, -0.02))  # Shifts along and across the line, [m]
+
+# Numbers of the claims, from the features of the movements
+NUMBERS: dict[str, Callable[[pd.DataFrame], Any]] = {
+    "bends": lambda f: 100 * f.bend.notna().mean(),
+    "valleys around lights": lambda f: 100 * f.valley.notna().mean(),
+    "agreement": lambda f: 100 * f.agrees.mean(),
+    "valley and bend": lambda f: (f.valley - f.bend).abs().median(),
+    "isochrony": lambda f: (f.bend - 0.5).abs().median(),
+    "mean residual": lambda f: f.residual.mean(),
+    "spread of residuals": lambda f: f.residual.std(ddof=0),
+    "trend of residuals": lambda f: f.along.cov(f.residual) / f.along.var(),
+    "match": lambda f: 100 * f.apart.median(),
+}
 
 
 class ObstacleMovements(NamedTuple):
@@ -110,32 +122,9 @@ def obstacle_claims(avoidance: ObstacleMovements) -> list[Claim]:
     worst, number = avoidance.motion.worst, len(arm)
     apart, arm_apart, scaled = slow_and_fast(avoidance.plan.trajectory(), 101)
     who = f"{avoidance.name}, {number} movements"
-
-    def claim(text: str, paper: str, value: Callable[..., float], expected: Range, unit: str = "") -> Claim:
-        numbers = (value(model), expected), (value(arm), expected)
-        return Claim(12, f"{text} ({who})", "8", paper, *numbers, worst, unit)
-
-    return [
-        Claim(12, f"Around rows of lights without contact, of {avoidance.n_scenes} scenes ({avoidance.name})", "8",
-              arm=(100.0 * number / avoidance.n_scenes, at_least(90.0)), deviation=worst, unit="%"),
-        claim("Movements with a curvature peak inside", "all", lambda f: 100 * f.bend.notna().mean(),
-              at_least(50.0), "%"),
-        claim("Movements with a speed valley: not all", "all", lambda f: 100 * f.valley.notna().mean(),
-              at_least(10.0), "%"),
-        claim("A valley exactly where the model through the point of greatest curvature has one", "-",
-              lambda f: 100 * f.agrees.mean(), at_least(90.0), "%"),
-        claim("Valley and curvature peak: median distance in time / t_f, where there are both", "at the same time",
-              lambda f: (f.valley - f.bend).abs().median(), at_most(0.05)),
-        claim("Isochrony: median of |t1/(t1+t2) - .5| at the curvature peak", "roughly .5",
-              lambda f: (f.bend - 0.5).abs().median(), at_most(0.1)),
-        claim("t1/(t1+t2) minus the model's through the point of greatest curvature: mean", "-.004",
-              lambda f: f.residual.mean(), near(0.0, 0.02)),
-        claim("The same: standard deviation", ".02", lambda f: f.residual.std(ddof=0), at_most(0.04)),
-        claim("The same: slope over d1/(d1+d2); it has a trend, in the model as on the arm", "no trend",
-              lambda f: f.along.cov(f.residual) / f.along.var(), at_least(0.005)),
-        claim("Distance from the model through the point of greatest curvature / distance of the targets: median",
-              "close match", lambda f: 100 * f.apart.median(), at_most(5.0), "%"),
-        Claim(12, f"Time scaling: every movement again in 1.1 s and .85 s: greatest distance of the paths ({who})",
-              "8, 11", "the same path", (apart, at_most(1e-9)), (arm_apart, at_most(1.0)),
-              max(each.worst for each in scaled), "mm"),
-    ]  # fmt: skip
+    share = 100.0 * number / avoidance.n_scenes
+    claims = [claim("contacts", None, share, worst, number=avoidance.n_scenes, name=avoidance.name)]
+    for key, value in NUMBERS.items():
+        claims.append(claim(key, value(model), value(arm), worst, who=who))
+    scaled_worst = max(each.worst for each in scaled)
+    return [*claims, claim("lights scaled", apart, arm_apart, scaled_worst, who=who)]

@@ -15,8 +15,7 @@ from sympy.abc import tau as tau1
 
 from viapoint.envs.common.arrays import Float
 from viapoint.primitives import Trajectory, speed_valleys
-from viapoint.training.paper import movements
-from viapoint.training.paper.claim import Claim, at_least, at_most, near
+from viapoint.training.paper import Claim, claim, movements
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, curved, passage_share, simulate
 
 
@@ -78,17 +77,13 @@ def passage_claims() -> list[Claim]:
     motion = simulate(movement)
     passed = 1e3 * np.linalg.norm(motion.at(np.array([share]))[0, 0] - waypoints[1])
     (arm_share,) = _closest_approach(motion, waypoints[None, 1])
+    words = {"along": EXAMPLE[0], "height": -EXAMPLE[1]}
     return [
-        Claim(4, f"Eq. C16 has one root in (0, 1): vias with another count, of {N_VIAS} (exact arithmetic)", "App. C",
-              "only one acceptable root", (wrong, near(0.0, 0.0))),
-        Claim(4, "Passage time from the exact root against the library's, the same vias: greatest difference",
-              "App. C", model=(difference, at_most(1e-12))),
-        Claim(4, "Eqs. 4 and 5, misprints put right, give the same movement (arm: distance from the via-point at t1)",
-              "1B", "Eqs. 4, 5, C12 to C15", (formula, at_most(1e-9)), (passed, at_most(1.0)), motion.worst, "mm"),
-        Claim(4, f"t1/t_f of the movement of Fig. 1B, d1/(d1+d2) = {EXAMPLE[0]}, d3/(d1+d2) = {-EXAMPLE[1]} (arm: when "
-              "nearest to the via-point)", "1B", "free, from Eq. C16",
-              (share, near(root, 1e-12)), (arm_share, near(share, 0.01)), motion.worst),
-    ]  # fmt: skip
+        claim("one root", wrong, n_vias=N_VIAS),
+        claim("exact root", difference),
+        claim("closed form", formula, passed, motion.worst),
+        claim("passage time", share, arm_share, motion.worst, expected=root, **words),
+    ]
 
 
 def _count_and_compare() -> tuple[int, float]:
@@ -149,29 +144,22 @@ def valley_claims() -> list[Claim]:
     family, worst = features(*map(np.ravel, np.meshgrid(ALONGS, HEIGHTS)))
     late = family.late.abs().groupby(family.who).agg(lambda each: each.max(skipna=False))
     return [
-        Claim(5, "d1 = d2: time from the speed valley to the curvature peak / t_f", "1B", "at the same time",
-              (model_even, at_most(1e-6)), (arm_even, at_most(0.01)), even_worst),
-        Claim(5, "d1 = .28125, d3 = .5 of d1+d2: the same; it is not zero, the paper's statement holds nearly", "1B",
-              "at the same time", (model_skewed, near(0.01073, 2e-5)), (arm_skewed, near(0.01073, 0.01)),
-              skewed_worst),
-        Claim(5, f"The same, greatest of {len(family) // 2} movements, d1/(d1+d2) .25 to .75, d3/(d1+d2) .42 to .54",
-              "5-7", "at the same time", (late.model, at_most(0.03)), (late.arm, at_most(0.04)), worst),
-        _threshold_claim(0.5, "; exact: 9/32 = .28125", 9.0 / 32.0, 1e-6),
-        _threshold_claim(0.3, "", 0.38115, 1e-4),
-    ]  # fmt: skip
+        claim("even valley", model_even, arm_even, even_worst),
+        claim("skewed valley", model_skewed, arm_skewed, skewed_worst),
+        claim("valleys", late.model, late.arm, worst, number=len(family) // 2),
+        _threshold_claim(0.5),
+        _threshold_claim(0.3),
+    ]
 
 
-def _threshold_claim(along: float, exact: str, expected: float, tolerance: float) -> Claim:
+def _threshold_claim(along: float) -> Claim:
     def arm_valleys(height: float) -> int:
         (profile,) = movements.arm_profiles(simulate(curved(*ENDS, along, -height)))
         return int(np.isfinite(profile.valley[0]))
 
     arm = _first_height(arm_valleys, precision=5e-5)
-    return Claim(
-        5, f"Not every curved movement has a valley: for d1/(d1+d2) = {along} only if d3/(d1+d2) exceeds", "1B",
-        f"two peaks and a valley{exact}", (valley_threshold(along), near(expected, tolerance)),
-        (arm, near(expected, 0.01)), simulate(curved(*ENDS, along, -arm)).worst,
-    )  # fmt: skip
+    worst = simulate(curved(*ENDS, along, -arm)).worst
+    return claim(f"threshold {along}", valley_threshold(along), arm, worst)
 
 
 def valley_threshold(along: float) -> float:
@@ -191,14 +179,10 @@ def place_claims() -> list[Claim]:
     steps = family.groupby(["who", "along"])[["depth", "curvature"]].diff().groupby(family.who)
     deeper, bent = -steps.depth.max(), steps.curvature.min()
     return [
-        Claim(6, "Longer side has the higher speed peak: ratio of the peaks, least of "
-              f"{len(ALONGS) * len(HEIGHTS)} vias", "6", "higher",
-              (lead.model, at_least(1.0)), (lead.arm, at_least(1.0)), worst),
-        Claim(6, "Larger d3, deeper valley: valley / peaks falls by at least, per step of .03 in d3/(d1+d2)", "5",
-              "deeper", (deeper.model, at_least(0.001)), (deeper.arm, at_least(0.001)), worst),
-        Claim(6, "Larger d3, higher curvature peak: it rises by at least, per step of .03 in d3/(d1+d2)", "5",
-              "higher", (bent.model, at_least(0.1)), (bent.arm, at_least(0.1)), worst, "1/m"),
-    ]  # fmt: skip
+        claim("longer side", lead.model, lead.arm, worst, number=len(ALONGS) * len(HEIGHTS)),
+        claim("deeper valley", deeper.model, deeper.arm, worst),
+        claim("higher bend", bent.model, bent.arm, worst),
+    ]
 
 
 SHARES = np.linspace(0.1, 0.9, 17)  # d1 / (d1 + d2) on the abscissa of Fig. 10A.
@@ -224,21 +208,13 @@ def isochrony_claims() -> list[Claim]:
     shares = passage_share(curved(*ENDS, SHARES, HEIGHT))
     arm, worst = arm_shares(SHARES, HEIGHT)
     spread = np.ptp(passage_share(curved(*ENDS, 0.2, [0.1, 0.6])))
-    text = "d3/(d1+d2) from .3 to .55"
     return [
-        Claim(7, f"d1 = d2: t1/(t1+t2) is .5 for every d3: greatest difference, {text}", "10C", ".5",
-              (np.abs(half - 0.5).max(), at_most(1e-12)), (np.abs(arm_half - 0.5).max(), at_most(0.01)), half_worst),
-        Claim(7, f"t1/(t1+t2) is roughly .5 for d1/(d1+d2) from .1 to .9, d3/(d1+d2) = {-HEIGHT}: greatest difference "
-              "from .5", "10A", "roughly .5; model and subjects differ by -.004 ± .02",
-              (np.abs(shares - 0.5).max(), at_most(0.1)), (np.abs(arm - 0.5).max(), at_most(0.11)), worst),
-        Claim(7, "Simulated arm against the model over the same via-points: greatest difference of t1/(t1+t2)", "10B",
-              "-.004 ± .02", arm=(np.abs(arm - shares).max(), at_most(0.02)), deviation=worst),
-        Claim(7, f"d1/(d1+d2) = {TYPICAL}, the paper's typical case: t1/(t1+t2) depends on d3 too little to see: its "
-              f"change, {text}", "10C", "independent of d3; measured scatter .017", (np.ptp(typical), at_most(0.017)),
-              (np.ptp(arm_typical), at_most(0.017)), typical_worst),
-        Claim(7, "d1/(d1+d2) = .2: the independence of d3 is only approximate: t1/(t1+t2) changes by, d3/(d1+d2) from "
-              ".1 to .6", "10C", "independent of d3", (spread, near(0.109, 0.001))),
-    ]  # fmt: skip
+        claim("half", np.abs(half - 0.5).max(), np.abs(arm_half - 0.5).max(), half_worst),
+        claim("roughly half", np.abs(shares - 0.5).max(), np.abs(arm - 0.5).max(), worst, height=-HEIGHT),
+        claim("arm and model", None, np.abs(arm - shares).max(), worst),
+        claim("typical", np.ptp(typical), np.ptp(arm_typical), typical_worst, along=TYPICAL),
+        claim("dependence", spread),
+    ]
 
 
 def scaling_claims() -> list[Claim]:
@@ -249,11 +225,9 @@ def scaling_claims() -> list[Claim]:
     slow_peak, fast_peak = (motion.speed().max() for motion in motions)
     worst = max(motion.worst for motion in motions)
     return [
-        Claim(8, "The same three points in 1.1 s and .85 s: greatest distance of the paths", "11", "the same path",
-              (apart, at_most(1e-9)), (arm_apart, at_most(1.0)), worst, "mm"),
-        Claim(8, "Their speeds scale with the durations: ratio of the peaks", "11", "1.1/.85 = 1.294",
-              (ratio, near(SLOW / FAST, 1e-9)), (fast_peak / slow_peak, near(SLOW / FAST, 0.01)), worst),
-    ]  # fmt: skip
+        claim("same path", apart, arm_apart, worst),
+        claim("peak ratio", ratio, fast_peak / slow_peak, worst, expected=SLOW / FAST),
+    ]
 
 
 def slow_and_fast(movement: Trajectory, count: int) -> tuple[float, float, list[SimulatedMovements]]:

@@ -13,8 +13,7 @@ from viapoint import primitives
 from viapoint.envs.common.arrays import Float
 from viapoint.envs.plans import Motion
 from viapoint.primitives import FREE, Trajectory, minimum_duration, point_to_point, through
-from viapoint.training.paper import movements
-from viapoint.training.paper.claim import Claim, at_least, at_most, near
+from viapoint.training.paper import TABLE, Claim, claim, movements
 from viapoint.training.paper.movements import TARGETS, SimulatedMovements, minimum_jerk_through, simulate
 
 # Ends of the straight movements of Figs. 3 and 4, shape (3, 2, 2), [m].
@@ -37,10 +36,10 @@ def relative_peak(speed: Float, peak: float) -> float:
 
 
 def bow(position: Float) -> Float:
-    """Return the greatest distance of paths (..., T, 2) from their chord, relative to its length, shape (...,)."""
+    """Return the greatest distance of paths (..., T, 2) from their chord, [%] of its length, shape (...,)."""
     points = np.broadcast_arrays(position[..., :1, :], position, position[..., -1:, :])
     _, height = movements.construction(np.stack(points, axis=-2))
-    return np.asarray(height.max(axis=-1))
+    return np.asarray(100 * height.max(axis=-1))
 
 
 def point_to_point_claims() -> list[Claim]:
@@ -55,17 +54,11 @@ def point_to_point_claims() -> list[Claim]:
     skew, arm_skew = (100 * np.abs(each - each[:, ::-1]).max() / each.max() for each in (speed, arm_speed))
     worst = motion.worst
     return [
-        Claim(1, "Path is straight: greatest distance from the chord / length", "1A, 3", "approximately straight",
-              (100 * bow(movement.sample(401, 0)[0]).max(), at_most(1e-9)),
-              (100 * bow(motion.hand).max(), at_most(0.2)), worst, unit="%"),
-        Claim(1, "Peak speed C in V_max = C A/t_f", "1A, 3", "1.875; measured 1.805 ± 0.153",
-              (peak, near(1.875, 1e-9)), (arm_peak, near(1.875, 0.01)), worst),
-        Claim(1, "Distance of C from the subjects' mean, in their standard deviations", "3",
-              "(1.875 - 1.805)/0.153 = 0.458", ((peak - 1.805) / 0.153, at_most(1.0)),
-              ((arm_peak - 1.805) / 0.153, at_most(1.0)), worst),
-        Claim(1, "Speed is bell-shaped and symmetric: difference from its mirror image / peak", "1A, 3",
-              "bell-shaped, single-peaked", (skew, at_most(1e-9)), (arm_skew, at_most(2.0)), worst, unit="%"),
-    ]  # fmt: skip
+        claim("straight", bow(movement.sample(401, 0)[0]).max(), bow(motion.hand).max(), worst),
+        claim("peak", peak, arm_peak, worst),
+        claim("subjects", (peak - 1.805) / 0.153, (arm_peak - 1.805) / 0.153, worst),
+        claim("symmetry", skew, arm_skew, worst),
+    ]
 
 
 def invariance_claims() -> list[Claim]:
@@ -73,11 +66,7 @@ def invariance_claims() -> list[Claim]:
     generator = np.random.default_rng(0)
     model = max(_invariance(generator, 67, vias) for vias in (1, 2, 3))
     shapes, worst = _placed_shapes()
-    return [
-        Claim(2, "Translation, rotation, amplitude and time scaling of 201 random movements commute with planning: "
-              "greatest difference / amplitude (arm: one shape in five places, sizes, times)", "1", "invariant",
-              (100 * model, at_most(1e-9)), (100 * np.abs(shapes - shapes[0]).max(), at_most(0.5)), worst, unit="%"),
-    ]  # fmt: skip
+    return [claim("invariance", 100 * model, 100 * np.abs(shapes - shapes[0]).max(), worst)]
 
 
 def _invariance(generator: np.random.Generator, count: int, vias: int) -> float:
@@ -125,15 +114,10 @@ def joint_claims() -> list[Claim]:
     torque, arm_torque = ((each.max(axis=0) / each.min(axis=0)).max() for each in peaks)
     worst = motion.deviation[[0, 2]].max()
     return [
-        Claim(3, "Hand speed profiles of T3-T6 and T2-T5, each / its peak: greatest difference", "4", "invariant",
-              (hand, at_most(1e-9)), (arm_hand, at_most(0.02)), worst),
-        Claim(3, "Joint velocity profiles of the same movements, each / its peak: greatest difference, of the joint "
-              "where it is smaller", "4", "not invariant",
-              (joints, at_least(0.1)), (arm_joints, at_least(0.1)), worst),
-        Claim(3, "Peak torque for one and the same hand movement in six places: greatest / least", "4",
-              "very different patterns of joint torques",
-              (torque, at_least(1.5)), (arm_torque, at_least(1.5)), placed.worst),
-    ]  # fmt: skip
+        claim("hand speeds", hand, arm_hand, worst),
+        claim("joint velocities", joints, arm_joints, worst),
+        claim("torques", torque, arm_torque, placed.worst),
+    ]
 
 
 def same_movement_elsewhere() -> tuple[Trajectory, SimulatedMovements]:
@@ -151,8 +135,6 @@ def _differences(profiles: Float) -> Float:
 
 # Minimised quantity and peak speed in units of A / t_f, by the order of the derivative
 PEAKS = {2: ("acceleration", 1.5), 3: ("jerk", 1.875), 4: ("snap", 2.1875)}
-# Acceleration at the onset: statement of the paper, and ranges for model and arm, by the order
-ONSETS = {2: ("not zero", near(6.0, 1e-9), near(6.0, 1.0)), 3: ("zero", at_most(1e-9), at_most(2.0))}
 ONSET = 0.02  # Time in which the simulated arm builds up a jump of the acceleration, [s]
 
 
@@ -170,25 +152,18 @@ def joint_space(ends: Float) -> SimulatedMovements:
 def alternative_claims() -> list[Claim]:
     """Return the claims of row 9."""
     peaks, onsets = [], []
-    for order, (name, peak) in PEAKS.items():
+    for order, (_, peak) in PEAKS.items():
         movement = diagonals(order)
         motion = simulate(movement)
         greatest = (movement.peak(1), motion.speed().max(axis=1))
         model, arm = (relative_peak(speed, peak) for speed in greatest)
-        peaks.append(
-            Claim(9, f"Minimum {name}: peak speed t_f/A", "text", "jerk 1.875; measured 1.805 ± 0.153",
-                  (model, near(peak, 1e-9)), (arm, near(peak, 0.02)), motion.worst)
-        )  # fmt: skip
-        if order in ONSETS:
-            paper, expected, arm_expected = ONSETS[order]
+        peaks.append(claim(f"peak of order {order}", model, arm, motion.worst))
+        key = f"onset of order {order}"
+        if key in TABLE:
             scale = DURATION**2 / LENGTHS
             first = np.linalg.norm(movement(0.0, 2), axis=-1) * scale
-            speed = motion.speed()[:, round(ONSET / motion.time[1])]
-            onsets.append(
-                Claim(9, f"Minimum {name}: acceleration t_f²/A at the onset (arm: mean of {1e3 * ONSET:.0f} ms)",
-                      "text", paper, (first.max(), expected), ((speed / ONSET * scale).max(), arm_expected),
-                      motion.worst)
-            )  # fmt: skip
+            mean = motion.speed()[:, round(ONSET / motion.time[1])] / ONSET * scale
+            onsets.append(claim(key, first.max(), mean.max(), motion.worst, ms=1e3 * ONSET))
     return [*peaks, *onsets, *_joint_space_claims()]
 
 
@@ -196,18 +171,13 @@ def _joint_space_claims() -> list[Claim]:
     of_joints = joint_space(DIAGONALS)
     of_hand = simulate(diagonals())
     placed = joint_space(same_movement_elsewhere()[0].sample(2, 0)[0])
-    bows, arm_bows = bow(placed.planned), bow(placed.hand)
+    bows = bow(placed.planned)
+    arm_bows = bow(placed.hand)
     return [
-        Claim(9, "Minimum jerk of the joints: hand path is curved: bow / length", "text",
-              "incompatible with straight hand paths", (100 * bow(of_joints.planned).max(), at_least(4.0)),
-              (100 * bow(of_joints.hand).max(), at_least(4.0)), of_joints.worst, "%"),
-        Claim(9, "Minimum jerk of the hand: the same", "text", "straight",
-              (100 * bow(of_hand.planned).max(), at_most(1e-9)), (100 * bow(of_hand.hand).max(), at_most(0.2)),
-              of_hand.worst, "%"),
-        Claim(9, "Minimum jerk of the joints: the bow changes with place: greatest / least for one hand movement in "
-              "six places", "text", "invariances in joint coordinates only", (bows.max() / bows.min(), at_least(1.3)),
-              (arm_bows.max() / arm_bows.min(), at_least(1.3)), placed.worst),
-    ]  # fmt: skip
+        claim("joint jerk", bow(of_joints.planned).max(), bow(of_joints.hand).max(), of_joints.worst),
+        claim("hand jerk", bow(of_hand.planned).max(), bow(of_hand.hand).max(), of_hand.worst),
+        claim("bow and place", bows.max() / bows.min(), arm_bows.max() / arm_bows.min(), placed.worst),
+    ]
 
 
 TOUR = ("T3", "T4", "T5", "T6", "T1")  # Start, three via-points and goal
@@ -233,13 +203,10 @@ def _tour_claims() -> list[Claim]:
     planned = np.abs(movement(knots[1:-1]) - points[1:-1]).max()
     equal = through(points, np.full(len(points) - 1, 0.4))
     return [
-        Claim(10, "Three via-points, free passage times: dJ/dt_k t_f/J, greatest", "App. C",
-              "more via points; Eq. C10", (np.abs(slope).max() * knots[-1] / movement.cost(), at_most(1e-6))),
-        Claim(10, "Its jerk cost / that with equal segment durations",
-              model=(movement.cost() / equal.cost(), at_most(1.0))),
-        Claim(10, "Distance from its via-points at their times, greatest", model=(1e3 * planned, at_most(1e-9)),
-              arm=(1e3 * missed, at_most(1.0)), deviation=motion.worst, unit="mm"),
-    ]  # fmt: skip
+        claim("tour", np.abs(slope).max() * knots[-1] / movement.cost()),
+        claim("tour cost", movement.cost() / equal.cost()),
+        claim("tour distance", 1e3 * planned, 1e3 * missed, motion.worst),
+    ]
 
 
 def swings() -> Trajectory:
@@ -255,16 +222,12 @@ def _repetitive_claims() -> list[Claim]:
     hit = point_to_point([0.0], [1.0], 1.0, goal_velocity=FREE, goal_acceleration=FREE)
     motion = simulate(swings())
     middle = (motion.time >= SWING * (SWINGS // 2)) & (motion.time <= SWING * (SWINGS // 2 + 1))
+    fastest = (motion.speed()[0] * (SWING / LENGTHS[0]))[middle].max()
     return [
-        Claim(10, "Repetitive movement, accelerations free: peak speed t_f/A per half cycle (a sinusoid has 1.571; "
-              "from rest to rest 1.875)", "text", "an excellent fit to repetitive movements",
-              (swing.peak(1), near(1.5625, 1e-9)),
-              ((motion.speed()[0] * (SWING / LENGTHS[0]))[middle].max(), near(1.5625, 0.02)), motion.worst),
-        Claim(10, "Its jerk cost / that from rest to rest", "text",
-              model=(swing.cost() / rest.cost(), near(1.0 / 6.0, 1e-9))),
-        Claim(10, "Hitting: final velocity and acceleration free: final speed t_f/A",
-              model=(hit(1.0, 1)[0], near(2.5, 1e-9))),
-    ]  # fmt: skip
+        claim("repetitive", swing.peak(1), fastest, motion.worst),
+        claim("repetitive cost", swing.cost() / rest.cost()),
+        claim("hitting", hit(1.0, 1)[0]),
+    ]
 
 
 def torque_limited() -> Trajectory:
@@ -284,15 +247,11 @@ def _performance_limited_claims() -> list[Claim]:
     fastest = torque_limited()
     swift, motion, late = map(simulate, (brisk, fastest, fastest.stretched(HURRY * fastest.duration)))
     used = (np.abs(motion.torque) / movements.ADULT.torque_limit).max()
+    peaks = brisk.peak(1) / SPEED_LIMIT, swift.speed().max() / SPEED_LIMIT
     return [
-        Claim(10, f"Curved movement in the least time at which the speed keeps {SPEED_LIMIT} m/s "
-              f"({float(brisk.duration):.3f} s): peak speed / limit", "text", "performance-limited movements",
-              (brisk.peak(1) / SPEED_LIMIT, near(1.0, 1e-9)), (swift.speed().max() / SPEED_LIMIT, near(1.0, 0.02)),
-              swift.worst),
-        Claim(10, f"T3-T6 in the least time within the torque limits ({float(fastest.duration):.3f} s): peak torque / "
-              "limit", "text", "performance-limited movements", (_relative_torque(fastest), near(1.0, 1e-6)),
-              (used, near(0.95, 0.05)), motion.worst),
-        Claim(10, f"In {HURRY} of that time the torques saturate: deviation from the plan / that at the limit", "text",
-              "planning and execution cannot be clearly separated",
-              arm=(late.worst / motion.worst, at_least(2.0)), deviation=late.worst),
-    ]  # fmt: skip
+        claim("speed limit", *peaks, swift.worst, limit=SPEED_LIMIT, duration=float(brisk.duration)),
+        claim(
+            "torque limit", _relative_torque(fastest), used, motion.worst, duration=float(fastest.duration)
+        ),
+        claim("saturation", None, late.worst / motion.worst, late.worst, hurry=HURRY),
+    ]

@@ -18,9 +18,15 @@ from matplotlib.figure import Figure
 from viapoint.training.configs import PaperConfig
 from viapoint.training.evaluation import one_thread
 from viapoint.training.files import MARK, check_ours, versions, write_bytes, write_figure, write_json
-from viapoint.training.paper import double_step, figures, obstacles, one_via, point_to_point
-from viapoint.training.paper.claim import Claim, Number
-from viapoint.training.paper.one_via import ENDS, FAST, SLOW, THREE_POINTS
+from viapoint.training.paper import (
+    Claim,
+    Number,
+    double_step,
+    figures,
+    obstacles,
+    one_via,
+    point_to_point,
+)
 from viapoint.training.plots import STYLE
 from viapoint.training.report import progress_bar
 
@@ -42,45 +48,20 @@ ROWS: dict[int, tuple[str, Callable[..., list[Claim]]]] = {
 }
 
 
-# Captions and functions of the figures by their file names, in the order of the paper
-DRAWINGS: dict[str, tuple[str, Callable[..., Figure]]] = {
-    "fig01_model": ("The model (Fig. 1). A: straight movement, speed relative to its peak. B: through a "
-        "via-point; path with d1, d2, d3, speed, curvature (valley of the speed dotted) and velocities.",
-        figures.model),
-    "fig03_straight": ("Straight movements (Fig. 3): path, speed and accelerations. Wide: model; dashed: "
-        "simulated arm, here and in the following figures.", figures.straight_movements),
-    "fig04_joints": ("Joint angles, joint velocities and torques of two straight movements (Fig. 4): what is "
-        "the same for the hand is not for the joints.", figures.joints),
-    "fig05_height": ("A larger d3 gives a deeper valley and a higher curvature peak (Fig. 5); d1 = d2; lengths "
-        "relative to d1 + d2. Dotted: passage of the via-point.",
-        partial(figures.pair, (*ENDS, 0.5, -0.52), (*ENDS, 0.5, -0.35), ("$d_3$ = 0.52", "$d_3$ = 0.35"))),
-    "fig06_place": ("The longer side has the higher speed peak (Fig. 6).",
-        partial(figures.pair, (*ENDS, 0.3, -0.45), (*ENDS, 0.7, -0.45), ("$d_1$ = 0.3", "$d_1$ = 0.7"))),
-    "fig07_turned": ("The same in other directions (Fig. 7).",
-        partial(figures.pair, ("T2", "T5", 0.35, 0.5), ("T3", "T6", 0.65, -0.5),
-            ("$T_2$ to $T_5$", "$T_3$ to $T_6$"))),
-    "fig08_obstacles": ("Around a row of lights (Fig. 8): the movement with the deepest valley (A) and a "
-        "median one (B), each with the model through its point of greatest curvature.",
-        figures.around_lights),
-    "fig10_isochrony": ("Passage times (Fig. 10). A: against d1, for three d3; C: against d3, for three d1. "
-        "B, D: difference from the model. Grey squares: movements around rows of lights.",
-        figures.isochrony),
-    "fig11_scaling": ("The same three points in 1.1 s and 0.85 s (Fig. 11).",
-        partial(figures.pair, (*ENDS, *THREE_POINTS, SLOW), (*ENDS, *THREE_POINTS, FAST),
-            (f"{SLOW} s", f"{FAST} s"))),
-    "valleys": ("Where there is a speed valley at all (A), and how much later the curvature has its peak (B; d1 < d2).",
-        figures.valleys),
-    "alternatives": ("Least acceleration, jerk and snap (A, B); least jerk of the hand (C) and of the joints "
-        "(D).", figures.orders_and_spaces),
-    "limits": ("A repetitive movement beside a sinusoid (A); T3 to T6 at the torque limit and faster (B), with "
-        "the torques of both (C, D; limits dotted).", figures.limits),
-    "double_step": ("The target jumps from T4 to T5 and the movement is revised (orange) 50, 100, 200 or 300 ms "
-        "after its start: by a second movement that is added, or by one new plan with the same arrival.",
-        figures.paths_and_speeds),
-    "double_step_jerk": ("Sum and plan compared. A: jerk, revised at 200 ms. B, C: jerk cost relative to the "
-        "plan's and greatest distance from it, for three durations of the second movement. D: peak speeds.",
-        figures.comparison),
-}  # fmt: skip
+# Functions of the figures by their file names
+DRAWINGS: dict[str, Callable[..., Figure]] = {
+    "fig01_model": figures.model,
+    "fig03_straight": figures.straight_movements,
+    "fig04_joints": figures.joints,
+    "fig08_obstacles": figures.around_lights,
+    "fig10_isochrony": figures.isochrony,
+    "valleys": figures.valleys,
+    "alternatives": figures.orders_and_spaces,
+    "limits": figures.limits,
+    "double_step": figures.paths_and_speeds,
+    "double_step_jerk": figures.comparison,
+    **{name: partial(figures.pair, name) for name in figures.PAIRS},
+}
 # Functions of them that take the movements around obstacles
 AROUND_LIGHTS = (obstacles.obstacle_claims, figures.around_lights, figures.isochrony)
 
@@ -96,10 +77,10 @@ def reproduce(out: Path, agent: Path | None) -> tuple[list[Claim], dict[Path, st
     for _, compute in progress_bar(iterable=ROWS.values(), desc="rows"):
         claims += result_of(compute)
     pictures = {}
-    for name, (caption, draw) in progress_bar(iterable=DRAWINGS.items(), desc="figures"):
+    for name, about in progress_bar(iterable=figures.FIGURES.items(), desc="figures"):
         with matplotlib.style.context(STYLE):
-            figure = result_of(draw)
-            pictures[write_figure(out / f"{name}.png", figure)] = caption
+            figure = result_of(DRAWINGS[name])
+            pictures[write_figure(out / f"{name}.png", figure)] = about["caption"]
             figure.set_layout_engine("none")  # the same layout for both files, computed once
             write_figure(out / f"{name}.svg", figure)
     return claims, pictures
