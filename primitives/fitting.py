@@ -61,6 +61,9 @@ _STEP = 1e-7
 _CONVERGED, _TINY = 1e-10, 1e-28
 # Residual, in sizes of the movement, below which a better fit is only rounding.
 _ROUNDING = 1e-7
+# Search for a movement in a long recording: number of parts; change from one to the next, relative to the greatest,
+# with which the hand moves; share of parts below which the others are cut off; fewest samples of which some are.
+_PARTS, _CHANGED, _MOSTLY, _FEWEST = 40, 0.1, 0.6, 200
 # Share of the integral of the squared speed of a reach, and the part of its duration in which it is reached.
 _ENERGY, _BEFORE = 0.01, 0.17
 
@@ -234,12 +237,19 @@ def _is_list(value: Any, axes: int = 2) -> bool:
 def _checked(time_name: str, time: Any, name: str, position: Any, fewest: int) -> _Recordings:
     """Return the movements of arrays (..., N) and (..., N, D), after all checks."""
     try:
-        _, (time, position) = as_floats(None, **{time_name: time, name: position})
+        # Clocks need more digits than positions may have.
+        _, (exact,) = as_floats(None, **{time_name: time})
+        _, (time, position) = as_floats(None, **{time_name: exact, name: position})
     except ValueError as error:
         advice = "; leave out samples that were not measured" if "finite" in str(error) else ""
         raise ValueError(f"{error}{advice}") from None
     batch = leading_shape(name, position, None, None)
     count = position.shape[-2]
+    if time.ndim and time.shape[-1] != count:
+        shapes = f"{tuple(time.shape)} and {tuple(position.shape)}"
+        raise ValueError(
+            f"{time_name} (..., N) and {name} (..., N, D) must have as many samples N, got {shapes}"
+        )
     batch = broadcast_batch(**{name: batch, time_name: leading_shape(time_name, time, count)})
     if count < fewest:
         most = (fewest - 5) // 2
@@ -250,7 +260,7 @@ def _checked(time_name: str, time: Any, name: str, position: Any, fewest: int) -
         )
     if 0 in batch:
         raise ValueError(f"{name} must hold one movement or more, got shape {tuple(position.shape)}")
-    times = flat_batch(np, to_numpy(time).astype(float), batch, 1)
+    times = flat_batch(np, to_numpy(exact).astype(float), batch, 1)
     places = flat_batch(np, to_numpy(position).astype(float), batch, 2)
     ascending = np.diff(times, prepend=-np.inf) > 0
     order = "must ascend: sort the samples, and keep one of equal times"
@@ -364,6 +374,26 @@ def _moving_part(time: Floats, position: Floats) -> tuple[float, float]:
     return max(first - beyond, -most), min(last + beyond, 1.0 + most)
 
 
+def _around_movement(position: Floats) -> slice:
+    """Return the samples from one length of a movement before it to one after it, of positions (N, D).
+
+    The movement is where the means of short parts of the recording change. In each step most of long rests is cut off.
+    """
+    kept = slice(0, len(position))
+    while kept.stop - kept.start >= _FEWEST:
+        parts = np.array_split(position[kept], _PARTS)
+        means = np.array([part.mean(axis=0) for part in parts])
+        edges = kept.start + np.cumsum([0, *map(len, parts)])
+        steps = np.linalg.norm(np.diff(means, axis=0), axis=-1)
+        moving = np.flatnonzero(steps >= _CHANGED * steps.max())
+        margin = moving[-1] - moving[0] + 2
+        first, last = max(moving[0] - margin, 0), min(moving[-1] + 2 + margin, _PARTS)
+        if last - first > _MOSTLY * _PARTS:
+            break
+        kept = slice(int(edges[first]), int(edges[last]))
+    return kept
+
+
 def _starts(time: Floats, position: Floats, n_via: int, free_ends: bool) -> Floats:
     """Return knots (S, K + 2) with passage times of a grid, those of least squares first."""
     grid = max(_GRID, n_via + 3)
@@ -382,18 +412,34 @@ def _fit(time: Floats, position: Floats, n_via: int, free_ends: bool) -> _Fit:
     centre = position.mean(axis=0)
     size = math.sqrt(np.square(position - centre).sum(axis=-1).mean())
     samples = (time - first) / length, (position - centre) / size
+    kept = _around_movement(position) if free_ends else slice(0, len(time))
+    if len(time) > kept.stop - kept.start:
+        # The movement is looked for without the rests around it, from where all samples count.
+        knots, *_ = _fit(time[kept], position[kept], n_via, free_ends)
+        start = _theta(((knots - first) / length)[None], free_ends)
+        theta, _ = _descend(start, *samples, free_ends, _STAGES[-1][1])
+        return _result(theta[0], time, position, free_ends)
     every = max(1, len(time) // _ENOUGH)
     some = samples[0][::every], samples[1][::every]
     theta = _theta(_starts(*some, n_via, free_ends), free_ends)
     for count, steps in _STAGES:
         theta, squares = _descend(theta[:count], *(samples if count == 1 else some), free_ends, steps)
         theta = theta[np.argsort(squares, kind="stable")]
-    knots = _knots(theta[0], free_ends)
-    basis = _basis(knots[None], samples[0])[0]
-    points = np.linalg.lstsq(basis, samples[1])[0]
-    residual = float(np.square(basis @ points - samples[1]).sum())
+    return _result(theta[0], time, position, free_ends)
+
+
+def _result(theta: Floats, time: Floats, position: Floats, free_ends: bool) -> _Fit:
+    """Return the movement of parameters (P,) with the waypoints of least squares, and how well it fits."""
+    first, length = time[0], time[-1] - time[0]
+    centre = position.mean(axis=0)
+    size = math.sqrt(np.square(position - centre).sum(axis=-1).mean())
+    knots = _knots(theta, free_ends)
+    basis = _basis(knots[None], (time - first) / length)[0]
+    scaled = (position - centre) / size
+    points = np.linalg.lstsq(basis, scaled)[0]
+    residual = float(np.square(basis @ points - scaled).sum())
     count = position.size
-    parameters = points.size + n_via + 2 * free_ends
+    parameters = points.size + len(knots) - 2 + 2 * free_ends
     variance = max(residual / count, _ROUNDING**2) * size**2
     r_squared = max(0.0, 1.0 - residual / len(time))
     noise = size * math.sqrt(residual / (count - parameters))
@@ -417,7 +463,7 @@ def _record(fits: list[_Fit], batch: tuple[int, ...], kind: Array) -> ViaPointFi
 
     r_squared, noise, bic = map(shaped, numbers)
     return ViaPointFit(
-        n_via=n_via.reshape(batch),
+        n_via=namespace_of(kind).asarray(n_via.reshape(batch)),
         via_points=shaped(np.where(exists[..., None], waypoints[:, 1:-1], np.nan)),
         passage_times=shaped(np.where(exists, knots[:, 1:-1], np.nan)),
         start=shaped(waypoints[:, 0]),

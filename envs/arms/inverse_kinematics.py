@@ -249,6 +249,12 @@ def unwound(arm: Arm, joints: Float, near: Float) -> Float:
     return np.where(arm.chain.sliding, joints, joints - TURN * turns)
 
 
+def nearest_goals(arm: Arm, goals: Float, start: Float) -> Float:
+    """Return goals in joint positions, shape (..., J), with continuous joints at the equivalent nearest to a start."""
+    endless = np.isin(arm.joint_names, arm.continuous)
+    return np.where(endless, unwound(arm, goals, start), goals)
+
+
 def _solutions(arm: Arm, position: Float, axes: Float | None, begin: Float, near: Float) -> list[Float]:
     """Return different configurations with the tool at a target, found from those to begin with, (N, J)."""
     found: list[Float] = []

@@ -51,6 +51,8 @@ LOOKED_AT, NEAR_LOOKED_AT = 16, 1000
 # least one, [m]
 NEAR, FINE = 0.03, 0.005
 STUCK = 100.0  # Damping beyond which a joint hardly moves: torque at full speed over the limit
+# Greatest range of a hinge, [rad], and length of an arm, [m], that are not taken for degrees or millimetres
+MOST_TURNS, LONGEST = 8.0 * np.pi, 20.0
 # Names of files that do not tell the arm; it gets the name of the model
 GENERIC_NAMES = ("arm", "model", "robot", "scene")
 MIN_JOINTS = 2  # Least number of joints
@@ -240,8 +242,9 @@ def _load(
     near = set(itertools.compress(pairs, np.median(looked_at, axis=0) < NEAR))
     apart = _apart(parsed, near, drawn)
     exclude |= dict.fromkeys(apart, never)
-    movable = itertools.compress(pairs, looked_at.max(axis=0) > 0.0)
-    home = _home(parsed, ranges, given["home"], [pair for pair in movable if pair not in exclude], notes)
+    movable = set(itertools.compress(pairs, looked_at.max(axis=0) > 0.0))
+    looked_after = [pair for pair in pairs if pair in movable and pair not in exclude]
+    home = _home(parsed, ranges, given["home"], looked_after, notes)
     origin = np.zeros(3) if given["origin"] is None else finite_array("origin", given["origin"], (3,))
     # Bodies that are near at home get smaller capsules, or are not compared, either.
     at_home = dict(zip(pairs, _distances(parsed, home, pairs).tolist(), strict=True))
@@ -249,6 +252,10 @@ def _load(
     exclude |= dict.fromkeys(_apart(parsed, close, drawn), never)
     touching = [pair for pair in pairs if pair not in exclude and at_home[pair] <= 0.0]
     exclude |= dict.fromkeys(touching, "in contact at home")
+    avoidable = [pair for pair in touching if pair in movable]
+    if given["home"] is not None and avoidable:
+        some = "; ".join(" and ".join(sorted(parsed.named(pair))) for pair in avoidable)
+        notes.append(f"{WARNING}in contact at the given home, and not compared in any plan: {some}")
     distances = {pair: away for pair, away in at_home.items() if pair not in exclude}
     tolerances = dict.fromkeys(parsed.geoms, given["tolerance"])
     for pair in near.difference(apart):
@@ -270,6 +277,7 @@ def _load(
         exclude={parsed.named(pair): reason for pair, reason in exclude.items()},
         touch=touch,
     )
+    _note_units(arm, notes)
     # Where masses are guesses, limits that do not hold them are no property of the arm, wherever it is.
     guessed = any(MASSES_GUESSED in note for note in notes)
     weighed = np.concatenate((home[None], drawn[: WEIGHED if guessed else 0]))
@@ -318,7 +326,11 @@ def _read(file: Any, packages: Packages, visual: bool = False) -> tuple[mujoco.M
     urdf = nothing._replace(text=text if is_text else "")
     if not is_text and not path.is_file():
         raise ValueError(f"there is no file {text!r}")
-    if not is_text and (path.suffix.lower() == ".urdf" or b"<robot" in path.read_bytes()[:4096]):
+    if is_text and _is_urdf(text):
+        raise ValueError(
+            "file must be the name of a URDF file, as its text does not tell where its meshes are"
+        )
+    if not is_text and (path.suffix.lower() == ".urdf" or _is_urdf(path.read_text(errors="replace"))):
         urdf = read_urdf(path, packages, visual)
     try:
         if urdf.text:
@@ -329,6 +341,11 @@ def _read(file: Any, packages: Packages, visual: bool = False) -> tuple[mujoco.M
         raise ValueError(f"MuJoCo cannot read {text!r:.60} as MJCF or URDF: {error}") from None
     named_after_model = is_text or path.stem.lower() in GENERIC_NAMES
     return spec, urdf.name or (spec.modelname if named_after_model else path.stem), urdf
+
+
+def _is_urdf(text: str) -> bool:
+    """Return True for a text with the first element of URDF files outside of comments."""
+    return bool(re.search(r"<robot[\s>]", re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)))
 
 
 def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
@@ -370,10 +387,8 @@ def _leave_out(spec: mujoco.MjSpec, fault: str) -> str:
         geoms = [geom for geom in spec.geoms if geom.meshname == name]
         bodies = [geom.parent.name for geom in geoms if geom.contype or geom.conaffinity]
         if bodies:
-            # A text has no folder to look in.
-            advice = "; give the URDF as a file, and packages=" if "package:" in mesh.file else ""
             raise ValueError(
-                f"the mesh {mesh.file} of {', '.join(bodies)}, which collides, is missing or broken: {fault}{advice}"
+                f"the mesh {mesh.file} of {', '.join(bodies)}, which collides, is missing or broken: {fault}"
             )
         bare = [geom.parent.name for geom in geoms if len(geom.parent.geoms) == 1]
         for part in (*geoms, mesh):
@@ -392,6 +407,19 @@ def _joint_names(joints: Any) -> Names:
             f"joints must be {MIN_JOINTS} or more different names, in order from the base to the tool, got {joints!r}"
         )
     return names
+
+
+def _note_units(arm: Arm, notes: list[str]) -> None:
+    """Note ranges and lengths that were probably written in degrees and millimetres."""
+    wide = ~arm.chain.sliding & (np.ptp(arm.joint_range, axis=1) > MOST_TURNS)
+    if wide.any():
+        some = ", ".join(itertools.compress(arm.joint_names, wide))
+        notes.append(
+            f"{WARNING}the range of {some} is over four turns; are they degrees in place of radians?"
+        )
+    length = float(np.linalg.norm(arm.chain.origin, axis=1).sum())
+    if length > LONGEST:
+        notes.append(f"{WARNING}the arm is {length:.3g} m long; are lengths millimetres in place of metres?")
 
 
 def _per_joint(name: str, values: Any, joints: Names) -> Float:
@@ -436,16 +464,16 @@ def _given_limits(name: str, given: Any, own: Float, joints: Names, notes: list[
 def _torques(
     model: mujoco.MjModel, joints: Names, ranges: Float, given: Any, arm: str, notes: list[str]
 ) -> Float:
-    """Return the torque limit of each joint, its own, or the greatest of the actuators that drive it."""
+    """Return the torque limit of each joint: the greatest of its actuators, or its own if that is less."""
     found = np.zeros(len(joints))
     for i, name in enumerate(joints):
         joint = model.joint(name).id
-        if model.jnt_actfrclimited[joint]:
-            found[i] = _symmetric_limit(model.jnt_actfrcrange[joint])
-            continue
         drives = np.isin(model.actuator_trntype, JOINT_TRANSMISSIONS) & (model.actuator_trnid[:, 0] == joint)
         for index in np.flatnonzero(drives):
             found[i] = max(found[i], _actuator_torque(model, int(index)))
+        if model.jnt_actfrclimited[joint]:
+            own = _symmetric_limit(model.jnt_actfrcrange[joint])
+            found[i] = min(found[i], own) if found[i] > 0.0 else own
     if given is not None:
         return _given_limits("torque_limit", given, found, joints, notes)
     known = known_limits(KNOWN_TORQUES, arm, len(joints))
@@ -483,15 +511,15 @@ def _greatest_weight(model: mujoco.MjModel, joints: Names) -> Float:
 
 
 def _actuator_torque(model: mujoco.MjModel, index: int) -> float:
-    """Return an actuator's limit: of its force, or of its control where force is gain * control; 0 for none."""
-    gear = abs(float(model.actuator_gear[index, 0]))
+    """Return an actuator's limit: of its force, and of its control where force is gain * control; 0 for none."""
+    limits = []
     if model.actuator_forcelimited[index]:
-        return gear * _symmetric_limit(model.actuator_forcerange[index])
+        limits.append(_symmetric_limit(model.actuator_forcerange[index]))
     plain = model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE
     if plain and model.actuator_ctrllimited[index]:
         gain = abs(float(model.actuator_gainprm[index, 0]))
-        return gear * gain * _symmetric_limit(model.actuator_ctrlrange[index])
-    return 0.0
+        limits.append(gain * _symmetric_limit(model.actuator_ctrlrange[index]))
+    return abs(float(model.actuator_gear[index, 0])) * min(limits, default=0.0)
 
 
 def _symmetric_limit(limits: Float) -> float:
@@ -506,8 +534,13 @@ def _velocities(
     found = np.array([in_urdf.get(name, 0.0) for name in joints])
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "velocity_limit") >= 0:
         own = model.numeric("velocity_limit").data
-        if given is None or len(own) in (1, len(joints)):
+        if len(own) in (1, len(joints)):
             found = _per_joint("velocity_limit", own, joints)
+        elif given is None:
+            raise ValueError(
+                f"the file's custom numbers velocity_limit are {len(own)}, and the arm has {len(joints)} joints; give "
+                "velocity_limit="
+            )
     if given is not None:
         return _given_limits("velocity_limit", given, found, joints, notes)
     how = f"{DEFAULT_VELOCITY_LIMIT:g} rad/s (slides m/s); give velocity_limit="

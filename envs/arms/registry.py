@@ -12,7 +12,7 @@ import numpy as np
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
 from viapoint.envs.arms.load import load_arm
 
-ARM_FILES = (".xml", ".mjcf", ".urdf")  # Suffixes of files of arms
+ARM_FILES = (".xml", ".urdf")  # Suffixes of files of arms
 
 
 # Arguments of :func:`arm_from_xml` for the built-in arms, whose files are in the assets

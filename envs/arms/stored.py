@@ -52,6 +52,9 @@ def write_arm(path: str | Path, arm: Arm) -> None:
 
     Its geoms are the capsules that collide; visual meshes are left out.
 
+    Raises:
+        ValueError: The file's name does not end in `.xml`.
+
     Example:
         >>> import tempfile
         >>> from pathlib import Path
@@ -61,12 +64,16 @@ def write_arm(path: str | Path, arm: Arm) -> None:
         >>> load_arm(file).joint_names
         ('shoulder', 'elbow')
     """
+    path = Path(path).expanduser()
+    if path.suffix != ".xml":
+        raise ValueError(f"path must end in .xml, got {str(path)!r}")
     choices: dict[str, Any] = {"name": arm.name, "joints": arm.joint_names}
     for each in (*ARGUMENTS, *ADDED):
         choices[each] = getattr(arm, each)
     model, _, _ = arm.xml.rpartition("</mujoco>")
     text = f"{model}{_element(json.dumps(choices, default=_plain))}</mujoco>\n"
-    Path(path).expanduser().write_text(text, encoding="utf-8")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
 
 
 def _element(choices: str) -> str:
@@ -115,7 +122,7 @@ def cached_arm(model: mujoco.MjModel, arguments: dict[str, Any], make: Callable[
     with suppress(OSError):  # the folder cannot be written
         folder.mkdir(parents=True, exist_ok=True)
         # A file of its own, which is renamed at the end: other processes never see half of it.
-        with tempfile.NamedTemporaryFile(dir=folder, suffix=".part", delete=False) as file:
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=".part", suffix=".xml", delete=False) as file:
             write_arm(Path(file.name), arm)
         os.replace(file.name, path)
     return arm

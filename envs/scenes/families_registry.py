@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from viapoint.envs.common.validation import whole_number
+from viapoint.envs.common.validation import names_of, whole_number
 from viapoint.envs.geometry.shapes import IN_TABLES, KINDS, PLAIN_KINDS, Shape, as_obstacles
 from viapoint.envs.scenes import families_plane, families_space
 from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Layout, Place, Room, most_rows
@@ -135,8 +135,11 @@ def register_scene_family(
     if not isinstance(name, str):
         raise TypeError(f"name must be a string, got {name!r}")
     taken = scene_families(plane)
-    if not name or name in taken:
-        raise ValueError(f"name must not be empty or one of {', '.join(taken)}, got {name!r}")
+    if not name:
+        raise ValueError("name must not be empty")
+    if name in taken:
+        raise ValueError(f"name {name!r} is taken, as are {', '.join(taken)}")
+    kinds = names_of("kinds", kinds) if kinds else ()
     unknown = [kind for kind in kinds if kind not in PLAIN_KINDS]
     if unknown:
         raise ValueError(f"kinds of families must be some of {', '.join(PLAIN_KINDS)}, got {unknown}")
@@ -156,6 +159,8 @@ def _checked(name: str, build: Build) -> Build:
         try:
             if not isinstance(built, Layout | tuple | list):
                 raise TypeError(f"build must return shapes and places, or a layout, got {built!r}")
+            if not isinstance(built, Layout) and any(isinstance(part, Shape) for part in built):
+                raise TypeError("build must return a list of shapes and a list of places, got shapes alone")
             layout = built if isinstance(built, Layout) else _as_layout(*built)
             numbers = np.array([*layout.rows, *layout.goals, *layout.starts])
             if len(layout.rows) % ROW or (len(layout.goals) + len(layout.starts)) % PLACE:
@@ -164,7 +169,10 @@ def _checked(name: str, build: Build) -> Build:
                 raise ValueError("obstacles and places must be finite")
             found = {KINDS[int(kind)] for kind in layout.rows[::ROW]}
             if not found <= set(room.kinds):
-                raise ValueError(f"kinds must be among {room.kinds}, got {sorted(found)}")
+                allowed = ", ".join(room.kinds)
+                raise ValueError(
+                    f"obstacles must be of the task's shapes, {allowed}, got {', '.join(sorted(found))}"
+                )
             drawn = len(layout.rows) // ROW
             count = layout.keep or drawn
             if count > room.most or drawn > most_rows(room.most):

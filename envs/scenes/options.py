@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.inverse_kinematics import inverse_kinematics, planar_joints
+from viapoint.envs.arms.inverse_kinematics import inverse_kinematics, nearest_goals, planar_joints
 from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.common.validation import finite_array
@@ -74,8 +74,11 @@ def draw_given(
     shapes = _shapes(options["obstacles"], sampler, number) if "obstacles" in options else None
     obstacles = no_obstacles(number, sampler.rows) if shapes is None else pack(shapes, sampler.rows)
     names = [[shape.name for shape in each] for each in shapes or ()]
-    ends = {name: _end(name, options[name], sampler, obstacles) for name in ENDS if name in options}
     home = np.tile(arm.home, (number, 1))
+    ends: dict[str, Float] = {}
+    for name in ENDS:  # the start first, near which the goal is looked for
+        if name in options:
+            ends[name] = _end(name, options[name], sampler, obstacles, ends.get("start", home))
     scenes = resting(ends.get("start", home), ends.get("goal", home), obstacles)
     if "jumps" in options:
         scenes = scenes._replace(jumps=_jumps(options["jumps"], sampler, number))
@@ -164,8 +167,8 @@ def _check_shape(row: int, shape: Shape, sampler: SceneSampler) -> None:
         raise ValueError(f"obstacle {row}{named} may touch the base of the arm, but not contain all of it")
 
 
-def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles) -> Float:
-    """Return the joint positions of a given end, shape (N, J)."""
+def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles, near: Float) -> Float:
+    """Return the joint positions of a given end, shape (N, J), where there are several those near others."""
     number, joints = len(obstacles.kind), len(sampler.task.arm.home)
     label = f"options[{name!r}]"
     several = [value] * number if isinstance(value, Pose | Mapping) else value
@@ -175,16 +178,19 @@ def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles) -> 
             raise ValueError(f"{label} must be one pose, or {number} poses, got {len(several)}")
         poses = [as_pose(label, each) for each in several]
         if sampler.task.space_name == "joints":
-            found = [
-                _solution(label, pose, sampler.task.arm, obstacles.take([i])) for i, pose in enumerate(poses)
-            ]
-            return np.array(found)
+            found = np.empty((number, joints))
+            for i, pose in enumerate(poses):
+                found[i] = _solution(label, pose, sampler.task.arm, obstacles.take([i]), near[i])
+            return found
         if any(pose.quaternion is not None for pose in poses):
             raise ValueError(f"{label} must have no quaternion: in hand space an end is a place of the hand")
         value = [pose.position for pose in poses]
     if sampler.task.space_name == "joints":
         array = finite_array(label, value, (joints,), (number, joints))
-        return np.array(np.broadcast_to(array, (number, joints)), order="C")
+        array = np.broadcast_to(array, (number, joints))
+        if name == "goal":
+            array = nearest_goals(sampler.task.arm, array, near)
+        return np.array(array, order="C")
     array = finite_array(label, value, (2,), (3,), (number, 2), (number, 3))
     height = sampler.room.foot[2]
     if array.shape[-1] == 3 and (np.abs(array[..., 2] - height) > REACHED).any():
@@ -214,10 +220,10 @@ def as_pose(label: str, value: Any) -> Pose:
     return Pose(**value)
 
 
-def _solution(label: str, pose: Pose, arm: Arm, obstacles: Obstacles) -> Float:
-    """Return joint positions with the tool at a pose, the first that are free, shape (J,)."""
+def _solution(label: str, pose: Pose, arm: Arm, obstacles: Obstacles, near: Float) -> Float:
+    """Return joint positions with the tool at a pose, the nearest to others that are free, shape (J,)."""
     try:
-        found = inverse_kinematics(arm, pose.position, pose.quaternion)
+        found = inverse_kinematics(arm, pose.position, pose.quaternion, seed=near)
     except ValueError as error:
         raise ValueError(f"{label}: {error}") from None
     many = obstacles.take(np.zeros(len(found), np.int64))

@@ -125,8 +125,8 @@ class SceneSampler:
             )
         raise RuntimeError(
             f"no scene of the families {', '.join(self.task.families)} with {self.room.fewest} to {self.room.most} "
-            f"obstacles was found in {ATTEMPTS} attempts for the arm {self.task.arm.name!r}; allow fewer obstacles or "
-            "other families, or give other ends"
+            f"obstacles, within {FARTHEST:g} m, was found in {ATTEMPTS} attempts for the arm {self.task.arm.name!r}; "
+            "allow fewer obstacles or other families, or give other ends"
         )
 
     def sensor_clearances(self, scenes: Scenes) -> Float:

@@ -254,7 +254,7 @@ def _check_end(
     for joint, (low, high) in enumerate(arm.joint_range):
         position = joints[:, joint]
         outside = (position < low - RANGE_TOLERANCE) | (position > high + RANGE_TOLERANCE)
-        allowed = f"must be from {low:.4g} to {high:.4g}"
+        allowed = f"must be from {low:.7g} to {high:.7g}"
         _refuse(there & outside, f"{name}: joint {arm.joint_names[joint]!r} {allowed}", position)
     rows, own = row_clearances(arm.chain, arm.spheres, joints, obstacles, FAR)
     wrong = there & (own <= 0.0)
@@ -277,4 +277,4 @@ def _refuse(wrong: Bool, message: str, values: Float, names: Sequence[Sequence[s
         known = names[scene] if scene < len(names) else ()
         name = f" {known[row]!r}" if row < len(known) and known[row] else ""
         which += f"obstacle {row}{name} "
-    raise ValueError(f"{which}{message}, got {values[place]:.4g}")
+    raise ValueError(f"{which}{message}, got {values[place]:.7g}")

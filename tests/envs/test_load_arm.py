@@ -258,6 +258,9 @@ REFUSED = [
     *[({"torque_limit": limit}, ValueError) for limit in (-1.0, [1e-3] * 6, "strong")],
     *[({"tolerance": tolerance}, ValueError) for tolerance in (0.0, "fine", np.nan)],
     ({"file": near_arm(1e-4), "home": None, **THREE}, ValueError),  # bodies too close at home
+    ({"file": "<?xml version='1.0'?><robot name='r'><link name='a'/></robot>"}, ValueError),  # text of a URDF
+    ({"file": changed((END, END + '<custom><numeric name="velocity_limit" data="3 3"/></custom>')),
+      "velocity_limit": None}, ValueError),
     *[({"file": TWO, "base": base, "tool": None, "joints": None}, ValueError) for base in (None, "right")],
     ({"file": TWO.replace("left_hand", "left_pinch"), "tool": None, "joints": None}, ValueError),
     ({"file": changed(*TIP_SLIDES), "tool": None, "joints": None, "home": None}, ValueError),  # no limits
@@ -593,7 +596,7 @@ def test_packages_are_looked_for_in_given_folders(crane, tmp_path):
     crane.rename(tmp_path / "store" / "parts")
     for packages in ([tmp_path / "store"], tmp_path / "store", str(tmp_path / "store")):
         assert load_arm(path, packages=packages).joint_names == ("lift", "turn", "tilt")
-    with pytest.raises(ValueError, match=r"wrist\.obj of wrist.*packages="):
+    with pytest.raises(ValueError):
         load_arm(URDF)  # a text has no folder
 
 
@@ -627,6 +630,30 @@ def test_the_second_time_an_arm_comes_from_the_cache(cache, monkeypatch):
         ur5e(text.replace("0.1625", "0.1626"), **changes)
 
 
+MOTOR = '<actuator><motor joint="elbow" gear="2" {}/></actuator>'
+
+
+@pytest.mark.parametrize(
+    ("limits", "found"),
+    [
+        ('ctrlrange="-20 20" forcerange="-50 50"', 40.0),
+        ('ctrlrange="-50 50" forcerange="-20 20"', 40.0),
+        ('ctrlrange="-900 900"', 150.0),  # that of the joint
+    ],
+)
+def test_the_least_of_the_limits_of_actuator_and_joint_is_the_torque_limit(limits, found):
+    arm = ur5e(changed((END, END + MOTOR.format(limits))))
+    assert arm.torque_limit[2] == found
+
+
+def test_what_a_user_hardly_means_is_told():
+    folded = (*HOME[:2], 3.1, *HOME[3:])
+    with pytest.warns(UserWarning, match="in contact at the given home"):
+        ur5e(TEXT, home=folded)
+    with pytest.warns(UserWarning, match="degrees"):
+        ur5e(TEXT, joint_range=[(-170.0, 170.0)] * 6)
+
+
 def test_a_written_arm_is_the_same_arm_and_takes_other_limits(tmp_path):
     slow, path = ur5e(velocity_limit=1.0), tmp_path / "slow.xml"
     write_arm(path, slow)
@@ -641,6 +668,8 @@ def test_a_written_arm_is_the_same_arm_and_takes_other_limits(tmp_path):
     for given in ({"tool": "hand"}, {"home": HOME}, {"torque_limit": 1e-3}):
         with pytest.raises(ValueError):
             load_arm(path, **given)
+    with pytest.raises(ValueError):
+        write_arm(tmp_path / "slow.urdf", slow)
 
 
 def test_a_capsule_of_hardly_any_length_is_covered():

@@ -31,7 +31,7 @@ ANY_ENVIRONMENT = [
     *(({"via_range": factor}, ValueError) for factor in (0.0, 10.0, np.nan, "far", True)),
     ({"timing": "fast"}, ValueError), ({"margin": -0.1}, ValueError), ({"horizon": 0.0}, ValueError),
     ({"horizon": np.nan}, ValueError), ({"n_jumps": 9}, ValueError), ({"n_jumps": (1, 2, 3)}, ValueError),
-    *(({"decide_at": events}, ValueError) for events in ("noon", "target", ("noon",), 3, None, {"target"})),
+    *(({"decide_at": events}, ValueError) for events in ("noon", "target", ("noon",), 3, None, {"target"}, [])),
     ({"reward_weights": {"speed": 1.0}}, ValueError), ({"reward_weights": {"success": -1.0}}, ValueError),
     ({"reward_weights": {1: 2.0}}, ValueError), ({"reward_weights": 3.0}, ValueError),
     *(({"duration_range": pair}, ValueError) for pair in (
@@ -225,7 +225,7 @@ CALLS = [
         ({"kinds": ("ball",)},), ({"kinds": ("convex_mesh",)},), ({"n_obstacles": 0},),
     ]),
     (built, [
-        (None,), (Layout([1.0], [], []),),
+        (None,), (Layout([1.0], [], []),), ([BALL],),
         *((([BALL], places),) for places in ([ve.Place((np.nan, 0.0, 0.0))], [ve.Place((0.0, 0.0, 0.0))] * 9)),
         *(((shapes,),) for shapes in (
             [BALL] * 3, [ve.Box((0.1, 0.1, 0.1))], [ve.ConvexMesh.hull(CUBE)], [{"shape": "sphere", "radius": -1.0}],

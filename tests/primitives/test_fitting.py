@@ -183,6 +183,32 @@ def test_the_kind_of_the_positions_is_kept(rng):
     assert isinstance(tensors.trajectory.coefficients, torch.Tensor)
     assert_same(tensors, expected)
     np.testing.assert_allclose(tensors(torch.tensor(time), 1), expected(time, 1), atol=1e-9)
+    assert isinstance(tensors.n_via, torch.Tensor)
     single = fit_via_points(time.astype(np.float32), position.astype(np.float32), 1)
     assert single.via_points.dtype == np.float32
     assert_same(single, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", [np.asarray, list, lambda time: np.rint(1e9 * time).astype(np.int64)])
+def test_clocks_of_many_digits_may_come_with_positions_of_few(kind, rng):
+    time, position = samples(movement(rng, 1)[2], True, rng, noise=0.001)
+    expected = fit_via_points(time, position, 1)
+    clock = kind(time + 1e5)
+    found = fit_via_points(clock, position.astype(np.float32), 1)
+    unit = np.ptp(clock) / np.ptp(time)
+    np.testing.assert_allclose(found.duration / unit, expected.duration, atol=1e-4)
+    np.testing.assert_allclose(found.via_points, expected.via_points, atol=1e-4)
+
+
+@pytest.mark.parametrize("length", [15.0, 60.0])
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_movement_is_found_among_long_rests(length, share, rng):
+    waypoints, _, trajectory = movement(rng, 1)
+    duration = float(trajectory.duration)
+    onset = 0.1 + share * (length - 0.2 - duration)
+    time = np.arange(0.0, length, 0.01)
+    inside = np.clip(time - onset, 0.0, duration)
+    fit = fit_via_points(time, trajectory(inside) + rng.normal(0.0, 5e-4, (len(time), 2)))
+    assert fit.n_via == 1
+    np.testing.assert_allclose((fit.onset, fit.end), (onset, onset + duration), atol=0.05)
+    np.testing.assert_allclose(fit.via_points, waypoints[1:-1], atol=0.02)

@@ -17,6 +17,13 @@ def tensor(rng):
     return draw
 
 
+@pytest.mark.parametrize("kind", [np, torch])
+def test_the_widest_type_counts_wherever_it_stands(kind):
+    wide, narrow = kind.asarray([0.1, 0.2], dtype=kind.float64), kind.asarray([1.0, 1.0], dtype=kind.float32)
+    for ends in ((wide, narrow), (narrow, wide)):
+        assert vp.point_to_point(*ends, 1.0).coefficients.dtype == kind.float64
+
+
 @pytest.mark.parametrize(
     ("kind", "dtype"), [(torch, torch.float64), (torch, torch.float32), (np, np.float32)], ids=str
 )

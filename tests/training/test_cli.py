@@ -460,6 +460,21 @@ def test_movements_that_cannot_be_fitted_are_left_out_and_doubtful_ones_told(tmp
         assert each in told
 
 
+def test_ends_of_lines_begin_no_column_and_other_encodings_are_told(tmp_path, failed):
+    path = tmp_path / "plain.csv"
+    recorded("time", "x", "y").to_csv(path, index=False)
+    run("fit", path, "--out", tmp_path / "plain")
+    wanted = pd.read_csv(tmp_path / "plain" / "fit.csv")
+    head, *lines = path.read_text().splitlines()
+    for separator, end in ((",", ","), ("\t", ","), (" ", "  "), (";", ",")):
+        text = "\n".join([head, *(line + end for line in lines)])
+        path.write_text(text.replace(",", separator))
+        run("fit", path, "--out", tmp_path / "other")
+        pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "other" / "fit.csv"), wanted)
+    path.write_bytes("time,x,y,movement\n0.0,0.1,0.2,é".encode("latin-1"))
+    assert "UTF-8" in failed("fit", path, "--out", tmp_path / "other")
+
+
 TABLE = ["time,x,y", "0.0,0.1,0.2", "0.1,0.1,0.2", "0.2,0.1,0.2"]
 
 

@@ -6,6 +6,7 @@ import json
 import re
 import sys
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import PANDA as PANDA_TASK
@@ -244,6 +245,9 @@ def test_goals_of_continuous_joints_are_taken_modulo_a_turn() -> None:
     for each, way in ((wide, 2.0 * np.pi - 6.0), (arm, -6.0)):
         end = plan_motion(each, start, start - 6.0 * np.eye(6)[0], time_limit=0.0).waypoints[-1]
         assert np.allclose(end - start, way * np.eye(6)[0])
+        env = gym.make("viapoint/Reach-v0", arm=each)  # as in environments
+        env.reset(options={"start": start, "goal": start - 6.0 * np.eye(6)[0]})
+        assert np.allclose(env.unwrapped.scenes.goal[0], end)
 
 
 def test_a_start_that_is_the_goal_is_a_plan() -> None:

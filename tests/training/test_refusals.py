@@ -395,6 +395,7 @@ COMMANDS = [
     ("fit nothing.csv", "nothing.csv"),
     (f"paper --agent {find_model('viapoint/PlanarReach-v0')}", "PlanarReach"),
     ("demo --out full", "full"),
+    (f"play {PLANE} --arm panda", "the same arm"),
     ("study nowhere.yaml", "nowhere.yaml"),
     ("doctor --out", "--out"),
 ]

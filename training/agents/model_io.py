@@ -138,6 +138,10 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
     except BadFileError:
         raise
     except Exception as error:
+        made = record.get("env")
+        name = made.get("id") if isinstance(made, Mapping) else None
+        if isinstance(name, str) and name not in gym.registry:
+            written += f"; import the module that registers {name}, on the command line --env MODULE:{name}"
         if env is not None:
             load_model(folder)  # raises the error of the file if that is to blame
             raise ValueError(f"env does not fit the agent in {folder}: {error}") from None

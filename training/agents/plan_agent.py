@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
 from viapoint.envs.common.arrays import Observation
-from viapoint.envs.common.validation import finite_array, whole_number
+from viapoint.envs.common.validation import finite_array, is_number, whole_number
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent
@@ -223,7 +223,10 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         policy_kwargs: dict[str, Any] | None,
         **kwargs: Any,
     ) -> None:
-        check_arguments(type(self), {**vars(self), "policy_kwargs": policy_kwargs})
+        given = {**vars(self), "policy_kwargs": policy_kwargs}
+        if is_number(learning_rate):
+            given["learning_rate"] = learning_rate
+        check_arguments(type(self), given)
         check_arguments(type(self), {name: value for name, value in kwargs.items() if name in LIMITS})
         super().__init__(
             policy,

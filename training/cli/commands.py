@@ -22,6 +22,7 @@ from viapoint.envs.arms.registry import arm_of
 from viapoint.training import configs, report
 from viapoint.training import trainer as training
 from viapoint.training.agents.agent import Agent, best_model, load_agent
+from viapoint.training.agents.model_io import check_same_task
 from viapoint.training.checks import SHIPPED_IDS
 from viapoint.training.configs import AgentConfig, EvaluateConfig, PlayConfig, RecordConfig, TrainConfig
 from viapoint.training.evaluation import evaluate as measure
@@ -51,7 +52,9 @@ def _named(config: AgentConfig, name: str | None) -> tuple[Agent | None, str, di
     if env_id is None:
         raise ValueError("name an agent (run folder, model folder or id), or an environment: --env or --arm")
     env_kwargs = {**({} if agent is None else agent.env_kwargs), **argument, **config.env_kwargs}
-    configs.task_with(env_id, env_kwargs)  # says what is wrong with an argument
+    task = configs.task_with(env_id, env_kwargs)  # says what is wrong with an argument
+    if agent is not None:
+        check_same_task(configs.task_with(agent.env_id, agent.env_kwargs), task)
     return agent, env_id, env_kwargs
 
 

@@ -77,6 +77,10 @@ def _trained(config: DemoConfig) -> Run:
     """Return the completed run in the folder, trained now if necessary."""
     if (config.out / "config.json").is_file():
         found = Run(config.out)
+        if found.config.env != config.env:
+            raise ValueError(
+                f"{config.out} holds a demo of {found.config.env}; name another folder with --out"
+            )
         number = config.n_timesteps or found.config.total_timesteps
         print(f"{config.out} holds a training of {found.decisions} decisions: starting from it")
     else:

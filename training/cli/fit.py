@@ -46,10 +46,11 @@ def run(config: FitConfig) -> None:
             with warnings.catch_warnings(record=True, action="always") as told:
                 fits[name] = fit_via_points(time, position, config.numbers, free_ends=config.free_ends)
         except ValueError as error:
+            reason = str(error).replace("n_via=", "--n-via ")
             if len(movements) == 1:
-                raise BadFileError(config.file, f"movement {name}: {error}") from None
+                raise BadFileError(config.file, f"movement {name}: {reason}") from None
             del movements[name]
-            print(f"movement {name} is left out: {error}", file=sys.stderr)
+            print(f"movement {name} is left out: {reason}", file=sys.stderr)
         for each in told:
             print(f"movement {name}: {each.message}", file=sys.stderr)
     _warn(movements, fits, config)
@@ -68,7 +69,9 @@ def read_movements(path: Path) -> Movements:
         found = ", ".join(map(str, table.columns))
         raise BadFileError(path, f"has no column {', '.join(missing)}; {EXPECTED}, got {found}")
     names = [name for name in ("time", *COORDINATES) if name in table]
-    numbers = table[names].apply(pd.to_numeric, errors="coerce")
+    # Spreadsheets of many countries write decimals with commas.
+    points = table[names].replace(",", ".", regex=True)
+    numbers = points.apply(pd.to_numeric, errors="coerce")
     wrong = np.argwhere(~np.isfinite(numbers.to_numpy(dtype=float)))
     if len(wrong):
         row, column = wrong[0]
@@ -130,11 +133,21 @@ def _read_table(path: Path) -> pd.DataFrame:
         raise BadFileError(path, "is empty")
     try:
         text = content.decode("utf-8-sig")
-        begun = text.lstrip()
-        file = io.StringIO(begun)
-        separator = next((each for each in ";\t, " if each in begun.partition("\n")[0]), ",")
+    except UnicodeDecodeError as error:
+        raise BadFileError(path, f"is not UTF-8 text ({error.reason}): save it in this encoding") from None
+    begun = text.lstrip()
+    first = begun.partition("\n")[0].rstrip()
+    separator = next((each for each in ";\t, " if each in first), ",")
+    # A separator at the end of a line, without one in the first line, begins no column.
+    ended = "\n".join(_without_end(line, separator, first.count(separator)) for line in begun.splitlines())
+    try:
         table = pd.read_csv(
-            file, sep=separator, header=None, dtype=str, skipinitialspace=True, skip_blank_lines=False
+            io.StringIO(ended),
+            sep=separator,
+            header=None,
+            dtype=str,
+            skipinitialspace=True,
+            skip_blank_lines=False,
         )
     except ValueError as error:
         reason = str(error).rpartition("C error: ")[2].strip()  # of pandas, without its own words
@@ -145,11 +158,13 @@ def _read_table(path: Path) -> pd.DataFrame:
     twice = [name for name in ("time", *COORDINATES, "movement") if (head == name).sum() > 1]
     if twice:
         raise BadFileError(path, f"has several columns {twice[0]}")
-    samples = table.iloc[1:].dropna(how="all").set_axis(head, axis="columns")  # without blank lines
-    if separator != ",":  # of spreadsheets where decimals have commas
-        numbers = samples.columns != "movement"
-        samples.loc[:, numbers] = samples.loc[:, numbers].replace(",", ".", regex=True)
-    return samples
+    return table.iloc[1:].dropna(how="all").set_axis(head, axis="columns")  # without blank lines
+
+
+def _without_end(line: str, separator: str, number: int) -> str:
+    """Return a line without spaces at its end, and without a separator there beyond a number of them."""
+    line = line.rstrip(" ")
+    return line.removesuffix(separator) if line.count(separator) > number else line
 
 
 def _printed(fits: Fits) -> str:

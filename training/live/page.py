@@ -25,11 +25,13 @@ from PIL import Image
 from viapoint.envs import Arm
 from viapoint.envs.common.arrays import Float
 from viapoint.training.agents.agent import Agent, load_agent
+from viapoint.training.agents.model_io import check_same_task
 from viapoint.training.checks import DEFAULT_ENV, SHIPPED_IDS
 from viapoint.training.configs import env_of_arm
 from viapoint.training.live import arena as live
 from viapoint.training.live.drawing import PLANE, RESET, SPACE, ArmDrawing, Panels, View
 from viapoint.training.planning.motion_plan import MotionPlan
+from viapoint.training.planning.search import registered_task
 
 LOOPBACK = "127.0.0.1"  # Address that only this machine reaches
 PAUSE = 0.12  # Time without other changes after which proposals are computed, [s]
@@ -325,7 +327,10 @@ class LivePage(contextlib.AbstractContextManager["LivePage", None]):
         if loaded is None and env in SHIPPED_IDS and not env_kwargs and not argument:
             loaded = load_agent(env)
         own = {} if loaded is None else loaded.env_kwargs
-        self._made = env, loaded, seed, {**(env_kwargs or own), **argument}, agent is not None
+        arguments = {**(env_kwargs or own), **argument}
+        if loaded is not None:
+            check_same_task(registered_task(env, **own), registered_task(env, **arguments))
+        self._made = env, loaded, seed, arguments, agent is not None
         self._model_file = model_file
         arena, _ = self._make()
         drawn = next(arena.scenes()["Random"])

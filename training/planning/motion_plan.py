@@ -112,7 +112,8 @@ class MotionPlan:
     limits: Limits
     """Shares of the velocity and torque limits."""
     jerk: float
-    """Jerk cost relative to that of the straight movement of the same duration; 1 where nothing moves."""
+    """Jerk cost relative to that of the straight movement of the same duration; 1 where nothing moves, and NaN for a
+    movement that begins in motion and ends where it began."""
     source: str
     """Origin of the via-points: `straight`, `straight, refined`, `given`, `random`, `path`, `ompl`, or another planner;
     `refused` where there is no movement."""

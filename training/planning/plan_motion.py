@@ -21,7 +21,7 @@ from viapoint.envs.arms.inverse_kinematics import (
     RANGE_TOLERANCE,
     UnreachableError,
     inverse_kinematics,
-    unwound,
+    nearest_goals,
 )
 from viapoint.envs.arms.kinematics import Spheres, motion_torques, slowdowns, torques
 from viapoint.envs.arms.registry import arm_of
@@ -442,8 +442,7 @@ def _goals(problem: _Problem, goal: Any) -> Float:
     several = values is not None and values.ndim > 1
     goals = finite_array("goal", goal if several else [goal], (None, len(problem.start)))
     if not problem.space.of_hand:
-        endless = np.isin(problem.arm.joint_names, problem.arm.continuous)
-        goals = np.where(endless, unwound(problem.arm, goals, problem.start), goals)
+        goals = nearest_goals(problem.arm, goals, problem.start)
     away = np.abs(goals - problem.start).max(axis=-1)
     # Copies are contiguous and writable, which compiled functions depend on.
     return np.array(goals[np.argsort(away, kind="stable")])
@@ -497,7 +496,7 @@ def _fault(problem: _Problem) -> tuple[str, float]:
             if space.of_hand or beyond[worst] <= 0.0:
                 return f"the {name} is out of reach", most
             low, high = arm.joint_range[worst]
-            allowed = f"must be from {low:.4g} to {high:.4g}, got {joints[end, worst]:.4g}"
+            allowed = f"must be from {low:.7g} to {high:.7g}, got {joints[end, worst]:.7g}"
             return f"the {name} is outside the limits: joint {arm.joint_names[worst]!r} {allowed}", most
         counts = both.present[end] & (resting | (end == 0))
         row = int(np.where(counts, rows[end], np.inf).argmin()) if counts.any() else -1
