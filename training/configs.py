@@ -210,7 +210,6 @@ def preset_of(task: Task, algo: Algorithm) -> Preset:
 Format = Literal["table", "md", "csv", "json"]  # Form of a table
 BENCHMARK = "motionbenchmaker"  # Name of the scene set that measures planners
 MOTION_FILES = (".csv", ".yaml", ".yml")  # Suffixes of files of movements
-NOTHING_TO_CHECK = "checks and refine concern an agent, and none is given"
 USUAL_BASELINES = ("straight", "random", "search512")  # Baselines of an evaluation
 
 
@@ -417,7 +416,7 @@ class EvaluateConfig(AgentConfig):
         if not self.checks:
             raise ValueError("checks must name at least one number, such as 0")
         if (any(self.checks) or self.refine) and self.agent is None:
-            raise ValueError(NOTHING_TO_CHECK)
+            raise ValueError("checks and refine concern an agent, and none is given")
         check_file("json", self.json)
 
 
@@ -437,7 +436,7 @@ class PlayConfig(AgentConfig):
 
     def _check(self) -> None:
         if self.agent is None and self.checks:
-            raise ValueError(NOTHING_TO_CHECK)
+            raise ValueError("checks concern an agent, and none is given")
         check_file("video", self.video, ".mp4")
 
 
