@@ -325,8 +325,8 @@ def _checked_decisions(decide_at: Any) -> str | tuple[Trigger, ...]:
     if isinstance(decide_at, str):
         if decide_at in (END, STEPS):
             return decide_at
-    elif isinstance(decide_at, Sequence) and decide_at and all(each in TRIGGERS for each in decide_at):
+    elif isinstance(decide_at, Sequence) and all(each in TRIGGERS for each in decide_at):
         return tuple(decide_at)
     raise ValueError(
-        f"decide_at must be {END!r}, {STEPS!r} or a list with one or more of {', '.join(TRIGGERS)}, got {decide_at!r}"
+        f"decide_at must be {END!r}, {STEPS!r} or a list with some of {', '.join(TRIGGERS)}, got {decide_at!r}"
     )

@@ -31,7 +31,7 @@ ANY_ENVIRONMENT = [
     *(({"via_range": factor}, ValueError) for factor in (0.0, 10.0, np.nan, "far", True)),
     ({"timing": "fast"}, ValueError), ({"margin": -0.1}, ValueError), ({"horizon": 0.0}, ValueError),
     ({"horizon": np.nan}, ValueError), ({"n_jumps": 9}, ValueError), ({"n_jumps": (1, 2, 3)}, ValueError),
-    *(({"decide_at": events}, ValueError) for events in ("noon", "target", ("noon",), 3, None, {"target"}, [])),
+    *(({"decide_at": events}, ValueError) for events in ("noon", "target", ("noon",), 3, None, {"target"})),
     ({"reward_weights": {"speed": 1.0}}, ValueError), ({"reward_weights": {"success": -1.0}}, ValueError),
     ({"reward_weights": {1: 2.0}}, ValueError), ({"reward_weights": 3.0}, ValueError),
     *(({"duration_range": pair}, ValueError) for pair in (

@@ -117,7 +117,7 @@ REASONS = [
         {"margin": 0.1, "obstacles": [POST, ve.Sphere(0.1, position=PANDA.hand(PANDA.home), name="ball")]},
         "obstacle 1 'ball'",
     ),
-    ({"goal": GOAL + 9.0 * np.eye(7)[2]}, "joint 'joint3' must be from -2.897 to 2.897"),
+    ({"goal": GOAL + 9.0 * np.eye(7)[2]}, "joint 'joint3' must be from -2.8973 to 2.8973"),
     ({"arm": "planar", "start": (0.0, 0.3), "goal": (0.0, 0.9)}, "out of reach"),
     ({"obstacles": [POST], "duration": 0.3}, "limit"),
     ({"obstacles": [POST], "time_limit": 0.0}, "no time for another one"),

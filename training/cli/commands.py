@@ -160,9 +160,9 @@ def record(config: RecordConfig) -> None:
     """Record episodes of an agent or a baseline as a Minari dataset, and print how to load it."""
     name = str(config.agent)
     if name in SHIPPED_IDS or Path(name).expanduser().exists():
-        agent, env_id, env_kwargs = _named(config, name)
         if config.env_kwargs:
             raise ValueError("env_kwargs are for baselines; an agent has those of its training")
+        agent, env_id, env_kwargs = _named(config, name)
         method = agent_method("agent", agent)
     else:
         if config.env is config.arm is None:
