@@ -138,8 +138,10 @@ def _numpy_floats(named: dict[str, Any]) -> list[Any]:
     dtype: np.dtype[Any] | None = None
     for value in named.values():
         if isinstance(value, np.ndarray) and value.dtype.kind == "f":
-            # No test of `dtype != value.dtype` may come first: NumPy's float64 equals None.
-            dtype = value.dtype if dtype is None else np.promote_types(dtype, value.dtype)
+            if dtype is None:  # before any comparison: NumPy's float64 equals None
+                dtype = value.dtype
+            elif value.dtype != dtype:
+                dtype = np.promote_types(dtype, value.dtype)
     dtype = np.dtype(np.float64) if dtype is None else dtype
     arrays: list[Any] = []
     for name, value in named.items():
