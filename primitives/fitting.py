@@ -406,11 +406,16 @@ def _starts(time: Floats, position: Floats, n_via: int, free_ends: bool) -> Floa
     return knots[np.argsort(squares, kind="stable")]
 
 
+def _units(time: Floats, position: Floats) -> tuple[float, float, Floats, float]:
+    """Return begin and length of a recording, [s], and centre (D,) and size of its positions, [m]."""
+    centre: Floats = position.mean(axis=0)
+    size = math.sqrt(np.square(position - centre).sum(axis=-1).mean())
+    return time[0], time[-1] - time[0], centre, size
+
+
 def _fit(time: Floats, position: Floats, n_via: int, free_ends: bool) -> _Fit:
     """Fit one movement with a number of via-points."""
-    first, length = time[0], time[-1] - time[0]
-    centre = position.mean(axis=0)
-    size = math.sqrt(np.square(position - centre).sum(axis=-1).mean())
+    first, length, centre, size = _units(time, position)
     samples = (time - first) / length, (position - centre) / size
     kept = _around_movement(position) if free_ends else slice(0, len(time))
     if len(time) > kept.stop - kept.start:
@@ -430,9 +435,7 @@ def _fit(time: Floats, position: Floats, n_via: int, free_ends: bool) -> _Fit:
 
 def _result(theta: Floats, time: Floats, position: Floats, free_ends: bool) -> _Fit:
     """Return the movement of parameters (P,) with the waypoints of least squares, and how well it fits."""
-    first, length = time[0], time[-1] - time[0]
-    centre = position.mean(axis=0)
-    size = math.sqrt(np.square(position - centre).sum(axis=-1).mean())
+    first, length, centre, size = _units(time, position)
     knots = _knots(theta, free_ends)
     basis = _basis(knots[None], (time - first) / length)[0]
     scaled = (position - centre) / size

@@ -243,8 +243,8 @@ def _load(
     apart = _apart(parsed, near, drawn)
     exclude |= dict.fromkeys(apart, never)
     movable = set(itertools.compress(pairs, looked_at.max(axis=0) > 0.0))
-    looked_after = [pair for pair in pairs if pair in movable and pair not in exclude]
-    home = _home(parsed, ranges, given["home"], looked_after, notes)
+    compared = [pair for pair in pairs if pair in movable and pair not in exclude]
+    home = _home(parsed, ranges, given["home"], compared, notes)
     origin = np.zeros(3) if given["origin"] is None else finite_array("origin", given["origin"], (3,))
     # Bodies that are near at home get smaller capsules, or are not compared, either.
     at_home = dict(zip(pairs, _distances(parsed, home, pairs).tolist(), strict=True))
@@ -252,7 +252,7 @@ def _load(
     exclude |= dict.fromkeys(_apart(parsed, close, drawn), never)
     touching = [pair for pair in pairs if pair not in exclude and at_home[pair] <= 0.0]
     exclude |= dict.fromkeys(touching, "in contact at home")
-    avoidable = [pair for pair in touching if pair in movable]
+    avoidable = [pair for pair in touching if pair in movable]  # they are apart elsewhere
     if given["home"] is not None and avoidable:
         some = "; ".join(" and ".join(sorted(parsed.named(pair))) for pair in avoidable)
         notes.append(f"{WARNING}in contact at the given home, and not compared in any plan: {some}")
