@@ -10,7 +10,7 @@ import numpy as np
 
 from viapoint.envs.arms.kinematics import slowdowns
 from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict, norm, put, take
-from viapoint.envs.events import NEVER, Event, EventPredictor, next_step
+from viapoint.envs.events import Event, EventPredictor, next_step
 from viapoint.envs.geometry.clearance import FAR, memory, row_clearances
 from viapoint.envs.geometry.obstacles import KINDS, no_obstacles
 from viapoint.envs.outcome import (
@@ -429,11 +429,13 @@ class Episodes:
         rows = np.flatnonzero(moves)
         self._run_until(np.where(moves, begin + number, begin), references)
         if rows.size:
-            state.jerk_cost[rows] += steering.jerk_cost(take(self._motion, rows), velocity[rows])
+            elapsed = np.asarray((state.steps - begin)[rows] * self.simulator.timestep)
+            state.jerk_cost[rows] += steering.jerk_cost(take(self._motion, rows), velocity[rows], elapsed)
             put(self._motion, rows, Motion(*(part[rows, -1] for part in ahead)))
         self.begun[:] = True
         jumps = self._events.steps(self.scenes.jump_times)
-        still = ((jumps <= state.steps[:, None]) | (jumps == NEVER)).all(axis=1)  # the target jumps no more
+        # The target jumps no more before the time is up.
+        still = ((jumps <= state.steps[:, None]) | (jumps >= self._events.limit)).all(axis=1)
         settled = still & (state.rest * self.simulator.timestep >= SETTLING - 1e-9)
         event = np.where(settled, Event.ARRIVAL, Event.HORIZON)
         event = np.where(state.steps >= self._events.limit, Event.TIME_LIMIT, event)

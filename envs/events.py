@@ -81,8 +81,8 @@ class EventPredictor:
         there = away < MAX_START_OFFSET  # a plan of a user may have rounded its end
         after_jump = next_step(jump, arrival)
         after_turn = next_step(turn, arrival)
-        # At rest at the goal, the arm waits for what is still to come.
-        waits = there & (np.minimum(after_jump, after_turn) < NEVER) & (len(self.triggers) > 0)
+        # At rest at the goal, the arm waits for what is still to come before the time is up.
+        waits = there & (np.minimum(after_jump, after_turn) < self.limit) & (len(self.triggers) > 0)
         horizon = now + self.steps(min(self.task.horizon, self.task.time_limit))
         interim = ("horizon" in self.triggers) & (horizon < moving_until)
         horizon = np.where(interim, horizon, NEVER)

@@ -459,20 +459,20 @@ class Steering:
         tables = self._tables(number)
         return Motion(*(_combined(table, motion, wanted) for table in tables))
 
-    def jerk_cost(self, motion: Motion, wanted: Float) -> Float:
-        """Return half the integral of the squared jerk over one control step, exact, shape (N,)."""
+    def jerk_cost(self, motion: Motion, wanted: Float, duration: Float) -> Float:
+        """Return half the integral of the squared jerk over times of a control step, shape (N,), exact, shape (N,)."""
         nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE)
-        half = 0.5 * (self.physics_steps * self.timestep)
-        time = half * (nodes + 1.0)
+        half = 0.5 * duration
+        time = half[:, None] * (nodes + 1.0)
         w, decay = self.bandwidth, np.exp(-self.bandwidth * time)
         of_velocity = -(w**2) * (1.0 - w * time) * decay
         of_acceleration = (w * time - 2.0) * w * decay
-        table = np.stack((0.0 * time, of_velocity, of_acceleration, -of_velocity), axis=-1)
-        jerk = _combined(table, motion, wanted)
+        jerk = of_velocity[..., None] * (motion.velocity - wanted)[:, None]
+        jerk = jerk + of_acceleration[..., None] * motion.acceleration[:, None]
         each = (jerk * jerk).sum(axis=-1)
         cost = np.zeros(len(each))
-        for k, weight in enumerate(half * weights):  # one after the other: the same bits in any batch
-            cost += 0.5 * weight * each[:, k]
+        for k, weight in enumerate(weights):  # one after the other: the same bits in any batch
+            cost += 0.5 * weight * half * each[:, k]
         return cost
 
     @functools.cache  # noqa: B019 - records of tasks live as long as the process

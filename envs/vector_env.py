@@ -206,7 +206,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             raise ValueError(f"options must be a mapping from names to values, or None, got {options!r}")
         options = dict(options or {})
         for name in ("jumps", "turns", "reaches"):
-            if name in options and self.task.whole_movement:
+            if np.size(options.get(name, ())) and self.task.whole_movement:
                 raise ValueError(
                     f"options[{name!r}] need several decisions, such as decide_at=('target',), got "
                     f"{self.task.decide_at!r}"
@@ -293,8 +293,14 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Raises:
             ValueError: A plan begins elsewhere, or has another number of via-points where plans are revised.
             TypeError: The task has no plans.
+            ResetNeeded: An episode is over.
         """
         self._check_running()
+        over = self.terminated | self.truncated
+        if over.any():
+            raise gym.error.ResetNeeded(
+                f"episode {int(over.argmax())} is over: call reset() before another plan"
+            )
         if self.task.stepwise:
             raise TypeError("an action steers the arm for one control step; plans need another decide_at")
         number, dimension = self.num_envs, self.task.space.dimension
@@ -362,7 +368,17 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state of environments of the same task and number, whatever its number of threads was."""
+        """Continue from a state of environments of the same task and number, whatever its number of threads was.
+
+        Raises:
+            ValueError: The state is one of another number of environments or joints.
+        """
+        number, joints = np.shape(state["scenes"]["start"])
+        if (number, joints) != (self.num_envs, len(self.task.arm.home)):
+            raise ValueError(
+                f"state must be one of {self.num_envs} environments of {len(self.task.arm.home)} joints, got one of "
+                f"{number} environments of {joints} joints"
+            )
         if not self.generators:
             self.generators = [np.random.default_rng() for _ in range(self.num_envs)]
             self._np_random = self.generators[0]

@@ -32,7 +32,7 @@ from viapoint.training.checks import (
     check_whole,
     named_path,
 )
-from viapoint.training.files import as_plain, parse_yaml
+from viapoint.training.files import as_plain, folder_name, parse_yaml
 from viapoint.training.planning.search import registered_task
 
 REGISTRY = ConstructorRegistry()  # Ways in which the command line reads numbers and paths
@@ -359,7 +359,7 @@ class TrainConfig(Config):
     @property
     def folder(self) -> Path:
         """Run folder."""
-        usual = Path("runs") / f"{self.env.rpartition('/')[2]}-{self.algo}-{self.seed}"
+        usual = Path("runs") / f"{folder_name(self.env)}-{self.algo}-{self.seed}"
         return Path(self.out) if self.out else usual
 
 

@@ -49,6 +49,16 @@ def written_by(version: Any) -> str:
     return "" if version in (None, mine) else f"; it was written by viapoint {version}, and this is {mine}"
 
 
+def folder_name(env: str) -> str:
+    """Return the name that the folder of an environment has, by its id or another name.
+
+    Example:
+        >>> folder_name("viapoint/PlanarReach-v0"), folder_name("my_module:my/Task-v0")
+        ('PlanarReach-v0', 'my-Task-v0')
+    """
+    return env.rpartition(":")[2].removeprefix("viapoint/").replace("/", "-")
+
+
 class BadFileError(ValueError):
     """Error of a file or folder; the message names it and the reason."""
 

@@ -100,7 +100,7 @@ class Trial:
 
     def folder(self, out: Path) -> Path:
         """Return the folder of the trial, or of the search."""
-        row = out / self.environment.rpartition("/")[2] / self.row
+        row = out / files.folder_name(self.environment) / self.row
         return row if self.parameters else row / f"seed-{self.seed}"
 
     def config(self, folder: Path, values: Values | None = None) -> TrainConfig:
@@ -483,7 +483,7 @@ def _write_results(study: Study, folder: Path) -> pd.DataFrame:
     files.write_bytes(folder / "results.csv", table.to_csv(index=False).encode())
     files.write_bytes(folder / "results.md", _page(table, study.name).encode())
     for environment, part in table.groupby("environment", sort=False):
-        figure = folder / f"{environment.rpartition('/')[2]}.png"
+        figure = folder / f"{files.folder_name(environment)}.png"
         success_of_rows(figure, part, curves.get(environment, {}))
     return table
 

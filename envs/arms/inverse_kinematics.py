@@ -288,6 +288,7 @@ def inverse_kinematics(
     Raises:
         UnreachableError: No solution was found; the message tells the nearest distance.
         ValueError: An argument has another shape or is not finite.
+        TypeError: It is no arm.
 
     Example:
         >>> from viapoint.envs.arms.inverse_kinematics import inverse_kinematics
@@ -297,6 +298,8 @@ def inverse_kinematics(
         >>> arm.hand(found[0]).round(4).tolist()
         [0.5, 0.2, 0.4]
     """
+    if not isinstance(arm, Arm):
+        raise TypeError(f"arm must be an Arm, as arm_of and load_arm return it, got {arm!r:.60}")
     position = finite_array("position", position, (3,))
     axes = None if quaternion is None else frame_matrices(unit_quaternion("quaternion", quaternion))
     number = whole_number("n_seeds", n_seeds, 1)

@@ -51,7 +51,7 @@ def register_arm(arm: Arm) -> None:
 
     Raises:
         TypeError: It is no arm.
-        ValueError: The name is that of a built-in arm.
+        ValueError: The name is that of a built-in arm or of a file, or empty.
 
     Example:
         >>> from viapoint.envs import arm_of, load_arm, register_arm
@@ -64,6 +64,10 @@ def register_arm(arm: Arm) -> None:
         raise TypeError(f"arm must be an Arm, as load_arm returns it, got {arm!r:.60}")
     if arm.name in _BUILT_IN:
         raise ValueError(f"there is a built-in arm of the name {arm.name!r}; give another one")
+    if not arm.name or arm.name.endswith(ARM_FILES):
+        raise ValueError(
+            f"name of an arm must be a word, and not end in {' or '.join(ARM_FILES)}, got {arm.name!r}"
+        )
     _OWN[arm.name] = arm
 
 

@@ -117,7 +117,7 @@ def register_scene_family(
         trained: True if the family is one of those of training by default.
 
     Raises:
-        TypeError: The name is not a string, or `build` is not a function of two arguments.
+        TypeError: The name is not a string, `build` is not a function of two arguments, or a flag is not a bool.
         ValueError: The name is taken or empty, or a kind or number is not allowed.
 
     Example:
@@ -134,6 +134,9 @@ def register_scene_family(
     """
     if not isinstance(name, str):
         raise TypeError(f"name must be a string, got {name!r}")
+    for flag, value in (("plane", plane), ("trained", trained)):
+        if not isinstance(value, bool):
+            raise TypeError(f"{flag} must be True or False, got {value!r}")
     taken = scene_families(plane)
     if not name:
         raise ValueError("name must not be empty")

@@ -295,8 +295,8 @@ def scene_options(scenes: Scenes, arm: Arm, space: SpaceName | None = None, scen
     options["obstacles"] = unpack(scenes.obstacles, scene)
     times = scenes.jump_times[scene]
     jumps = scenes.jumps[scene][times < NEVER]
-    if len(jumps):
-        options["jumps"] = np.column_stack((jumps[:, 0], where.coordinates(jumps[:, 1:])))
+    # Without jumps the list is empty: a task that may have some draws them where none are given.
+    options["jumps"] = np.column_stack((jumps[:, 0], where.coordinates(jumps[:, 1:])))
     present = scenes.obstacles.present[scene]
     turn_time = scenes.turn_time[scene][present]
     if (turn_time < NEVER).any():

@@ -217,11 +217,11 @@ def _write(draft: Draft, scene: int, layout: Layout) -> None:
 
 
 def is_planar(arm: Arm) -> bool:
-    """Return True for an arm of two hinges with vertical axes."""
+    """Return True for an arm of two hinges with axes that point up."""
     if len(arm.home) != 2 or arm.chain.sliding.any():
         return False
     rotation, _ = link_poses(arm.chain, arm.home)
-    return bool((np.abs(rotation[1:, 2, 2]) > 1.0 - 1e-6).all())
+    return bool((rotation[1:, 2, 2] > 1.0 - 1e-6).all())
 
 
 def _setting_of(task: Task, plane: bool) -> Setting:

@@ -131,6 +131,8 @@ def test_episodes_go_on_with_another_number_of_threads(env_id):
     first.step(action)
     for source, target in ((first, second), (second, first)):
         target.unwrapped.restore(source.unwrapped.state())
+        with pytest.raises(ValueError, match="9 environments"):
+            gym.make_vec(env_id, num_envs=3).unwrapped.restore(source.unwrapped.state())
         assert target.unwrapped.physics_steps == source.unwrapped.physics_steps
     expected, found = (each.step(action) for each in (first, second))
     same(expected[0], found[0])

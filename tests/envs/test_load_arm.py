@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import re
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
@@ -22,6 +23,13 @@ from viapoint.envs.geometry.obstacles import pack
 TEXT = UR5E.read_text(encoding="utf-8")
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 HOME = (0.28, -1.55, -1.93, -1.232, np.pi / 2, 0.28)
+
+
+# An arm of two hinges with vertical axes that point up or down
+TWO_LINKS = """<mujoco><worldbody><body><joint name="s" axis="0 0 {}" range="-115 115"/>
+<geom type="capsule" fromto=".05 0 0 .27 0 0" size=".02"/><body pos=".3 0 0">
+<joint name="e" axis="0 0 {}" range="6 143"/><geom type="capsule" fromto=".05 0 0 .25 0 0" size=".02"/>
+<site name="tool" pos=".25 0 0"/></body></body></worldbody></mujoco>"""
 
 
 def ur5e(file=TEXT, **changes):
@@ -768,6 +776,17 @@ ODD = [
     ("0.2 0.2 0.1", "0 0 0"),
     ('<link name="base">', f'<link name="odom"/>{FLOATING}<link name="base">'),
 ]
+
+
+@pytest.mark.parametrize("axes", [(1, 1), (-1, -1), (1, -1)])
+def test_starts_and_goals_are_reached_whichever_way_the_axes_point(axes):
+    arm = load_arm(TWO_LINKS.format(*axes), velocity_limit=2.0, torque_limit=50.0)
+    env = gym.make("viapoint/Obstacles-v0", arm=arm).unwrapped
+    for seed in range(3):
+        env.reset(seed=seed)
+        scenes = env.batch.scenes
+        assert not env.step(np.zeros(env.action_space.shape, np.float32))[4]["is_success"]
+        assert row_clearances(arm.chain, arm.spheres, scenes.goal, scenes.obstacles, 1.0)[0].min() > 0.0
 
 
 def test_planar_joints_of_a_urdf_are_fixed(crane):

@@ -1,5 +1,6 @@
 """Bad input raises one error where it enters: the input, and the type of the error."""
 
+import dataclasses
 import functools
 
 import gymnasium as gym
@@ -219,7 +220,9 @@ CALLS = [
         *(({"sensor": "hand_rays", "decide_at": ["sight", telling]},) for telling in ("clearance", "course")),
     ]),
     (ve.arm_of, [("large",)]),
-    (ve.register_arm, [(ve.arm_of("panda"),)]),
+    (ve.register_arm, [
+        (ve.arm_of("panda"),), *((dataclasses.replace(ve.arm_of("panda"), name=name),) for name in ("", "x.xml")),
+    ]),
     (family, [("",), ("shelf",)]),
     (lambda values: family("x", **values), [
         ({"kinds": ("ball",)},), ({"kinds": ("convex_mesh",)},), ({"n_obstacles": 0},),
@@ -259,6 +262,8 @@ OF_ANOTHER_TYPE = [
     (lambda change: record(**change), [({"speed": 1},), ({"shapes": 1},)]),
     (ve.register_arm, [("small",)]),
     (family, [(3,), ("x", lambda rng: None), ("x", None)]),
+    (lambda flag: family("x", **flag), [({"plane": "yes"},), ({"trained": 1},)]),
+    (ve.inverse_kinematics, [("panda", (0.5, 0.0, 0.4))]),
 ]
 ROWS = [
     *((call, arguments, ValueError) for call, arguments in CALLS),

@@ -5,7 +5,21 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import GOAL, JUMPS, MOVING, OTHER, PANDA, PANDA_MOVING, PLANE, events, given, play, post, same
+from helpers import (
+    GOAL,
+    JUMPS,
+    MOVING,
+    OTHER,
+    PANDA,
+    PANDA_MOVING,
+    PLANE,
+    START,
+    events,
+    given,
+    play,
+    post,
+    same,
+)
 
 from viapoint import primitives
 from viapoint.envs.arms.kinematics import LIMIT_SHARE, slowdowns
@@ -149,6 +163,15 @@ def test_a_plan_in_metres_and_seconds_can_be_executed_on_the_way():
     np.testing.assert_allclose(states(before, np.array([time]))[2], after.acceleration, atol=1e-9)
 
 
+@pytest.mark.parametrize(("env_id", "decide_at"), [(PLANE, "end"), (JUMPS, ("target",))])
+def test_no_plan_is_executed_after_the_end(env_id, decide_at):
+    env, _ = given(env_id, decide_at=decide_at)
+    plan = Plan(np.stack((START, OTHER, GOAL))[None], np.full((1, 2), 0.5))
+    assert env.batch.execute_plan(plan).info["is_success"]
+    with pytest.raises(gym.error.ResetNeeded):
+        env.batch.execute_plan(plan)
+
+
 @pytest.mark.parametrize("env_id", [JUMPS, PANDA_MOVING])
 def test_a_moved_goal_is_reached_without_a_jump(env_id):
     env = gym.make_vec(env_id, num_envs=3, horizon=0.1, threads=1, n_obstacles=0).unwrapped
@@ -241,6 +264,13 @@ def test_a_jump_that_is_no_reason_to_decide_is_noticed_on_arrival():
     infos = play(env)
     assert events(infos) == [Event.ARRIVAL, Event.ARRIVAL]
     assert [info["is_success"] for info in infos] == [False, True]
+
+
+@pytest.mark.parametrize("late", [3.0, 30.0])
+def test_changes_after_the_time_limit_keep_nobody_waiting(late):
+    for changes in ({"jumps": [[late, *OTHER]]}, {"turns": [[late, 0.1, 0.0, 0.0]]}):
+        env, _ = given(MOVING, [post(0.3, 0.2)], decide_at=("target", "course"), **changes)
+        assert play(env)[-1]["is_success"]
 
 
 def test_an_obstacle_that_changes_its_course_ends_the_decision():

@@ -85,7 +85,8 @@ def test_a_scene_depends_on_its_generator_alone(env_id):
     ("env_id", "kwargs"),
     [
         (PLANE, {}), (PANDA, {}), (MOVING, {}), (MOVING, REACHING), ("viapoint/PlanarTargetJump-v0", {}),
-        ("viapoint/PlanarTargetJumpStep-v0", {}), ("viapoint/PlanarMovingObstaclesStep-v0", REACHING),
+        ("viapoint/PlanarTargetJump-v0", {"n_jumps": (0, 2)}), ("viapoint/PlanarTargetJumpStep-v0", {}),
+        ("viapoint/PlanarMovingObstaclesStep-v0", REACHING),
     ],
 )  # fmt: skip
 def test_drawn_scenes_survive_json(env_id, kwargs):

@@ -5,7 +5,7 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import GOAL, STEP, WALL, given, post
+from helpers import GOAL, OTHER, STEP, WALL, given, post
 from scipy.integrate import simpson
 
 from viapoint.envs.outcome import SETTLING
@@ -56,7 +56,10 @@ def test_the_filter_obeys_its_equation_and_control_steps_join():
         for part, begin in zip(whole, motion, strict=True):
             np.testing.assert_allclose(part[:, 0], begin, rtol=1e-12)
         cost = 0.5 * simpson((law**2).sum(axis=-1), dx=fine.timestep, axis=-1)
-        np.testing.assert_allclose(fine.jerk_cost(motion, wanted), cost, rtol=1e-5)
+        half = 0.5 * simpson((law[:, :201] ** 2).sum(axis=-1), dx=fine.timestep, axis=-1)
+        for share, expected in ((1.0, cost), (0.5, half)):  # a contact may end a control step
+            found = fine.jerk_cost(motion, wanted, np.full(len(cost), 400 * share * fine.timestep))
+            np.testing.assert_allclose(found, expected, rtol=1e-5)
         motion = Motion(*(part[:, -1] for part in whole))
 
 
@@ -128,6 +131,23 @@ def test_a_reference_out_of_reach_ends_the_episode():
     assert not any(info[name] for name in ("reachable", "is_success", "collision"))
     assert env.physics_steps == before
     assert env.observation_space.contains(observation)
+
+
+def test_no_jerk_counts_after_a_contact():
+    costs = []
+    for control_step in (0.02, 0.4):
+        env, _ = given(STEP, [WALL], control_step=control_step)
+        terminated = False
+        while not terminated:
+            *_, terminated, _, info = env.step(np.array([1.0, 0.0], np.float32))
+        assert info["collision"]
+        costs.append(info["jerk_cost"])
+    assert costs[0] == pytest.approx(costs[1], rel=1e-6)
+
+
+def test_a_jump_after_the_time_limit_keeps_nobody_waiting():
+    env, observation = given("viapoint/PlanarTargetJumpStep-v0", jumps=[[30.0, *OTHER]])
+    assert towards(env, observation)[-1][-1]["is_success"]
 
 
 def test_obstacles_turn_within_a_control_step():

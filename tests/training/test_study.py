@@ -144,6 +144,12 @@ def test_a_search_writes_its_best_settings_and_a_command_for_them(ray, tmp_path)
     assert not lines
 
 
+def test_names_that_end_alike_have_folders_of_their_own():
+    environments = {name: {"id": PLANE} for name in (PLANE, "my/PlanarObstacles-v0")}
+    trials = Study.from_dict({**GIVEN, "environments": environments}).trials
+    assert len({trial.folder(Path("out")) for trial in trials}) == len(trials)
+
+
 def test_grids_and_checks_make_rows():
     grid = {"hyperparameters.batch_size": [64, 128], "env_kwargs.n_via": [1, 2]}
     given = {"environments": [PLANE], "seeds": [3], "agents": {"sac": {"algo": "sac", "grid": grid}}}
