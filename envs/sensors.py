@@ -34,7 +34,7 @@ MOST_LOOKS = 64  # Greatest number of looks that are remembered
 WIDEST_IMAGE = 2.9  # Greatest field of view of an image, [rad]: its rays meet a plane
 VIEW_MARGIN = 0.01  # Least distance of obstacles from a sensor when an episode begins, [m]
 TOUCH = 1e-5  # Distance from a surface at which a ray has met it, [m]
-MOST_STEPS = 100  # Greatest number of steps along a ray towards one obstacle
+MOST_STEPS = 100  # Greatest number of steps along a ray towards a convex obstacle
 
 
 class Readings(NamedTuple):
@@ -336,9 +336,10 @@ def _cast(
                     first = max(middle - half, 0.0)
                     last = min(middle + half, last)
                 way = first
-                for _ in range(MOST_STEPS):
-                    if way >= last:
-                        break
+                # A ray along points goes on in small steps, and to a convex shape in few.
+                steps = 0
+                while way < last and (steps < MOST_STEPS or kind == POINT_CLOUD):
+                    steps += 1
                     apart, a, b, c = point_distance_and_normal(
                         obstacles, scene, row, x0 + way * x, y0 + way * y, z0 + way * z, 0.0, 1e9
                     )
@@ -346,7 +347,7 @@ def _cast(
                         ranges[scene, ray] = way
                         seen[scene, ray] = row
                         break
-                    step = apart
+                    step = max(apart, TOUCH)
                     if kind != POINT_CLOUD:
                         # A convex shape lies behind the plane through its nearest point.
                         closing = -(a * x + b * y + c * z)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from viapoint.envs.common.validation import did_you_mean, whole_number
-from viapoint.training.files import check_ours
+from viapoint.training.files import BadFileError, check_ours, read_json
 
 DEFAULT_ENV = "viapoint/PlanarObstacles-v0"
 SHIPPED = Path(str(files("viapoint.training") / "pretrained"))  # Agents of the package
@@ -18,6 +18,7 @@ SHIPPED = Path(str(files("viapoint.training") / "pretrained"))  # Agents of the 
 SHIPPED_IDS = tuple(f"viapoint/{path.parent.name}" for path in sorted(SHIPPED.glob("*/model.json")))
 
 # Arguments that a training's environment does not take, and what to use instead
+RESULTS = frozenset({"methods", "problems"})  # Names in files of results, of which each has one
 ELSEWHERE = {
     "num_envs": "--n-envs says how many environments are stepped together",
     "seed": "--seed is that of everything",
@@ -71,6 +72,8 @@ def check_file(name: str, path: Path | None, suffix: str = "") -> None:
     if suffix and path.suffix.lower() != suffix:
         raise ValueError(f"{name} must end in {suffix}, got {path}")
     check_ours(path)
+    if path.suffix == ".json" and path.is_file() and RESULTS.isdisjoint(read_json(path)):
+        raise BadFileError(path, "holds no results of viapoint; name another file")
     check_folder(f"{name} {path}", path.parent)
 
 

@@ -176,9 +176,9 @@ def arm_from_xml(
     """Return the arm of an MJCF text without actuators, in which all collision geoms are capsules and spheres.
 
     The joints are hinges and slides from the base to the tool, which is a site; all other bodies move with one of them.
-    Pairs of bodies in `exclude` may pass through one another, with the reason. So may pairs for which `touch` is False
-    wherever their spheres overlap; by default, spheres decide. The servos of the joints are critically
-    damped; `bandwidth` is their natural frequency, [rad/s].
+    A body and those of the link before that carry it may pass through one another, and so may pairs in `exclude`, which
+    has the reason, and pairs for which `touch` is False wherever their spheres overlap; by default, spheres decide. The
+    servos of the joints are critically damped; `bandwidth` is their natural frequency, [rad/s].
 
     Raises:
         ValueError: Bodies that are apart at home cannot be told apart.
@@ -188,7 +188,14 @@ def arm_from_xml(
     chain, links, frames = _chain(model, data, joints, tool)
     capsules = _capsules(model, data, links, frames)
     home = np.array(home, dtype=np.float64)
-    names, spheres, left_out, excess = cover(chain, capsules, links, home, exclude or {})
+    carried = {}
+    for name, link in links.items():
+        carrier = model.body(name)
+        while carrier.id:
+            carrier = model.body(carrier.parentid[0])
+            if links.get(carrier.name, 0) == link - 1 > 0:
+                carried[frozenset((carrier.name, name))] = "consecutive links"
+    names, spheres, left_out, excess = cover(chain, capsules, links, home, {**carried, **(exclude or {})})
     # Pairs that touch in none of many configurations are not compared, either.
     ranges = np.array([model.joint(each).range for each in joints])
     low, high = ranges.T

@@ -172,7 +172,7 @@ def arm_joints(model: mujoco.MjModel, chain: list[str], notes: list[str]) -> lis
     """Return the joints of a chain without those of a mobile base, and without those of fingers.
 
     A body with a slide that has no end is a mobile base, unless a hinge carries it. Fingers are what hangs on a body
-    from which several short branches move.
+    from which several short branches move, unless one of them is longer than the others.
     """
     carriers = {name: int(model.joint(name).bodyid[0]) for name in chain}
     endless = (model.jnt_type == MOVES[1]) & (model.jnt_limited == 0)
@@ -186,7 +186,12 @@ def arm_joints(model: mujoco.MjModel, chain: list[str], notes: list[str]) -> lis
     for name in chain:
         for body in ancestors(model, carriers[name])[:-1]:
             moving, arms = _branches(model, body)
-            if len(moving) > 1 and not arms:
+            rest = _rest_of_arm(model, moving)
+            if (
+                len(moving) > 1
+                and not arms
+                and rest not in (carriers[name], *ancestors(model, carriers[name]))
+            ):
                 fingers.add(name)
     for some, what in ((mobile, "a mobile base"), (fingers, "fingers")):
         if some:
@@ -227,8 +232,8 @@ def _tip(model: mujoco.MjModel, sites: list[Tool], bodies: list[Tool], root: int
             raise ValueError(f"the chain branches into {names}; name one with base=, or a tool with tool=")
         if arms:
             body = arms[int(np.argmax(lengths))]
-        elif len(moving) == 1 and not _is_gripper(model, moving[0]):
-            body = moving[0]
+        elif (rest := _rest_of_arm(model, moving)) is not None:
+            body = rest
         else:  # nothing more that moves, or fingers
             break
     if len(chain_joints(model, body, root)) < 2:
@@ -237,8 +242,9 @@ def _tip(model: mujoco.MjModel, sites: list[Tool], bodies: list[Tool], root: int
     if len(own) == 1:
         return own[0]._replace(name=f"the site {own[0].name!r} of {bodies[body - 1].name!r}")
     flange = body
-    while not moving:
-        frames = [each for each in _children(model, flange) if not model.body_geomnum[each]]
+    while True:
+        still = [each for each in _children(model, flange) if not _joints_below(model, each)]
+        frames = [each for each in still if not model.body_geomnum[each]]
         if len(frames) != 1:
             break
         flange = frames[0]
@@ -294,6 +300,15 @@ def _branches(model: mujoco.MjModel, body: int) -> tuple[list[int], list[int]]:
         if _joints_below(model, each) >= LEAST_CHAIN and not _is_gripper(model, each):
             arms.append(each)
     return moving, arms
+
+
+def _rest_of_arm(model: mujoco.MjModel, moving: list[int]) -> int | None:
+    """Return the one of some moving bodies that goes on with the arm: the longest, and no gripper; None for fingers."""
+    lengths = [_joints_below(model, each) for each in moving]
+    if not moving or lengths.count(max(lengths)) > 1:
+        return None
+    longest = moving[int(np.argmax(lengths))]
+    return None if _is_gripper(model, longest) else longest
 
 
 def _is_gripper(model: mujoco.MjModel, body: int) -> bool:

@@ -307,8 +307,13 @@ def inverse_kinematics(
     rng = np.random.default_rng(0)
     low, high = arm.joint_range.T
     begin = np.concatenate((first[None], rng.uniform(low, high, (number - 1, len(low)))))
-    found = _solutions(arm, position, axes, begin, first)
-    if not found:  # some poses near the joint limits are reached from few places
+    # Nothing reaches farther than all links in one line.
+    chain = arm.chain
+    lengths = np.linalg.norm((*chain.origin[1:], chain.tool_origin), axis=1)
+    slides = np.abs(arm.joint_range).max(axis=1)[chain.sliding]
+    far = np.linalg.norm(position - chain.origin[0]) > lengths.sum() + slides.sum() + PLACE_TOLERANCE
+    found = [] if far else _solutions(arm, position, axes, begin, first)
+    if not found and not far:  # some poses near the joint limits are reached from few places
         begin = rng.uniform(low, high, (PATIENCE * number, len(low)))
         found = _solutions(arm, position, axes, begin, first)
     if not found:

@@ -417,7 +417,8 @@ def _note_units(arm: Arm, notes: list[str]) -> None:
         notes.append(
             f"{WARNING}the range of {some} is over four turns; are they degrees in place of radians?"
         )
-    length = float(np.linalg.norm(arm.chain.origin, axis=1).sum())
+    spheres = np.linalg.norm(arm.spheres.centre, axis=1) + arm.spheres.radius
+    length = float(max(np.linalg.norm(arm.chain.origin, axis=1).sum(), spheres.max()))
     if length > LONGEST:
         notes.append(f"{WARNING}the arm is {length:.3g} m long; are lengths millimetres in place of metres?")
 
@@ -663,7 +664,7 @@ def _note_rest(model: mujoco.MjModel, joints: Names, tool: Tool, bodies: list[in
 def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> dict[Pair, str]:
     """Return the pairs of bodies that the file, or an SRDF file, does not let collide, and those of consecutive links.
 
-    Of the base, the bodies that carry the first link count. MuJoCo decides by contact bits, excluded bodies, and
+    Of each link, the bodies that carry the next one count. MuJoCo decides by contact bits, excluded bodies, and
     explicit pairs of geoms.
     """
     model = parsed.model
@@ -680,7 +681,7 @@ def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> dict[Pa
             collide = collide or bool(bits or spare[a] or spare[b] or frozenset((a, b)) in explicit)
         excluded = (min(first, second) << 16) + max(first, second) in model.exclude_signature
         carries = first > 0 and first in ancestors(model, second)
-        if parsed.links[second] - parsed.links[first] == 1 and (parsed.links[first] or carries):
+        if parsed.links[second] - parsed.links[first] == 1 and carries:
             found[first, second] = "consecutive links"
         elif excluded or not collide or parsed.named((first, second)) in silent:
             found[first, second] = "excluded in the file"

@@ -70,19 +70,13 @@ def cover(
 def _pairs(
     names: Sequence[str], links: dict[str, int], exclude: Mapping[frozenset[str], str]
 ) -> tuple[list[tuple[int, int]], list[LeftOut]]:
-    """Return the pairs of groups that are compared, and those of different links that are not.
-
-    Consecutive links are not compared; which parts of the base carry the first link, `exclude` tells.
-    """
+    """Return the pairs of groups that are compared, and those of different links that are not."""
     pairs, left_out = [], []
     for (i, first), (j, second) in itertools.combinations(enumerate(names), 2):
-        apart = abs(links[first] - links[second])
         pair = frozenset((first, second))
-        if apart == 0:  # rigid to one another
+        if links[first] == links[second]:  # rigid to one another
             continue
-        if apart == 1 and min(links[first], links[second]) > 0:
-            left_out.append(LeftOut(first, second, "consecutive links"))
-        elif pair in exclude:
+        if pair in exclude:
             left_out.append(LeftOut(first, second, exclude[pair]))
         else:
             pairs.append((i, j))

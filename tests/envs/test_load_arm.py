@@ -197,6 +197,29 @@ def test_the_first_link_is_compared_with_the_base_except_with_bodies_that_carry_
     check_contact_implies_overlap(arm)
 
 
+RAIL = """
+    <mujoco><compiler angle="radian"/><worldbody><body name="rail" pos="0 0 1">
+      <joint name="x" type="slide" axis="1 0 0" range="-1 1"/><geom type="box" size=".1 .1 .05" mass="5"/>
+      <body name="carriage" pos="0 0 -.1"><joint name="lift" type="slide" axis="0 0 1" range="-.5 0"/>
+        <geom type="box" size=".05 .05 .05" mass="2"/>
+        <body name="mast" pos="-.09 .11 0">{}<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".03" mass=".2"/></body>
+        <body name="upper" pos=".1 0 -.1"><joint name="shoulder" axis="0 0 1" range="-2.6 2.6"/>
+          <geom type="capsule" fromto=".1 0 0 .3 0 0" size=".03" mass="1"/>
+          <body name="fore" pos=".35 0 0"><joint name="elbow" axis="0 0 1" range="-2.6 2.6"/>
+            <geom type="capsule" fromto=".1 0 0 .3 0 0" size=".03" mass="1"/>{}
+    </body></body></body></body></worldbody></mujoco>"""
+"""Arm of two hinges on a carriage, beside which a mast stands that may turn."""
+
+
+@pytest.mark.parametrize("camera", ["", '<joint name="pan" axis="0 0 1" range="-1 1"/>'])
+@pytest.mark.parametrize("tool", ["", '<site name="tcp" pos=".3 0 0"/>'])
+def test_what_stands_beside_an_arm_on_a_carriage_is_no_part_of_it_and_no_finger(camera, tool):
+    arm = load_arm(RAIL.format(camera, tool), velocity_limit=1.0, torque_limit=500.0)
+    assert arm.joint_names == ("x", "lift", "shoulder", "elbow")
+    names = arm.group_names
+    assert {"mast", "upper"} in [{names[a], names[b]} for a, b in arm.spheres.pairs]
+
+
 def near_arm(gap):
     """Three links, of which the third has a box at a distance from a ball of the first."""
     return f"""
@@ -348,6 +371,17 @@ def test_the_tip_of_the_last_link_is_where_its_geoms_end_and_is_mirrored_with_th
     sign = "-" if side < 0.0 else ""
     tip = f"the tip of 'c', {away:.3g} m along {sign}y of its frame" if away else "the frame of 'c'"
     assert arm.notes[0] == f'tool: "{tip}"'
+
+
+def test_a_frame_between_fingers_is_the_tool():
+    finger = (
+        '<body pos="{0} 0 .1"><joint type="slide" axis="{0} 0 0" range="0 .02"/><geom size=".01"/></body>'
+    )
+    hand = f'<body name="flange" pos="0 0 .07"/>{finger.format(0.03)}{finger.format(-0.03)}'
+    text = re.sub(r'<site name="tool"[^>]*/>', hand, near_arm(0.02))
+    arm = load_arm(text, **{**THREE, "tool": None, "joints": None})
+    np.testing.assert_allclose(arm.hand(np.zeros(3)), (0.0, 0.0, 0.57), atol=1e-9)
+    assert arm.joint_names == THREE["joints"]
 
 
 def test_joints_without_names_get_some_and_those_that_follow_others_are_told():
@@ -660,6 +694,10 @@ def test_what_a_user_hardly_means_is_told():
         ur5e(TEXT, home=folded)
     with pytest.warns(UserWarning, match="degrees"):
         ur5e(TEXT, joint_range=[(-170.0, 170.0)] * 6)
+    with pytest.warns(UserWarning, match="millimetres"):  # of geoms alone
+        three(
+            ('geom size="0.05" mass="1"/>\n        <body name="b"', 'geom size="50" mass="1"/><body name="b"')
+        )
 
 
 def test_a_written_arm_is_the_same_arm_and_takes_other_limits(tmp_path):

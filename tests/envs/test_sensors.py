@@ -55,6 +55,15 @@ def test_ranges_are_those_of_mujoco(shape) -> None:
     assert (found.ranges[0] < 3.0).any()
 
 
+def test_rays_that_run_along_points_go_on_to_what_is_behind_them() -> None:
+    row = np.arange(-0.3, 0.3, 0.01)
+    floor = np.stack(np.meshgrid(np.arange(-0.2, 1.0, 0.01), row, 0.0), -1).reshape(-1, 3)
+    wall = np.stack(np.meshgrid(1.0, row, np.arange(0.0, 0.4, 0.01)), -1).reshape(-1, 3)
+    sensor = ve.Sensor(position=(0.0, 0.0, 0.015), columns=21, field_of_view=0.4, range=1.5)
+    alone, both = [ve.PointCloud(each, radius=0.01) for each in (wall, np.concatenate((floor, wall)))]
+    np.testing.assert_allclose(look(sensor, both).ranges, look(sensor, alone).ranges, atol=1e-4)
+
+
 def test_the_nearest_obstacle_is_seen_and_readings_do_not_depend_on_the_batch() -> None:
     sensor = dataclasses.replace(WIDE, noise=0.01, dropped=0.1)
     alone = np.array([look(sensor, shape).ranges[0] for shape in SCENE])

@@ -38,7 +38,7 @@ from viapoint.training.agents.pairs import CLEAR, LENGTHS, NO_OBSTACLE, pairs_of
 from viapoint.training.planning.baselines import agent_method
 from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.candidates import best_duration, candidate_actions, sobol_actions
-from viapoint.training.planning.cautious import DEPTHS, cleared_depths, places_of
+from viapoint.training.planning.cautious import places_of
 from viapoint.training.planning.movements import INSTANTS, OUTSIDE
 from viapoint.training.planning.problem import Problem, moves_of
 from viapoint.training.planning.search import CLEARANCE_MARGIN, plan_clearances, registered_task
@@ -643,7 +643,7 @@ def test_rounds_of_candidates_never_lower_the_best_value(agent) -> None:
     policy = agent.policy
     scenes = scenes_of(policy.task, 16, 5)
     problem, sight = Problem.of_scenes(scenes, policy.task), Sight.of_scenes(scenes, policy.task)
-    rank = functools.partial(policy.rank, problem, sight)
+    rank = functools.partial(policy.rank, policy.beliefs(problem, sight), sight)
     actions, value = policy.proposals(16, rank)
     first = value[:, : policy.candidates].max(axis=1)
     assert actions.shape[1] == policy.all_candidates > policy.candidates
@@ -655,28 +655,41 @@ def test_cautious_plans_keep_from_what_may_be_behind_fronts(agent, monkeypatch) 
     policy, simulation = agent.policy, SceneSimulation(SENSED)
     observation = simulation.observe(scenes_of(simulation.task, 32, 7))
     problem = Problem.of_observation(observation, policy.task)
-    cleared = cleared_depths(policy.task, problem, Sight.of(observation, policy.task))
-    depths = []
+    deep = problem._replace(obstacles=thick_points(policy.task, Sight.of(observation, policy.task), 0.16))
+    clear = []
     for caution in (0.0, 0.8):
         monkeypatch.setattr(policy, "caution", caution)
-        depths.append(cleared(policy.decide(observation)[:, None]))
-    assert (depths[1] >= depths[0]).mean() > 0.9
-    assert depths[1].mean() > depths[0].mean() + 0.1
+        actions = policy.decide(observation)[:, None]
+        clear.append(plan_clearances(policy.task, deep, actions, CLEARANCE_MARGIN, CLEARANCE_MARGIN))
+    assert (clear[1] >= CLEARANCE_MARGIN).mean() > (clear[0] >= CLEARANCE_MARGIN).mean() + 0.1
 
 
-def test_a_plan_that_clears_a_depth_clears_lesser_ones() -> None:
-    task = registered_task(SENSED)
+def test_a_plan_that_clears_a_depth_clears_lesser_ones(agent, monkeypatch) -> None:
+    policy, task = agent.policy, agent.policy.task
+    monkeypatch.setattr(policy, "effort", 0.0)
+    monkeypatch.setattr(
+        policy, "caution", policy.depths[-1]
+    )  # so that the worth is the depth that is cleared
     scenes = scenes_of(task, 16, 3)
     problem, sight = Problem.of_scenes(scenes, task), Sight.of_scenes(scenes, task)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (16, 64, task.action.size))
-    cleared = cleared_depths(task, problem, sight)(actions)
-    assert set(np.unique(cleared)) == {0.0, *(DEPTHS["hand"] / DEPTHS["hand"][0])}
-    for depth in DEPTHS["hand"]:
-        belief = problem._replace(obstacles=thick_points(task, sight, depth))
+    beliefs = policy.beliefs(problem, sight)
+    _, cleared = policy.inputs(beliefs, sight, actions)
+    np.testing.assert_allclose(np.unique(cleared), policy.depths)
+    for depth, belief in zip(policy.depths[1:], beliefs[2:], strict=True):
         clearance = plan_clearances(task, belief, actions, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
-        at_least = cleared * DEPTHS["hand"][0] > depth - 1e-9
         # Points of a deeper belief are in cubes of their own, so that few plans differ.
-        assert (at_least == (clearance >= CLEARANCE_MARGIN)).mean() > 0.99
+        assert ((cleared > depth - 1e-9) == (clearance >= CLEARANCE_MARGIN)).mean() > 0.99
+
+
+def test_half_of_the_scenes_are_of_further_families_that_the_task_has_room_for() -> None:
+    env = ViaVecEnv(SENSED, 16, seed=0, shapes="box", n_obstacles=(1, 4))
+    agent = ViaRank("ViaRankPolicy", env, families=["gate", "ring"], policy_kwargs={"candidates": 32})
+    assert [draw.task.families for draw in agent._samplers] == [("clutter",), ("gate",)]  # a ring needs five
+    walls, _, _ = agent._drawn(agent._samplers, list(range(40)))
+    posts = agent._drawn(agent._samplers[:1], list(range(0, 40, 2)))[0]
+    np.testing.assert_array_equal(walls.start[:20], posts.start)
+    assert (walls.obstacles.present.sum(axis=1)[20:] == 2).all()
 
 
 def test_places_are_those_of_the_movement() -> None:

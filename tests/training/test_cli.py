@@ -17,7 +17,7 @@ import imageio_ffmpeg
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import MOVING, PLANE, REACH, UR5E, scenes_of
+from helpers import MOVING, PLANE, REACH, STEP, UR5E, scenes_of
 from matplotlib.image import imread
 from PIL import Image
 
@@ -119,7 +119,7 @@ def trained(tmp_path_factory):
     return folder
 
 
-def test_train_then_evaluate_then_play(trained, shipped, tmp_path, capsys):
+def test_train_then_evaluate_then_play(trained, shipped, tmp_path, capsys, failed):
     results = tmp_path / "new" / "results.json"
     words = ["evaluate", trained, "--baselines", "straight", "--scenes", "test", "--json", results]
     run(*words, "--n-scenes", 12)
@@ -127,12 +127,16 @@ def test_train_then_evaluate_then_play(trained, shipped, tmp_path, capsys):
     record = json.loads(results.read_text())
     assert [each["scenes"] for each in record["methods"].values()] == [12, 12]
     assert record["env"] == PLANE
+    run(*words, "--n-scenes", 1)  # results are replaced, other files stay
+    for kept in (trained / "final" / "model.json", trained / "versions.json"):
+        assert kept.name in failed(*words[:-1], kept, "--n-scenes", 1)
     run("evaluate", trained, "--baselines", "--checks", 0, 8, "--n-scenes", 4)
     kept = [json.loads(path.read_text()) for path in (trained / "evaluations").glob("test-*.json")]
     assert ["agent", "agent, 8 checks"] in [list(each["methods"]) for each in kept]
     video = tmp_path / "film" / "a.mp4"
     run("play", trained, "--video", video, "--n-scenes", 1)
     assert video.stat().st_size > 1000
+    run("play", "--env", STEP, "--video", video, "--n-scenes", 1)
 
 
 def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, tmp_path):

@@ -125,6 +125,7 @@ def test_content_that_is_none_is_refused(name, content, model):
         {"algorithm": "os.system"},
         {"policy": "CnnPolicy2"},
         {"hyperparameters": {"tensorboard_log": "x"}},
+        *({"num_timesteps": number} for number in (-5, 1e300, "7", True)),
         {"hyperparameters": {"learning_rate": {"kind": "eval"}}},
         *({"env": {"id": name, "kwargs": {}}} for name in ("../../etc/passwd", "os:system", None, ["x"])),
     ],

@@ -75,7 +75,9 @@ def test_a_dataset_replays_bit_for_bit(method, words, capsys):
     assert_replays(dataset)
 
 
-def test_episodes_are_those_of_the_method_and_have_names_by_default(folder):
+def test_episodes_are_those_of_the_method_and_have_names_by_default(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "straight").mkdir()  # a folder of this name is no agent
     record("--env", PLANE, "--episodes", 2, "--agent=straight")
     dataset = minari.load_dataset("viapoint/PlanarObstacles/straight-v0")
     assert (folder / "viapoint/PlanarObstacles/straight-v0/data").is_dir()

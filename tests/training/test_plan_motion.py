@@ -184,6 +184,27 @@ def test_movements_in_motion_use_all_of_their_limits_and_nothing_more() -> None:
         assert done.duration[0] == pytest.approx(plan.duration)
 
 
+def test_the_shortest_duration_that_is_allowed_keeps_the_limits_between_all_instants() -> None:
+    rng = np.random.default_rng(0)
+    for change in rng.uniform(-0.6, 0.6, (20, 7)):
+        usual = plan_motion(PANDA, PANDA.home, PANDA.home + change)
+        plan = plan_motion(
+            PANDA, PANDA.home, PANDA.home + change, duration=usual.duration * max(usual.limits)
+        )
+        motion = plan.joints(5e4, force=True)
+        if plan.success:
+            assert (np.abs(motion.velocity) <= PANDA.velocity_limit).all()
+            assert (np.abs(motion.torque) <= PANDA.torque_limit).all()
+
+
+def test_no_seeds_are_no_seeds() -> None:
+    plans = [
+        plan_motion(PANDA, PANDA.home, GOAL, [POST], seeds=seeds) for seeds in ([], np.zeros((0, 2, 7)), 256)
+    ]
+    for plan in plans[1:]:
+        assert np.array_equal(plan.waypoints, plans[0].waypoints)
+
+
 def test_a_plan_that_leaves_the_joint_limits_has_no_success() -> None:
     beyond = np.stack((PANDA.home, PANDA.joint_range[:, 1] + 0.1, GOAL))
     plan = ve.Plan.at_rest(beyond, np.array([2.0, 2.0]))
@@ -239,6 +260,8 @@ def test_goals_of_continuous_joints_are_taken_modulo_a_turn() -> None:
     goal = arm.home + 0.5
     plan = plan_motion(arm, arm.home, goal + 2.0 * np.pi * np.array([1, -1, 0, 2, 0, 0]))
     assert np.allclose(plan.waypoints[-1], goal)
+    turned = arm.home + 2.0 * np.pi * np.array([1, 0, 0, -1, 0, 0])  # as encoders may read it
+    assert np.array_equal(plan_motion(arm, turned, goal).waypoints.round(9), plan.waypoints.round(9))
     wide = ve.load_arm(text, velocity_limit=3.0, home=arm.home, joint_range=[(-6.0, 6.0)] * 6)
     assert wide.continuous == arm.joint_names
     start = arm.home + 3.0 * np.eye(6)[0]
@@ -491,6 +514,8 @@ def test_the_smoothest_of_enough_free_movements_is_taken() -> None:
 @pytest.mark.parametrize("file", ["plan.csv", "plan.yaml"])
 def test_files_hold_the_movement(tmp_path, file) -> None:
     written = write_motion(plan_motion(PANDA, PANDA.home, GOAL, [POST]), tmp_path / file, rate=250)
+    text = (tmp_path / file).read_text()
+    (tmp_path / file).write_text(f"{text}\n", encoding="utf-8-sig")  # as a spreadsheet may save it
     names, again = read_motion(tmp_path / file)
     assert names == PANDA.joint_names
     for one, other in zip(written, again, strict=True):

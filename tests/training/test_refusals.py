@@ -1,5 +1,6 @@
 """Bad input raises one error where it enters: the input, and the type of the error."""
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -159,9 +160,11 @@ def predicted(**changes):
 
 
 def sensed(**changes):
-    return ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1)).predict(
-        {**ViaVecEnv(SENSED, 2, seed=0).reset(), **changes}
-    )
+    observation = {**ViaVecEnv(SENSED, 2, seed=0).reset(), **changes}
+    with contextlib.suppress(ValueError):  # both must refuse
+        SAC("MultiInputPolicy", ViaVecEnv(SENSED, 1), buffer_size=2).predict(observation)
+        return
+    ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1)).predict(observation)
 
 
 def shorter():
@@ -209,6 +212,10 @@ CALLS = [
         ("checks", -1), ("checks", 1.5), ("refine", True), ("candidates", 0), ("refinements", 10**9),
     )),
     lambda: setattr(load_agent(SENSED).policy, "belief", "magic"),
+    *(lambda depths=depths: setattr(load_agent(SENSED).policy, "depths", depths)
+      for depths in ((0.1,), (0.1, 0.0, 0.2, 0.3, 0.4, 0.5), (-0.1, 0.0, 0.1, 0.2, 0.3, 0.4), 0.1)),
+    lambda: ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1), families=["maze"]),
+    lambda: ViaQ("ViaQPolicy", ViaVecEnv(PLANE, 1), replay_buffer_class=HerReplayBuffer),
     *(lambda name=name, weight=weight: setattr(load_agent(SENSED).policy, name, weight)
       for name in ("caution", "effort") for weight in (-0.1, np.nan)),
     lambda: agent_method("agent", SAC("MultiInputPolicy", ViaVecEnv(PLANE, 1), buffer_size=2), 8),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -10,18 +11,69 @@ import gymnasium as gym
 import numpy as np
 import sb3_contrib
 import stable_baselines3
+from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.type_aliases import GymEnv
 
-from viapoint.envs.common.validation import did_you_mean
+from viapoint.envs.common.arrays import Observation
+from viapoint.envs.common.validation import did_you_mean, finite_array
 from viapoint.envs.scenes.options import draw_given
+from viapoint.envs.sensors import Sensor
+from viapoint.envs.task import Task
 from viapoint.training.agents.model_io import ALGORITHMS, load_model, save_model
 from viapoint.training.checks import SHIPPED, SHIPPED_IDS
 from viapoint.training.files import BadFileError, write_folder
+from viapoint.training.planning.beliefs import Sight
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.plan_motion import checked_motion
 from viapoint.training.vec_env import env_arguments, predicted_actions
+
+SAME_RAY = 0.02  # Greatest distance of a point from the ray of the sensor, [m]
+
+
+def checked_observation(observation: Any, space: spaces.Dict, task: Task) -> Observation:
+    """Return the parts of an observation of a task, or of a batch of them, after a check.
+
+    Raises:
+        ValueError: The observation has other parts or sizes than the observation space, or is not finite; in tasks with
+            whole movements, start and goal are the same; points are not on the rays of the task's sensor.
+    """
+    wanted = ", ".join(space.spaces)
+    if not isinstance(observation, Mapping):
+        raise ValueError(f"observation must be a dict of {wanted}; got {type(observation).__name__}")
+    if observation.keys() != space.spaces.keys():
+        got = ", ".join(map(str, observation))
+        raise ValueError(f"observation must have the parts {wanted}; got {got}")
+    arrays = {}
+    batch = {}
+    for name, box in space.spaces.items():
+        shape: Any = box.shape
+        finite_array(name, observation[name], (..., *shape))
+        arrays[name] = np.asarray(observation[name])
+        batch[name] = arrays[name].reshape(-1, *shape)
+    here, there = ("joints", "goal_joints") if "goal_joints" in batch else ("hand", "goal")
+    apart = batch[here] != batch[there]
+    if task.whole_movement and not apart.any(axis=-1).all():
+        raise ValueError("start and goal must differ: no movement leads from a point to itself")
+    if task.sensor is not None:
+        _check_rays(Sight.of(batch, task), task.sensor)
+    return arrays
+
+
+def _check_rays(sight: Sight, sensor: Sensor) -> None:
+    """Check that readings are those of the sensor of the training."""
+    if (sight.ranges > sensor.range + SAME_RAY).any():
+        raise ValueError(
+            f"ranges must be at most {sensor.range:g} m, as in training, got {sight.ranges.max():.3g}"
+        )
+    rays = np.einsum("nlij,rj->nlri", sight.rotation, sensor.directions).reshape(sight.points.shape)
+    apart = np.abs(sight.eyes + sight.ranges[..., None] * rays - sight.points)
+    farthest = apart.reshape(*sight.made.shape, -1)[sight.made].max(initial=0.0)
+    if farthest > SAME_RAY:
+        raise ValueError(
+            f"points must lie on the rays of the sensor of the training, {sensor}, got {farthest:.2g} m from them"
+        )
 
 
 class Agent(BaseAlgorithm):
@@ -54,6 +106,22 @@ class Agent(BaseAlgorithm):
     def env_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of that environment, without those that belong to its id."""
         return env_arguments(self.get_env())[1]
+
+    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """Return actions for one observation or a batch, and no state, as in Stable-Baselines3.
+
+        Raises:
+            ValueError: The observation cannot be one of the agent's environment, see :func:`checked_observation`.
+        """
+        normalize, env = self.get_vec_normalize_env(), self.get_env()
+        raw = normalize is None or not normalize.norm_obs
+        if (
+            raw and env is not None and not hasattr(self.policy, "task")
+        ):  # policies that know the task check it
+            (task,) = env.get_attr("task", [0])
+            space: Any = self.observation_space
+            observation = checked_observation(observation, space, task)
+        return super().predict(observation, *args, **kwargs)
 
     def plan(self, start: Any, goal: Any, obstacles: Any = ()) -> MotionPlan:
         """Return the plan of a movement from rest to rest among obstacles that stand still, without an environment.
@@ -103,7 +171,7 @@ class Agent(BaseAlgorithm):
         )
 
     @classmethod
-    def load(cls, path: str | Path, env: VecEnv | None = None) -> Self:  # type: ignore[override]
+    def load(cls, path: str | Path, env: GymEnv | None = None) -> Self:  # type: ignore[override]
         """Load an agent of this algorithm; see :func:`load_agent`, which loads those of every algorithm.
 
         Args:
@@ -114,7 +182,8 @@ class Agent(BaseAlgorithm):
         Raises:
             ValueError: There is no agent, its files are damaged, or it is of another algorithm.
         """
-        model: Any = load_model(find_model(path), env)
+        wrapped = None if env is None else BaseAlgorithm._wrap_env(env)
+        model: Any = load_model(find_model(path), wrapped)
         if not isinstance(model, cls):
             raise ValueError(
                 f"{path} holds an agent of {type(model).__name__}, not of {cls.__name__}; load_agent() loads both"
@@ -122,13 +191,17 @@ class Agent(BaseAlgorithm):
         model.trainable = env is not None
         return model
 
-    def _setup_model(self) -> None:
-        buffer = getattr(self, "replay_buffer_class", None)
+    @staticmethod
+    def check_buffer(buffer: Any) -> None:
+        """Check the class of a replay buffer; ValueError if it does not apply."""
         if buffer is not None and issubclass(buffer, HerReplayBuffer):
             raise ValueError(
                 "HerReplayBuffer does not apply: the observation has no achieved_goal, and the reward of another goal "
                 "depends on contact and jerk of a movement that was not made; leave replay_buffer_class out"
             )
+
+    def _setup_model(self) -> None:
+        self.check_buffer(getattr(self, "replay_buffer_class", None))
         super()._setup_model()  # type: ignore[safe-super]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
@@ -159,7 +232,7 @@ class TQC(Agent, sb3_contrib.TQC):
 ALGORITHMS.update(sac=SAC, td3=TD3, ppo=PPO, tqc=TQC)
 
 
-def load_agent(source: str | Path, env: VecEnv | None = None) -> Agent:
+def load_agent(source: str | Path, env: GymEnv | None = None) -> Agent:
     """Load a trained agent of any algorithm.
 
     Args:

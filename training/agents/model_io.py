@@ -33,7 +33,7 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
 from viapoint.envs.arms.stored import keep_arm, with_kept_arm
-from viapoint.envs.common.validation import is_number
+from viapoint.envs.common.validation import is_number, whole_number
 from viapoint.envs.task import Task
 from viapoint.training.agents.extractors import SceneExtractor
 from viapoint.training.files import (
@@ -134,7 +134,7 @@ def load_model(folder: Path, env: VecEnv | None = None) -> BaseAlgorithm:
                 check_spaces(own, env)
                 check_same_task(_task_of(own), _task_of(env))
             model = build(record["algorithm"], record["policy"], env or own, hyperparameters)
-        model.num_timesteps = int(record["num_timesteps"])
+        model.num_timesteps = whole_number("num_timesteps", record["num_timesteps"], 0)
     except BadFileError:
         raise
     except Exception as error:

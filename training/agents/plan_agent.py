@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BaseModel, BasePolicy
 from stable_baselines3.common.utils import is_vectorized_observation
@@ -19,10 +20,10 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
 from viapoint.envs.common.arrays import Observation
-from viapoint.envs.common.validation import finite_array, is_number, whole_number
+from viapoint.envs.common.validation import is_number, whole_number
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.task import Task
-from viapoint.training.agents.agent import Agent
+from viapoint.training.agents.agent import Agent, checked_observation
 from viapoint.training.agents.model_io import LIMITS, check_arguments, check_same_task
 from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.checks import unknown_name
@@ -172,37 +173,17 @@ class PlanPolicy(BasePolicy):
         """Return actions for one observation or a batch, and no state, as policies of Stable-Baselines3 do.
 
         Raises:
-            ValueError: The observation has other parts or sizes than the observation space, or is not finite; in tasks
-                with whole movements, start and goal are the same; with a sensor, points are not on its rays.
+            ValueError: The observation cannot be one of the task, see
+                :func:`~viapoint.training.agents.agent.checked_observation`.
         """
         parts: Any = self.observation_space
-        wanted = ", ".join(parts.spaces)
-        if not isinstance(observation, Mapping):
-            raise ValueError(f"observation must be a dict of {wanted}; got {type(observation).__name__}")
-        if observation.keys() != parts.spaces.keys():
-            got = ", ".join(map(str, observation))
-            raise ValueError(f"observation must have the parts {wanted}; got {got}")
-        for name, each in observation.items():
-            finite_array(name, each, (..., *parts[name].shape))
-        arrays = {name: np.asarray(observation[name]) for name in parts.spaces}
+        arrays = checked_observation(observation, parts, self.task)
         several = is_vectorized_observation(cast(Any, arrays), parts)
         batch = {name: arrays[name].reshape(-1, *box.shape) for name, box in parts.spaces.items()}
         if not len(batch[next(iter(batch))]):
             return np.zeros((0, *cast(Any, self.action_space).shape), np.float32), state
-        self._check_observation(batch)
         actions = np.clip(self.decide(batch), -1.0, 1.0).astype(np.float32)
         return (actions if several else actions[0]), state
-
-    def _check_observation(self, batch: Observation) -> None:
-        """Check what the values of a batch of observations mean.
-
-        Raises:
-            ValueError: Start and goal are the same.
-        """
-        here, there = ("joints", "goal_joints") if "goal_joints" in batch else ("hand", "goal")
-        apart = batch[here] != batch[there]
-        if self.task.whole_movement and not apart.any(axis=-1).all():
-            raise ValueError("start and goal must differ: no movement leads from a point to itself")
 
 
 class PlanAlgorithm(Agent, OffPolicyAlgorithm):
@@ -221,8 +202,14 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         learning_rate: Any,
         *,
         policy_kwargs: dict[str, Any] | None,
+        buffer: type[ReplayBuffer],
         **kwargs: Any,
     ) -> None:
+        if "replay_buffer_class" in kwargs:
+            self.check_buffer(kwargs["replay_buffer_class"])
+            raise ValueError(
+                f"{type(self).__name__} has a replay buffer of its own; leave replay_buffer_class out"
+            )
         given = {**vars(self), "policy_kwargs": policy_kwargs}
         if is_number(learning_rate):
             given["learning_rate"] = learning_rate
@@ -233,6 +220,7 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
             env,
             learning_rate,
             policy_kwargs=dict(policy_kwargs or {}),
+            replay_buffer_class=buffer,
             support_multi_env=True,
             sde_support=False,
             **kwargs,

@@ -306,7 +306,7 @@ class ViaQ(PlanAlgorithm):
             batch_size=batch_size,
             gamma=gamma,
             gradient_steps=gradient_steps,
-            replay_buffer_class=OutcomeReplayBuffer,
+            buffer=OutcomeReplayBuffer,
             policy_kwargs=policy_kwargs,
             train_freq=train_freq,
             tau=tau,

@@ -10,8 +10,9 @@ would be right on average, and too sure of those that it chooses.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -31,20 +32,20 @@ from torch.nn import functional
 from viapoint.envs.common.arrays import Float, Observation, Single
 from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
-from viapoint.envs.scenes.sampler import SceneSampler
+from viapoint.envs.scenes.families_registry import scene_families
+from viapoint.envs.scenes.sampler import SceneSampler, is_planar
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training.agents.model_io import ALGORITHMS
 from viapoint.training.agents.plan_agent import PlanAlgorithm, PlanPolicy
-from viapoint.training.planning.beliefs import Sight
+from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.cautious import (
     BELIEFS,
     DEFAULT_BELIEF,
     OUT_OF_VIEW,
     PRIVILEGED,
-    cleared_depths,
     instants_of,
     places_of,
 )
@@ -55,17 +56,20 @@ from viapoint.training.planning.search import (
     refined_actions,
 )
 
-# Weights beside the probability of success: of the depth behind all fronts that a plan clears, and of the reward of a
-# plan that succeeds. They were tuned on `validation` scenes. In space caution takes half of the time of a decision and
-# solves no more, and later looks see what it is for: with it, 89 in place of 92 %.
-ONE_LOOK_OF_HAND = {"caution": 0.8, "effort": 0.4}
-OTHERWISE = {"caution": 0.0, "effort": 0.05}
+# Weights beside the probability of success, of the depth that a plan clears and of the reward of a plan that succeeds,
+# and the depths to which what is seen may go on behind its front, [m]. They were tuned on scenes that were drawn. In
+# space depths take half of the time of a decision and solve no more, and later looks see what they are for.
+ONE_LOOK_OF_HAND: dict[str, Any] = {
+    "caution": 0.2,
+    "effort": 0.1,
+    "depths": (0.0, 0.015, 0.03, 0.1, 0.16, 0.25),
+}
+OTHERWISE: dict[str, Any] = {"caution": 0.0, "effort": 0.05, "depths": ()}
 # Time up to which a contact counts twice as much as later ones, which a revised plan may still avoid, [s]
 SOON = 0.45
 KEEP = 2.0  # Reward by which another plan must be better than the one under way, as each change of plan costs jerk
 # First part of the seeds of scenes for the calibration, far from those of training, and their number
 CALIBRATION, CALIBRATION_SCENES = 3_000_017, 640
-SAME_RAY = 0.02  # Greatest distance of a point from the ray of the sensor, [m]
 BLOCK = 16  # Scenes that are decided together
 DEEP, SHALLOW = 0.4, 0.05  # Depths behind a surface at which two of the inputs saturate, [m]
 # Pixels in whose square a place is compared with the nearest surface, to find the places that matter
@@ -89,14 +93,16 @@ class ViaRankPolicy(PlanPolicy):
         refinements: Rounds of candidates around the best ones.
         per_refinement: Candidates of each round.
         refine: Number of best candidates that the planner refines around what is seen; they are ranked, too.
-        caution: Weight of the depth behind all fronts that a plan clears beside its probability of success. What the
-            network learned of the space behind fronts is wrong for obstacles that are unlike those of training.
-            Usual are 0.8 with one look in the plane, and 0 elsewhere, where it gains nothing.
-        effort: Weight of the reward of a plan that succeeds, which is greater for smooth and short ones. Usual are 0.4
+        caution: Weight of the greatest of `depths` that a plan clears, relative to the last of them, beside its
+            probability of success. Usual are 0.2 with one look in the plane, and 0 elsewhere.
+        effort: Weight of the reward of a plan that succeeds, which is greater for smooth and short ones. Usual are 0.1
             with one look in the plane, and 0.05 elsewhere.
         belief: Obstacles whose clearance the network sees beside the readings, one of
             :data:`~viapoint.training.planning.cautious.BELIEFS`. With `known` and `seen` the agent decides only where
             the true obstacles are given, as in evaluations.
+        depths: Depths to which all that is seen may go on behind its front, ascending, [m]. The network sees the
+            clearance of a plan for each of them, too. Usual are six up to 25 cm with one look in the plane and the
+            usual belief, and none elsewhere.
     """
 
     OWN = (
@@ -110,6 +116,7 @@ class ViaRankPolicy(PlanPolicy):
         "caution",
         "effort",
         "belief",
+        "depths",
     )
 
     def __init__(
@@ -129,6 +136,7 @@ class ViaRankPolicy(PlanPolicy):
         caution: float | None = None,
         effort: float | None = None,
         belief: str = DEFAULT_BELIEF,
+        depths: Sequence[float] | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(observation_space, action_space, task=task, **kwargs)
@@ -139,14 +147,16 @@ class ViaRankPolicy(PlanPolicy):
         self.refinements = refinements
         self.per_refinement = per_refinement
         self.refine = refine
-        usual = ONE_LOOK_OF_HAND if self.task.space.of_hand and not self.replanning else OTHERWISE
+        self.belief = belief
+        one_look = self.task.space.of_hand and not self.replanning and belief == DEFAULT_BELIEF
+        usual = ONE_LOOK_OF_HAND if one_look else OTHERWISE
         self.caution: float = usual["caution"] if caution is None else caution
         self.effort: float = usual["effort"] if effort is None else effort
-        self.belief = belief
+        self.depths: tuple[float, ...] = usual["depths"] if depths is None else tuple(depths)
         self._check_candidates()
         sensor = self.task.sensor
         assert sensor is not None
-        self.network = SightNetwork(sensor, width=width)
+        self.network = SightNetwork(sensor, width=width, beliefs=1 + len(self.depths))
         self._make_optimizer(self.network, lr_schedule)
 
     def _check_setting(self, name: str, value: Any) -> None:
@@ -155,29 +165,41 @@ class ViaRankPolicy(PlanPolicy):
             number_of_at_least(name, value, 0.0)
         if name == "belief" and value not in BELIEFS:
             raise ValueError(f"belief must be one of {', '.join(BELIEFS)}, got {value!r}")
+        if name == "depths":
+            ascending = list(value) == sorted(set(value)) and all(0.0 <= depth < np.inf for depth in value)
+            number = len(getattr(self, "depths", value))
+            if not ascending or len(value) != number:
+                raise ValueError(f"depths must be {number} of 0 m or more, ascending, got {value!r}")
+
+    def beliefs(self, problem: Problem, sight: Sight) -> list[Problem]:
+        """Return a problem with the obstacles that are believed to be there, and with what is seen at each depth."""
+        deeper = [thick_points(self.task, sight, depth) for depth in self.depths]
+        return [problem, *(problem._replace(obstacles=obstacles) for obstacles in deeper)]
+
+    def inputs(self, beliefs: list[Problem], sight: Sight, actions: Numbers) -> tuple[SightInputs, Numbers]:
+        """Return the inputs of the network for actions of shape (B, H, m), and what these are worth, shape (B, H).
+
+        The worth beside the probability of success is `effort` times the reward of an action that succeeds, and
+        `caution` times the greatest depth that it clears.
+        """
+        inputs, reward = sight_inputs(self.task, beliefs, sight, actions, self.instants, self.nearest)
+        worth = self.effort * reward
+        if self.depths:
+            clear = inputs.plans[..., 1:-1].numpy() * CLEAR >= CLEARANCE_MARGIN
+            worth += self.caution * (clear * np.array(self.depths) / self.depths[-1]).max(axis=-1)
+        return inputs, worth
 
     @torch.no_grad()
-    def success(self, problem: Problem, sight: Sight, actions: Numbers) -> tuple[Numbers, Numbers]:
-        """Return the probability of success of actions of shape (B, H, m), and the reward where they succeed, (B, H).
-
-        The problems have the obstacles that are believed to be there.
-        """
-        inputs, worth = sight_inputs(self.task, problem, sight, actions, self.instants, self.nearest)
+    def success(self, beliefs: list[Problem], sight: Sight, actions: Numbers) -> tuple[Numbers, Numbers]:
+        """Return the probability of success of actions of shape (B, H, m), and what they are worth, shape (B, H)."""
+        inputs, worth = self.inputs(beliefs, sight, actions)
         # Geometry is computed on the processor, the network may be on another device.
         return torch.sigmoid(self.network(inputs.to(self.device))).cpu().numpy(), worth
 
-    def rank(self, problem: Problem, sight: Sight, actions: Numbers) -> Numbers:
-        """Return the probability of success of actions, and `effort` times the reward of those that succeed."""
-        success, worth = self.success(problem, sight, actions)
-        return np.asarray(success + self.effort * worth)
-
-    def _cautious(self, problem: Problem, sight: Sight) -> Callable[[Numbers], Numbers]:
-        """Return the criterion of decisions, a function of actions; caution counts where the truth is hidden."""
-        rank = functools.partial(self.rank, problem, sight)
-        if not self.caution or self.belief in PRIVILEGED:
-            return rank
-        cleared = cleared_depths(self.task, problem, sight)
-        return lambda actions: rank(actions) + self.caution * cleared(actions)
+    def rank(self, beliefs: list[Problem], sight: Sight, actions: Numbers) -> Numbers:
+        """Return the criterion of decisions for actions: the probability of success and what they are worth."""
+        success, worth = self.success(beliefs, sight, actions)
+        return np.asarray(success + worth)
 
     def decide(self, observation: Observation) -> Numbers:
         """Return the best actions, shape (B, m), for parts of B observations."""
@@ -214,7 +236,8 @@ class ViaRankPolicy(PlanPolicy):
             rows = slice(first, first + BLOCK)
             some = sight.take(rows)
             there = problem.take(np.arange(len(problem.start))[rows])
-            rank = self._cautious(there, some)
+            beliefs = self.beliefs(there, some)
+            rank = functools.partial(self.rank, beliefs, some)
             actions, value = self.proposals(len(there.start), rank)
             if self.refine:
                 top = np.argsort(-value, axis=1, kind="stable")[:, : self.refine]
@@ -224,25 +247,8 @@ class ViaRankPolicy(PlanPolicy):
                 value = np.concatenate((value, rank(refined)), axis=1)
             best = np.arange(len(value)), self.best_within_reach(there, actions, value)
             chosen.append(actions[best])
-            success.append(self.success(there, some, actions[best][:, None])[0][:, 0])
+            success.append(self.success(beliefs, some, actions[best][:, None])[0][:, 0])
         return np.concatenate(chosen).astype(np.float64), np.concatenate(success).astype(np.float64)
-
-    def _check_observation(self, batch: Observation) -> None:
-        """Check that start and goal differ, and that points lie on the rays of the sensor of the training."""
-        super()._check_observation(batch)
-        sensor, sight = self.task.sensor, Sight.of(batch, self.task)
-        assert sensor is not None
-        if (sight.ranges > sensor.range + SAME_RAY).any():
-            raise ValueError(
-                f"ranges must be at most {sensor.range:g} m, as in training, got {sight.ranges.max():.3g}"
-            )
-        rays = np.einsum("nlij,rj->nlri", sight.rotation, sensor.directions).reshape(sight.points.shape)
-        apart = np.abs(sight.eyes + sight.ranges[..., None] * rays - sight.points)
-        apart = apart.reshape(*sight.made.shape, -1)[sight.made].max(initial=0.0)
-        if apart > SAME_RAY:
-            raise ValueError(
-                f"points must lie on the rays of the sensor of the training, {sensor}, got {apart:.2g} m from them"
-            )
 
 
 class _NoBuffer(ReplayBuffer):
@@ -271,6 +277,8 @@ class ViaRank(PlanAlgorithm):
         gradient_steps: Updates after each step of all environments.
         explore_candidates: Candidates of each scene during training, of which the best one is executed.
         labels: Plans of each scene that are learned from: the better half are the best candidates, the others random.
+        families: Families of half of the scenes that are drawn for updates, as far as the task has room and kinds of
+            obstacles for them; the other half are scenes of the task.
         train_freq: Steps of all environments between two rounds of updates.
         policy_kwargs: Arguments of :class:`ViaRankPolicy`; `env` provides the task.
         **kwargs: Arguments that all algorithms of Stable-Baselines3 have, such as `seed`, `device`, `verbose` and
@@ -304,12 +312,14 @@ class ViaRank(PlanAlgorithm):
         gradient_steps: int = 3,
         explore_candidates: int = 96,
         labels: int = 24,
+        families: Sequence[str] = (),
         train_freq: int | tuple[int, str] = 1,
         policy_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
         self.explore_candidates = explore_candidates
         self.labels = labels
+        self.families = families
         super().__init__(
             policy,
             env,
@@ -319,11 +329,15 @@ class ViaRank(PlanAlgorithm):
             batch_size=batch_size,
             gamma=1.0,
             gradient_steps=gradient_steps,
-            replay_buffer_class=_NoBuffer,
+            buffer=_NoBuffer,
             policy_kwargs=policy_kwargs,
             train_freq=train_freq,
             **kwargs,
         )
+        known = scene_families(is_planar(self.policy.task.arm))
+        for name in families:
+            if name not in known:
+                raise ValueError(f"families must be some of {', '.join(known)}, got {name!r}")
         if labels > explore_candidates:
             raise ValueError(f"labels must be at most explore_candidates, {explore_candidates}, got {labels}")
 
@@ -352,10 +366,10 @@ class ViaRank(PlanAlgorithm):
         """Return the best of some random candidates; they are only measured, so the belief is the usual one."""
         observation: Any = self._last_obs
         candidates = self._candidates(n_envs)
-        task = self.policy.task
-        problem = Problem.of_observation(observation, task)
+        policy, task = self.policy, self.policy.task
         sight = Sight.of(observation, task)
-        value = self.policy.rank(problem, sight, candidates)
+        beliefs = policy.beliefs(Problem.of_observation(observation, task), sight)
+        value = policy.rank(beliefs, sight, candidates)
         actions = candidates[np.arange(n_envs), value.argmax(axis=1)]
         return actions, actions
 
@@ -371,10 +385,10 @@ class ViaRank(PlanAlgorithm):
             truth, believed, sight = self._under_way()
         else:  # new scenes for each update: the network cannot learn them by heart
             seeds = np.random.randint(0, 2**31, size=batch_size)  # noqa: NPY002 - seeded by SB3
-            truth, believed, sight = self._drawn(list(seeds))
+            truth, believed, sight = self._drawn(self._samplers, list(seeds))
         # Some plans are labelled: those that the network would choose, and others.
         plans = self._candidates(len(sight.ranges))
-        inputs, worth = sight_inputs(task, believed, sight, plans, policy.instants, policy.nearest)
+        inputs, worth = policy.inputs(policy.beliefs(believed, sight), sight, plans)
         inputs = inputs.to(policy.device)
         chosen = self._chosen(inputs, worth)
         some = np.take_along_axis(plans, chosen[..., None], axis=1)
@@ -386,9 +400,11 @@ class ViaRank(PlanAlgorithm):
         logits = policy.network(inputs.take(torch.from_numpy(chosen).to(policy.device)))
         return {"loss": functional.binary_cross_entropy_with_logits(logits, labels)}
 
-    def _drawn(self, seeds: list[Any]) -> tuple[Problem, Problem, Sight]:
+    def _drawn(self, samplers: list[SceneSampler], seeds: list[Any]) -> tuple[Problem, Problem, Sight]:
         """Return new scenes as they are, as they are believed to be, and what is seen of them."""
-        scenes = self._sampler([np.random.default_rng(seed) for seed in seeds])
+        generators = [np.random.default_rng(seed) for seed in seeds]
+        number = len(samplers)
+        scenes = Scenes.together([draw(generators[k::number]) for k, draw in enumerate(samplers)])
         task = self.policy.task
         truth = Problem.of_scenes(scenes, task)
         sight = Sight.of_scenes(scenes, task)
@@ -412,7 +428,7 @@ class ViaRank(PlanAlgorithm):
     @torch.no_grad()
     def _chosen(self, inputs: SightInputs, worth: NDArray[Any]) -> NDArray[np.int64]:
         """Return the plans to learn from: the best ones by the present network, and others, shape (B, labels)."""
-        value = torch.sigmoid(self.policy.network(inputs)).cpu().numpy() + self.policy.effort * worth
+        value = torch.sigmoid(self.policy.network(inputs)).cpu().numpy() + worth
         order = np.argsort(-value, axis=1)
         best = order[:, : self.labels // 2]
         others = np.random.uniform(size=(len(order), order.shape[1] - best.shape[1])).argsort(axis=1)  # noqa: NPY002
@@ -429,7 +445,8 @@ class ViaRank(PlanAlgorithm):
         policy.set_training_mode(False)
         chances, labels = [], []
         for first in range(0, CALIBRATION_SCENES, BLOCK):
-            truth, believed, sight = self._drawn([(CALIBRATION, first + each) for each in range(BLOCK)])
+            seeds = [(CALIBRATION, first + each) for each in range(BLOCK)]
+            truth, believed, sight = self._drawn(self._samplers[:1], seeds)
             actions, success = policy.best(believed, sight)
             # In hand space, exact geometry keeps room at a straight elbow that successful movements need not keep.
             exact = not task.space.of_hand
@@ -446,9 +463,12 @@ class ViaRank(PlanAlgorithm):
         policy.network.calibration.copy_(torch.tensor([slope, offset]))
 
     @functools.cached_property
-    def _sampler(self) -> SceneSampler:
-        """Sampler of the scenes that are learned from."""
-        return self.policy.task.sampler()
+    def _samplers(self) -> list[SceneSampler]:
+        """Samplers of the scenes that are learned from: that of the task, and if there are any, of other families."""
+        task = self.policy.task
+        known, most = scene_families(is_planar(task.arm)), task.n_obstacles[1]
+        others = tuple(name for name in self.families if most and not known[name].lack(task.shapes, most))
+        return [task.sampler(), *([dataclasses.replace(task, families=others).sampler()] if others else [])]
 
 
 ALGORITHMS["viarank"] = ViaRank
@@ -461,7 +481,7 @@ class SightInputs(NamedTuple):
     image: Tensor
     pixel: Tensor  # Pixels of all images in whose direction P places lie, shape (B, H, P), int64
     places: Tensor  # Other inputs of these places, shape (B, H, P, FEATURES)
-    plans: Tensor  # Inputs of whole movements: clearance by the belief, reach, shape (B, H, 2)
+    plans: Tensor  # Inputs of whole movements: clearance by each of N beliefs, reach, shape (B, H, N + 1)
 
     def take(self, chosen: Tensor) -> SightInputs:
         """Return the inputs of some of the movements, by indices of shape (B, h)."""
@@ -476,13 +496,14 @@ class SightInputs(NamedTuple):
 
 
 def sight_inputs(
-    task: Task, problem: Problem, sight: Sight, actions: Numbers, instants: int, nearest: int
+    task: Task, beliefs: list[Problem], sight: Sight, actions: Numbers, instants: int, nearest: int
 ) -> tuple[SightInputs, Single]:
     """Return the inputs of the network for actions, shape (B, H, m), and the rewards of those that succeed, (B, H).
 
-    The problems have the obstacles that are believed to be there. Of all places at some instants, the network sees the
-    ones that are nearest to surfaces, or deepest behind them.
+    The problems differ in the obstacles that are believed to be there. Of all places at some instants, the network sees
+    the ones that are nearest to surfaces, or deepest behind them.
     """
+    problem = beliefs[0]
     sensor = task.sensor
     assert sensor is not None
     moves = moves_of(task, problem, actions)
@@ -515,8 +536,9 @@ def sight_inputs(
         pixel == OUT_OF_VIEW,
         *np.moveaxis(centre, -1, 0),
     )
-    clearance = plan_clearances(task, problem, actions, CLEAR, -CLEAR)
-    plans_in = np.stack((np.clip(clearance / CLEAR, -1.0, 1.0), places.inside), axis=-1)
+    clearances = [plan_clearances(task, each, actions, CLEAR, -CLEAR) for each in beliefs]
+    relative = [np.clip(each / CLEAR, -1.0, 1.0) for each in clearances]
+    plans_in = np.stack((*relative, places.inside), axis=-1)
     # Pixels are numbered through all looks that were made.
     made = sight.made
     image = (np.cumsum(made) - 1).reshape(made.shape)
@@ -575,13 +597,13 @@ class SightNetwork(nn.Module):
     which may hold what usually stands behind such a front. A movement is a set of places of the arm's spheres. Inputs
     of one network for all places are the features of the pixel in whose direction a place lies, its distance, and its
     depth behind the surface (an implicit decoder, as in L. Mescheder et al., Occupancy networks, 2019). The greatest
-    and the mean of its `width` outputs (C. R. Qi et al., PointNet, 2017), and the clearance that is computed with a
-    belief, tell the logit.
+    and the mean of its `width` outputs (C. R. Qi et al., PointNet, 2017), and the clearances that are computed with
+    some beliefs, tell the logit.
     """
 
     DILATIONS = (2, 4, 8, 1)
 
-    def __init__(self, sensor: Sensor, *, width: int) -> None:
+    def __init__(self, sensor: Sensor, *, width: int, beliefs: int = 1) -> None:
         super().__init__()
         self.rays, self.columns = sensor.n_rays, sensor.columns
         self.stride = 1 if sensor.rows == 1 else 2
@@ -597,7 +619,9 @@ class SightNetwork(nn.Module):
         self.of_pixel = nn.Conv2d(width, 2 * width, 1)
         self.of_place = nn.Linear(FEATURES, 2 * width, bias=False)
         self.each = nn.Sequential(nn.ReLU(), nn.Linear(2 * width, width), nn.ReLU())
-        self.last = nn.Sequential(nn.Linear(2 * width + 2, 2 * width), nn.ReLU(), nn.Linear(2 * width, 1))
+        self.last = nn.Sequential(
+            nn.Linear(2 * width + beliefs + 1, 2 * width), nn.ReLU(), nn.Linear(2 * width, 1)
+        )
         self.calibration: Tensor
         self.register_buffer("calibration", torch.tensor([1.0, 0.0]))
         """Slope and offset of the logit of the plan that is chosen; it is the best of many, and its logit too high."""

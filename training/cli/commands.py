@@ -31,6 +31,7 @@ from viapoint.training.planning import benchmark
 from viapoint.training.planning.baselines import Method, PlannerMethod, agent_method, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.report import scene_progress
+from viapoint.training.rollout import whole_task
 from viapoint.training.scene_sets import evenly_spread, scenes_for
 
 MOST_FAULTS = 10  # Greatest number of problems that are named with what is wrong
@@ -148,6 +149,7 @@ def play(config: PlayConfig) -> None:
     agent, env_id, env_kwargs = _named(config, config.agent)
     scenes = scenes_for(config.scenes, registered_task(env_id, **env_kwargs), config.n_scenes).scenes
     if agent is None:
+        env_kwargs = whole_task(env_id, env_kwargs)
         method = make_method("search512", env_id, **env_kwargs)
     else:
         method = agent_method("agent", agent, config.checks)
@@ -159,7 +161,8 @@ def play(config: PlayConfig) -> None:
 def record(config: RecordConfig) -> None:
     """Record episodes of an agent or a baseline as a Minari dataset, and print how to load it."""
     name = str(config.agent)
-    if name in SHIPPED_IDS or Path(name).expanduser().exists():
+    folder = Path(name).expanduser()
+    if name in SHIPPED_IDS or any((folder / each).is_file() for each in ("model.json", "config.json")):
         if config.env_kwargs:
             raise ValueError("env_kwargs are for baselines; an agent has those of its training")
         agent, env_id, env_kwargs = _named(config, name)

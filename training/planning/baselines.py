@@ -20,7 +20,6 @@ from viapoint.training.planning.candidates import MOST_CANDIDATES
 from viapoint.training.planning.cautious import (
     BELIEFS,
     DEFAULT_BELIEF,
-    DEPTHS,
     PRIVILEGED,
     BeliefMethod,
     CautiousSearch,
@@ -35,6 +34,7 @@ from viapoint.training.rollout import Outcomes, SceneSimulation
 from viapoint.training.vec_env import env_arguments, predicted_actions
 
 DEEP = "deep:plan_motion"  # Name of the planner that assumes the greatest depth behind what is seen
+DEEPEST = {"hand": 0.4, "joints": 0.12}  # Its first depth, [m]
 # From one of its depths to the next: the factor; then the depth that ends it, [m], and the time for each, [s]
 SHALLOWER, SHALLOWEST, DEEP_TIME = 0.8, 0.02, 0.02
 
@@ -144,7 +144,7 @@ class DeepPlanner(PlannerMethod):
         task = self._simulation.task
         sight = Sight.of(observation, task)
         plans = dict[int, MotionPlan]()
-        depth = float(DEPTHS[task.space_name][0])
+        depth = DEEPEST[task.space_name]
         while depth > SHALLOWEST:
             left = [row for row in range(len(scenes.start)) if row not in plans or not plans[row].success]
             if not left:

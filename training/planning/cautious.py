@@ -49,8 +49,6 @@ MARGIN = 0.03  # Distance in front of unseen space at which the penalty begins, 
 DEEPEST = 0.1  # Depth in unseen space at which the penalty of an instant saturates, [m]
 # Number of best candidates that are refined around what is seen. The settings were tuned on `validation` scenes.
 REFINED = {"hand": 0, "joints": 8}
-# Depths behind a surface, from the greatest, of which a plan is ranked by the greatest that it clears, [m]
-DEPTHS = {name: deepest * 0.7 ** np.arange(6) for name, deepest in {"hand": 0.4, "joints": 0.12}.items()}
 
 
 class Places(NamedTuple):
@@ -152,25 +150,6 @@ BELIEFS: dict[str, Callable[[Task, Sight, Obstacles], Obstacles]] = {
 }
 PRIVILEGED = ("known", "seen")
 DEFAULT_BELIEF = "thick"  # Belief of planners and agents where none is named
-
-
-def cleared_depths(task: Task, problem: Problem, sight: Sight) -> Callable[[Numbers], Numbers]:
-    """Return a function that tells how far what is seen could go on behind its fronts, and a plan still be clear.
-
-    Of actions of shape (B, H, m) it returns the greatest of DEPTHS that each plan clears, relative to the first of
-    them, shape (B, H); 0 for plans that clear none.
-    """
-    depths = DEPTHS[task.space_name]
-    beliefs = [problem._replace(obstacles=thick_points(task, sight, depth)) for depth in depths]
-
-    def cleared(actions: Numbers) -> Numbers:
-        found = np.zeros(actions.shape[:2])
-        for depth, belief in zip(depths[::-1], beliefs[::-1], strict=True):
-            clearance = plan_clearances(task, belief, actions, CLEARANCE_MARGIN, CLEARANCE_MARGIN)
-            found = np.where(clearance >= CLEARANCE_MARGIN, depth / depths[0], found)
-        return found
-
-    return cleared
 
 
 class BeliefMethod:

@@ -68,7 +68,7 @@ def read_motion(path: str | Path) -> tuple[tuple[str, ...], JointMotion]:
     path = Path(path).expanduser()
     form = _form(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # of a spreadsheet
         names, time, parts = _read_table(text) if form == "csv" else _read_message(text)
         if not (np.diff(finite_array("time", time, (len(time),))) > 0.0).all():
             raise ValueError("its times do not increase")
@@ -108,7 +108,7 @@ def _read_table(text: str) -> tuple[tuple[str, ...], Float, list[Float]]:
     names = tuple(column.removeprefix("position:") for column in head if column.startswith("position:"))
     if head != _columns(names):
         raise ValueError("its columns are others")
-    numbers = np.array(list(rows), np.float64)
+    numbers = np.array([row for row in rows if row], np.float64)
     return names, numbers[:, 0], np.split(numbers[:, 1:], len(PARTS), axis=1)
 
 

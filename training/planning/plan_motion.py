@@ -82,6 +82,7 @@ SHORTEST = 0.25  # Shortest duration that is chosen, after which servos come to 
 UNLIMITED = 0.85  # The same for arms without velocity limits, [s]
 # Instants of FINE_INSTANTS at which limits are looked at: every second one, and the last
 LIMIT_INSTANTS = np.append(np.arange(0, FINE_INSTANTS - 1, 2), FINE_INSTANTS - 1)
+BETWEEN = 1.0005  # Factor on shares of limits at these instants, for the greatest ones between two of them
 ROUNDS = 6  # Number of durations that are tried in motion and among moving obstacles
 # Factor from one of these durations to the next, and from the straight movement to the first
 LONGER = 1.3
@@ -175,7 +176,8 @@ def plan_motion(
 
     Args:
         arm: Arm, or name of one.
-        start: Joint positions, shape (J,), [rad]; in hand space a position of the hand, shape (2,), [m].
+        start: Joint positions, shape (J,), [rad]; in hand space a position of the hand, shape (2,), [m]. Positions of
+            continuous joints count modulo a turn; the movement has them within their range.
         goal: The same; or several of them, shape (G, D), of which the cheapest to reach is taken; or one or several
             poses of the tool, :class:`~viapoint.envs.scenes.options.Pose`.
         obstacles: Shapes or dictionaries at time 0, with their velocities, or packed obstacles of one scene.
@@ -184,7 +186,7 @@ def plan_motion(
             tried first, before up to 256 random ones.
         enough: Number of free movements among which the one with the least jerk is chosen.
         time_limit: Time after which no further seed is tried, [s]; with 0, only the straight movement is looked at.
-            Inverse kinematics of poses, some 20 ms, comes before.
+            Inverse kinematics of poses, 10 to 40 ms, and up to 200 ms for one out of reach, comes before.
         margin: Least clearance of the movement from obstacles, [m]; from itself, the arm keeps 0.
         duration: Duration, [s]; None for the shortest that keeps 97 % of the limits, 0.25 s or more.
         space: `joints` or `hand`; that of the arm by default.
@@ -228,7 +230,7 @@ def plan_motion(
     number, given = SEEDS, np.zeros((0, n_via, where.dimension))
     if np.ndim(seeds) == 0:
         number = whole_number("seeds", seeds, 0)
-    else:
+    elif np.size(seeds):
         given = finite_array("seeds", seeds, (None, n_via, where.dimension))
     if not isinstance(rng, np.random.Generator):
         rng = np.random.default_rng(whole_number("rng", 0 if rng is None else rng, 0))
@@ -250,6 +252,8 @@ def plan_motion(
         generator=rng,
         names=[shape.name for shape in shapes],
     )
+    if not where.of_hand:
+        problem = problem._replace(start=nearest_goals(arm, problem.start, arm.home))
     goals = _goals(problem, goal)
     number = -(-number // len(goals))  # rounded up
     until = time.perf_counter() + time_limit
@@ -820,7 +824,7 @@ def _timed(problem: _Problem, movement: Movement, least: float | None) -> tuple[
     change = motion.acceleration / factor**2
     torque = motion_torques(arm.chain, motion.position, rate, change)
     shares = np.stack((np.abs(rate) / arm.velocity_limit, np.abs(torque) / arm.torque_limit)).max(axis=1)
-    limits = Limits(float(shares[0].max()), float(shares[1].max()))
+    limits = Limits(*(BETWEEN * shares.max(axis=1)).tolist())
     kind = "velocity" if limits.velocity > limits.torque else "torque"
     share = max(limits)
     worst = shares.max(axis=0).argmax()
