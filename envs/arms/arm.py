@@ -189,12 +189,12 @@ def arm_from_xml(
     capsules = _capsules(model, data, links, frames)
     home = np.array(home, dtype=np.float64)
     carried = {}
-    for name, link in links.items():
-        carrier = model.body(name)
+    for body, link in links.items():
+        carrier = model.body(body)
         while carrier.id:
             carrier = model.body(carrier.parentid[0])
             if links.get(carrier.name, 0) == link - 1 > 0:
-                carried[frozenset((carrier.name, name))] = "consecutive links"
+                carried[frozenset((carrier.name, body))] = "consecutive links"
     names, spheres, left_out, excess = cover(chain, capsules, links, home, {**carried, **(exclude or {})})
     # Pairs that touch in none of many configurations are not compared, either.
     ranges = np.array([model.joint(each).range for each in joints])

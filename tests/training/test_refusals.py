@@ -214,7 +214,6 @@ CALLS = [
     lambda: setattr(load_agent(SENSED).policy, "belief", "magic"),
     *(lambda depths=depths: setattr(load_agent(SENSED).policy, "depths", depths)
       for depths in ((0.1,), (0.1, 0.0, 0.2, 0.3, 0.4, 0.5), (-0.1, 0.0, 0.1, 0.2, 0.3, 0.4), 0.1)),
-    lambda: ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1), families=["maze"]),
     lambda: ViaQ("ViaQPolicy", ViaVecEnv(PLANE, 1), replay_buffer_class=HerReplayBuffer),
     *(lambda name=name, weight=weight: setattr(load_agent(SENSED).policy, name, weight)
       for name in ("caution", "effort") for weight in (-0.1, np.nan)),

@@ -10,7 +10,6 @@ would be right on average, and too sure of those that it chooses.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -32,8 +31,7 @@ from torch.nn import functional
 from viapoint.envs.common.arrays import Float, Observation, Single
 from viapoint.envs.common.validation import number_of_at_least
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles
-from viapoint.envs.scenes.families_registry import scene_families
-from viapoint.envs.scenes.sampler import SceneSampler, is_planar
+from viapoint.envs.scenes.sampler import SceneSampler
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
@@ -60,8 +58,8 @@ from viapoint.training.planning.search import (
 # and the depths to which what is seen may go on behind its front, [m]. They were tuned on scenes that were drawn. In
 # space depths take half of the time of a decision and solve no more, and later looks see what they are for.
 ONE_LOOK_OF_HAND: dict[str, Any] = {
-    "caution": 0.2,
-    "effort": 0.1,
+    "caution": 0.3,
+    "effort": 0.2,
     "depths": (0.0, 0.015, 0.03, 0.1, 0.16, 0.25),
 }
 OTHERWISE: dict[str, Any] = {"caution": 0.0, "effort": 0.05, "depths": ()}
@@ -94,8 +92,8 @@ class ViaRankPolicy(PlanPolicy):
         per_refinement: Candidates of each round.
         refine: Number of best candidates that the planner refines around what is seen; they are ranked, too.
         caution: Weight of the greatest of `depths` that a plan clears, relative to the last of them, beside its
-            probability of success. Usual are 0.2 with one look in the plane, and 0 elsewhere.
-        effort: Weight of the reward of a plan that succeeds, which is greater for smooth and short ones. Usual are 0.1
+            probability of success. Usual are 0.3 with one look in the plane, and 0 elsewhere.
+        effort: Weight of the reward of a plan that succeeds, which is greater for smooth and short ones. Usual are 0.2
             with one look in the plane, and 0.05 elsewhere.
         belief: Obstacles whose clearance the network sees beside the readings, one of
             :data:`~viapoint.training.planning.cautious.BELIEFS`. With `known` and `seen` the agent decides only where
@@ -277,8 +275,6 @@ class ViaRank(PlanAlgorithm):
         gradient_steps: Updates after each step of all environments.
         explore_candidates: Candidates of each scene during training, of which the best one is executed.
         labels: Plans of each scene that are learned from: the better half are the best candidates, the others random.
-        families: Families of half of the scenes that are drawn for updates, as far as the task has room and kinds of
-            obstacles for them; the other half are scenes of the task.
         train_freq: Steps of all environments between two rounds of updates.
         policy_kwargs: Arguments of :class:`ViaRankPolicy`; `env` provides the task.
         **kwargs: Arguments that all algorithms of Stable-Baselines3 have, such as `seed`, `device`, `verbose` and
@@ -312,14 +308,12 @@ class ViaRank(PlanAlgorithm):
         gradient_steps: int = 3,
         explore_candidates: int = 96,
         labels: int = 24,
-        families: Sequence[str] = (),
         train_freq: int | tuple[int, str] = 1,
         policy_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
         self.explore_candidates = explore_candidates
         self.labels = labels
-        self.families = families
         super().__init__(
             policy,
             env,
@@ -334,10 +328,6 @@ class ViaRank(PlanAlgorithm):
             train_freq=train_freq,
             **kwargs,
         )
-        known = scene_families(is_planar(self.policy.task.arm))
-        for name in families:
-            if name not in known:
-                raise ValueError(f"families must be some of {', '.join(known)}, got {name!r}")
         if labels > explore_candidates:
             raise ValueError(f"labels must be at most explore_candidates, {explore_candidates}, got {labels}")
 
@@ -385,7 +375,7 @@ class ViaRank(PlanAlgorithm):
             truth, believed, sight = self._under_way()
         else:  # new scenes for each update: the network cannot learn them by heart
             seeds = np.random.randint(0, 2**31, size=batch_size)  # noqa: NPY002 - seeded by SB3
-            truth, believed, sight = self._drawn(self._samplers, list(seeds))
+            truth, believed, sight = self._drawn(list(seeds))
         # Some plans are labelled: those that the network would choose, and others.
         plans = self._candidates(len(sight.ranges))
         inputs, worth = policy.inputs(policy.beliefs(believed, sight), sight, plans)
@@ -400,11 +390,9 @@ class ViaRank(PlanAlgorithm):
         logits = policy.network(inputs.take(torch.from_numpy(chosen).to(policy.device)))
         return {"loss": functional.binary_cross_entropy_with_logits(logits, labels)}
 
-    def _drawn(self, samplers: list[SceneSampler], seeds: list[Any]) -> tuple[Problem, Problem, Sight]:
+    def _drawn(self, seeds: list[Any]) -> tuple[Problem, Problem, Sight]:
         """Return new scenes as they are, as they are believed to be, and what is seen of them."""
-        generators = [np.random.default_rng(seed) for seed in seeds]
-        number = len(samplers)
-        scenes = Scenes.together([draw(generators[k::number]) for k, draw in enumerate(samplers)])
+        scenes = self._sampler([np.random.default_rng(seed) for seed in seeds])
         task = self.policy.task
         truth = Problem.of_scenes(scenes, task)
         sight = Sight.of_scenes(scenes, task)
@@ -445,8 +433,7 @@ class ViaRank(PlanAlgorithm):
         policy.set_training_mode(False)
         chances, labels = [], []
         for first in range(0, CALIBRATION_SCENES, BLOCK):
-            seeds = [(CALIBRATION, first + each) for each in range(BLOCK)]
-            truth, believed, sight = self._drawn(self._samplers[:1], seeds)
+            truth, believed, sight = self._drawn([(CALIBRATION, first + each) for each in range(BLOCK)])
             actions, success = policy.best(believed, sight)
             # In hand space, exact geometry keeps room at a straight elbow that successful movements need not keep.
             exact = not task.space.of_hand
@@ -463,12 +450,9 @@ class ViaRank(PlanAlgorithm):
         policy.network.calibration.copy_(torch.tensor([slope, offset]))
 
     @functools.cached_property
-    def _samplers(self) -> list[SceneSampler]:
-        """Samplers of the scenes that are learned from: that of the task, and if there are any, of other families."""
-        task = self.policy.task
-        known, most = scene_families(is_planar(task.arm)), task.n_obstacles[1]
-        others = tuple(name for name in self.families if most and not known[name].lack(task.shapes, most))
-        return [task.sampler(), *([dataclasses.replace(task, families=others).sampler()] if others else [])]
+    def _sampler(self) -> SceneSampler:
+        """Sampler of the scenes that are learned from."""
+        return self.policy.task.sampler()
 
 
 ALGORITHMS["viarank"] = ViaRank
