@@ -35,8 +35,6 @@ def wait_for(condition, seconds=PATIENCE, every=0.05):
 
 
 class Browser:
-    """Process of the browser."""
-
     def __init__(self):
         self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         words = ["--headless=new", "--no-sandbox", "--remote-debugging-port=0", "--no-first-run"]
@@ -134,7 +132,6 @@ class Tab:
         )  # fmt: skip
 
     def drag(self, first, last, steps=6):
-        """Drag from one point to another."""
         self.mouse("Moved", first)
         time.sleep(0.2)
         self.mouse("Pressed", first, 1)
@@ -145,7 +142,6 @@ class Tab:
         self.mouse("Released", last)
 
     def press_right(self):
-        """Press the right arrow key."""
         pressed = {"key": "ArrowRight", "code": "ArrowRight", "windowsVirtualKeyCode": 39}
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, **pressed)

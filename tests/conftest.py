@@ -50,7 +50,6 @@ def registries():
 
 @pytest.fixture(scope="module")
 def browser():
-    """Headless Chromium, or the test is skipped."""
     from browser import Browser, chromium
 
     if chromium() is None:

@@ -36,7 +36,6 @@ CRATE = Box((0.03, 0.04, 0.05), position=(0.2, 0.7, 0.4), quaternion=(0.96, 0.0,
 
 
 def post(x, y, radius=0.02, **others):
-    """Return a post in the plane."""
     return Cylinder(radius, 0.04, position=(x, y, 0.0), **others)
 
 
@@ -65,7 +64,6 @@ def play(env, scale=0.0, seed=0):
 
 
 def events(infos):
-    """Return the events of the decisions."""
     return [Event(info["event"]) for info in infos]
 
 
@@ -95,12 +93,10 @@ def scenes_of(task, number, seed=0):
 
 
 def problem_of(task, number, seed=0):
-    """Return the problems of drawn scenes."""
     return Problem.of_scenes(scenes_of(task, number, seed), task)
 
 
 def random_shape(kind, rng, *, moving=False):
-    """Return a shape of a kind near the origin."""
     quaternion = rng.normal(size=4)
     a, b, c = rng.uniform(0.02, 0.2, 3)
     some, many = (0.1 * rng.normal(size=(number, 3)) for number in rng.integers((4, 1), (30, 60)))

@@ -79,13 +79,11 @@ def source(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def wheel_path(source, tmp_path_factory):
-    """The wheel of the tree."""
     return build("wheel", source, tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
 def wheel(wheel_path):
-    """The wheel of the tree, opened."""
     with zipfile.ZipFile(wheel_path) as archive:
         yield archive
 

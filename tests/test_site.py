@@ -79,7 +79,6 @@ def test_every_environment_has_a_page(site):
 
 @pytest.fixture(scope="module")
 def address(site):
-    """Address of a server of the site on this machine."""
     handler = functools.partial(Silent, directory=str(site))
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -89,8 +88,6 @@ def address(site):
 
 
 class Silent(http.server.SimpleHTTPRequestHandler):
-    """Server that prints nothing."""
-
     def log_message(self, *_):
         pass
 

@@ -40,7 +40,6 @@ def env_id(request):
 
 
 def actions_for(env, number, seed=3):
-    """Return random actions of one environment."""
     shape = getattr(env, "single_action_space", env.action_space).shape
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (number, *shape)).astype(np.float32)
 
@@ -86,7 +85,6 @@ def test_an_episode_is_the_same_alone_and_in_a_batch_on_two_threads(env_id):
         assert (mine, over, cut) == (reward[row], terminated[row], truncated[row])
         if over or cut or (terminated | truncated).any():
             break
-    batch.close()
 
 
 def test_observations_share_no_memory_and_stay_in_their_space(env_id):
@@ -207,7 +205,6 @@ def test_broken_physics_ends_its_episode_alone(env_id, broken, tmp_path, monkeyp
 @pytest.mark.parametrize("env_id", [PLANE, STEP, MOVING])
 @pytest.mark.parametrize("mode", MODES)
 def test_the_native_batch_is_gymnasiums_in_each_mode(env_id, mode):
-    """Observations, rewards, ends and infos are those of Gymnasium's own vector environment, step by step."""
     mine = gym.make_vec(env_id, num_envs=3, autoreset_mode=mode)
     assert mine.metadata["autoreset_mode"] is AutoresetMode(mode)
     theirs = gym.vector.SyncVectorEnv([lambda: gym.make(env_id)] * 3, autoreset_mode=AutoresetMode(mode))
@@ -275,7 +272,6 @@ def test_a_loop_as_in_cleanrl_learns():
     number, steps = 32, 4
     envs = gym.make_vec("viapoint/PlanarReach-v0", num_envs=number, autoreset_mode="NextStep")
     envs = wrappers.FlattenObservation(envs)
-    envs = wrappers.RecordEpisodeStatistics(envs)
     size, actions = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     actor = torch.nn.Sequential(torch.nn.Linear(size, 32), torch.nn.Tanh(), torch.nn.Linear(32, actions))
     critic = torch.nn.Sequential(torch.nn.Linear(size, 32), torch.nn.Tanh(), torch.nn.Linear(32, 1))

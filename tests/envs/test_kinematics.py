@@ -158,7 +158,6 @@ def test_reach_in_the_plane_without_angles(limits):
 
 
 def test_spheres_contain_the_geoms_and_stick_out_little(arm):
-    """Points on the surface of every collision geom are inside a sphere; no sphere is farther out than the excess."""
     model = arm.compile(0)
     data = mujoco.MjData(model)
     position, _, _ = states(arm, 3)

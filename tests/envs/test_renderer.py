@@ -23,7 +23,6 @@ DRAWN = {
     "goal": [-0.1, 0.55],
     "obstacles": [post(-0.4, 0.6), Box((0.05, 0.01, 0.04), position=(-0.16, 0.4, 0.0))],
 }
-"""Scene of the tests of pictures."""
 STRAIGHT, AROUND = np.zeros(3, np.float32), np.array([0.0, -0.5, 0.5], np.float32)
 
 
@@ -35,7 +34,6 @@ def quick_pictures(monkeypatch):
 
 @pytest.fixture(scope="module")
 def opengl():
-    """OpenGL, or the test is skipped."""
     env = gym.make(PLANE, render_mode="rgb_array", width=16, height=16)
     env.reset(seed=0)
     try:
@@ -61,7 +59,6 @@ def make(opengl):
 
 
 def moved(env, action):
-    """Return the info of a movement in the scene of the tests of pictures."""
     env.reset(options=DRAWN)
     return env.step(action)[-1]
 
@@ -160,12 +157,11 @@ def test_pictures_leave_no_trace_in_the_simulation(make):
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
-@pytest.mark.usefixtures("opengl")
-def test_pictures_of_a_batch_are_those_of_its_environments(mode):
+def test_pictures_of_a_batch_are_those_of_its_environments(mode, make):
     """Also of an episode that is over, where the next one has begun."""
-    sizes = {"render_mode": "rgb_array", "width": 48, "height": 32}
-    batch = gym.make_vec(PLANE, num_envs=3, autoreset_mode=mode, **sizes)
-    singles = [gym.make(PLANE, **sizes) for _ in range(3)]
+    sizes = {"width": 48, "height": 32}
+    batch = gym.make_vec(PLANE, num_envs=3, autoreset_mode=mode, render_mode="rgb_array", **sizes)
+    singles = [make(**sizes) for _ in range(3)]
     batch.reset(seed=0)
     for seed, single in enumerate(singles):
         single.reset(seed=seed)
@@ -178,8 +174,6 @@ def test_pictures_of_a_batch_are_those_of_its_environments(mode):
             assert frame.shape == (32, 48, 3)
             assert_alike(frame, single.render())
     batch.close()
-    for single in singles:
-        single.close()
 
 
 def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
@@ -207,7 +201,6 @@ def test_a_window_plays_in_real_time_and_stops_when_closed(monkeypatch):
 
 
 def frames_of(path):
-    """Number of frames of a video."""
     reader = imageio_ffmpeg.read_frames(str(path))
     next(reader)
     return sum(1 for _ in reader)
@@ -298,9 +291,8 @@ def test_without_opengl_the_error_says_what_to_install(monkeypatch, made):
         env.render()
 
 
-@pytest.mark.usefixtures("opengl")
-def test_a_picture_too_large_for_opengl_is_refused_with_its_size():
-    env = gym.make(PLANE, render_mode="rgb_array", width=40000, height=40000)
+def test_a_picture_too_large_for_opengl_is_refused_with_its_size(make):
+    env = make(side=40000)
     env.reset(seed=0)
     with pytest.raises(ValueError, match="40000 x 40000"):
         env.render()

@@ -37,12 +37,7 @@ HOUSE = ve.Box((0.3, 0.3, 0.3), position=(0.3, 0.0, 0.5), name="house")
 
 @pytest.fixture(scope="module")
 def several():
-    made = gym.make_vec(PANDA, num_envs=3, threads=1).unwrapped
-    yield made
-    made.close()
-
-
-# Drawn scenes
+    return gym.make_vec(PANDA, num_envs=3, threads=1).unwrapped
 
 
 @pytest.mark.parametrize(
@@ -76,9 +71,6 @@ def test_a_scene_depends_on_its_generator_alone(env_id):
     for i in (0, 5):
         same_scenes(task.sampler()([np.random.default_rng((0, i))]), together.take([i]))
     same_scenes(ve.Scenes.together([together.take([0, 1]), together.take([2, 3, 4, 5])]), together)
-
-
-# Given scenes
 
 
 @pytest.mark.parametrize(
@@ -277,8 +269,6 @@ def test_families_that_do_not_fit_are_no_defaults():
 
 
 def test_furniture_moves_with_its_frame():
-    """Turn and shift the frame: the layout is turned and shifted."""
-
     def build(x, y, yaw):
         furniture = ve.Furniture(ve.Room(ALL, 1, 9), x, y, yaw)
         furniture.box((0.1, 0.2, 0.3), (0.01, 0.02, 0.03), 0.4)

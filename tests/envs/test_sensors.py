@@ -25,14 +25,11 @@ SCENE = [
     ve.HalfSpace(position=(0.0, 0.0, -0.5)),
     ve.ConvexMesh(CORNERS, position=(0.9, 0.3, 0.5)),
 ]
-
-
 WIDE = ve.Sensor(columns=40, rows=30, field_of_view=2.0, range=3.0)
 FINE = ve.Sensor(columns=200, rows=150, field_of_view=1.0, range=3.0)
 
 
 def look(sensor, *shapes, joints=PANDA.home):
-    """Return the readings of a sensor of the Panda among shapes."""
     return sensor.read(PANDA, joints[None], pack([shapes]))
 
 

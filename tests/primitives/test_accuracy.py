@@ -75,10 +75,9 @@ class Reference:
 @pytest.mark.parametrize("offset", [0.0, 1e6])
 def test_derivatives_are_exact_to_rounding(vias, ratio, duration, offset, rng):
     points = offset + rng.uniform(-1, 1, vias + 2)
-    durations = np.exp(rng.uniform(0, np.log(ratio), vias + 1)) if ratio > 1 else np.ones(vias + 1)
-    if ratio > 1:
-        durations[vias // 2] = 1.0
-        durations[-1] = ratio
+    durations = np.exp(rng.uniform(0, np.log(ratio), vias + 1))
+    durations[vias // 2] = 1.0
+    durations[-1] = ratio
     durations *= duration / durations.sum()
     trajectory = through(points[:, None], durations)
     reference = Reference(points, durations)

@@ -56,7 +56,6 @@ def test_single_precision_holds_any_duration_and_so_do_gradients(seconds, order,
     found = vp.through(points, lengths, order=order, start_velocity=rate)(when)
     np.testing.assert_allclose(found.detach().numpy(), exact, atol=2e-4)
     gradient = torch.autograd.grad(found.sum() * seconds, lengths)[0]
-    assert torch.isfinite(gradient).all()
     assert gradient.abs().max() < 100.0
 
 

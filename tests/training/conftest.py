@@ -21,7 +21,6 @@ def one_thread():
 
 @pytest.fixture(scope="module")
 def env():
-    """Six environments, which SB3 takes."""
     env = ViaVecEnv(PLANE, 6, seed=3, threads=1)
     yield env
     env.close()
@@ -49,7 +48,6 @@ def small_scenes():
     scenes = simulation.task.sampler()([generator] * 40)
     actions = generator.uniform(-1.0, 1.0, (12, 40, simulation.task.action.size))
     success = np.array([simulation(scenes, each)["is_success"] for each in actions])
-    simulation.close()
     return FrozenScenes(
         name="small",
         task=simulation.task.as_dict(),

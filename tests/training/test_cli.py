@@ -109,7 +109,6 @@ def test_warnings_are_lines_that_name_flags(capsys, monkeypatch):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A run of a few decisions."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     run(
         "train", "--env", PLANE, "--n-timesteps", 64, "--n-envs", 32, "--eval-every", 64, "--eval-scenes", 8,
@@ -128,6 +127,7 @@ def test_train_then_evaluate_then_play(trained, shipped, tmp_path, capsys, faile
     assert [each["scenes"] for each in record["methods"].values()] == [12, 12]
     assert record["env"] == PLANE
     run(*words, "--n-scenes", 1)  # results are replaced, other files stay
+    assert [path.name for path in results.parent.iterdir()] == ["results.json"]
     for kept in (trained / "final" / "model.json", trained / "versions.json"):
         assert kept.name in failed(*words[:-1], kept, "--n-scenes", 1)
     run("evaluate", trained, "--baselines", "--checks", 0, 8, "--n-scenes", 4)
@@ -137,6 +137,7 @@ def test_train_then_evaluate_then_play(trained, shipped, tmp_path, capsys, faile
     run("play", trained, "--video", video, "--n-scenes", 1)
     assert video.stat().st_size > 1000
     run("play", "--env", STEP, "--video", video, "--n-scenes", 1)
+    assert [path.name for path in video.parent.iterdir()] == ["a.mp4"]
 
 
 def test_an_evaluation_in_some_scenes_replaces_none_in_others(trained, shipped, tmp_path):

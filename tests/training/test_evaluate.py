@@ -61,7 +61,6 @@ def test_every_method_meets_the_same_scenes(small_scenes):
         direct = simulation(small_scenes.scenes, method.actions)
         for name, values in direct.items():
             np.testing.assert_array_equal(result.outcomes[name], values, err_msg=name)
-    simulation.close()
     record = evaluation.to_dict()
     assert record["sha256"] == small_scenes.sha256
     assert evaluation.results[0].success.sum() == 0  # the straight line always hits something
@@ -79,8 +78,8 @@ def test_a_model_that_was_loaded_without_an_environment_gets_the_one_that_is_nam
 
 
 @pytest.mark.parametrize("env_id", [REACH, "viapoint/PlanarReachStep-v0", MOVING])
-def test_a_model_of_normalised_observations_sees_such_ones(env_id, monkeypatch):
-    env = VecNormalize(ViaVecEnv(env_id, 8, seed=0, threads=1), norm_reward=False)
+def test_a_model_of_normalised_observations_sees_such_ones(env_id, made, monkeypatch):
+    env = VecNormalize(made(env_id, threads=1), norm_reward=False)
     model = PPO("MultiInputPolicy", env, n_steps=2, batch_size=16, seed=0).learn(16)
     raw, seen = [], []
     normalize, predict = env.normalize_obs, model.policy.predict
@@ -105,7 +104,6 @@ def test_a_model_of_normalised_observations_sees_such_ones(env_id, monkeypatch):
         for name, part in normalize(before).items():
             np.testing.assert_array_equal(after[name], part)
     assert env.obs_rms["hand"].count == count
-    env.close()
 
 
 def fake(success, **changes):
@@ -180,8 +178,6 @@ def test_an_interrupted_evaluation_keeps_what_is_done(small_scenes):
 
 
 def test_decisions_are_timed_one_by_one_and_slow_ones_by_the_batch(small_scenes, monkeypatch):
-    import viapoint.training.evaluation as module
-
     class Timed(Given):
         cost = 0.001
 
@@ -191,7 +187,7 @@ def test_decisions_are_timed_one_by_one_and_slow_ones_by_the_batch(small_scenes,
             return np.zeros((len(scenes.goal), 3))
 
     clock = {"now": 0.0}
-    monkeypatch.setattr(module.time, "perf_counter", lambda: clock["now"])
+    monkeypatch.setattr(evaluation.time, "perf_counter", lambda: clock["now"])
     quick, slow = Timed("quick", ZEROS), Timed("slow", ZEROS)
     slow.cost = 2.0 * SLOW_DECISION
     results = run([quick, slow], small_scenes, time_decisions=True).results

@@ -31,9 +31,7 @@ SHIPPED = {f"{path.stem} {name}": frozen for path in FILES for name, frozen in s
 
 @pytest.fixture(scope="module")
 def simulation():
-    simulation = SceneSimulation(PLANE, 250, threads=1)
-    yield simulation
-    simulation.close()
+    return SceneSimulation(PLANE, 250, threads=1)
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-pytest.importorskip("viser", reason="the extra `live` is not installed")
 pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 
 from helpers import JUMPS, MOVING, PANDA, PLANE, STEP, UR5E
@@ -45,7 +44,6 @@ def untrained(env_id):
 
 
 def drawn(arena, number=0):
-    """Return a random scene."""
     scenes = arena.scenes()["Random"]
     return [next(scenes) for _ in range(number + 1)][-1]
 
@@ -63,7 +61,6 @@ def with_proposals(arena, state):
 
 
 def assert_same(first, second, atol=0.0):
-    """Check that scenes are the same."""
     for name in ("start", "goal", "jumps", "turns"):
         np.testing.assert_allclose(getattr(first, name), getattr(second, name), rtol=0.0, atol=atol)
     for mine, theirs in zip(first.obstacles, second.obstacles, strict=True):

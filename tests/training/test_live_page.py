@@ -7,7 +7,6 @@ import time
 import numpy as np
 import pytest
 
-pytest.importorskip("viser", reason="the extra `live` is not installed")
 pytest.importorskip("mjviser", reason="the extra `live` is not installed")
 
 from browser import wait_for

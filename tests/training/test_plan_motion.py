@@ -685,7 +685,6 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
 
 
 def test_where_there_is_no_way_it_gives_up(monkeypatch):
-    """Bars are all around the goal."""
     pytest.importorskip("ompl")
     monkeypatch.setattr(module, "OMPL_MARGINS", module.OMPL_MARGINS[:1])
     monkeypatch.setattr(module, "OMPL_PATIENCE", 0.05)

@@ -298,13 +298,6 @@ def test_no_file_of_something_else_is_written_over(write, name, content, tmp_pat
     assert content_of(tmp_path) == before
 
 
-@pytest.mark.parametrize(("write", "name"), [(evaluate, "own.json"), (film, "own.mp4")])
-def test_an_own_file_is_replaced(write, name, tmp_path):
-    write(tmp_path / name)
-    write(tmp_path / name)
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
 @pytest.mark.parametrize("name", ["thesis/a.tex", "versions.json", "best/model.json"])
 def test_a_training_begins_in_no_folder_of_something_else(name, tmp_path):
     put(tmp_path, name)

@@ -79,7 +79,6 @@ def same_state(one, other, name=""):
 
 
 def after_steps(monkeypatch, steps, event):
-    """Let something happen after so many steps."""
     step_wait = ViaVecEnv.step_wait
     number = itertools.count()
 
@@ -188,7 +187,6 @@ def test_ctrl_c_saves_and_leaves_and_the_rest_follows(whole, tmp_path, monkeypat
 
 
 STALLING = {"stop_when_stalled": 0.4, "n_timesteps": 640}
-"""Training that stalls unless success rises."""
 
 
 def with_success(monkeypatch, rates):
