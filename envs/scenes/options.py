@@ -296,7 +296,8 @@ def scene_options(scenes: Scenes, arm: Arm, space: SpaceName | None = None, scen
     times = scenes.jump_times[scene]
     jumps = scenes.jumps[scene][times < NEVER]
     # Without jumps the list is empty: a task that may have some draws them where none are given.
-    options["jumps"] = np.column_stack((jumps[:, 0], where.coordinates(jumps[:, 1:])))
+    jumped = np.column_stack((jumps[:, 0], where.coordinates(jumps[:, 1:])))
+    options["jumps"] = jumped if len(jumps) else ()
     present = scenes.obstacles.present[scene]
     turn_time = scenes.turn_time[scene][present]
     if (turn_time < NEVER).any():

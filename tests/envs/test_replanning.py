@@ -5,21 +5,7 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import (
-    GOAL,
-    JUMPS,
-    MOVING,
-    OTHER,
-    PANDA,
-    PANDA_MOVING,
-    PLANE,
-    START,
-    events,
-    given,
-    play,
-    post,
-    same,
-)
+from helpers import GOAL, JUMPS, MOVING, OTHER, PANDA, PANDA_MOVING, PLANE, events, given, play, post, same
 
 from viapoint import primitives
 from viapoint.envs.arms.kinematics import LIMIT_SHARE, slowdowns
@@ -165,8 +151,8 @@ def test_a_plan_in_metres_and_seconds_can_be_executed_on_the_way():
 
 @pytest.mark.parametrize(("env_id", "decide_at"), [(PLANE, "end"), (JUMPS, ("target",))])
 def test_no_plan_is_executed_after_the_end(env_id, decide_at):
-    env, _ = given(env_id, decide_at=decide_at)
-    plan = Plan(np.stack((START, OTHER, GOAL))[None], np.full((1, 2), 0.5))
+    env, first = given(env_id, decide_at=decide_at)
+    plan = Plan(np.stack((first["hand"][:2], OTHER, GOAL))[None], np.full((1, 2), 0.5))
     assert env.batch.execute_plan(plan).info["is_success"]
     with pytest.raises(gym.error.ResetNeeded):
         env.batch.execute_plan(plan)
