@@ -618,7 +618,8 @@ def _parse(model: mujoco.MjModel, joints: Names, tool: Tool, notes: list[str]) -
     geoms = collision_geoms(model, links)
     if not any(links[body] for body in geoms):
         raise ValueError(
-            f"no geom moves with any of {', '.join(joints)}: nothing of the arm can collide; {'; '.join(notes)}"
+            f"no geom moves with any of {', '.join(joints)}, so nothing of the arm can collide: give its links geoms "
+            f"that do, in a URDF elements `collision`; {'; '.join(notes)}"
         )
     pairs = [(one, other) for one, other in itertools.combinations(geoms, 2) if links[one] != links[other]]
     _note_rest(model, joints, tool, list(links), notes)
