@@ -29,7 +29,7 @@ from viapoint.training.scene_sets import scenes_for
 
 ENV_ID, SCENES = "viapoint/PlanarSensed-v0", (300, 420, 450)
 """Environment, and rows of its `validation` set."""
-LIMITS = (-0.5, 0.42), (-0.06, 0.7)
+LIMITS = (-0.5, 0.48), (-0.06, 0.7)
 RAY = "#e8c15a"
 DRAWN, N_DRAWN = 7, 3000
 """First part of the seeds of scenes in which success is counted, and their number."""

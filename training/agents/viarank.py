@@ -99,8 +99,8 @@ class ViaRankPolicy(PlanPolicy):
             :data:`~viapoint.training.planning.cautious.BELIEFS`. With `known` and `seen` the agent decides only where
             the true obstacles are given, as in evaluations.
         depths: Depths to which all that is seen may go on behind its front, ascending, [m]. The network sees the
-            clearance of a plan for each of them, too. Usual are six up to 25 cm with one look in the plane and the
-            usual belief, and none elsewhere.
+            clearance of a plan for each of them, too. Usual are six up to 25 cm with one look in the plane, and none
+            elsewhere.
     """
 
     OWN = (
@@ -146,8 +146,9 @@ class ViaRankPolicy(PlanPolicy):
         self.per_refinement = per_refinement
         self.refine = refine
         self.belief = belief
-        one_look = self.task.space.of_hand and not self.replanning and belief == DEFAULT_BELIEF
-        usual = ONE_LOOK_OF_HAND if one_look else OTHERWISE
+        usual = ONE_LOOK_OF_HAND if self.task.space.of_hand and not self.replanning else OTHERWISE
+        if belief in PRIVILEGED:  # nothing is behind what is believed
+            usual = {**usual, "caution": 0.0, "depths": ()}
         self.caution: float = usual["caution"] if caution is None else caution
         self.effort: float = usual["effort"] if effort is None else effort
         self.depths: tuple[float, ...] = usual["depths"] if depths is None else tuple(depths)
