@@ -283,7 +283,7 @@ def scene_to_json(
         >>> task = Task.of()
         >>> text = scene_to_json(task.sampler()([np.random.default_rng(0)]), task.arm)
         >>> sorted(scene_from_json(text))
-        ['goal', 'obstacles', 'start']
+        ['goal', 'jumps', 'obstacles', 'start']
     """
     return options_to_json(scene_options(scenes, arm, space, scene), env_id)
 

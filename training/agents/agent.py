@@ -56,7 +56,7 @@ def checked_observation(observation: Any, space: spaces.Dict, task: Task) -> Obs
     apart = batch[here] != batch[there]
     if task.whole_movement and not apart.any(axis=-1).all():
         raise ValueError("start and goal must differ: no movement leads from a point to itself")
-    if task.sensor is not None:
+    if task.sensor is not None and len(apart):
         _check_rays(Sight.of(batch, task), task.sensor)
     return arrays
 
