@@ -293,7 +293,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         Raises:
             ValueError: A plan begins elsewhere, or has another number of via-points where plans are revised.
             TypeError: The task has no plans.
-            ResetNeeded: An episode is over.
+            gymnasium.error.ResetNeeded: An episode is over.
         """
         self._check_running()
         over = self.terminated | self.truncated

@@ -111,13 +111,13 @@ class Agent(BaseAlgorithm):
         """Return actions for one observation or a batch, and no state, as in Stable-Baselines3.
 
         Raises:
-            ValueError: The observation cannot be one of the agent's environment, see :func:`checked_observation`.
+            ValueError: The observation cannot be one of the agent's environment: it has other parts or sizes, is not
+                finite, or holds readings of another sensor.
         """
         normalize, env = self.get_vec_normalize_env(), self.get_env()
         raw = normalize is None or not normalize.norm_obs
-        if (
-            raw and env is not None and not hasattr(self.policy, "task")
-        ):  # policies that know the task check it
+        # Policies that know the task check observations themselves.
+        if raw and env is not None and not hasattr(self.policy, "task"):
             (task,) = env.get_attr("task", [0])
             space: Any = self.observation_space
             observation = checked_observation(observation, space, task)

@@ -173,8 +173,7 @@ class PlanPolicy(BasePolicy):
         """Return actions for one observation or a batch, and no state, as policies of Stable-Baselines3 do.
 
         Raises:
-            ValueError: The observation cannot be one of the task, see
-                :func:`~viapoint.training.agents.agent.checked_observation`.
+            ValueError: The observation cannot be one of the task, see `checked_observation`.
         """
         parts: Any = self.observation_space
         arrays = checked_observation(observation, parts, self.task)
