@@ -184,14 +184,10 @@ def arm_joints(model: mujoco.MjModel, chain: list[str], notes: list[str]) -> lis
             break
     fingers = set()
     for name in chain:
-        for body in ancestors(model, carriers[name])[:-1]:
+        way = [carriers[name], *ancestors(model, carriers[name])]
+        for body in way[1:-1]:
             moving, arms = _branches(model, body)
-            rest = _rest_of_arm(model, moving)
-            if (
-                len(moving) > 1
-                and not arms
-                and rest not in (carriers[name], *ancestors(model, carriers[name]))
-            ):
+            if len(moving) > 1 and not arms and _rest_of_arm(model, moving) not in way:
                 fingers.add(name)
     for some, what in ((mobile, "a mobile base"), (fingers, "fingers")):
         if some:

@@ -183,7 +183,7 @@ class ViaRankPolicy(PlanPolicy):
         """
         inputs, reward = sight_inputs(self.task, beliefs, sight, actions, self.instants, self.nearest)
         worth = self.effort * reward
-        if self.depths:
+        if self.depths:  # their clearances come after that of the belief
             clear = inputs.plans[..., 1:-1].numpy() * CLEAR >= CLEARANCE_MARGIN
             worth += self.caution * (clear * np.array(self.depths) / self.depths[-1]).max(axis=-1)
         return inputs, worth
