@@ -21,6 +21,9 @@ from viapoint.envs.geometry.shapes import as_obstacle
 from viapoint.envs.plans import SpaceName
 
 HIDDEN_GROUP = 5  # Group of geoms that MuJoCo does not draw
+# Configurations in which bodies get smaller spheres if these overlap though capsules are ROOM apart, [m]
+VIEWS, ROOM = 48, 0.0015
+COVERED = "covered"  # Custom number in models of which this holds: those whose capsules cover other geoms
 COMPARED = 100_000  # Number of configurations in which bodies that never touch are looked for
 SAMPLED = 64  # Configurations at which the greatest inertia of the joints is looked for
 OBSTACLE_COLOUR = (0.83, 0.52, 0.30, 1.0)  # Colour of obstacles in pictures
@@ -195,7 +198,8 @@ def arm_from_xml(
             carrier = model.body(carrier.parentid[0])
             if links.get(carrier.name, 0) == link - 1 > 0:
                 carried[frozenset((carrier.name, body))] = "consecutive links"
-    names, spheres, left_out, excess = cover(chain, capsules, links, home, {**carried, **(exclude or {})})
+    exclude = {**carried, **(exclude or {})}
+    names, spheres, left_out, excess = cover(chain, capsules, links, home, exclude)
     # Pairs that touch in none of many configurations are not compared, either.
     ranges = np.array([model.joint(each).range for each in joints])
     low, high = ranges.T
@@ -206,9 +210,19 @@ def arm_from_xml(
         if touch is not None:  # spheres reach beyond the geoms, which may be apart where spheres overlap
             kept[row] = any(touch(names[first], names[second], each) for each in drawn[overlap[:, row]])
         if not kept[row]:
-            reason = f"in contact in none of {COMPARED:,} configurations"
-            left_out.append(LeftOut(names[first], names[second], reason))
-    spheres = spheres._replace(pairs=spheres.pairs[kept])
+            pair = frozenset((names[first], names[second]))
+            exclude[pair] = f"in contact in none of {COMPARED:,} configurations"
+
+    def room(first: str, second: str, configuration: Float) -> bool:
+        """Return True if the capsules of two bodies are ROOM apart in a configuration."""
+        move(data, joints, configuration)
+        geoms = [np.flatnonzero(model.geom_bodyid == model.body(name).id) for name in (first, second)]
+        pairs = itertools.product(*geoms)
+        return all(mujoco.mj_geomDistance(model, data, *both, 2.0 * ROOM, None) >= ROOM for both in pairs)
+
+    covered = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, COVERED) >= 0
+    elsewhere = drawn[: VIEWS if covered else 0]
+    _, spheres, left_out, excess = cover(chain, capsules, links, home, exclude, elsewhere, room)
     inertia = greatest_inertia(data, joints, ranges)
     # Much damping makes a joint as slow to return as much inertia does.
     inertia = np.maximum(inertia, 0.5 * chain.damping / bandwidth)

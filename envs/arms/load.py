@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.arm import HIDDEN_GROUP, Arm, arm_from_xml, asset, greatest_inertia, move
+from viapoint.envs.arms.arm import HIDDEN_GROUP, VIEWS, Arm, arm_from_xml, asset, greatest_inertia, move
 from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
 from viapoint.envs.arms.choices import (
     GROUNDS,
@@ -45,11 +45,11 @@ DEFAULT_VELOCITY_LIMIT = 2.0  # Velocity limit of joints without one, [rad/s] or
 WEIGHTS, ACCELERATION, LEAST_TORQUE = 3.0, 5.0, 1.0
 """Torque limit of joints without one: multiple of what gravity needs, acceleration [rad/s^2], and least one, [N m]."""
 WEIGHED = 200  # Number of configurations in which the arm is weighed
-# Numbers of configurations in which bodies that are always near are looked for, and contacts of these
-LOOKED_AT, NEAR_LOOKED_AT = 16, 1000
-# Distance within which bodies are near in at least half of the configurations, and tolerance for these, which is the
-# least one, [m]
-NEAR, FINE = 0.03, 0.005
+NEAR_LOOKED_AT = (
+    1000  # Number of configurations in which contacts of bodies that are always near are looked for
+)
+NEAR = 0.03  # Distance within which bodies are near in at least half of the configurations, [m]
+FINEST = 0.005  # Least tolerance, [m]
 STUCK = 100.0  # Damping beyond which a joint hardly moves: torque at full speed over the limit
 # Greatest range of a hinge, [rad], and length of an arm, [m], that are not taken for degrees or millimetres
 MOST_TURNS, LONGEST = 8.0 * np.pi, 20.0
@@ -60,6 +60,8 @@ MAX_TOLERANCE = 1.0  # Greatest tolerance of fitted capsules, [m]
 # Distance at home that capsules leave between bodies, as a share of that of the geoms, and at most, [m]
 LEFT_SHARE, LEFT_MOST = 0.25, 0.002
 LEAST_EXCESS = 0.001  # Excess of capsules below which they are not split, [m]
+# Distance of bodies in other configurations that capsules leave free, too, and excess below which they do not, [m]
+PASSING, WORTH = 0.005, 0.004
 SHORT = 1e-5  # Length of a capsule that is written as a sphere around it, [m]
 MIN_INERTIA = 1e-12  # Least principal moment of inertia of a body, [kg m^2]
 INERTIA_MARGIN = 2e-5  # Relative margin of the triangle inequality of principal moments
@@ -164,7 +166,7 @@ def load_arm(
         "joint_range": joint_range,
         "torque_limit": torque_limit,
         "velocity_limit": velocity_limit,
-        "tolerance": number_of_at_least("tolerance", tolerance, FINE, MAX_TOLERANCE),
+        "tolerance": number_of_at_least("tolerance", tolerance, FINEST, MAX_TOLERANCE),
     }
     notes = list(urdf.notes)
     whole = _compiled(spec, notes)
@@ -238,15 +240,14 @@ def _load(
     pairs = [pair for pair in parsed.pairs if pair not in exclude]
     low, high = ranges.T
     drawn = np.random.default_rng(0).uniform(low, high, (NEAR_LOOKED_AT, len(names)))
-    looked_at = np.array([_distances(parsed, each, pairs) for each in drawn[:LOOKED_AT]])
-    near = set(itertools.compress(pairs, np.median(looked_at, axis=0) < NEAR))
-    apart = _apart(parsed, near, drawn)
-    exclude |= dict.fromkeys(apart, never)
+    looked_at = np.array([_distances(parsed, each, pairs) for each in drawn[:VIEWS]])
+    near = itertools.compress(pairs, np.median(looked_at, axis=0) < NEAR)
+    exclude |= dict.fromkeys(_apart(parsed, near, drawn), never)
     movable = set(itertools.compress(pairs, looked_at.max(axis=0) > 0.0))
     compared = [pair for pair in pairs if pair in movable and pair not in exclude]
     home = _home(parsed, ranges, given["home"], compared, notes)
     origin = np.zeros(3) if given["origin"] is None else finite_array("origin", given["origin"], (3,))
-    # Bodies that are near at home get smaller capsules, or are not compared, either.
+    # Bodies that are near at home are not compared, either, or get smaller capsules.
     at_home = dict(zip(pairs, _distances(parsed, home, pairs).tolist(), strict=True))
     close = [pair for pair in pairs if pair not in exclude and 0.0 < at_home[pair] < LEAST_GAP]
     exclude |= dict.fromkeys(_apart(parsed, close, drawn), never)
@@ -256,11 +257,12 @@ def _load(
     if given["home"] is not None and avoidable:
         some = "; ".join(" and ".join(sorted(parsed.named(pair))) for pair in avoidable)
         notes.append(f"{WARNING}in contact at the given home, and not compared in any plan: {some}")
-    distances = {pair: away for pair, away in at_home.items() if pair not in exclude}
-    tolerances = dict.fromkeys(parsed.geoms, given["tolerance"])
-    for pair in near.difference(apart):
-        tolerances.update(dict.fromkeys(pair, FINE))
-    xml, excess = _fitted(parsed, ranges, origin, home, distances, tolerances)
+    compared = [pair for pair in pairs if pair not in exclude]
+    views = [(home, {pair: at_home[pair] for pair in compared})]
+    for configuration, row in zip(drawn, looked_at, strict=False):
+        there = dict(zip(pairs, row.tolist(), strict=True))
+        views.append((configuration, {pair: there[pair] for pair in compared if there[pair] >= PASSING}))
+    xml, excess = _fitted(parsed, ranges, origin, views, given["tolerance"])
     bodies = {known: body for body, known in parsed.names.items()}
 
     def touch(first: str, second: str, configuration: Float) -> bool:
@@ -693,44 +695,54 @@ def _fitted(
     parsed: Parsed,
     ranges: Float,
     origin: Float,
-    home: Float,
-    distances: dict[Pair, float],
-    tolerances: dict[int, float],
+    views: Sequence[tuple[Float, dict[Pair, float]]],
+    tolerance: float,
 ) -> tuple[str, float]:
     """Return the text of the arm's model, and the greatest excess of its capsules, [m].
 
-    Capsules of bodies that are apart at home must be apart there, too: those that are not are split.
+    Capsules of bodies that are apart at home must be apart there, too: those that are not are split. So are those of
+    pairs with room between them in other configurations, as far as that is worth it.
+
+    Args:
+        parsed: Arm in the form of its file.
+        ranges: Range of each joint, shape (J, 2).
+        origin: Point of the file's world that becomes the origin, [m].
+        views: Configurations, home first, and distances of pairs of bodies that are compared there, [m].
+        tolerance: Greatest excess of capsules, as far as that is possible, [m].
 
     Raises:
-        ValueError: Bodies are too close for that.
+        ValueError: Bodies are too close at home for that.
     """
     model = parsed.model
     fits: dict[int, list[FittedCapsule]] = {}
     for body, geoms in parsed.geoms.items():
         fits[body] = []
         for geom in geoms:
-            fits[body] += cover_geom(model, geom, tolerances[body])
+            fits[body] += cover_geom(model, geom, tolerance)
     while True:
         xml = _write(parsed, ranges, origin, fits)
         capsules = mujoco.MjModel.from_xml_string(xml)
         data = mujoco.MjData(capsules)
-        move(data, parsed.joints, home)
         begin = {body: int(capsules.body(parsed.names[body]).geomadr[0]) for body in fits}
         coarse: set[tuple[int, int]] = set()
-        for (first, second), distance in distances.items():
-            least = min(LEFT_SHARE * distance, LEFT_MOST)
-            for i, j in itertools.product(range(len(fits[first])), range(len(fits[second]))):
-                both = begin[first] + i, begin[second] + j
-                if mujoco.mj_geomDistance(capsules, data, *both, 0.01, None) >= least:
-                    continue
-                one, other = fits[first][i].excess, fits[second][j].excess
-                if max(one, other) < LEAST_EXCESS:
-                    raise ValueError(
-                        f"the bodies {parsed.names[first]!r} and {parsed.names[second]!r} are "
-                        f"{1e3 * distance:.2g} mm apart at home, too close for the capsules around them: give another "
-                        "home, or exclude their contact in the file"
-                    )
-                coarse.add((first, i) if one >= other else (second, j))
+        for place, (configuration, distances) in enumerate(views):
+            move(data, parsed.joints, configuration)
+            for (first, second), distance in distances.items():
+                least = min(LEFT_SHARE * distance, LEFT_MOST)
+                for i, j in itertools.product(range(len(fits[first])), range(len(fits[second]))):
+                    both = begin[first] + i, begin[second] + j
+                    if mujoco.mj_geomDistance(capsules, data, *both, 0.01, None) >= least:
+                        continue
+                    one, other = fits[first][i].excess, fits[second][j].excess
+                    if place and max(one, other) < WORTH:
+                        continue
+                    if max(one, other) < LEAST_EXCESS:
+                        raise ValueError(
+                            f"the bodies {parsed.names[first]!r} and {parsed.names[second]!r} are "
+                            f"{1e3 * distance:.2g} mm apart at home, too close for the capsules around them: give "
+                            "another home, or exclude their contact in the file"
+                        )
+                    coarse.add((first, i) if one >= other else (second, j))
         if not coarse:
             return xml, max(capsule.excess for some in fits.values() for capsule in some)
         for body, index in sorted(coarse, reverse=True):

@@ -34,7 +34,7 @@ _BUILT_IN: dict[str, dict[str, Any]] = {
         # model (panda_spherized.urdf) leave them at least 7 mm apart, whatever the joint positions.
         "exclude": {
             frozenset(("link0", "link1")): "consecutive links",
-            frozenset(("link5", "link7")): "never in contact",
+            frozenset(("link5", "link7")): "never in contact, though their capsules overlap",
         },
     },
 }

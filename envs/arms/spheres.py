@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from viapoint.envs.geometry.compiled import compiled
 LARGEST_EXCESS = 0.005  # Greatest distance by which a sphere may stick out of a capsule, [m]
 SHRUNK = 0.5  # Factor on this distance for bodies whose spheres overlap at home although their geoms do not
 SHRINKING = 6  # Greatest number of times that it is applied
+FINEST = 0.002  # Distance above which it is applied for bodies that have room between them elsewhere, [m]
 ROUNDS = 2000  # Iterations for bounding balls
 
 Capsule = tuple[Float, float]  # Ends of the axis, shape (2, 3), equal for a sphere, and radius, [m]
@@ -35,10 +36,14 @@ def cover(
     links: dict[str, int],
     home: Float,
     exclude: Mapping[frozenset[str], str],
+    elsewhere: Sequence[Float] = (),
+    room: Callable[[str, str, Float], bool] | None = None,
 ) -> tuple[tuple[str, ...], Spheres, list[LeftOut], float]:
     """Return groups of spheres that contain all capsules: names of bodies, spheres, pairs left out, and excess, [m].
 
     Capsules of each body are in the frame of its link. Pairs in `exclude`, with a reason, may pass through one another.
+    Others that overlap at home get smaller spheres, and those that overlap in configurations `elsewhere`, shape (N, J),
+    although there is `room` between them.
 
     Raises:
         ValueError: Spheres of bodies that are apart at home overlap there, however small they are.
@@ -55,11 +60,18 @@ def cover(
             for (_, inner), (_, outer) in zip(capsules[name], covers, strict=True):
                 beyond = max(beyond, outer - inner)
         spheres = grouped(centres, radii, [links[name] for name in names], pairs)
-        close = spheres.pairs[overlapping(chain, spheres, home[None], False)[0]]
-        if not len(close):
+        overlap: Any = overlapping(chain, spheres, np.array((home, *elsewhere)), True)
+        close = spheres.pairs[overlap[0]]
+        coarse = {names[group] for group in close.flat}
+        for view, row in np.argwhere(overlap[1:]):
+            pair = [names[group] for group in spheres.pairs[row]]
+            wide = {name for name in pair if excess[name] > FINEST}
+            if wide - coarse and room is not None and room(*pair, elsewhere[view]):
+                coarse |= wide
+        if not coarse:
             return names, spheres, left_out, beyond
-        for group in np.unique(close):
-            excess[names[group]] *= SHRUNK  # smaller spheres, and more of them
+        for name in coarse:
+            excess[name] *= SHRUNK  # smaller spheres, and more of them
     first, second = close[0]
     raise ValueError(
         f"the bodies {names[first]!r} and {names[second]!r} are so close at home that spheres on them overlap: give "

@@ -294,26 +294,27 @@ def _find(path: Path, packages: Packages, file: str) -> Path:
 def _srdf(path: Path, urdf: ET.Element, notes: list[str]) -> tuple[tuple[str, str], ...]:
     """Return the pairs of links that an SRDF file of the same robot does not compare.
 
-    It has the same name and is beside the URDF or in the folder srdf beside that folder; or it is the only one beside.
+    It is beside the URDF or in the folder srdf beside that folder, and names the same robot. Of several, the one is
+    taken that has the name of the URDF.
     """
-    beside = list(path.parent.glob("*.srdf"))
-    places = [path.with_suffix(".srdf"), path.resolve().parents[1] / "srdf" / f"{path.stem}.srdf"]
-    places += beside if len(beside) == 1 else []
+    folders = path.parent, path.resolve().parent.parent / "srdf"
+    places = [place for folder in folders for place in sorted(folder.glob("*.srdf"))]
+    roots = {place: _root(place) for place in dict.fromkeys(places)}
     robot = urdf.get("name")
-    for place in dict.fromkeys(places):
-        if not place.is_file():
-            continue
-        root = _root(place)
-        if root.get("name") != robot:
-            notes.append(f"{place.name} is not used: it is for robot {root.get('name')!r}, not {robot!r}")
-            continue
-        notes.append(f"pairs of links that are not compared: those of {place.name}")
-        pairs = [
-            (pair.get("link1", ""), pair.get("link2", "")) for pair in root.findall("disable_collisions")
-        ]
-        links = {link.get("name") for link in urdf.findall("link")}
-        unknown = dict.fromkeys(name for name in itertools.chain(*pairs) if name not in links)
-        if unknown:
-            notes.append(f"{WARNING}{place.name} names links that the URDF lacks: {', '.join(unknown)}")
-        return tuple(pairs)
-    return ()
+    same = [place for place, root in roots.items() if root.get("name") == robot]
+    named = [place for place in same if place.stem == path.stem]
+    if not same or (len(same) > 1 and not named):
+        for place, root in roots.items():
+            why = "it is one of several" if same else f"it is for robot {root.get('name')!r}, not {robot!r}"
+            notes.append(f"{place.name} is not used: {why}")
+        return ()
+    place = (named or same)[0]
+    notes.append(f"pairs of links that are not compared: those of {place.name}")
+    pairs = [
+        (pair.get("link1", ""), pair.get("link2", "")) for pair in roots[place].findall("disable_collisions")
+    ]
+    links = {link.get("name") for link in urdf.findall("link")}
+    unknown = dict.fromkeys(name for name in itertools.chain(*pairs) if name not in links)
+    if unknown:
+        notes.append(f"{WARNING}{place.name} names links that the URDF lacks: {', '.join(unknown)}")
+    return tuple(pairs)

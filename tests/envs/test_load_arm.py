@@ -16,6 +16,7 @@ from viapoint.envs.arms.choices import KNOWN_VELOCITIES, known_limits
 from viapoint.envs.arms.kinematics import forward, sphere_centres, torques
 from viapoint.envs.arms.load import load_arm, read_model
 from viapoint.envs.arms.registry import arm_of
+from viapoint.envs.arms.spheres import overlapping
 from viapoint.envs.arms.stored import write_arm
 from viapoint.envs.geometry.clearance import row_clearances
 from viapoint.envs.geometry.obstacles import pack
@@ -241,6 +242,20 @@ THREE = {"tool": "tool", "joints": ("one", "two", "three"), "velocity_limit": 1.
 def three(*pairs, gap=0.02, **changes):
     """Return the arm of three links with some words of its file replaced."""
     return load_arm(changed(*pairs, text=near_arm(gap)), **{**THREE, **changes})
+
+
+def test_spheres_leave_room_between_bodies_that_pass_close_by_one_another():
+    """A plate sweeps over a box and tilts; apart at home, spheres as large as there touch elsewhere."""
+    text = """
+    <mujoco><compiler angle="radian"/><worldbody><body name="base"><geom type="box" size=".4 .4 .1"/>
+      <body name="turn" pos="0 0 .12"><joint name="one" axis="0 0 1" range="-3 3"/><geom size=".02" mass="1"/>
+        <body name="plate" pos="0 0 .03"><joint name="two" axis="0 1 0" range="-.1 .1"/>
+          <geom type="box" size=".2 .1 .02" pos=".2 0 0" mass="1"/>
+    </body></body></body></worldbody></mujoco>"""
+    arm = load_arm(text, velocity_limit=1.0, torque_limit=50.0)
+    drawn = np.random.default_rng(1).uniform(*arm.joint_range.T, (300, 2))
+    apart = 0.03 - 0.4 * np.sin(drawn[:, 1]) > 0.015  # [m]
+    assert overlapping(arm.chain, arm.spheres, drawn, True)[apart].mean() < 0.05
 
 
 def test_two_tools_side_by_side_on_a_wrist_are_refused():
@@ -577,14 +592,24 @@ def test_urdf_files_at_fault_are_refused_and_the_fault_is_named(crane, old, new,
         load_arm(written(crane, (old, new)))
 
 
-@pytest.mark.parametrize(("robot", "note"), [("crane", "those of"), ("ship", "crane.srdf is not used")])
-def test_pairs_of_an_srdf_of_the_same_robot_beside_it_are_not_compared(crane, robot, note):
+@pytest.mark.parametrize(
+    ("robot", "files", "note"),
+    [
+        ("crane", ["urdf/crane.srdf"], "those of"),
+        ("crane", ["srdf/any.srdf"], "those of any.srdf"),
+        ("crane", ["srdf/any.srdf", "srdf/other.srdf"], "other.srdf is not used"),
+        ("ship", ["urdf/crane.srdf"], "crane.srdf is not used"),
+    ],
+)
+def test_pairs_of_an_srdf_of_the_same_robot_beside_it_are_not_compared(crane, robot, files, note):
     path = written(crane)
-    (crane / "urdf" / "crane.srdf").write_text(
-        f'<robot name="{robot}"><disable_collisions link1="wrist" link2="post" reason="Never"/></robot>'
-    )
+    (crane / "srdf").mkdir()
+    for file in files:
+        (crane / file).write_text(
+            f'<robot name="{robot}"><disable_collisions link1="wrist" link2="post" reason="Never"/></robot>'
+        )
     arm = load_arm(path)
-    assert (("post", "wrist", "excluded in the file") in arm.left_out) == (robot == "crane")
+    assert (("post", "wrist", "excluded in the file") in arm.left_out) == (note.startswith("those"))
     assert note in "\n".join(arm.notes)
 
 
