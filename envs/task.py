@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm
+from viapoint.envs.arms.kinematics import slowdowns
 from viapoint.envs.arms.registry import arm_names, arm_of
 from viapoint.envs.common.validation import (
     fewest_and_most,
@@ -37,7 +38,7 @@ from viapoint.envs.plans import (
 from viapoint.envs.rewards import RewardWeights
 from viapoint.envs.scenes.families_registry import check_families, default_families
 from viapoint.envs.scenes.sampler import MOST_DRAWN, SceneSampler, farthest_reach, is_planar, room_of
-from viapoint.envs.scenes.scene import MOST_JUMPS
+from viapoint.envs.scenes.scene import MINIMUM_JERK_PEAK, MOST_JUMPS
 from viapoint.envs.sensors import Sensor, named_sensor
 from viapoint.envs.spaces import Space, space_of
 
@@ -50,11 +51,13 @@ MOST_RANGE = 10.0  # Bound of the factor on offsets of via-points
 MOST_OBSTACLES = 256  # Greatest number of obstacles in a scene that is given
 PLANE_SHAPES = ("cylinder", "box")  # Default shapes of obstacles in the plane
 SPACE_SHAPES = ("sphere", "capsule", "cylinder", "box", "half_space")  # Default shapes of obstacles in space
-JOINT_MOVEMENT = 5.0  # Time that a movement in joint space is given where time is limited, [s]
+JOINT_MOVEMENT = 5.0  # Least time that a movement in joint space is given where time is limited, [s]
+JOINT_WAY = 0.4  # Share of a joint's range for which the slowest action has time, too
 # Top speed of the hand where it is steered, [m/s], and bandwidth of the reference, [rad/s]
 HAND_SPEED, HAND_BANDWIDTH = 1.5, 25.0
 # Top speed of the joints where they are steered, as a share of their limits, and bandwidth, [rad/s]
 JOINT_SPEED_SHARE, JOINT_BANDWIDTH = 0.5, 12.0
+STEERED = 4096  # Number of states of an arm that is steered in which its torques are looked at
 # Default duration range by space: seconds, and multiples of the shortest movement that the limits allow
 DURATIONS: dict[str, tuple[float, float]] = {"hand": (0.6, 1.2), "joints": (1.1, 2.5)}
 
@@ -240,13 +243,14 @@ class Task:
         if abs(number * timestep - self.control_step) > 1e-6 * self.control_step or number > 500:
             raise ValueError(f"control_step must be 1 to 500 times {timestep} s, got {self.control_step!r}")
         speeds = JOINT_SPEED_SHARE * np.minimum(self.arm.velocity_limit, 10.0)
-        return Steering(
+        usual = Steering(
             names=("x", "y") if in_hand else self.arm.joint_names,
             top_speed=(HAND_SPEED,) * 2 if in_hand else tuple(float(speed) for speed in speeds),
             bandwidth=HAND_BANDWIDTH if in_hand else JOINT_BANDWIDTH,
             physics_steps=number,
             timestep=timestep,
         )
+        return usual if in_hand or not self.stepwise else _within_torques(usual, self.arm)
 
     @property
     def hand_alone(self) -> bool:
@@ -268,12 +272,17 @@ class Task:
         every = tuple(each for each in TRIGGERS if each not in refused)
         return dataclasses.replace(self, decide_at=every if changes else END, weights=weights)
 
-    @property
+    @functools.cached_property
     def time_limit(self) -> float:
         """Time limit of an episode, [s]; very long where an episode is one movement."""
         if self.whole_movement:
             return 1e9
-        movement = self.duration_range[1] if self.space_name == "hand" else JOINT_MOVEMENT
+        movement = self.duration_range[1]
+        if self.space_name == "joints":
+            width = self.arm.joint_range[:, 1] - self.arm.joint_range[:, 0]
+            way = float((JOINT_WAY * width / self.action.rate_limit).max())
+            slower = JOINT_BANDWIDTH / self.steering.bandwidth
+            movement = slower * max(JOINT_MOVEMENT, MINIMUM_JERK_PEAK * way * movement)
         changes = self.replanning or self.moving_obstacles or self.n_jumps[1] > 0
         return (2 + self.n_jumps[1] if changes else 1) * movement + SETTLING
 
@@ -306,6 +315,24 @@ class Task:
             del values["via_range"]
         plain: dict[str, Any] = json.loads(json.dumps(values))  # lists in place of tuples
         return plain
+
+
+def _within_torques(steering: Steering, arm: Arm) -> Steering:
+    """Return steering of the joints that is slower by a factor where the torque limits of the arm need it.
+
+    In the states that are looked at, all joints turn round at once, at their greatest speed and acceleration.
+    """
+    shape = STEERED, 1, len(arm.home)
+    rng = np.random.default_rng(0)
+    low, high = arm.joint_range.T
+    joints = rng.uniform(low, high, shape)
+    top = np.array(steering.top_speed)
+    velocity, toward = top * rng.choice([-1.0, 1.0], (2, *shape))
+    acceleration = 2.0 * steering.bandwidth / np.e * toward  # see Steering.greatest_acceleration
+    needed = slowdowns(arm.chain, arm.velocity_limit, arm.torque_limit, joints, velocity, acceleration)
+    slower = max(float(np.quantile(needed, arm.steerable_share)), 1.0)
+    speeds = tuple((top / slower).tolist())
+    return dataclasses.replace(steering, top_speed=speeds, bandwidth=steering.bandwidth / slower)
 
 
 def _checked_durations(space: SpaceName, given: Any) -> tuple[float, float]:

@@ -25,7 +25,7 @@ from viapoint.envs.outcome import Rollout
 from viapoint.envs.plans import Plan
 from viapoint.envs.renderer import RENDER_MODES, EpisodeRenderer
 from viapoint.envs.scenes.options import draw_given
-from viapoint.envs.scenes.scene import Scenes
+from viapoint.envs.scenes.scene import Scenes, check_end
 from viapoint.envs.task import Task
 
 SINGLE_METADATA: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
@@ -324,7 +324,8 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             goals: New targets, shape (num_envs, 2) [m] in hand space, (num_envs, J) [rad] in joint space.
 
         Raises:
-            ValueError: A target is out of reach; the episodes are unchanged.
+            ValueError: A target is out of reach, or the arm would touch itself or an obstacle where it is now; the
+                episodes are unchanged.
         """
         self._check_running()
         space = self.task.space
@@ -334,6 +335,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             row = int(inside.argmin())
             raise ValueError(f"goals must be within the arm's reach, got {goals[row].tolist()} in row {row}")
         joints = space.joints(goals)
+        now = np.concatenate([each.time for each in self._episodes])
+        obstacles = Scenes.together([each.scenes for each in self._episodes]).obstacles_at(now)
+        check_end(self.task.arm, "goal", joints, obstacles, np.ones(self.num_envs, bool))
         for episodes, share in zip(self._episodes, self._shares, strict=True):
             episodes.scenes.goal[:] = joints[share]
             episodes.scenes.jumps[:] = 0.0

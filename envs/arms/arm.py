@@ -77,6 +77,8 @@ class Arm:
     """Space in which movements are planned by default."""
     timestep: float
     """Length of a physics step, [s]."""
+    steerable_share: float = 0.99
+    """Share of states in which the torque limits allow the greatest acceleration in control steps."""
     continuous: tuple[str, ...] = ()
     """Names of joints that turn without end in the file; goals of planning are taken modulo a turn."""
     file: str = ""
@@ -173,6 +175,7 @@ def arm_from_xml(
     torque_limit: Any,
     space: SpaceName = "joints",
     bandwidth: float = 50.0,
+    steerable_share: float = 0.99,
     exclude: Mapping[frozenset[str], str] | None = None,
     touch: Callable[[str, str, Float], bool] | None = None,
 ) -> Arm:
@@ -245,6 +248,7 @@ def arm_from_xml(
         damping=np.maximum(2.0 * inertia * bandwidth - chain.damping, 0.0),
         space=space,
         timestep=float(model.opt.timestep),
+        steerable_share=steerable_share,
     )
 
 

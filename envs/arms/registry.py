@@ -30,6 +30,7 @@ _BUILT_IN: dict[str, dict[str, Any]] = {
         "home": (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785),  # Franka's ready pose
         "velocity_limit": (2.175,) * 4 + (2.61,) * 3,
         "torque_limit": (87.0,) * 4 + (12.0,) * 3,
+        "steerable_share": 0.95,  # as fast as agents were trained with
         # Capsules of wrist and flange are always within 2 cm, though the links never touch: the 59 spheres of VAMP's
         # model (panda_spherized.urdf) leave them at least 7 mm apart, whatever the joint positions.
         "exclude": {

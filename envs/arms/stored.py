@@ -27,7 +27,7 @@ from viapoint.envs.arms.spheres import LeftOut
 
 MARK = "viapoint_arm"  # Name of the text element with the choices
 # Fields of an arm that it is made with, and those that its file adds
-ARGUMENTS = ("home", "velocity_limit", "torque_limit", "space")
+ARGUMENTS = ("home", "velocity_limit", "torque_limit", "space", "steerable_share")
 ADDED = ("left_out", "excess", "continuous", "notes")
 COPY = "arm.xml"  # Name of a copy in the folder of a run or a model
 
@@ -96,7 +96,7 @@ def read_arm(file: Any) -> Arm | None:
     choices: dict[str, Any] = json.loads(data)
     left_out = tuple(LeftOut(*each) for each in choices["left_out"])
     exclude = {frozenset((pair.first, pair.second)): pair.reason for pair in left_out}
-    kept = {each: choices[each] for each in ("joints", *ARGUMENTS)}
+    kept = {each: choices[each] for each in ("joints", *ARGUMENTS) if each in choices}  # old: fewer
     xml = text.replace(_element(data), "")
     arm = arm_from_xml(choices["name"], xml, tool="hand", exclude=exclude, **kept)
     texts: dict[str, Any] = {each: tuple(choices[each]) for each in ("continuous", "notes")}

@@ -189,7 +189,7 @@ def check_scenes(
     _check_obstacles(scenes, names)
     everywhere = np.ones(len(scenes.start), bool)
     for name in ends:
-        _check_end(arm, name, getattr(scenes, name), scenes.obstacles, everywhere, names)
+        check_end(arm, name, getattr(scenes, name), scenes.obstacles, everywhere, names)
     if len(ends) == len(ENDS):
         apart = np.abs(scenes.goal - scenes.start).max(axis=-1)
         allowed = f"start and goal must be apart, by {LEAST_APART} rad or more in a joint"
@@ -209,7 +209,7 @@ def _check_jumps(scenes: Scenes, arm: Arm, names: Sequence[Sequence[str]]) -> No
         _refuse(late, f"jump {jump} must come after the one before it, and after 0 s", time)
         obstacles = scenes.obstacles_at(np.where(given, time, 0.0))
         target = np.where(given[:, None], scenes.jumps[:, jump, 1:], scenes.goal)
-        _check_end(arm, f"target of jump {jump}", target, obstacles, given, names)
+        check_end(arm, f"target of jump {jump}", target, obstacles, given, names)
         before = time  # jumps are in order
 
 
@@ -247,8 +247,8 @@ def _check_obstacles(scenes: Scenes, names: Sequence[Sequence[str]]) -> None:
     _refuse(reaches & (speed > FASTEST), f"must reach with at most {FASTEST:g} m/s", speed, names)
 
 
-def _check_end(
-    arm: Arm, name: str, joints: Float, obstacles: Obstacles, there: Bool, names: Sequence[Sequence[str]]
+def check_end(
+    arm: Arm, name: str, joints: Float, obstacles: Obstacles, there: Bool, names: Sequence[Sequence[str]] = ()
 ) -> None:
     """Check an end of the scenes that have it: inside the joint limits, and free of the arm itself and of obstacles."""
     for joint, (low, high) in enumerate(arm.joint_range):

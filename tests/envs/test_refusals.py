@@ -162,6 +162,16 @@ def test_goals_that_are_moved(goals):
     np.testing.assert_array_equal(env.observe()["goal"], before["goal"])
 
 
+def test_goals_are_not_moved_into_contact_with_obstacles_where_they_are_now():
+    env = gym.make_vec(MOVING, num_envs=1, decide_at=("horizon",), threads=1).unwrapped
+    env.reset(options={**ENDS, "obstacles": [post(-0.1, 0.5, velocity=(0.0, -0.3, 0.0))]})
+    before = env.step(np.zeros(env.action_space.shape))[0]  # for 0.3 s
+    with pytest.raises(ValueError, match="obstacle 0 touches the arm at the goal"):
+        env.move_goals([[-0.1, 0.41]])
+    np.testing.assert_array_equal(env.observe()["goal"], before["goal"])
+    env.move_goals([[-0.1, 0.5]])
+
+
 CUBE = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]) / 10
 POINT, BALL = np.ones(3), ve.Sphere(0.1)
 

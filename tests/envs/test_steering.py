@@ -5,9 +5,10 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import GOAL, OTHER, STEP, WALL, given, post
+from helpers import GOAL, OTHER, STEP, UR5E, WALL, given, post
 from scipy.integrate import simpson
 
+from viapoint.envs import Task, load_arm
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import Motion, Steering
 from viapoint.envs.scenes.scene import NEVER
@@ -76,6 +77,36 @@ def test_the_zero_action_brings_to_rest_and_no_action_exceeds_the_bounds():
     for _ in range(15):
         motion = Motion(*(part[:, -1] for part in usual.follow(motion, np.zeros((64, 2)), 20)))
     assert np.abs(motion.velocity).max() < 1e-4
+
+
+def test_arms_of_the_package_are_steered_as_fast_as_agents_were_trained():
+    for arm, speeds in (("planar", (5.0,) * 2), ("panda", (1.0875,) * 4 + (1.305,) * 3)):
+        task = Task.of(arm=arm, space="joints", n_obstacles=0, decide_at="steps")
+        assert (task.steering.top_speed, task.steering.bandwidth, task.time_limit) == (speeds, 12.0, 5.1)
+
+
+def test_an_arm_of_little_torque_is_steered_so_slowly_that_it_follows():
+    arm = load_arm(UR5E, torque_limit=[82.0] * 3 + [15.0] * 3)
+    env = gym.make_vec("viapoint/Reach-v0", 20, arm=arm, decide_at="steps", threads=1).unwrapped
+    env.reset(seed=0)
+    rng, active = np.random.default_rng(0), np.ones(20, bool)
+    for step in range(60):
+        if step % 5 == 0:  # all joints turn round at once
+            action = rng.choice([-1.0, 1.0], env.action_space.shape)
+        active &= ~env.execute_actions(action, active).terminated
+    for each in env.last_rollout:
+        if len(each.time) > 1 and not each.contact.any():
+            assert np.abs(each.joints - each.planned).max() < 0.02
+            assert (np.abs(np.diff(each.joints, axis=0)) <= arm.timestep * arm.velocity_limit).all()
+
+
+def test_slow_movements_are_not_cut_off():
+    slow = load_arm(UR5E, velocity_limit=0.5)
+    for arm, changes in ((slow, {}), ("panda", {"duration_range": (1.1, 20.0)})):
+        env = gym.make_vec("viapoint/Reach-v0", 3, arm=arm, decide_at=(), threads=1, **changes).unwrapped
+        env.reset(seed=0)
+        slowest = np.eye(env.task.action.size)[[-1] * 3]
+        assert env.execute_actions(slowest).info["is_success"].all()
 
 
 def test_the_way_round_succeeds_where_the_straight_line_crashes():

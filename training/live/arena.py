@@ -490,8 +490,8 @@ def _distinct(arena: Arena, state: State) -> list[Proposal]:
 def execute(arena: Arena, state: State) -> Iterator[Movement]:
     """Execute the plan, decision by decision where it is revised, and yield the movement so far after each.
 
-    A goal that is dragged meanwhile is followed. When the arm has reached a goal that has been dragged away, a new
-    episode begins there.
+    A goal that is dragged meanwhile is followed; one that is dragged into contact goes back. When the arm has reached a
+    goal that has been dragged away, a new episode begins there.
     """
     assert state.plan is not None
     scene, goal, reward = state.scene, state.scene.goal, 0.0
@@ -509,6 +509,7 @@ def execute(arena: Arena, state: State) -> Iterator[Movement]:
         assert scenes is not None
         reward += float(decision.reward[0])
         info = {name: value[0] for name, value in decision.info.items()}
+        kept = state.scene
         yield Movement(rollout, scenes, None if plans is None else plans.take(0), info, reward)
         moved = not np.array_equal(state.scene.goal, goal)
         observation, goal, now = decision.observation, state.scene.goal, rollout.time[-1:]
@@ -520,7 +521,10 @@ def execute(arena: Arena, state: State) -> Iterator[Movement]:
             scene = Scene(here, goal, tuple(unpack(left._replace(velocity=0.0 * left.velocity), 0)))
             observation, now = begin_episode(env, scene), np.zeros(1)
         elif moved:
-            observation = env.move_goals(goal[None])
+            try:
+                observation = env.move_goals(goal[None])
+            except ValueError:
+                state.scene, goal = kept, kept.goal
         if state.method == MOTION:
             decision = _plan_on(env, observation, now, decide_)
         else:
