@@ -243,7 +243,7 @@ class Episodes:
             pieces = [self._still(1, scene.start)]
         steps, joints, planned, contact = map(np.concatenate, zip(*pieces, strict=True))
         time = np.asarray(self.simulator.timestep * steps)
-        every = scene.take(np.zeros(len(time), np.int64)).obstacles_at(time)
+        every = scene.take(np.zeros(len(time), np.int64)).obstacles_at(time, in_chords=True)
         arm = self.task.arm
         apart, _ = row_clearances(arm.chain, arm.spheres, joints, every, FAR)
         clearance = apart.min(axis=1, initial=FAR)
@@ -362,7 +362,7 @@ class Episodes:
         state, task, simulator = self.metrics, self.task, self.simulator
         arm, timestep, number = task.arm, simulator.timestep, int(steps.max())
         scenes, begin = self.scenes.take(rows), state.steps[rows]
-        obstacles = scenes.obstacles_at(np.asarray(begin * timestep))
+        obstacles = scenes.obstacles_at(np.asarray(begin * timestep), in_chords=True)
         goal = task.space.coordinates(scenes.goals(np.asarray((begin + steps) * timestep)))
         path, rates, accelerations = task.space.joint_motion(motion)
         controls = arm.controls(path, rates, accelerations, CONTROL_STRIDE)[:, :number]

@@ -124,7 +124,7 @@ class EventPredictor:
         steps = begin[:, None] + every * np.arange(int(looks.max()) + ahead)
         movement = plan.take(rows).trajectory()
         path = self.task.space.joints(movement(self.timestep * (steps - began[rows][:, None])))
-        obstacles = scenes.take(rows).obstacles_at(begin * self.timestep)
+        obstacles = scenes.take(rows).obstacles_at(begin * self.timestep, in_chords=True)
         interval = every * self.timestep
         chain, spheres, margin = self.task.arm.chain, self.task.arm.spheres, self.task.margin
         _first_falls(

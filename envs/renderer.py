@@ -80,7 +80,7 @@ class EpisodeRenderer:
     def __init__(
         self, episodes: Episodes, row: int, mode: str | None, width: int, height: int, fps: int
     ) -> None:
-        if mode not in (None, *RENDER_MODES):
+        if mode is not None and not (isinstance(mode, str) and mode in RENDER_MODES):
             raise ValueError(f"render_mode must be None or one of {', '.join(RENDER_MODES)}, got {mode!r}")
         self._episodes, self._row, self._mode, self._fps = episodes, row, mode, fps
         self._size = whole_number("width", width, 1), whole_number("height", height, 1)

@@ -12,6 +12,7 @@ from viapoint.envs.arms.inverse_kinematics import (
     planar_solutions,
 )
 from viapoint.envs.common.arrays import Bool, Float
+from viapoint.envs.common.validation import one_of
 from viapoint.envs.plans import Motion, SpaceName
 
 REACH_TOLERANCE = 1e-6  # Greatest distance of the hand from a reference within reach, [m]
@@ -82,6 +83,4 @@ def space_of(arm: Arm, name: SpaceName) -> Space:
         ValueError: The arm has no such space.
     """
     spaces = ("hand", "joints") if arm.space == "hand" else ("joints",)
-    if name not in spaces:
-        raise ValueError(f"space of this arm must be one of {', '.join(spaces)}, got {name!r}")
-    return HandPlane(arm) if name == "hand" else Space(arm)
+    return HandPlane(arm) if one_of("space of this arm", name, spaces) == "hand" else Space(arm)

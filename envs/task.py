@@ -20,6 +20,7 @@ from viapoint.envs.common.validation import (
     finite_array,
     names_of,
     number_of_at_least,
+    one_of,
     record_of,
     whole_number,
 )
@@ -131,9 +132,7 @@ class Task:
         for name, value in (("moving_obstacles", moving_obstacles), ("whole_arm", whole_arm)):
             if not isinstance(value, bool | np.bool_):
                 raise TypeError(f"{name} must be True or False, got {value!r}")
-        if courses not in COURSES:
-            raise ValueError(f"courses must be one of {', '.join(COURSES)}, got {courses!r}")
-        if courses != COURSES[0] and not moving_obstacles:
+        if one_of("courses", courses, COURSES) != COURSES[0] and not moving_obstacles:
             raise ValueError(f"courses={courses!r} needs moving_obstacles=True")
         n_obstacles = fewest_and_most("n_obstacles", n_obstacles, MOST_OBSTACLES, MOST_DRAWN)
         plane = is_planar(arm)
@@ -164,7 +163,7 @@ class Task:
             arm=arm,
             space_name=space,
             n_via=whole_number("n_via", n_via, 0, MOST_VIAS),
-            timing=timing,
+            timing=one_of("timing", timing, get_args(Timing)),
             duration_range=_checked_durations(space, duration_range),
             via_range=number_of_at_least("via_range", via_range, 0.1, MOST_RANGE),
             n_obstacles=n_obstacles,
@@ -183,8 +182,6 @@ class Task:
             ),
             sensor=sensor,
         )
-        if timing not in get_args(Timing):
-            raise ValueError(f"timing must be one of {', '.join(get_args(Timing))}, got {timing!r}")
         if "sight" in task.decide_at and sensor is None:
             raise ValueError("decide_at with 'sight' needs a sensor")
         telling = [each for each in TELLING if each in task.decide_at]
@@ -352,7 +349,9 @@ def _checked_decisions(decide_at: Any) -> str | tuple[Trigger, ...]:
     if isinstance(decide_at, str):
         if decide_at in (END, STEPS):
             return decide_at
-    elif isinstance(decide_at, Sequence) and all(each in TRIGGERS for each in decide_at):
+    elif isinstance(decide_at, Sequence) and all(
+        isinstance(each, str) and each in TRIGGERS for each in decide_at
+    ):
         return tuple(decide_at)
     raise ValueError(
         f"decide_at must be {END!r}, {STEPS!r} or a list with some of {', '.join(TRIGGERS)}, got {decide_at!r}"

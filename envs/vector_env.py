@@ -205,12 +205,6 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         if options is not None and not isinstance(options, Mapping):
             raise ValueError(f"options must be a mapping from names to values, or None, got {options!r}")
         options = dict(options or {})
-        for name in ("jumps", "turns", "reaches"):
-            if np.size(options.get(name, ())) and self.task.whole_movement:
-                raise ValueError(
-                    f"options[{name!r}] need several decisions, such as decide_at=('target',), got "
-                    f"{self.task.decide_at!r}"
-                )
         rows = masked_rows(options.pop("reset_mask", None), self.num_envs, self._running)
         generators, first_seed = self._seeded(seed, rows)
         # Nothing changes before all scenes are there: impossible ones raise an error.

@@ -15,6 +15,7 @@ from viapoint.envs.common.arrays import Float, Int
 from viapoint.primitives.array_api import is_whole
 
 Record = TypeVar("Record")
+Name = TypeVar("Name", bound=str)
 UNIT_TOLERANCE = 1e-3  # Greatest error of a quaternion's length; smaller ones are corrected
 
 
@@ -56,11 +57,18 @@ def names_of(argument: str, names: Any) -> tuple[Any, ...]:
     """
     if isinstance(names, str):
         return (names,)
-    if not isinstance(names, Sequence):
+    if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
         raise TypeError(f"{argument} must be a name or a sequence of names, got {names!r:.60}")
     if not names:
         raise ValueError(f"{argument} must be one name or more, got {names!r}")
     return tuple(names)
+
+
+def one_of(argument: str, name: Name, allowed: Sequence[Any]) -> Name:
+    """Return a name that is an allowed one; arrays, which are compared by their elements, are refused, too."""
+    if not isinstance(name, str) or name not in allowed:
+        raise ValueError(f"{argument} must be one of {', '.join(allowed)}, got {name!r}")
+    return name
 
 
 def fewest_and_most(name: str, number: Any, most: int, most_drawn: int) -> tuple[int, int]:
@@ -90,18 +98,18 @@ def masked_rows(mask: Any, num_envs: int, running: bool) -> Int:
     """Return the indices of the environments in a reset mask; without a mask, of all."""
     if mask is None:
         return np.arange(num_envs)
-    mask = np.asarray(mask)
-    if mask.shape != (num_envs,) or mask.dtype != np.bool_ or not mask.any():
+    array = as_real_array(mask, "b")
+    if array is None or array.shape != (num_envs,) or not array.any():
         raise ValueError(
-            f"options['reset_mask'] must be {num_envs} bools, one or more of them True, got {mask!r}"
+            f"options['reset_mask'] must be {num_envs} bools, one or more of them True, got {mask!r:.60}"
         )
-    if not running and not mask.all():
+    if not running and not array.all():
         raise ValueError("options['reset_mask'] must be True for every environment at the first reset")
-    return np.flatnonzero(mask)
+    return np.flatnonzero(array)
 
 
-def as_real_array(values: Any) -> NDArray[Any] | None:
-    """Return real numbers as an array, or None for anything else."""
+def as_real_array(values: Any, kinds: str = "fiu") -> NDArray[Any] | None:
+    """Return real numbers, or values of other NumPy kinds, as an array, or None for anything else."""
     if isinstance(values, np.ma.MaskedArray):
         return None  # what is masked is missing
     try:
@@ -109,7 +117,7 @@ def as_real_array(values: Any) -> NDArray[Any] | None:
     except (TypeError, ValueError, RuntimeError):
         # Rows of different lengths, or tensors that require a gradient.
         return None
-    return array if array.dtype.kind in "fiu" else None
+    return array if array.dtype.kind in kinds else None
 
 
 def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:

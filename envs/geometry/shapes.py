@@ -584,7 +584,8 @@ def as_obstacles(values: Iterable[Shape | Mapping[str, Any]]) -> list[Shape]:
         Traceback (most recent call last):
         ValueError: obstacle 1: sphere: radius must be greater than 0, got -1.0
     """
-    if isinstance(values, Shape | Mapping | str) or not isinstance(values, Iterable):
+    single = isinstance(values, Shape | Mapping | str) or getattr(values, "ndim", 1) == 0
+    if single or not isinstance(values, Iterable):
         raise ValueError(f"obstacles must be a list of shapes or dictionaries, got {values!r:.80}")
     found = []
     for i, value in enumerate(values):

@@ -12,7 +12,7 @@ from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import inverse_kinematics, nearest_goals, planar_joints
 from viapoint.envs.arms.kinematics import sphere_centres
 from viapoint.envs.common.arrays import Float, norm
-from viapoint.envs.common.validation import finite_array
+from viapoint.envs.common.validation import as_real_array, finite_array
 from viapoint.envs.geometry.clearance import FAR, row_clearances
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, pack, unpack
 from viapoint.envs.geometry.shapes import (
@@ -60,7 +60,7 @@ def draw_given(
             in joint space joint positions, shape (J,) or (N, J), or a :class:`Pose` or its dictionary, or N of them.
             `obstacles`: a list of shapes or dictionaries, or their JSON, for all scenes, or N such lists. `jumps`: rows
             (time [s], target). `turns`: rows (time [s], velocity [m/s]), and `reaches`: rows (begin [s], duration [s],
-            x, y, z of the way [m]), for each given obstacle, of zeros for none. Shape (n, .) or (N, n, .).
+            x, y, z of the way [m]), for each given obstacle, of zeros for none. All are rows (n, .), or N such.
         sampler: Sampler of the task's scenes.
         generators: N random generators.
 
@@ -86,9 +86,10 @@ def draw_given(
         if name in options and shapes is None:
             raise ValueError(f"options[{name!r}] are those of options['obstacles'], which must be given, too")
     if "reaches" in options:
-        scenes = scenes._replace(reach=_rows("reaches", options["reaches"], (number, sampler.rows, 5)))
+        reach = _rows("reaches", options["reaches"], sampler, (number, sampler.rows, 5))
+        scenes = scenes._replace(reach=reach)
     if "turns" in options:
-        turns = _rows("turns", options["turns"], (number, sampler.rows, 4))
+        turns = _rows("turns", options["turns"], sampler, (number, sampler.rows, 4))
         given = (turns != 0.0).any(axis=-1)
         absent = given & ~obstacles.present
         if absent.any():
@@ -237,7 +238,7 @@ def _jumps(value: Any, sampler: SceneSampler, number: int) -> Float:
     """Return given jumps of N scenes in joint positions, the absent ones last."""
     joints = len(sampler.task.arm.home)
     size = 2 if sampler.task.space_name == "hand" else joints
-    given = _rows("jumps", value, (number, MOST_JUMPS, 1 + size))
+    given = _rows("jumps", value, sampler, (number, MOST_JUMPS, 1 + size))
     present = (given != 0.0).any(axis=-1)
     jumps = np.zeros((number, MOST_JUMPS, 1 + joints))
     targets = given[present][:, 1:]
@@ -248,20 +249,27 @@ def _jumps(value: Any, sampler: SceneSampler, number: int) -> Float:
     return np.take_along_axis(jumps, order[..., None], axis=1)
 
 
-def _rows(name: str, value: Any, shape: tuple[int, int, int]) -> Float:
+def _rows(name: str, value: Any, sampler: SceneSampler, shape: tuple[int, int, int]) -> Float:
     """Return an option as rows of N scenes; rows of zeros stand behind the given ones."""
     number, most, size = shape
-    array = finite_array(f"options[{name!r}]", value)
-    found = np.zeros(shape)
-    if array.size == 0:
-        return found
-    fits = array.ndim == 2 or (array.ndim == 3 and len(array) == number)
-    if not fits or array.shape[-1] != size or array.shape[-2] > most:
-        raise ValueError(
-            f"options[{name!r}] must have shape (n, {size}) or ({number}, n, {size}) with n at most {most}, got "
-            f"{array.shape}"
-        )
-    found[:, : array.shape[-2]] = array
+    label, found = f"options[{name!r}]", np.zeros(shape)
+    # Scenes with different numbers of rows are no array.
+    ragged = isinstance(value, list | tuple) and as_real_array(value) is None
+    if ragged and len(value) != number:
+        raise ValueError(f"{label} must be one list of rows of numbers, or {number} lists, got {len(value)}")
+    for place, rows in enumerate(value) if ragged else [(slice(None), value)]:
+        array = finite_array(label, rows)
+        if array.size == 0:
+            continue
+        fits = array.ndim == 2 or (array.ndim == 3 and len(array) == number and not ragged)
+        if not fits or array.shape[-1] != size or array.shape[-2] > most:
+            raise ValueError(
+                f"{label} must have shape (n, {size}) or ({number}, n, {size}) with n at most {most}, got "
+                f"{array.shape}{f' in scene {place}' if ragged else ''}"
+            )
+        found[place][..., : array.shape[-2], :] = array
+    if found.any() and sampler.task.whole_movement:
+        raise ValueError(f"{label} need several decisions, such as decide_at=('target',), not 'end'")
     return found
 
 

@@ -33,11 +33,12 @@ from viapoint.envs.scenes.layout import MOST_PLACES, PLACE, ROW, Layout, Room, m
 from viapoint.envs.scenes.motions import (
     CANDIDATES,
     COURSE_NUMBERS,
+    MARGIN,
     draw_courses,
     draw_jumps,
     numbers_of_jumps,
 )
-from viapoint.envs.scenes.scene import ENDS, FARTHEST, Scenes, extents, resting
+from viapoint.envs.scenes.scene import ENDS, FARTHEST, MOST_JUMPS, NEVER, Scenes, extents, resting
 from viapoint.envs.sensors import VIEW_MARGIN
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ class SceneSampler:
         raise RuntimeError(
             f"no scene of the families {', '.join(self.task.families)} with {self.room.fewest} to {self.room.most} "
             f"obstacles, within {FARTHEST:g} m, was found in {ATTEMPTS} attempts for the arm {self.task.arm.name!r}; "
-            "allow fewer obstacles or other families, or give other ends"
+            "allow fewer obstacles or other families, or give other ends or jumps"
         )
 
     def sensor_clearances(self, scenes: Scenes) -> Float:
@@ -134,6 +135,15 @@ class SceneSampler:
         assert self.task.sensor is not None
         _, eyes = self.task.sensor.pose(self.task.arm, scenes.start)
         return point_clearances(scenes.obstacles, eyes)
+
+    def _are_jumps_clear(self, scenes: Scenes) -> Bool:
+        """Return True where the arm is clear of obstacles at all targets when they appear, shape (N,)."""
+        arm, clear = self.task.arm, np.ones(len(scenes.start), bool)
+        for jump in range(MOST_JUMPS):
+            time, target = scenes.jump_times[:, jump], scenes.jumps[:, jump, 1:].copy()
+            apart, _ = row_clearances(arm.chain, arm.spheres, target, scenes.obstacles_at(time), MARGIN)
+            clear &= (time == NEVER) | (apart >= MARGIN).all(axis=1)
+        return clear
 
     def _draft(self, scenes: Scenes, given: Collection[str]) -> Draft:
         """Return copies of scenes with the given parts, and memory for the others."""
@@ -190,19 +200,21 @@ class SceneSampler:
         def numbers(*shape: int) -> Float:
             return np.array([generators[scene].random(shape) for scene in which]).reshape(-1, *shape)
 
-        moves = self.task.moving_obstacles and "obstacles" not in given
+        drawn = "obstacles" not in given
+        moves = self.task.moving_obstacles and drawn
         jumps = self.task.n_jumps[1] > 0 and "jumps" not in given
-        if not moves and not jumps:
-            return np.ones(len(which), bool)
-        space, action = self.task.space, self.task.action
-        start, goal = draft.scenes.start[which], draft.scenes.goal[which]
-        durations = action.zero_duration(space.coordinates(start), space.coordinates(goal))
-        durations = np.maximum(durations, SHORTEST_DURATION * action.centre)
+        if moves or jumps:
+            space, action = self.task.space, self.task.action
+            start, goal = draft.scenes.start[which], draft.scenes.goal[which]
+            durations = action.zero_duration(space.coordinates(start), space.coordinates(goal))
+            durations = np.maximum(durations, SHORTEST_DURATION * action.centre)
         if moves:
             draw_courses(draft, which, durations, numbers(self._width, CANDIDATES, COURSE_NUMBERS))
-        if not jumps:
-            return np.ones(len(which), bool)
-        return draw_jumps(draft, which, durations, numbers(numbers_of_jumps(start.shape[1])))
+        if jumps:
+            return draw_jumps(draft, which, durations, numbers(numbers_of_jumps(start.shape[1])))
+        if drawn and "jumps" in given:  # given targets are as free as drawn ones
+            return self._are_jumps_clear(draft.scenes.take(which))
+        return np.ones(len(which), bool)
 
 
 def _write(draft: Draft, scene: int, layout: Layout) -> None:

@@ -23,10 +23,13 @@ ROUNDING = 1e-9  # Rounding error of times, [s]
 LEAST_APART = 0.02  # Least difference of start and goal in the joint that moves most, [rad] or [m]
 FARTHEST = 2.0  # Greatest coordinate of an obstacle's centre, and greatest size, [m]; half-spaces have none
 FASTEST = 1.0  # Greatest speed of an obstacle, [m/s]
-# Time between two points of a reach, [s]: obstacles move straight between them, at most 1 mm from the smooth reach
+# Time between two points of a reach, [s]: in the physics, obstacles move straight between them
 CHORD = 0.04
 SHORTEST_REACH, LATEST = 1e-3, 60.0  # Shortest duration of a reach of an obstacle, and its latest end, [s]
 MINIMUM_JERK_PEAK = 1.875  # Peak speed of a minimum-jerk movement relative to its mean speed
+# Peak acceleration of a minimum-jerk movement relative to length / duration^2, and the greatest one of an obstacle,
+# [m/s^2]: chords are at most acceleration * CHORD^2 / 8 = 1 mm from the reach
+MINIMUM_JERK_ACCELERATION, MOST_ACCELERATION = 10.0 / math.sqrt(3.0), 8e-3 / CHORD**2
 
 
 class Scenes(NamedTuple):
@@ -106,8 +109,8 @@ class Scenes(NamedTuple):
         targets = np.concatenate((self.goal[:, None], self.jumps[..., 1:]), axis=1)
         return np.asarray(targets[np.arange(len(targets)), number])
 
-    def obstacles_at(self, time: Float) -> Obstacles:
-        """Return the obstacles with their places and velocities at one time for each scene, shape (N,), [s]."""
+    def obstacles_at(self, time: Float, *, in_chords: bool = False) -> Obstacles:
+        """Return the obstacles at one time for each scene, shape (N,), [s], or as the physics moves them, in chords."""
         time = time[:, None]
         before = np.minimum(time, self.turn_time)[..., None]  # time on the first course
         after = np.maximum(time - self.turn_time, 0.0)[..., None]  # and on the second one
@@ -116,10 +119,11 @@ class Scenes(NamedTuple):
         turned = (self.turn_time <= time + ROUNDING)[..., None]
         now = np.where(turned, self.turn_velocity, velocity)
         if self.reach.any():
-            begin = CHORD * np.floor(time[:, 0] / CHORD + ROUNDING)
-            moved = _ways(self.reach, begin)
-            rate = (_ways(self.reach, begin + CHORD) - moved) / CHORD
-            centre = centre + moved + rate * (time[:, 0] - begin)[:, None, None]
+            begin = CHORD * np.floor(time / CHORD + ROUNDING) if in_chords else time
+            moved, rate = _ways(self.reach, begin[:, 0])
+            if in_chords:
+                rate = (_ways(self.reach, begin[:, 0] + CHORD)[0] - moved) / CHORD
+            centre = centre + moved + rate * (time - begin)[..., None]
             now = now + rate
         return self.obstacles._replace(centre=centre, velocity=now)
 
@@ -145,6 +149,13 @@ def reached(begin: float, duration: float, time: float) -> float:
 
 
 @compiled
+def reach_rate(begin: float, duration: float, time: float) -> float:
+    """Return the rate of :func:`reached` at a time, 30 s^2 (1 - s)^2 / T with the share s of the duration T, [1/s]."""
+    share = min(max((time - begin) / duration, 0.0), 1.0)
+    return 30.0 * (share * (1.0 - share)) ** 2 / duration
+
+
+@compiled
 def way_since_start(reach: Float, time: float) -> float:
     """Return the share of its way that an obstacle with a reach, shape (5,), has made since time 0."""
     if reach[1] <= 0.0:
@@ -153,13 +164,16 @@ def way_since_start(reach: Float, time: float) -> float:
 
 
 @compiled
-def _ways(reach: Float, time: Float) -> Float:
-    """Return how far reaches, shape (N, n, 5), have moved obstacles at times, shape (N,), shape (N, n, 3), [m]."""
-    found = np.zeros((*reach.shape[:2], 3))
+def _ways(reach: Float, time: Float) -> tuple[Float, Float]:
+    """Return ways [m] and velocities [m/s], shape (N, n, 3), of reaches, shape (N, n, 5), at times, shape (N,), [s]."""
+    moved, velocity = np.zeros((2, *reach.shape[:2], 3))
     for scene in range(reach.shape[0]):
         for row in range(reach.shape[1]):
-            found[scene, row] = way_since_start(reach[scene, row], time[scene]) * reach[scene, row, 2:]
-    return found
+            begin, duration = reach[scene, row, :2]
+            if duration > 0.0:
+                moved[scene, row] = way_since_start(reach[scene, row], time[scene]) * reach[scene, row, 2:]
+                velocity[scene, row] = reach_rate(begin, duration, time[scene]) * reach[scene, row, 2:]
+    return moved, velocity
 
 
 def resting(start: Float, goal: Float, obstacles: Obstacles) -> Scenes:
@@ -242,9 +256,13 @@ def _check_obstacles(scenes: Scenes, names: Sequence[Sequence[str]]) -> None:
     _refuse(reaches & (duration < SHORTEST_REACH), shortest, duration, names)
     late = reaches & (begin + duration > LATEST)
     _refuse(late, f"must end its reach within {LATEST:g} s", begin + duration, names)
-    mean = norm(scenes.reach[..., 2:]) / np.where(reaches & (duration > 0.0), duration, np.inf)
+    time = np.where(reaches & (duration > 0.0), duration, np.inf)
+    mean = norm(scenes.reach[..., 2:]) / time
     speed = MINIMUM_JERK_PEAK * mean
     _refuse(reaches & (speed > FASTEST), f"must reach with at most {FASTEST:g} m/s", speed, names)
+    peak = MINIMUM_JERK_ACCELERATION * mean / time
+    longer = f"must have a longer duration in reaches, with at most {MOST_ACCELERATION:g} m/s^2"
+    _refuse(reaches & (peak > MOST_ACCELERATION), longer, peak, names)
 
 
 def check_end(

@@ -15,7 +15,7 @@ from viapoint.envs.common.arrays import Float, Observation, norm
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.scenes.motions import REACH_LENGTH, REACH_TIME
-from viapoint.envs.scenes.scene import CHORD, Scenes, reached
+from viapoint.envs.scenes.scene import CHORD, Scenes, reach_rate, reached
 from viapoint.training.planning.problem import Problem
 from viapoint.training.rollout import Outcomes, SceneSimulation
 
@@ -62,13 +62,12 @@ def _hypotheses(time: Float, centre: Float, velocity: Float, ahead: Float) -> tu
     """
     duration, passed = (part.ravel() for part in np.meshgrid(DURATIONS, PASSED, indexing="ij"))
     begin = time[-1] - passed * duration
-    every = np.concatenate((time, time + CHORD, time[-1] + ahead))
-    share = _shares(begin, duration, every)
     number = len(time)
+    share, rate = _shares(begin, duration, np.concatenate((time, time[-1] + ahead)))
     now = share[:, number - 1, None]
     # Places and velocities in units of their errors, as products of a coefficient and the way
-    rate = (share[:, number : 2 * number] - share[:, :number]) / CHORD
-    coefficient = np.concatenate(((share[:, :number] - now) / PLACE_ERROR, rate / RATE_ERROR), axis=1)
+    seen = (share[:, :number] - now) / PLACE_ERROR, rate[:, :number] / RATE_ERROR
+    coefficient = np.concatenate(seen, axis=1)
     value = np.concatenate(((centre - centre[-1]) / PLACE_ERROR, velocity / RATE_ERROR))
     square = np.maximum((coefficient**2).sum(axis=1), 1e-12)
     way = coefficient @ value / square[:, None]
@@ -77,17 +76,18 @@ def _hypotheses(time: Float, centre: Float, velocity: Float, ahead: Float) -> tu
     beyond = np.maximum(REACH_LENGTH[0] - length, 0.0) + np.maximum(length - REACH_LENGTH[1], 0.0)
     misfit = misfit + (beyond / LENGTH_ERROR) ** 2
     weight = np.exp(-0.5 * (misfit - misfit.min()))
-    return share[:, 2 * number :] - now, weight / weight.sum(), way
+    return share[:, number:] - now, weight / weight.sum(), way
 
 
 @compiled
-def _shares(begin: Float, duration: Float, time: Float) -> Float:
-    """Return the shares of their ways that H reaches have made at T times, shape (H, T)."""
-    found = np.empty((len(begin), len(time)))
+def _shares(begin: Float, duration: Float, time: Float) -> tuple[Float, Float]:
+    """Return the shares of their ways that H reaches have made at T times, and their rates, shape (H, T)."""
+    share, rate = np.empty((2, len(begin), len(time)))
     for h in range(len(begin)):
         for k in range(len(time)):
-            found[h, k] = reached(begin[h], duration[h], time[k])
-    return found
+            share[h, k] = reached(begin[h], duration[h], time[k])
+            rate[h, k] = reach_rate(begin[h], duration[h], time[k])
+    return share, rate
 
 
 # Predictions of the places of obstacles by name: from the times of the M decisions of an episode so far, shape (M,),
