@@ -202,7 +202,7 @@ def arm_from_xml(
             if links.get(carrier.name, 0) == link - 1 > 0:
                 carried[frozenset((carrier.name, body))] = "consecutive links"
     exclude = {**carried, **(exclude or {})}
-    names, spheres, left_out, excess = cover(chain, capsules, links, home, exclude)
+    names, spheres, left_out, excess = cover(chain, capsules, links, home[None], exclude)
     # Pairs that touch in none of many configurations are not compared, either.
     ranges = np.array([model.joint(each).range for each in joints])
     low, high = ranges.T
@@ -224,8 +224,8 @@ def arm_from_xml(
         return all(mujoco.mj_geomDistance(model, data, *both, 2.0 * ROOM, None) >= ROOM for both in pairs)
 
     covered = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, COVERED) >= 0
-    elsewhere = drawn[: VIEWS if covered else 0]
-    _, spheres, left_out, excess = cover(chain, capsules, links, home, exclude, elsewhere, room)
+    views = np.concatenate((home[None], drawn[: VIEWS if covered else 0]))
+    _, spheres, left_out, excess = cover(chain, capsules, links, views, exclude, room)
     inertia = greatest_inertia(data, joints, ranges)
     # Much damping makes a joint as slow to return as much inertia does.
     inertia = np.maximum(inertia, 0.5 * chain.damping / bandwidth)

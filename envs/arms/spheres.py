@@ -34,16 +34,15 @@ def cover(
     chain: Chain,
     capsules: dict[str, list[Capsule]],
     links: dict[str, int],
-    home: Float,
+    views: Float,
     exclude: Mapping[frozenset[str], str],
-    elsewhere: Sequence[Float] = (),
     room: Callable[[str, str, Float], bool] | None = None,
 ) -> tuple[tuple[str, ...], Spheres, list[LeftOut], float]:
     """Return groups of spheres that contain all capsules: names of bodies, spheres, pairs left out, and excess, [m].
 
     Capsules of each body are in the frame of its link. Pairs in `exclude`, with a reason, may pass through one another.
-    Others that overlap at home get smaller spheres, and those that overlap in configurations `elsewhere`, shape (N, J),
-    although there is `room` between them.
+    Others get smaller spheres if they overlap in the first of the configurations `views`, shape (N, J), which is home,
+    or in another one although there is `room` between them.
 
     Raises:
         ValueError: Spheres of bodies that are apart at home overlap there, however small they are.
@@ -60,18 +59,20 @@ def cover(
             for (_, inner), (_, outer) in zip(capsules[name], covers, strict=True):
                 beyond = max(beyond, outer - inner)
         spheres = grouped(centres, radii, [links[name] for name in names], pairs)
-        overlap: Any = overlapping(chain, spheres, np.array((home, *elsewhere)), True)
+        overlap: Any = overlapping(chain, spheres, views, True)
         close = spheres.pairs[overlap[0]]
         coarse = {names[group] for group in close.flat}
-        for view, row in np.argwhere(overlap[1:]):
+        for view, row in np.argwhere(overlap)[len(close) :]:
             pair = [names[group] for group in spheres.pairs[row]]
             wide = {name for name in pair if excess[name] > FINEST}
-            if wide - coarse and room is not None and room(*pair, elsewhere[view]):
+            if wide - coarse and room is not None and room(pair[0], pair[1], views[view]):
                 coarse |= wide
         if not coarse:
             return names, spheres, left_out, beyond
         for name in coarse:
             excess[name] *= SHRUNK  # smaller spheres, and more of them
+    if not len(close):
+        return names, spheres, left_out, beyond
     first, second = close[0]
     raise ValueError(
         f"the bodies {names[first]!r} and {names[second]!r} are so close at home that spheres on them overlap: give "
