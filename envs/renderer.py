@@ -499,6 +499,6 @@ def _import_triton() -> None:
     Mesa's software renderer and triton each bring their LLVM. If Mesa's is loaded first, the later import of triton,
     with torch's first optimizer, ends the process; in the other order both work.
     """
-    if importlib.util.find_spec("torch") and importlib.util.find_spec("triton"):
-        with contextlib.suppress(Exception):  # a broken triton concerns torch only
+    with contextlib.suppress(Exception):  # a broken triton concerns torch only, and a finder may raise
+        if importlib.util.find_spec("torch") and importlib.util.find_spec("triton"):
             importlib.import_module("triton")

@@ -72,7 +72,8 @@ def check_file(name: str, path: Path | None, suffix: str = "") -> None:
     if suffix and path.suffix.lower() != suffix:
         raise ValueError(f"{name} must end in {suffix}, got {path}")
     check_ours(path)
-    if path.suffix == ".json" and path.is_file() and RESULTS.isdisjoint(read_json(path)):
+    filled = path.is_file() and path.stat().st_size > 0
+    if path.suffix == ".json" and filled and RESULTS.isdisjoint(read_json(path)):
         raise BadFileError(path, "holds no results of viapoint; name another file")
     check_folder(f"{name} {path}", path.parent)
 

@@ -18,7 +18,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.registry import ARM_FILES, arm_of
-from viapoint.envs.common.validation import is_number
+from viapoint.envs.common.validation import is_number, number_of_at_least
 from viapoint.envs.registration import ENV_IDS, check_registered, full_id
 from viapoint.envs.task import Task
 from viapoint.primitives.fitting import MOST_VIA_POINTS, USUAL_RANGE
@@ -33,6 +33,7 @@ from viapoint.training.checks import (
     named_path,
 )
 from viapoint.training.files import as_plain, folder_name, parse_yaml
+from viapoint.training.planning.motion_plan import HIGHEST_RATE
 from viapoint.training.planning.search import registered_task
 
 REGISTRY = ConstructorRegistry()  # Ways in which the command line reads numbers and paths
@@ -502,6 +503,7 @@ class PlanConfig(Config):
             check_folder(f"out {self.out}", self.out.parent)
         if self.goal and self.position:
             raise ValueError("a goal is either --goal, joint positions, or --position; both are given")
+        number_of_at_least("rate", self.rate, 1e-3, HIGHEST_RATE)
         if self.quaternion and not self.position:
             raise ValueError("--quaternion belongs to --position, the place of the tool at the goal")
 

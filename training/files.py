@@ -72,9 +72,17 @@ class BadFileError(ValueError):
 
 
 def check_ours(path: Path) -> None:
-    """Check that a file may be written: there is none yet, or one that this package wrote."""
-    if os.path.lexists(path) and not _is_ours(path):
+    """Check that a file may be written: there is none yet, an empty one, or one that this package wrote."""
+    _check_regular(path)
+    empty = path.is_file() and path.stat().st_size == 0
+    if os.path.lexists(path) and not empty and not _is_ours(path):
         raise BadFileError(path, "exists and was not written by viapoint; name another file, or move it away")
+
+
+def _check_regular(path: Path) -> None:
+    """Check that a path is no folder, pipe or device, which a new file would replace."""
+    if path.exists() and not path.is_file():
+        raise BadFileError(path, "exists and is no regular file; name another one")
 
 
 def _is_ours(path: Path) -> bool:
@@ -85,6 +93,8 @@ def _is_ours(path: Path) -> bool:
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file and its folder; readers see the old content or the new, even after a crash."""
+    _check_regular(path)
+    path = Path(os.path.realpath(path))  # a link to a file stays a link
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:

@@ -45,6 +45,7 @@ START: dict[str, Any] = {**POINT, "color": PALETTE.start, "marker": "s", "marker
 GOAL: dict[str, Any] = {**POINT, "color": PALETTE.goal, "marker": "D", "markersize": 5.0, "label": "goal"}
 
 
+@matplotlib.rc_context({"text.parse_math": False})  # names are no formulas
 def success_of_rows(
     path: Path, table: Any, curves: Mapping[str, Sequence[Sequence[Sequence[float]]]], sets: str = "scenes"
 ) -> Path:
@@ -101,7 +102,8 @@ def fitted_movements(
             left.plot(*fit.goal[shown], **GOAL)
             left.set_aspect("equal", adjustable="datalim")
             horizontal, vertical = ("xyz"[i] for i in shown)
-            left.set(xlabel=f"{horizontal} [m]", ylabel=f"{vertical} [m]", title=f"movement {name}")
+            left.set(xlabel=f"{horizontal} [m]", ylabel=f"{vertical} [m]")
+            left.set_title(f"movement {name}", parse_math=False)  # a name is no formula
 
             measured = np.linalg.norm(np.gradient(position, time, axis=0), axis=1)
             every = np.linspace(min(fit.onset, time[0]), max(fit.end, time[-1]), 300)

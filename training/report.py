@@ -133,6 +133,7 @@ def scene_progress() -> Iterator[Callable[[str, int, int], None]]:
                 shown = name
                 bar.reset(total)
                 bar.set_description(name)
+                bar.delay = 0.0  # it is shown now, and ends its line even if one report is all
             bar.update(done - bar.n)
 
         yield progress

@@ -25,6 +25,7 @@ from viapoint.envs.renderer import EpisodeRenderer
 from viapoint.envs.scenes.scene import Scenes
 from viapoint.training.files import MARK, write_figure
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
+from viapoint.training.report import progress_bar
 from viapoint.training.rollout import Decide, play_episodes
 
 CAPTION = 48  # Height of the caption below the picture, [pixels]
@@ -54,7 +55,7 @@ def record_video(
     told = "only the hand must clear" if env.get_wrapper_attr("task").hand_alone else ""
 
     def frames() -> Iterator[Frame]:
-        for i in range(number):
+        for i in progress_bar(iterable=range(number), desc=name, unit=" scenes"):
             info = play(env, scenes.take([i]), decide)
             left = f"{name}   {i + 1}/{number}   {info['duration']:.2f} s"
             yield from _with_captions(env.unwrapped.render(), left, info, fps, told)
@@ -76,6 +77,7 @@ def record_plan(path: Path, plan: MotionPlan) -> int:
 
 def _write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> int:
     """Encode frames of equal size, at least one, as a slow MP4 file (H.264), and return their number."""
+    path = Path(os.path.realpath(path))  # a link to a file stays a link
     path.parent.mkdir(parents=True, exist_ok=True)
     full = OSError(f"the encoder could not write {path}: is there room on the disk?")
     part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part.mp4")

@@ -126,6 +126,7 @@ def test_a_dataset_that_cannot_be_written_leaves_nothing(error, folder, monkeypa
     record_dataset("group/new-v0", PLANE, {}, method, 1)
 
 
-def test_without_the_library_its_extra_is_named(monkeypatch, failed):
-    monkeypatch.setitem(sys.modules, "minari", None)
-    assert "pip install 'viapoint[minari]'" in failed("record", "straight", "--env", PLANE)
+@pytest.mark.parametrize("library", ["minari", "h5py"])
+def test_without_the_library_its_extra_is_named(library, monkeypatch, failed, folder):
+    monkeypatch.setitem(sys.modules, library, None)
+    assert "pip install '.[minari]' in a clone" in failed("record", "straight", "--env", PLANE)

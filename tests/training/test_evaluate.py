@@ -238,6 +238,14 @@ def test_the_table_fits_a_terminal_of_80_columns(record, number):
     assert shown.count("untrained") == number
 
 
+def test_a_bar_that_moves_once_ends_its_line(capsys, monkeypatch):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    with report.scene_progress() as progress:
+        progress("straight", 20, 20)
+    last = capsys.readouterr().err.rpartition("\r")[2]
+    assert ("20/20" in last, last[-1]) == (True, "\n")
+
+
 def test_fewer_scenes_than_asked_for_are_told(small_scenes, capsys):
     result = evaluate(env=PLANE, scenes=small_scenes, n_scenes=50, baselines=["straight"])
     assert len(result.results[0].success) == 40

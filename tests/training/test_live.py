@@ -353,6 +353,7 @@ def test_what_cannot_be_served_is_refused(failed, tmp_path):
         assert port in failed("live", "--port", port)
     assert "none" in failed("live", tmp_path / "none")
     assert "nowhere.xml" in failed("live", "--arm", "nowhere.xml", "--port", 0)
+    assert "env_kwargs of" in failed("live", "--env-kwargs", "n_vias=1", "--port", 0)
     with pytest.raises(ValueError):
         LivePage(PLANE, env=PANDA, port=0)
 

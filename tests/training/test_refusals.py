@@ -96,7 +96,7 @@ def test_configurations(kind, values):
     ],
 )
 def test_places_that_cannot_be_written_to(kind, name, needed, tmp_path):
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").write_text("mine")
     kind(**needed, **{name: tmp_path / "deeper/new.mp4"})
     for bad in ("file", "file/deeper/new.mp4"):
         with pytest.raises(ValueError):
@@ -368,6 +368,9 @@ COMMANDS = [
     ("plan --arm nowhere.xml --position 0.4 0.3 0.3", "nowhere.xml"),
     ("plan --arm panda --goal 0 0 0 -1 0 1 0 --quaternion 0 1 0 0", "--quaternion"),
     ("record", "name an agent"),
+    (f"evaluate --baselines straight {PLANE}", "(first, or as --agent NAME)"),
+    ("plan --position 0.4 0.3 0.3 --rate 0", "--rate must be"),
+    ("plan --position 0.4 0.3 0.3 --scene full/notes.txt", "notes.txt: "),
     ("evaluate --scenes motionbenchmaker --baselines nothing", "plan_motion+ompl"),
     ("evaluate --scenes motionbenchmaker --baselines", "at least one planner"),
     ("evaluate --problems nowhere", "nowhere"),
@@ -399,6 +402,6 @@ COMMANDS = [
 def test_commands_end_with_one_line_that_names_the_offender(words, named, failed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "notes.txt").write_text("mine")
+    (tmp_path / "full" / "notes.txt").write_bytes(b"\xff mine")
     assert named in failed(*words.split())
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "notes.txt"]

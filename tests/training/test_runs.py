@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import pickle
 import subprocess
 import sys
@@ -173,15 +174,19 @@ def test_checkpoints_are_kept_two_deep_and_torn_ones_passed_over(env, run, capsy
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
-    path = tmp_path / "file"
-    files.write_bytes(path, b"old")
+    path, link = tmp_path / "file", tmp_path / "link"
+    link.symlink_to(path)
+    files.write_bytes(link, b"old")  # it stays a link
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(BadFileError, match="no regular file"):
+        files.write_bytes(tmp_path / "pipe", b"new")
 
     def full(handle):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(files.os, "fsync", full)
     for write in (
-        lambda: files.write_bytes(path, b"new"),
+        lambda: files.write_bytes(link, b"new"),
         lambda: files.write_folder(
             tmp_path / "folder", lambda folder: files.write_bytes(folder / "a", b"new")
         ),
@@ -189,7 +194,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
         with pytest.raises(OSError) as error:
             write()
         assert error.value.filename  # a full disk does not say what it has no room for
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+    assert {p.name for p in tmp_path.iterdir()} == {"file", "link", "pipe"}
     assert path.read_bytes() == b"old"
 
 
@@ -279,7 +284,7 @@ def begin_fit(path):
 
 
 OVER = [
-    *((evaluate, "foreign.json", content) for content in (NOTES, b"", FOREIGN_JSON)),
+    *((evaluate, "foreign.json", content) for content in (NOTES, FOREIGN_JSON)),
     (film, "wedding.mp4", NOTES),
     *((begin_demo, name, NOTES) for name in ("table.md", "movements.mp4")),
     *((begin_paper, name, NOTES) for name in ("index.html", "limits.png")),

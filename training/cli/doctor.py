@@ -1,5 +1,6 @@
 """Command `doctor`: what works on this machine, and what to install where something does not."""
 
+import importlib.util
 import subprocess
 import sys
 
@@ -8,11 +9,12 @@ VERSIONS = "import sys, {0}; print(sys.version[:7], *(f'{{m.__name__}} {{m.__ver
 ENV = "import gymnasium as g, viapoint.envs as v; e = g.make(v.ENV_IDS[1], render_mode='rgb_array'); e.reset(seed=0); "
 STEP = ENV + "print(f'{e.step(0 * e.action_space.sample())[4][\"duration\"]:.3f} s of movement')"
 AGENT = "from viapoint.training import load_agent; print(load_agent('viapoint/PlanarObstacles-v0').env_id)"
-EXTRAS = "from importlib.util import find_spec as f; print(*(n if f(n) else f'(no {{n}}: extra {{e}})' for n, e in {}))"
+EXTRAS = "from viapoint.training.cli.doctor import is_installed as f; "
+EXTRAS += "print(*(n if f(n) else f'(no {{n}}: extra {{e}})' for n, e in {}))"
 # Packages that are imported where they are needed, and their extras; others belong to `training`
 PACKAGES = {
-    "torch": "training", "ompl": "planning", "viser": "live", "mjviser": "live", "minari": "minari",
-    "ray": "study", "optuna": "study",
+    "torch": "training", "tensorboard": "training", "ompl": "planning", "viser": "live", "mjviser": "live",
+    "trimesh": "live", "minari": "minari", "h5py": "minari", "ray": "study", "optuna": "study",
 }  # fmt: skip
 CHECKS = {  # Script that fails, or prints what it found, and remedy, by the name of what is checked
     "packages": (VERSIONS.format("numpy, gymnasium, mujoco, numba"), "pip install . in a clone"),
@@ -46,10 +48,20 @@ def outcome(script: str) -> tuple[bool, str]:
 
 def explain_import_error(error: ImportError, subject: str = "the command") -> str:
     """Return one line on a failed import of `subject`: what to install if a package is missing."""
-    missing = (error.name or "").partition(".")[0]
-    if isinstance(error, ModuleNotFoundError) and missing not in ("", "viapoint"):
+    # A library that has found out itself says so without the name of a module.
+    missing = next((name for name in PACKAGES if f"{name} is not installed" in str(error)), "")
+    if isinstance(error, ModuleNotFoundError):
+        missing = (error.name or "").partition(".")[0]
+    if missing not in ("", "viapoint"):
         extra = PACKAGES.get(missing, "training")
-        return (
-            f"{subject} needs the extra `{extra}` (not installed: {missing}): pip install 'viapoint[{extra}]'"
-        )
+        remedy = f"pip install '.[{extra}]' in a clone of the project"
+        return f"{subject} needs the extra `{extra}` (not installed: {missing}): {remedy}"
     return f"{type(error).__name__}: {' '.join(str(error).split())} (viapoint doctor says more)"
+
+
+def is_installed(name: str) -> bool:
+    """Return True if a package is found; finders may raise errors instead of an answer."""
+    try:
+        return importlib.util.find_spec(name) is not None
+    except (ImportError, ValueError):
+        return False

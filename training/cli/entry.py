@@ -53,6 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     usual = warnings.formatwarning
     if not debug:
         warnings.formatwarning = lambda message, *_: f"warning: {_with_flags(str(message), words)}\n"
+    if sys.stdout is None:  # it was closed, as by `>&-`
+        sys.stdout = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names that a terminal without UTF-8 cannot show
     try:

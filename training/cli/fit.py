@@ -55,8 +55,8 @@ def run(config: FitConfig) -> None:
             print(f"movement {name}: {each.message}", file=sys.stderr)
     _warn(movements, fits, config)
     print(_printed(fits))
-    fitted_movements(figure, dict(itertools.islice(movements.items(), DRAWN)), fits)
     write_bytes(table, _written(fits).to_csv(index=False).encode())
+    fitted_movements(figure, dict(itertools.islice(movements.items(), DRAWN)), fits)
     shown = "" if len(movements) <= DRAWN else f" of the first {DRAWN} movements"
     print(f"\ntable: {table}{', replaced' if again else ''}\nfigure{shown}: {figure}")
 

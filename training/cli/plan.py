@@ -92,8 +92,9 @@ def _scene(path: Path | None, arm: Arm) -> dict[str, Any]:
     """Return start, goal and obstacles of a scene file, or of a list of obstacles; ends of another arm are refused."""
     if path is None:
         return {}
-    text = read_bytes(path, LARGEST_JSON).decode("utf-8-sig")
+    content = read_bytes(path, LARGEST_JSON)
     try:
+        text = content.decode("utf-8-sig")
         if text.lstrip().startswith("["):
             return {"obstacles": obstacles_from_json(text)}
         scene = scene_from_json(text)

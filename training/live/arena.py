@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import importlib.util
 import itertools
 import json
 import pprint
@@ -28,6 +27,7 @@ from viapoint.envs.outcome import Rollout
 from viapoint.envs.scenes.options import OPTIONS, options_to_json, scene_options
 from viapoint.primitives import passage_durations
 from viapoint.training.agents.agent import Agent
+from viapoint.training.cli.doctor import is_installed
 from viapoint.training.paper.movements import TARGETS, rows_of_lights
 from viapoint.training.planning.baselines import AgentMethod
 from viapoint.training.planning.candidates import candidate_actions
@@ -189,7 +189,7 @@ class Arena:
         self._sampler = self.task.sampler()
         own_agent = () if agent is None else (AGENT,)
         decides = (*own_agent, MOTION) if named or revising else (MOTION, *own_agent)
-        library = () if revising or importlib.util.find_spec("ompl") is None else (OMPL,)
+        library = () if revising or not is_installed("ompl") else (OMPL,)
         self.methods = (*decides, SEARCH, STRAIGHT, *library)  # the first one is the default
 
     def env(self, name: str) -> ve.ReachVectorEnv:

@@ -27,7 +27,7 @@ from viapoint.envs.common.arrays import Float
 from viapoint.training.agents.agent import Agent, load_agent
 from viapoint.training.agents.model_io import check_same_task
 from viapoint.training.checks import DEFAULT_ENV, SHIPPED_IDS
-from viapoint.training.configs import env_of_arm
+from viapoint.training.configs import env_of_arm, task_with
 from viapoint.training.live import arena as live
 from viapoint.training.live.drawing import PLANE, RESET, SPACE, ArmDrawing, Panels, View
 from viapoint.training.planning.motion_plan import MotionPlan
@@ -328,8 +328,9 @@ class LivePage(contextlib.AbstractContextManager["LivePage", None]):
             loaded = load_agent(env)
         own = {} if loaded is None else loaded.env_kwargs
         arguments = {**(env_kwargs or own), **argument}
+        task = task_with(env, arguments)  # says what is wrong with an argument
         if loaded is not None:
-            check_same_task(registered_task(env, **own), registered_task(env, **arguments))
+            check_same_task(registered_task(env, **own), task)
         self._made = env, loaded, seed, arguments, agent is not None
         self._model_file = model_file
         arena, _ = self._make()

@@ -41,7 +41,7 @@ def _ompl() -> Any:
     except ImportError:
         raise ValueError(
             "the method ompl needs the library of that name, which has packages for Python 3.11 to 3.13: "
-            "pip install 'viapoint[planning]'"
+            "pip install '.[planning]' in a clone of the project"
         ) from None
     ompl.util.setLogLevel(ompl.util.LogLevel.LOG_ERROR)
     ompl.util.RNG.setSeed(1)
