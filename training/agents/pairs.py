@@ -38,6 +38,7 @@ STEPS = 2  # Greatest number of instants by which it may lie beside the nearest 
 PARTS = 8  # Parts in which the way to the next instant is looked at
 NEAREST = 16  # Number of pairs of a movement that the network sees
 CLEAR = 0.1  # Greatest clearance of the arm from itself that matters, [m]
+AT_FIRST = 0.1  # Distance from the box at which the margin is about 0 before training, [m]
 NO_OBSTACLE = 1.0  # Margin in a scene without obstacles, [m]
 NOWHERE = 1e6  # Gap of a pair that does not exist, [m]
 # Lengths that describe a pair: centre of the sphere 3, half lengths of the obstacle 3, radius of the sphere 1
@@ -305,6 +306,9 @@ def _gather(
 class PairNetwork(nn.Module):
     """Network of a pair, whose minimum over the pairs of a movement is the learned margin.
 
+    The network is added to the distance of the sphere's centre from the bounding box, so that it need not learn how the
+    margin grows with it.
+
     An obstacle that is larger than all of its kind in training is seen as the largest of them, as far from the sphere:
     the distance from a box does not depend on where its other side is.
     """
@@ -314,9 +318,6 @@ class PairNetwork(nn.Module):
     def __init__(self, shapes: Sequence[str], width: int) -> None:
         super().__init__()
         self.layers = nn.Sequential(*create_mlp(LENGTHS + len(shapes), 1, [width, width]))
-        self.nearness = nn.Parameter(torch.tensor([1.0, -2.0]))
-        """Slope and offset of a skip connection from the distance of the bounding box. It makes the nearest pair the
-        minimum at the start of training."""
         # Greatest half lengths of each kind in training, 0 where there was none, [m]
         self.register_buffer("largest", torch.zeros(len(shapes), 3))
         # Places beside meshes and clouds have signs, so that these kinds stay as they are.
@@ -339,6 +340,6 @@ class PairNetwork(nn.Module):
         place = torch.where(spare > 0.0, (place - spare).clamp(min=0.0), place)
         lengths = torch.cat((place, half - spare, radius), dim=-1)
         values = self.layers(torch.cat((SCALE * lengths, kind), dim=-1))[..., 0]
-        values = values + self.nearness[0] * (pairs.distance / UNIT) + self.nearness[1]
+        values = values + (pairs.distance - AT_FIRST) / UNIT
         least = torch.where(pairs.present, values * UNIT, NO_OBSTACLE).amin(dim=-1)
-        return torch.minimum(least, torch.full_like(least, NO_OBSTACLE))
+        return least.clamp(max=NO_OBSTACLE)

@@ -60,7 +60,7 @@ REWARD_TOLERANCE = 1e-4
 EFFORT = 4
 IN_TIME = 20.0  # Logits of arrival for each second of spare time in tasks with a time limit, [1/s]
 # Logits of arrival that a movement beyond reach or joint ranges loses: it is not executed
-OUTSIDE = 20.0
+OUTSIDE = 1000.0
 # Penalty on the merit of plans that are unlikely to succeed; larger than the range of Q
 UNLIKELY = 10.0
 
@@ -648,10 +648,10 @@ class ViaQCritic(nn.Module):
         """Return the ranking criterion, shape (B, H): Q if success is more likely than not, otherwise a lower number.
 
         If no plan is likely to succeed, Q prefers plans out of reach, which are not executed and so touch nothing. The
-        probability of success ranks such plans instead.
+        logarithm of the probability of success ranks such plans instead; the probability itself may round to 0.
         """
-        success = torch.sigmoid(values.no_contact) * torch.sigmoid(values.arrival)
-        merit: Tensor = torch.where(success > 0.5, self.value(values), success - UNLIKELY)
+        log = functional.logsigmoid(values.no_contact) + functional.logsigmoid(values.arrival)
+        merit: Tensor = torch.where(log > np.log(0.5), self.value(values), log - UNLIKELY)
         return merit
 
 
