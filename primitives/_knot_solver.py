@@ -64,6 +64,7 @@ from .array_api import (
     flat_batch,
     is_given,
     like,
+    ordered_sum,
     to_numpy,
     unit_factors,
 )
@@ -183,7 +184,7 @@ def least_cost_coefficients(
     """
     segments = durations.shape[-1]
     eps = float(xp.finfo(durations.dtype).eps)
-    if not _is_extreme(to_numpy(durations), eps).any():
+    if not is_extreme(to_numpy(durations), eps).any():
         return _banded_coefficients(xp, order, waypoints, durations, states)
     batch = waypoints.shape[:-2]
     points = flat_batch(xp, waypoints, batch, 2)
@@ -192,7 +193,7 @@ def least_cost_coefficients(
     numbers = to_numpy(durations)
     empty = numbers <= 0
     positive = np.where(empty, numbers.max(axis=-1, keepdims=True), numbers)
-    kinds = np.column_stack([empty, _is_extreme(positive, eps)])
+    kinds = np.column_stack([empty, is_extreme(positive, eps)])
     result = like(xp, np.zeros((len(points), 2 * order, segments, points.shape[-1])), waypoints)
     result[:, 0] = points[:, :-1]  # an empty segment is a constant
     for kind in np.unique(kinds, axis=0):  # movements with the same empty segments are solved together
@@ -210,7 +211,7 @@ def least_cost_coefficients(
     return xp.reshape(result, (*batch, *result.shape[1:]))
 
 
-def _is_extreme(durations: Any, eps: float) -> Any:
+def is_extreme(durations: Any, eps: float) -> Any:
     """Return (...,) True where the normal equations lose digits at durations (..., S), or a segment is empty."""
     return durations.min(axis=-1) <= eps**_DIGITS * durations.max(axis=-1)
 
@@ -256,7 +257,7 @@ def _weighted_coefficients(
     places = xp.astype(waypoints, xp.float64)
     lengths = xp.astype(durations, xp.float64).mT
     rows = [change_given(lambda value: xp.astype(value, xp.float64).mT, state) for state in states]
-    total = xp.sum(lengths, axis=0)
+    total = sum(lengths)  # from first to last, alone as in a batch
     points = to_numpy(places)
     pace = to_numpy(total)
     ends = []
@@ -273,7 +274,7 @@ def _weighted_coefficients(
     costs = []
     for found in (exact, soft):
         modes = np.einsum("ik,nksd->nisd", table, to_numpy(found)[:, order:])
-        costs.append(((modes * modes).sum(axis=(1, 3)) / shares).sum(axis=-1))
+        costs.append(ordered_sum((modes * modes).sum(axis=(1, 3)) / shares, -1))
     steps = to_numpy(soft)[:, 1:].sum(axis=1)
     missed = np.abs(steps - np.diff(points, axis=1)).max(axis=(1, 2))
     far = missed > _MISS * np.abs(points - points[:, :1]).max(axis=(1, 2))
@@ -383,7 +384,7 @@ def _origins(xp: Namespace, lengths: Array, steps: Array, states: Any) -> dict[U
     """
     means = steps / lengths[:, None]
     speeds = xp.linalg.vector_norm(means, axis=1)
-    fastest = _FASTEST * xp.linalg.vector_norm(steps, axis=1).sum(0) / lengths.sum(0)
+    fastest = _FASTEST * sum(xp.linalg.vector_norm(steps, axis=1)) / sum(lengths)
     means = means * xp.where(speeds > fastest, fastest / xp.where(speeds > 0, speeds, 1.0), 1.0)[:, None]
     origins = {}
     for k, state in enumerate(states):

@@ -24,14 +24,14 @@ With the states at the via-points eliminated, J(h) is the least sum of the segme
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
-from ._knot_solver import fit_modes, knot_states, mode_weights, rounding_slack
+from ._knot_solver import fit_modes, is_extreme, knot_states, mode_weights, rounding_slack
 from ._passage_one_via import (
     SHORTEST,
     attach_root_gradient,
@@ -59,7 +59,7 @@ from .array_api import (
     unit_time_ends,
     waypoint_shapes,
 )
-from .trajectory import connect, duration_gradient
+from .trajectory import Trajectory, connect, duration_gradient
 
 # Fraction of the duration below which a segment is dropped in lower than double precision, which it would overflow.
 _LEAST_FRACTION = 1e-7
@@ -222,6 +222,18 @@ def _solve(points: Any, ends: list[Any]) -> Any:
         rows = slice(first, first + size)
         found = _fractions_by_newton(cost.chosen(rows), guess[rows].T, bound[rows], several=moving)
         fractions[rows], converged[rows] = found
+        # Where `connect` would miss a waypoint by too much, it passes it exactly: seek that movement instead.
+        near = first + np.flatnonzero(is_extreme(fractions[rows], 2.0**-52))
+        if not near.size:
+            continue
+        soft, _ = cost.chosen(near).derivatives(np.ascontiguousarray(fractions[near].T))
+        real = _movement(points, ends, fractions[near], near).cost()
+        far, real = near[real > 1.001 * soft], real[real > 1.001 * soft]
+        if far.size:
+            exact = replace(cost.chosen(far), slack=np.zeros(far.size))
+            again, ok = _fractions_by_newton(exact, guess[far].T, bound[far], several=moving)
+            cheaper = _movement(points, ends, again, far).cost() < real
+            fractions[far[cheaper]], converged[far[cheaper]] = again[cheaper], ok[cheaper]
     if not converged.all():
         warnings.warn(
             f"the passage times of {np.sum(~converged)} of {count} movements did not converge; the best found are "
@@ -230,6 +242,12 @@ def _solve(points: Any, ends: list[Any]) -> Any:
             stacklevel=4,
         )
     return fractions
+
+
+def _movement(points: Any, ends: list[Any], fractions: Any, items: Any) -> Trajectory:
+    """Return n of the movements through points (N, S + 1, D) with durations (n, S) in unit total time."""
+    states = knot_states(3, change_given(itemgetter(items), ends), points.shape[1] - 2)
+    return connect(np, 3, points[items], fractions, states)
 
 
 def _from_fewer_points(points: Any, ends: list[Any], moving: bool) -> tuple[Any, Any]:
@@ -362,7 +380,7 @@ def _starts(cost: _PassageCost, guess: Floats, several: bool) -> list[Floats]:
     guesses = [np.cbrt(chord), _straight_durations(chord)]
     if not np.isnan(guess).all():
         guesses.append(guess)
-    shares = np.stack([each / each.sum(axis=0) for each in guesses])
+    shares = np.stack([each / ordered_sum(each) for each in guesses])
     costs = np.stack([cost.derivatives(each)[0] for each in shares])
     best = np.argmin(np.where(costs >= 0, costs, np.inf), axis=0)
     starts = [np.take_along_axis(shares, best[None, None], axis=0)[0]]
@@ -370,7 +388,7 @@ def _starts(cost: _PassageCost, guess: Floats, several: bool) -> list[Floats]:
         starts.append(np.ones_like(chord))
         drawn = np.random.default_rng(0).dirichlet(np.ones(segments), _STARTS - 2)
         starts += [np.broadcast_to(0.02 + row[:, None], (segments, count)) for row in drawn]
-    return [start / start.sum(axis=0) for start in starts]
+    return [start / ordered_sum(start) for start in starts]
 
 
 def _straight_durations(chord: Floats) -> Floats:

@@ -183,9 +183,10 @@ def spectral_arc_length(trajectory: Trajectory, *, cutoff: float = 10.0, thresho
     with np.errstate(divide="ignore", invalid="ignore"):  # a movement that stands still may last no time
         step = _SPECTRUM_SAMPLES / (_PADDED * to_numpy(trajectory.duration)[..., None])  # [Hz]
         counts = (numbers >= threshold) & (index * step <= cutoff)
-    last = np.max(np.where(counts, index, 0), axis=-1, keepdims=True)
+    # The first interval counts even if it is wider than the cutoff, as in very short movements.
+    last = np.max(np.where(counts, index, 1), axis=-1, keepdims=True)
     used = like(xp, (index[:-1] < last).astype(float), spectrum)
-    width = like(xp, 1.0 / np.maximum(last, 1), spectrum)
+    width = like(xp, 1.0 / last, spectrum)
     rise = spectrum[..., 1:] - spectrum[..., :-1]
     lengths = -xp.sum(used * xp.sqrt(width * width + rise * rise), axis=-1)
     return lengths if lengths.dtype == dtype else xp.astype(lengths, dtype)

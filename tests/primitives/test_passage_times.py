@@ -59,6 +59,14 @@ def test_no_shift_of_a_passage_time_lowers_the_cost(vias, ends, rng):
             assert (through(waypoints, moved, **moving).cost() >= best * (1 - 1e-12)).all()
 
 
+@pytest.mark.parametrize("gap", [3e-9, 1e-8])
+def test_nearly_equal_via_points_anywhere_cost_no_more_than_a_stop_there(gap):
+    waypoints = np.array([[0.0, 0.0], [0.5, 0.2], [0.5, 0.2 + gap], [1.0, 0.0]])
+    waypoints = waypoints + np.array([0.0, 3e3, 1e5])[:, None, None]
+    cost = through(waypoints, passage_durations(waypoints, 1.0)).cost()
+    np.testing.assert_allclose(cost, 6169.6, rtol=1e-3)
+
+
 def test_equal_neighbours_are_merged():
     waypoints = np.array([[0.0, 0], [1, 1], [1, 1], [2, -1], [3, 0], [3, 0]])
     durations = passage_durations(waypoints, 1.0)
@@ -67,7 +75,7 @@ def test_equal_neighbours_are_merged():
     np.testing.assert_array_equal(durations[[1, 4]], 0.0)
 
 
-@pytest.mark.parametrize("vias", [1, 2, 4])
+@pytest.mark.parametrize("vias", [1, 2, 4, 7, 12, 20])
 def test_a_batch_gives_bit_for_bit_what_each_item_gives_alone(vias, rng):
     waypoints = rng.normal(size=(12, vias + 2, 3))
     waypoints[2] = waypoints[2, 0]
@@ -77,6 +85,10 @@ def test_a_batch_gives_bit_for_bit_what_each_item_gives_alone(vias, rng):
     waypoints[6, -2] = waypoints[6, -1] + 1e-9
     duration = rng.uniform(0.5, 2, 12)
     velocity = rng.normal(size=(12, 3)) * (rng.uniform(size=(12, 1)) < 0.5)
+    uneven, distinct = 10.0 ** rng.uniform(-9, 0, (12, vias + 1)), rng.normal(size=waypoints.shape)
+    together = through(distinct, uneven).coefficients
+    for i in range(12):
+        np.testing.assert_array_equal(through(distinct[i], uneven[i]).coefficients, together[i])
     for ends in ({}, {"start_velocity": velocity}):
         batch = passage_durations(waypoints, duration, **ends)
         movements = through(waypoints, batch, **ends)

@@ -22,6 +22,7 @@ def test_the_straight_reach_has_its_closed_forms(duration):
     np.testing.assert_allclose(vp.dimensionless_jerk(reach), 204.8, rtol=1e-12)
     np.testing.assert_allclose(vp.log_dimensionless_jerk(reach), -5.3220, atol=5e-5)
     np.testing.assert_allclose(vp.spectral_arc_length(reach), -1.4024, atol=5e-5)
+    np.testing.assert_allclose(vp.spectral_arc_length(reach.stretched(0.005)), -1.0, atol=1e-3)
 
 
 @pytest.mark.parametrize("measure", MEASURES)

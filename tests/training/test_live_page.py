@@ -178,6 +178,12 @@ def test_a_scene_without_a_decision_is_not_shown(page, open_tab):
     tab.press("button", "Random")
     wait_for(lambda: "The plan takes" in tab.text(MESSAGE))
     assert session.state.scene is not before.scene
+    session._panels._method.value = SEARCH
+    session.state.scene = before.scene.with_obstacle(0, post)
+    session.act("compare")
+    settled(session)
+    assert session._panels._method.value == session.state.method != SEARCH
+    assert {movement for *_, movement in session.state.results} == {None}
 
 
 def test_an_arm_in_space_follows_what_is_dragged_and_turned(page, open_tab):

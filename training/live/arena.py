@@ -154,7 +154,8 @@ class State:
     movement: Movement | None = None  # Executed movement so far
     instant: int = 0  # Row of its rollout that is shown
     playing: bool = False  # True while the movement is played
-    results: tuple[tuple[str, float, Movement], ...] = ()  # Compared: method, time [s], movement
+    # Compared: method, time [s], and movement unless the method refused the scene
+    results: tuple[tuple[str, float, Movement | None], ...] = ()
     message: str = "Getting ready."  # Sentence on the plan or the movement
     good: bool = True  # False for bad news
 
@@ -187,6 +188,8 @@ class Arena:
         self.stepwise = self.env("own").task.stepwise  # True if the agent acts in every control step
         self.planar = self.task.arm.space == "hand"  # True if the arm moves in a horizontal plane
         self._sampler = self.task.sampler()
+        room = self._sampler.room
+        self.foot, self.scale = np.array(room.foot), room.scale  # Place of the base, [m], and relative reach
         own_agent = () if agent is None else (AGENT,)
         decides = (*own_agent, MOTION) if named or revising else (MOTION, *own_agent)
         library = () if revising or not is_installed("ompl") else (OMPL,)
@@ -324,8 +327,10 @@ class Arena:
         ends = np.stack((scene.start, scene.goal))
         start, goal = self.tool(ends)
         middle, line = 0.5 * (start + goal), goal - start
-        aside = np.array([-line[1], line[0], 0.0]) / max(float(np.hypot(line[0], line[1])), 1e-9)
-        if aside @ middle < 0.0:
+        if np.hypot(line[0], line[1]) < 1e-9:  # no direction: any will do
+            line = np.array([1.0, 0.0, 0.0])
+        aside = np.array([-line[1], line[0], 0.0]) / np.hypot(line[0], line[1])
+        if aside @ (middle - self.foot) < 0.0:
             aside = -aside
         shape, sides = self.new_shapes()[name], [aside, -aside]
         if name == "wall":

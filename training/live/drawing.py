@@ -32,7 +32,7 @@ ABOVE = np.array([0.0, 0.0, 0.004])  # Shift of the executed path, so that the p
 DROP = 0.0015  # Radius of the lines from handles down to the table, [m]
 RADII = {"start": 0.018, "goal": 0.018, "via": 0.013}  # Radii of the handles, [m]
 HANDLES = {name: trimesh.creation.icosphere(3, radius) for name, radius in RADII.items()}
-# First views: position of the camera, point that it looks at, [m], direction up, and field of view, [rad]
+# First views of the reference arm: place of the camera, point that it looks at, [m], direction up, field of view, [rad]
 PLANE = (-0.03, 0.26, 1.75), (-0.03, 0.29, 0.0), (0.0, 1.0, 0.0), math.radians(33.0)
 SPACE = (2.6, -2.0, 1.75), (0.15, 0.0, 0.42), (0.0, 0.0, 1.0), math.radians(38.0)
 ORIGIN = (0.0, 0.0, 0.0)  # Place of what is drawn where it is, [m]
@@ -44,7 +44,7 @@ MOST_RAYS = 96  # How many of these are drawn at most
 LARGE = 0.16  # Greatest size of obstacles in space that are not large, [m]
 LOW, TALL = 0.030, 0.060  # Height of obstacles in the plane, [m]: below links, and as tall as links
 GRID, PALE = (214, 214, 218), 0.45  # Colour of the lines on the table, and strength of pale colours
-FARTHEST = 1.2  # Greatest coordinate to which something can be dragged, [m]
+FARTHEST = 1.3  # Greatest coordinate to which something can be dragged, [m] of the reference arm
 WIDTH = 330  # Width of a panel, [pixels]
 RESET = "Reset"  # Name of the button that undoes all changes of a scene
 CHECKS = {"none": 0, "16": 16, "64": 64}  # Proposals that are checked with computed geometry
@@ -150,9 +150,10 @@ class View:
         self._nodes: dict[str, Any] = {}
         self._meshes: dict[str, Any] = {}  # what the nodes show
         self._shapes: dict[str, Shape] = {}  # obstacles of these meshes
-        centre = (-0.03, 0.35) if self._planar else (0.0, 0.0)
+        centre, side = (-0.03, 0.35) if self._planar else (0.0, 0.0), 2.0 * arena.scale
+        place = (*(arena.foot[:2] + arena.scale * np.array(centre)), self._floor)
         self._scene.add_grid(
-            "/grid", 2.0, 2.0, position=(*centre, self._floor), cell_size=0.1, section_size=0.1,
+            "/grid", side, side, position=place, cell_size=0.1, section_size=0.1,
             cell_color=GRID, section_color=GRID, section_thickness=1.0, shadow_opacity=0.0,
             plane_color=_rgb(PALETTE.table), plane_opacity=1.0,
         )  # fmt: skip
@@ -308,7 +309,8 @@ class View:
         if upright:
             point = np.array([*place[:2], max(point[2], self._floor)])
         if share > 0.0:
-            self._act("drag", kind, number, np.clip(point, -FARTHEST, FARTHEST))
+            foot, farthest = self._arena.foot, self._arena.scale * FARTHEST
+            self._act("drag", kind, number, np.clip(point, foot - farthest, foot + farthest))
 
 
 def _rgb(colour: Colour, strength: float = 1.0) -> Any:
@@ -335,9 +337,11 @@ class Panels:
         message = MESSAGE.format("#1b7f4b" if state.good else "#c4202b", html.escape(state.message))
         self._message.content = message + NOTE.format(html.escape(remark))
         self._execute.label = "Stop" if state.playing else "Execute"
+        self._method.value = state.method  # a choice may have been refused
         self._vias.visible = state.method != OMPL  # which takes as many as its path needs
         if self._checks is not None:
             self._checks.visible = state.method == AGENT
+            self._checks.value = next(name for name, number in CHECKS.items() if number == state.checks)
         self._vias.min = int(state.method == MOTION)
         self._vias.value = n_via(self._arena, state)
         if plan is not None and state.duration is None:
@@ -392,6 +396,9 @@ class Panels:
     def _draw_comparison(self, state: State) -> None:
         rows = []
         for name, seconds, movement in state.results:
+            if movement is None:  # the method refused the scene
+                rows.append((name, "no", *4 * [np.nan]))
+                continue
             info = movement.info
             success = "yes" if info["is_success"] else "no"
             clearance = _millimetres(info["min_clearance"])
@@ -478,8 +485,9 @@ class Panels:
         low, high = action.duration_range if arena.task.space.of_hand else (0.3, 12.0)
         self._duration = gui.add_slider("Duration [s]", low, high, 0.01, (low * high) ** 0.5)
         _on_slide(self._duration, lambda value: act("change", duration=value))
-        methods = gui.add_dropdown("Method", arena.methods, hint="Decides after each change of the scene")
-        methods.on_update(lambda event: act("change", method=event.target.value, **anew))
+        hint = "Decides after each change of the scene"
+        self._method = gui.add_dropdown("Method", arena.methods, hint=hint)
+        _on_choice(self._method, lambda value: act("change", method=value, **anew))
         most = action.n_via if arena.task.replanning else max(3, action.n_via)
         self._vias = gui.add_slider("Via-points", 0, most, 1, action.n_via, disabled=most == action.n_via)
         _on_slide(self._vias, lambda value: act("change", n_via=value, by_hand=None))
@@ -487,7 +495,7 @@ class Panels:
         if hasattr(arena.policy, "checks"):
             hint = "Proposals whose clearance is computed"
             self._checks = gui.add_dropdown("Exact checks", tuple(CHECKS), hint=hint)
-            self._checks.on_update(lambda event: act("change", checks=CHECKS[event.target.value]))
+            _on_choice(self._checks, lambda value: act("change", checks=CHECKS[value]))
         gui.add_button("Decide anew").on_click(lambda _: act("change", **anew))
 
     def _button(self, label: str, name: str, **kwargs: Any) -> Any:
@@ -497,14 +505,19 @@ class Panels:
         return button
 
 
-def _on_slide(slider: Any, function: Callable[[Any], None]) -> None:
-    """Call a function with the values that a user gives a slider; a number that is typed may lie outside."""
+def _on_choice(control: Any, function: Callable[[Any], None]) -> None:
+    """Call a function with the values that a user gives a control."""
 
     def call(event: Any) -> None:
         if event.client is not None:  # otherwise the page itself has set it
-            function(min(max(slider.value, slider.min), slider.max))
+            function(control.value)
 
-    slider.on_update(call)
+    control.on_update(call)
+
+
+def _on_slide(slider: Any, function: Callable[[Any], None]) -> None:
+    """Call a function with the values that a user gives a slider; a number that is typed may lie outside."""
+    _on_choice(slider, lambda value: function(min(max(value, slider.min), slider.max)))
 
 
 def _table(names: Iterable[str], rows: Iterable[Iterable[Any]], note: str) -> str:

@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import io
 import logging
+import math
 import socket
 import threading
 import time
@@ -257,9 +258,12 @@ class Tab:
         state.playing, state.results = False, ()
         for method in self.arena.methods:
             trial = live.State(scene=state.scene, drawn=state.drawn, method=method, checks=state.checks)
-            trial.proposals = (live.decide(self.arena, trial, time_limit=1.0),)
-            *_, movement = live.execute(self.arena, trial)
-            state.results = (*state.results, (method, trial.proposals[0].seconds, movement))
+            movement, seconds = None, math.nan
+            with contextlib.suppress(ValueError):  # the method refuses the scene
+                trial.proposals = (live.decide(self.arena, trial, time_limit=1.0),)
+                *_, movement = live.execute(self.arena, trial)
+                seconds = trial.proposals[0].seconds
+            state.results = (*state.results, (method, seconds, movement))
             self._draw()
             if self._jobs.keys() - {("advance",), ("propose",)}:
                 break
@@ -344,7 +348,8 @@ class LivePage(contextlib.AbstractContextManager["LivePage", None]):
         self._server = _serve(port)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         camera = self._server.initial_camera  # also the view to which the library's button resets
-        camera.position, camera.look_at, camera.up, camera.fov = PLANE if arena.planar else SPACE
+        *places, camera.up, camera.fov = PLANE if arena.planar else SPACE
+        camera.position, camera.look_at = arena.foot + arena.scale * np.array(places)
         scene = self._server.scene  # lights in which pale colours are not white
         scene.configure_environment_map(None)
         scene.configure_default_lights(enabled=False)
