@@ -131,10 +131,7 @@ def test_the_wheel_works_with_the_packages_that_it_requires(extra, wheel_path, t
                     (site / name).symlink_to(distribution.locate_file(name))
     install = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-index"]
     named = str(wheel_path) if extra == "base" else f"{wheel_path}[{extra}]"
-    for command in (
-        [*install, named],
-        [python, "-I", "-c", IMPORT_ALL + SCRIPTS[extra]],
-    ):
+    for command in ([*install, named], [python, "-I", "-c", IMPORT_ALL + SCRIPTS[extra]]):
         environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
         done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr

@@ -38,17 +38,10 @@ def test_contact_implies_negative_clearance_and_clearance_implies_no_contact(arm
     """In MuJoCo at every physics step of random movements past a random shape."""
     rng = np.random.default_rng(7)
     # Not all kinds have default families in the plane.
-    kinds = (kind, "box", "cylinder")
-    env = gym.make_vec(
-        PANDA if arm == "panda" else PLANE,
-        num_envs=50,
-        n_obstacles=1,
-        shapes=tuple(dict.fromkeys(kinds)),
-        families="clutter",
-        whole_arm=arm == "planar",
-        space="joints",
-        autoreset_mode="Disabled",
-    ).unwrapped
+    kinds = tuple(dict.fromkeys((kind, "box", "cylinder")))
+    settings = {"n_obstacles": 1, "shapes": kinds, "families": "clutter", "whole_arm": arm == "planar"}
+    settings |= {"space": "joints", "autoreset_mode": "Disabled"}
+    env = gym.make_vec(PANDA if arm == "panda" else PLANE, num_envs=50, **settings).unwrapped
     env.reset(seed=0)
     touched = clear = 0
     for _ in range(2):

@@ -46,13 +46,8 @@ from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import scenes_for
 
 FEW = {"width": 8, "instants": 8, "candidates": 32, "refinements": 1, "per_refinement": 16}
-SMALL = {
-    "learning_starts": 16,
-    "batch_size": 8,
-    "gradient_steps": 1,
-    "explore_candidates": 16,
-    "policy_kwargs": FEW,
-}
+SMALL = {"learning_starts": 16, "batch_size": 8, "gradient_steps": 1}
+SMALL |= {"explore_candidates": 16, "policy_kwargs": FEW}
 NUMBER = 12
 """Number of scenes in which policies are compared."""
 
@@ -88,6 +83,7 @@ def test_the_algorithm_is_used_as_those_of_stable_baselines(make, tmp_path):
 
 
 def test_a_planned_movement_is_the_one_that_an_environment_executes():
+    """Also of an observation of lists."""
     shapes = ("capsule", "box", "cylinder")
     env = gym.make(PLANE, shapes=shapes).unwrapped
     agent = ViaQ("ViaQPolicy", ViaVecEnv(PLANE, 4, seed=0, threads=1, shapes=shapes), seed=0)
@@ -97,7 +93,8 @@ def test_a_planned_movement_is_the_one_that_an_environment_executes():
         scene = env.batch.scenes
         start, goal = env.task.space.coordinates(np.concatenate((scene.start, scene.goal)))
         plan = method.plan(start=start, goal=goal, obstacles=unpack(scene.obstacles, 0))
-        env.step(method.predict(observation, deterministic=True)[0])
+        lists = {name: part.tolist() for name, part in observation.items()}
+        env.step(method.predict(lists, deterministic=True)[0])
         np.testing.assert_allclose(plan.waypoints, env.last_plan.waypoints, atol=1e-6)
         np.testing.assert_allclose(plan.durations, env.last_plan.durations, atol=1e-6)
         ends = plan.trajectory()(np.array([0.0, plan.durations.sum()]))
@@ -229,12 +226,14 @@ def with_rows(problem, rows):
     return problem._replace(obstacles=obstacles._replace(**parts))
 
 
-@pytest.mark.parametrize("env_id", [WHOLE, PANDA])
-def test_the_order_of_the_obstacles_is_irrelevant(env_id):
+@pytest.mark.parametrize("env_id", [PLANE, WHOLE, PANDA])
+def test_margins_do_not_depend_on_the_order_of_obstacles_and_are_constant_without_any(env_id):
     task = registered_task(env_id)
     policy, problem = policy_of(task), problem_of(task, NUMBER)
     other = with_rows(problem, slice(None, None, -1))
     np.testing.assert_allclose(margins(policy, other), margins(policy, problem), atol=1e-5)
+    empty = problem._replace(obstacles=no_obstacles(NUMBER))
+    assert (margins(policy, empty) == NO_OBSTACLE).all()
 
 
 def test_the_margin_is_the_least_of_the_margins_from_each_obstacle():
@@ -343,10 +342,6 @@ def test_plans_out_of_reach_are_not_taken(env_id):
     assert 0.2 < within.mean() < 0.95
 
 
-KNOW_OBSTACLES = (
-    viapoint.envs.geometry.clearance,
-    viapoint.training.planning.search,
-)
 EVERY = np.arange(INSTANTS)
 
 
@@ -375,7 +370,7 @@ def refuse_geometry(monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError("the geometry of obstacles was computed")
 
-    for module in KNOW_OBSTACLES:
+    for module in (viapoint.envs.geometry.clearance, viapoint.training.planning.search):
         for name, function in inspect.getmembers(module, callable):
             if getattr(function, "__module__", "") == module.__name__ and not inspect.isclass(function):
                 monkeypatch.setattr(module, name, refuse)
@@ -428,13 +423,6 @@ def test_an_obstacle_larger_than_all_in_training_is_seen_as_the_largest_as_far_a
     torch.testing.assert_close(network(larger), network(usual))
 
 
-@pytest.mark.parametrize("env_id", [PLANE, PANDA])
-def test_without_obstacles_the_margin_is_constant(env_id):
-    task = registered_task(env_id)
-    empty = problem_of(task, NUMBER)._replace(obstacles=no_obstacles(NUMBER))
-    assert (margins(policy_of(task), empty) == NO_OBSTACLE).all()
-
-
 def test_the_clearance_of_the_arm_from_itself_is_computed():
     task, problem, actions, moves = movements(PANDA)
     found = pairs_of(task, problem, moves, EVERY)
@@ -465,9 +453,7 @@ def test_only_instants_that_were_carried_out_count():
 
 @pytest.mark.parametrize("checks", [1, 11, 64])
 @pytest.mark.parametrize("env_id", [WHOLE, PANDA, MOVING])
-def test_as_many_plans_are_checked_as_one_says_and_the_best_of_them_is_taken(
-    small, env_id, checks, monkeypatch
-):
+def test_as_many_plans_are_checked_as_one_says_and_the_best_is_taken(small, env_id, checks, monkeypatch):
     model, env = small(env_id)
     observation, checked, exact = env.reset(), {}, viaq.merits
     model.policy.checks = 0
@@ -580,14 +566,6 @@ def test_exploration_goes_from_the_best_candidate_to_any(small, temperature, mon
         chosen += (seen["candidates"] == actions[:, None]).all(axis=-1).argmax(axis=1).tolist()
     counts = np.bincount(chosen, minlength=8)
     assert counts[7] == 480 if temperature < 1.0 else counts.min() > 30  # of 60 each
-
-
-def test_observations_may_be_lists():
-    env, agent = gym.make(PLANE), load_agent(PLANE)
-    observation, _ = env.reset(seed=0)
-    expected, _ = agent.predict(observation)
-    found, _ = agent.predict({name: part.tolist() for name, part in observation.items()})
-    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("env_id", [PLANE, PANDA])
@@ -708,11 +686,8 @@ LOOKING = {"sensor": "hand_rays", "decide_at": ["horizon"], "horizon": 0.3, "via
 
 def test_it_learns_to_revise_plans(tmp_path) -> None:
     env = ViaVecEnv(SENSED, 32, seed=0, **LOOKING)
-    small = {
-        "explore_candidates": 24,
-        "labels": 12,
-        "policy_kwargs": {"candidates": 64, "refinements": 0, "caution": 0.0, "effort": 0.05},
-    }
+    own = {"candidates": 64, "refinements": 0, "caution": 0.0, "effort": 0.05}
+    small = {"explore_candidates": 24, "labels": 12, "policy_kwargs": own}
     agent = ViaRank("ViaRankPolicy", env, seed=0, gradient_steps=8, **small).learn(256)
     agent.save(tmp_path / "agent.zip")
     again = ViaRank.load(tmp_path / "agent.zip")

@@ -121,7 +121,6 @@ def test_content_that_is_none_is_refused(name, content, model):
 @pytest.mark.parametrize(
     "change",
     [
-        {"format": 99},
         {"algorithm": "os.system"},
         {"policy": "CnnPolicy2"},
         {"hyperparameters": {"tensorboard_log": "x"}},

@@ -169,10 +169,8 @@ def test_an_interrupted_evaluation_keeps_what_is_done(small_scenes):
     methods = [Given("first", ZEROS), Interrupted("second", ZEROS), Given("third", ZEROS)]
     evaluation = run(methods, small_scenes, batch=10)
     assert evaluation.partial
-    assert [(r.name, len(r.success), r.partial) for r in evaluation.results] == [
-        ("first", 40, False),
-        ("second", 20, True),
-    ]
+    found = [(result.name, len(result.success), result.partial) for result in evaluation.results]
+    assert found == [("first", 40, False), ("second", 20, True)]
     record = json.loads(json.dumps(evaluation.to_dict(), allow_nan=False))
     assert record["methods"]["second"]["scenes"] == 20
 
@@ -275,17 +273,15 @@ def test_across_seeds_draws_whole_agents():
     draws = sorted(np.mean(each) for each in itertools.product(rates, repeat=3))
     # One draw of 27 is more than 2.5 %.
     assert interval == pytest.approx((rates.mean(), draws[0], draws[-1]))
-    trimmed = evaluation.across_seeds(
-        np.array([[0.0], [0.5], [0.6], [0.7], [1.0]]), [0], np.random.default_rng(0)
-    )
+    five = np.array([[0.0], [0.5], [0.6], [0.7], [1.0]])
+    trimmed = evaluation.across_seeds(five, [0], np.random.default_rng(0))
     assert trimmed[0] == pytest.approx(0.6)
 
 
 def test_across_seeds_draws_scenes_within_their_strata():
     success = np.random.default_rng(0).random(400) < 0.7
-    _, low, high = evaluation.across_seeds(
-        success[None], np.zeros(400), np.random.default_rng(1), samples=4000
-    )
+    given = success[None], np.zeros(400), np.random.default_rng(1)
+    _, low, high = evaluation.across_seeds(*given, samples=4000)
     half = 1.96 * math.sqrt(success.mean() * (1 - success.mean()) / 400)
     assert high - low == pytest.approx(2 * half, rel=0.1)
     score = np.where(success, 0.9, 0.2)

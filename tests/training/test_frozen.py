@@ -114,12 +114,7 @@ def test_frozen_scenes_are_met_where_they_fit(kwargs, capsys):
 
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "rows"),
-    [
-        (PLANE, {"n_obstacles": 3}, 3),
-        (PLANE, {"arm": "panda"}, 5),
-        ("viapoint/Obstacles-v0", {"arm": "planar"}, 16),
-        (MOVING, {"n_obstacles": 2}, 2),
-    ],
+    [(PLANE, {"n_obstacles": 3}, 3), (PLANE, {"arm": "panda"}, 5), (MOVING, {"n_obstacles": 2}, 2)],
 )
 def test_others_are_drawn_always_the_same_and_it_is_said(env_id, kwargs, rows, capsys):
     task = registered_task(env_id, **kwargs)

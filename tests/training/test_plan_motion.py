@@ -186,23 +186,13 @@ def test_movements_in_motion_use_all_of_their_limits_and_nothing_more() -> None:
 
 def test_the_shortest_duration_that_is_allowed_keeps_the_limits_between_all_instants() -> None:
     rng = np.random.default_rng(0)
-    for change in rng.uniform(-0.6, 0.6, (20, 7)):
-        usual = plan_motion(PANDA, PANDA.home, PANDA.home + change)
-        plan = plan_motion(
-            PANDA, PANDA.home, PANDA.home + change, duration=usual.duration * max(usual.limits)
-        )
+    for goal in PANDA.home + rng.uniform(-0.6, 0.6, (20, 7)):
+        usual = plan_motion(PANDA, PANDA.home, goal)
+        plan = plan_motion(PANDA, PANDA.home, goal, duration=usual.duration * max(usual.limits))
         motion = plan.joints(5e4, force=True)
         if plan.success:
             assert (np.abs(motion.velocity) <= PANDA.velocity_limit).all()
             assert (np.abs(motion.torque) <= PANDA.torque_limit).all()
-
-
-def test_no_seeds_are_no_seeds() -> None:
-    plans = [
-        plan_motion(PANDA, PANDA.home, GOAL, [POST], seeds=seeds) for seeds in ([], np.zeros((0, 2, 7)), 256)
-    ]
-    for plan in plans[1:]:
-        assert np.array_equal(plan.waypoints, plans[0].waypoints)
 
 
 def test_a_plan_that_leaves_the_joint_limits_has_no_success() -> None:
@@ -222,9 +212,8 @@ def objective(setting, table, row, start, offsets, scene, aim, gradient):
 
 def test_nothing_is_refined_further_after_the_time_limit() -> None:
     still, tables = np.zeros(7), (movements.movement_table(2), movements.fine_table(2))
-    problem = module._Problem(
-        PANDA, space_of(PANDA, "joints"), PANDA.home, still, still, GOAL, pack([[POST]])
-    )
+    ends = PANDA.home, still, still, GOAL
+    problem = module._Problem(PANDA, space_of(PANDA, "joints"), *ends, pack([[POST]]))
     seeds = np.tile(np.linspace(0.0, GOAL - PANDA.home, 4)[1:-1], (4, 1, 1))
     given = problem, problem.setting(), 0.001, tables, seeds, 2.0
     tried, found = module._refined(*given, np.inf, enough=4)
@@ -293,7 +282,7 @@ def test_short_movements_succeed_in_physics() -> None:
     assert outcome.is_success.all()
 
 
-def test_results_depend_on_neither_threads_nor_the_form_of_obstacles() -> None:
+def test_results_depend_on_neither_threads_nor_the_form_of_obstacles_and_of_no_seeds() -> None:
     task, starts, goals, obstacles = drawn(6, arm="panda")
     several = np.random.default_rng(5).spawn(6)  # problems of a batch share no generator
     for threads, rng, own in ((1, 5, [5] * 6), (3, np.random.default_rng(5), several)):
@@ -302,9 +291,10 @@ def test_results_depend_on_neither_threads_nor_the_form_of_obstacles() -> None:
             alone = plan_motion(task.arm, starts[i], goals[i], obstacles[i], rng=own[i])
             assert np.array_equal(alone.waypoints, together[i].waypoints)
             assert np.array_equal(alone.durations, together[i].durations)
-    forms = [POST], [POST.to_dict()], pack([[POST]])
-    first, *others = (plan_motion(PANDA, PANDA.home, GOAL, form) for form in forms)
-    assert all(np.array_equal(first.waypoints, other.waypoints) for other in others)
+    first = plan_motion(PANDA, PANDA.home, GOAL, [POST])
+    for form, seeds in (([POST.to_dict()], []), (pack([[POST]]), np.zeros((0, 2, 7)))):
+        other = plan_motion(PANDA, PANDA.home, GOAL, form, seeds=seeds)
+        assert np.array_equal(first.waypoints, other.waypoints)
 
 
 def test_within_bounds_no_allowed_direction_is_better() -> None:
@@ -334,10 +324,8 @@ def test_within_bounds_no_allowed_direction_is_better() -> None:
 def test_gradient_of_the_objective(kwargs) -> None:
     task, starts, goals, obstacles = drawn(5, **kwargs)
     aim = refine.SEED._replace(clearance=0.2)  # many residuals
-    setting, table = (
-        movements.arm_setting(task.arm, task.space.of_hand, pack([[]])),
-        movements.movement_table(2),
-    )
+    setting = movements.arm_setting(task.arm, task.space.of_hand, pack([[]]))
+    table = movements.movement_table(2)
     dimension = task.space.dimension
     generator = np.random.default_rng(0)
     gradient, measured = np.empty((2, 2 * dimension))
@@ -348,10 +336,8 @@ def test_gradient_of_the_objective(kwargs) -> None:
         for i in range(2 * dimension):
             change = np.zeros_like(offsets)
             change[i // dimension, i % dimension] = 1e-6
-            more, less = (
-                objective(setting, table, 80, start, each, scene, aim, gradient)
-                for each in (offsets + change, offsets - change)
-            )
+            more = objective(setting, table, 80, start, offsets + change, scene, aim, gradient)
+            less = objective(setting, table, 80, start, offsets - change, scene, aim, gradient)
             measured[i] = (more - less) / 2e-6
         objective(setting, table, 80, start, offsets, scene, aim, gradient)
         computed = 2.0 * gradient
@@ -365,11 +351,10 @@ REFUSED = [
     ({"goal": {"place": (0.5, 0.2, 0.4)}}, "position"),
     ({"obstacles": 5}, "obstacles must be"),
 ]
-UNSOLVED = {"goal": GOAL + 9.0 * np.eye(7)[2]}, "outside the limits"
 
 
 def test_a_batch_goes_on_after_problems_that_are_refused(tmp_path) -> None:
-    faults = [*REFUSED, UNSOLVED]
+    faults = [*REFUSED, ({"goal": GOAL + 9.0 * np.eye(7)[2]}, "outside the limits")]
     problems = [changes for changes, _ in faults] + [{}]
     given = [{"start": PANDA.home, "goal": GOAL, "obstacles": [], **changes} for changes in problems]
     parts = ([each[name] for each in given] for name in ("start", "goal", "obstacles"))
@@ -445,6 +430,9 @@ POINTS, PLACE, LOW = np.random.default_rng(0).normal(0.0, 0.04, (30, 3)), (0.5, 
 SURFACE = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 3))
 SURFACE[np.arange(200), np.arange(200) % 3] = 1.0
 TO_THE_GOAL = np.array((-0.18, 0.24, 0.0))
+CROSSING = []
+for seconds in (1.0, 1.25, 1.5, 1.75):
+    CROSSING.append(ve.Sphere(0.05, position=(0.1, 0.4, 0.0) - seconds * TO_THE_GOAL, velocity=TO_THE_GOAL))
 
 
 @pytest.mark.parametrize(
@@ -458,13 +446,7 @@ TO_THE_GOAL = np.array((-0.18, 0.24, 0.0))
         ("planar", ve.Capsule(0.02, 0.05, position=LOW)),
         ("planar", ve.PointCloud([LOW], 0.02)),
         # The movement waits or hurries where it crosses the goal after so many seconds.
-        *(
-            (
-                "planar",
-                ve.Sphere(0.05, position=(0.1, 0.4, 0.0) - seconds * TO_THE_GOAL, velocity=TO_THE_GOAL),
-            )
-            for seconds in (1.0, 1.25, 1.5, 1.75)
-        ),
+        *(("planar", each) for each in CROSSING),
     ],
 )
 def test_plans_succeed_among_all_shapes_at_rest_and_moving(arm, obstacle) -> None:
@@ -757,9 +739,8 @@ def test_a_path_of_trees_is_clear_between_its_ends(arm):
         problem = next(each for each in benchmark_problems() if each.name == "cage 1")
         ends, shapes = np.stack((problem.start, problem.goal)), problem.obstacles
     obstacles, setting = pack([shapes]), movements.arm_setting(arm, False, pack([shapes]))
-    path, again = (
-        clear_path(setting, ends, obstacles, 0.002, np.random.default_rng(5), 20.0) for _ in range(2)
-    )
+    path = clear_path(setting, ends, obstacles, 0.002, np.random.default_rng(5), 20.0)
+    again = clear_path(setting, ends, obstacles, 0.002, np.random.default_rng(5), 20.0)
     np.testing.assert_array_equal(path, again)
     np.testing.assert_array_equal(path[[0, -1]], ends)
     low, high = arm.joint_range.T

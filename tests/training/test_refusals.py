@@ -159,10 +159,6 @@ def sensed(**changes):
     ViaRank("ViaRankPolicy", ViaVecEnv(SENSED, 1)).predict(observation)
 
 
-def shorter():
-    return dataclasses.replace(registered_task(SENSED).sensor, range=0.4)
-
-
 def revising(**changes):
     return ViaQ("ViaQPolicy", ViaVecEnv(MOVING, 1), **changes)
 
@@ -260,7 +256,9 @@ CALLS = [
     lambda: ViaQ("ViaQPolicy", make_vec_env("Pendulum-v1")),
     *(lambda wrapper=wrapper: ViaQ("ViaQPolicy", make_vec_env(PLANE, 2, wrapper_class=wrapper))
       for wrapper in (FlattenObservation, lambda env: RescaleAction(env, np.float32(-2), np.float32(2)))),
-    lambda: evaluate(load_agent(SENSED), scenes="validation", n_scenes=2, env_kwargs={"sensor": shorter()}),
+    lambda: evaluate(load_agent(SENSED), scenes="validation", n_scenes=2, env_kwargs={
+        "sensor": dataclasses.replace(registered_task(SENSED).sensor, range=0.4),
+    }),
     *(lambda changes=changes: evaluate(PLANE, scenes="validation", n_scenes=2, env_kwargs=changes)
       for changes in ({"shapes": ["box", "cylinder"]}, {"duration_range": (0.3, 0.6)}, {"n_obstacles": 8})),
     *(lambda wrapped=wrapped: ViaQ("ViaQPolicy", wrapped)

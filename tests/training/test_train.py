@@ -253,17 +253,10 @@ class Heard(BaseCallback):
         self.ended += 1
 
 
-@pytest.mark.parametrize(
-    ("given", "env_id", "arm"),
-    [
-        ({}, PLANE, "planar"),
-        ({"arm": "panda"}, PANDA, "panda"),
-        ({"arm": "panda", "env": PLANE}, PLANE, "panda"),
-    ],
-)
-def test_an_environment_that_is_named_keeps_its_id_with_any_arm(given, env_id, arm):
-    config = TrainConfig(**given)
-    assert (config.env, config.task.arm.name) == (env_id, arm)
+@pytest.mark.parametrize(("given", "env_id"), [({}, PANDA), ({"env": PLANE}, PLANE)])
+def test_an_environment_that_is_named_keeps_its_id_with_any_arm(given, env_id):
+    config = TrainConfig(arm="panda", **given)
+    assert (config.env, config.task.arm.name) == (env_id, "panda")
 
 
 def test_a_run_keeps_its_settings_when_the_presets_change(tmp_path, monkeypatch):
