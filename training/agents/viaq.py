@@ -39,8 +39,8 @@ from viapoint.training.planning.problem import Numbers, Problem, moves_of
 from viapoint.training.planning.search import best_of, merits, refined_actions
 from viapoint.training.vec_env import ELAPSED
 
-# Margin by which chosen plans are farther from contact than is predicted, [m]: the best of many predictions is too high.
-# Of 0 to .02, it solved most of the `validation` scenes that are hardest, with little more jerk.
+# Distance by which chosen plans are farther from contact than the critic asks for, [m]: the best of many predictions is
+# too high. It costs up to 15 % of jerk.
 CAUTION = 0.01
 KEEP = 0.1  # Minimum gain of Q for which a running plan is revised
 # Least distance of the via-points of two candidates that are refined, in the action space. Of .2 to 1.8, .5 solved most
