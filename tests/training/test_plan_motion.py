@@ -647,7 +647,7 @@ def test_narrow_passages_that_a_search_finds_are_planned() -> None:
 def test_without_the_library_its_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl.base", None)
     ompl_paths._ompl.cache_clear()
-    with pytest.raises(ValueError, match=r"pip install 'viapoint\[planning\]'"):
+    with pytest.raises(ValueError, match=r"pip install '\.\[planning\]'"):
         make_method("ompl", PLANE)
 
 
