@@ -45,11 +45,9 @@ DEFAULT_VELOCITY_LIMIT = 2.0  # Velocity limit of joints without one, [rad/s] or
 WEIGHTS, ACCELERATION, LEAST_TORQUE = 3.0, 5.0, 1.0
 """Torque limit of joints without one: multiple of what gravity needs, acceleration [rad/s^2], and least one, [N m]."""
 WEIGHED = 200  # Number of configurations in which the arm is weighed
-NEAR_LOOKED_AT = (
-    1000  # Number of configurations in which contacts of bodies that are always near are looked for
-)
+NEAR_LOOKED_AT = 1000  # Number of configurations in which bodies that are always near are looked at
 NEAR = 0.03  # Distance within which bodies are near in at least half of the configurations, [m]
-FINEST = 0.005  # Least tolerance, [m]
+LEAST_TOLERANCE = 0.005  # Least tolerance of fitted capsules, [m]
 STUCK = 100.0  # Damping beyond which a joint hardly moves: torque at full speed over the limit
 # Greatest range of a hinge, [rad], and length of an arm, [m], that are not taken for degrees or millimetres
 MOST_TURNS, LONGEST = 8.0 * np.pi, 20.0
@@ -60,7 +58,7 @@ MAX_TOLERANCE = 1.0  # Greatest tolerance of fitted capsules, [m]
 # Distance at home that capsules leave between bodies, as a share of that of the geoms, and at most, [m]
 LEFT_SHARE, LEFT_MOST = 0.25, 0.002
 LEAST_EXCESS = 0.001  # Excess of capsules below which they are not split, [m]
-# Distance of bodies in other configurations that capsules leave free, too, and excess below which they do not, [m]
+# Distance of bodies in other configurations at which their capsules are split, too, and least excess for that, [m]
 PASSING, WORTH = 0.005, 0.004
 SHORT = 1e-5  # Length of a capsule that is written as a sphere around it, [m]
 MIN_INERTIA = 1e-12  # Least principal moment of inertia of a body, [kg m^2]
@@ -166,7 +164,7 @@ def load_arm(
         "joint_range": joint_range,
         "torque_limit": torque_limit,
         "velocity_limit": velocity_limit,
-        "tolerance": number_of_at_least("tolerance", tolerance, FINEST, MAX_TOLERANCE),
+        "tolerance": number_of_at_least("tolerance", tolerance, LEAST_TOLERANCE, MAX_TOLERANCE),
     }
     notes = list(urdf.notes)
     whole = _compiled(spec, notes)
