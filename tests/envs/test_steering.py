@@ -16,11 +16,7 @@ from viapoint.envs.scenes.scene import NEVER
 
 def steering(timestep=0.002, physics_steps=20):
     return Steering(
-        names=("x", "y"),
-        top_speed=(1.5, 1.5),
-        bandwidth=25.0,
-        physics_steps=physics_steps,
-        timestep=timestep,
+        names=("x", "y"), top_speed=(1.5, 1.5), bandwidth=25.0, physics_steps=physics_steps, timestep=timestep
     )
 
 

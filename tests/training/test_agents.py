@@ -46,10 +46,9 @@ from viapoint.training.rollout import SceneSimulation
 from viapoint.training.scene_sets import scenes_for
 
 FEW = {"width": 8, "instants": 8, "candidates": 32, "refinements": 1, "per_refinement": 16}
-SMALL = {"learning_starts": 16, "batch_size": 8, "gradient_steps": 1}
-SMALL |= {"explore_candidates": 16, "policy_kwargs": FEW}
-NUMBER = 12
-"""Number of scenes in which policies are compared."""
+SMALL = {"learning_starts": 16, "batch_size": 8, "gradient_steps": 1, "explore_candidates": 16}
+SMALL["policy_kwargs"] = FEW
+NUMBER = 12  # Number of scenes in which policies are compared
 
 
 def model_on(env, **kwargs):
@@ -129,14 +128,12 @@ def test_the_least_and_the_most_of_each_setting_can_be_learned_with(made, env_id
     model = model_on(env, **settings).learn(32)
     assert model._n_updates > 0
     assert torch.isfinite(weights(model)).all()
-    actions = model.predict(env.reset())[0]
-    assert (np.abs(actions) <= 1.0).all()
+    assert (np.abs(model.predict(env.reset())[0]) <= 1.0).all()
 
 
 def test_a_training_that_would_change_nothing_is_told(made):
-    env = made()
     with pytest.warns(UserWarning, match="8 decisions"):
-        assert model_on(env, learning_starts=16).learn(8)._n_updates == 0
+        assert model_on(made(), learning_starts=16).learn(8)._n_updates == 0
 
 
 @pytest.fixture(scope="module")
@@ -174,11 +171,8 @@ def test_as_many_proposals_are_checked_as_one_says(learned):
 
 def test_the_outcome_is_known_only_where_the_terms_sum_to_the_reward():
     info = dict(zip(TERMS, (1.0, 0.0, 0.1, 0.0, -0.2, -0.3, 0.0), strict=True))
-    found = viaq.Outcomes(*viaq.outcome_of(info, 0.6))
-    told = (found.success, found.contact, found.clearance, found.goal_error, found.effort_terms)
-    np.testing.assert_allclose(told, (1.0, 0.0, 0.1, 0.0, -0.5))
-    assert np.isnan(viaq.outcome_of(info, 0.7)).all()
-    assert np.isnan(viaq.outcome_of({}, 0.6)).all()
+    np.testing.assert_allclose(viaq.outcome_of(info, 0.6), (1.0, 0.0, 0.1, 1.0, 0.0, -0.5))
+    assert np.isnan([viaq.outcome_of(info, 0.7), viaq.outcome_of({}, 0.6)]).all()
 
 
 def test_refinement_solves_more_than_as_many_checks(made):
@@ -537,6 +531,23 @@ def test_without_terms_only_the_sum_is_learned_from(small):
     assert all(loss.item() == 0.0 for name, loss in losses.items() if name != "reward")
     model.train(20, 16)
     assert not torch.equal(before, model.policy.critic.pairs.layers[0].weight)
+
+
+def test_each_decision_is_looked_at_once_however_often_it_is_learned_from(small, monkeypatch):
+    model = small(MOVING, n_obstacles=1)[0].learn(64)
+    model.train(40, 64)
+    monkeypatch.setattr(viaq.ViaQPolicy, "inputs", None)
+    model.train(1, 64)
+
+
+def test_a_clearance_that_is_predicted_too_high_weighs_more(small):
+    outcomes = viaq.Outcomes(*torch.tensor([[0.0], [0.0], [0.0], [1.0], [0.0], [0.0]]))
+
+    def loss(margin):
+        values = viaq.Values(*torch.full((6, 1), margin))
+        return small(PLANE)[0]._clearance_loss(values, outcomes, torch.ones(1)).item()
+
+    assert loss(0.004) / loss(-0.004) == pytest.approx(viaq.TOO_HIGH)
 
 
 def test_what_follows_counts_only_where_an_episode_goes_on(small):

@@ -56,10 +56,6 @@ class Pairs(NamedTuple):
     self_clearance: Tensor
     inside: Tensor  # True for movements within reach and joint ranges, shape (B, H)
 
-    def to(self, device: torch.device) -> Pairs:
-        """Return the same pairs on a device."""
-        return Pairs(*(each.to(device) for each in self))
-
 
 def pairs_of(
     task: Task,

@@ -8,7 +8,7 @@ reward that `info` reports; training computes no distance to an obstacle.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils._pytree import tree_leaves, tree_map
 
 from viapoint.envs.common.arrays import Float, Observation, Single, norm
 from viapoint.envs.outcome import SETTLING
@@ -39,9 +40,9 @@ from viapoint.training.planning.problem import Numbers, Problem, moves_of
 from viapoint.training.planning.search import best_of, merits, refined_actions
 from viapoint.training.vec_env import ELAPSED
 
-# Distance by which chosen plans are farther from contact than the critic asks for, [m]: the best of many predictions is
-# too high. It costs up to 15 % of jerk.
-CAUTION = 0.01
+# Weight of a clearance that was predicted too high, where one that was too low has 1: the policy takes the best of many
+# predictions, among which those that are too high gather (an asymmetric loss, as in expectile regression).
+TOO_HIGH = 4.0
 KEEP = 0.1  # Minimum gain of Q for which a running plan is revised
 # Least distance of the via-points of two candidates that are refined, in the action space. Of .2 to 1.8, .5 solved most
 # of the `validation` scenes of PandaObstacles.
@@ -139,14 +140,7 @@ class ViaQPolicy(PlanPolicy):
         instants = np.linspace(0, INSTANTS - 1, min(self.instants, INSTANTS)).round().astype(np.int64)
         pairs = pairs_of(self.task, problem, moves, instants, until)
         ends = seen_ends(self.task, problem)
-        # Geometry is computed on the processor, the networks may be on another device.
-        device = self.device
-        return PlanInputs(
-            _tensor(ends).to(device),
-            _tensor(actions).to(device),
-            _tensor(effort).to(device),
-            pairs.to(device),
-        )
+        return PlanInputs(_tensor(ends), _tensor(actions), _tensor(effort), pairs)
 
     @torch.inference_mode()
     def values(self, problem: Problem, actions: Numbers) -> Numbers:
@@ -154,9 +148,7 @@ class ViaQPolicy(PlanPolicy):
 
         In replanning tasks a first action of zero, which keeps the plan, gets a bonus of KEEP.
         """
-        found = self.critic(self.inputs(problem, actions))
-        sharpness = torch.exp(self.critic.slope[0])
-        found = found._replace(no_contact=found.no_contact - CAUTION * sharpness)
+        found = self.critic(self.inputs(problem, actions).to(self.device))
         values: Numbers = self.critic.merit(found).cpu().numpy()
         if self.replanning:
             values[:, 0] += np.where((actions[:, 0] == 0.0).all(axis=-1), KEEP, 0.0)
@@ -347,18 +339,13 @@ class ViaQ(PlanAlgorithm):
 
     def _losses(self, batch: OutcomeSamples) -> dict[str, Tensor]:
         """Return the losses of the predictions of the critic by name."""
-        policy, critic = self.policy, self.policy.critic
-        until = None
-        if policy.replanning:
-            # After a contact, the clearance is that of the movement up to the next decision.
-            until = batch.elapsed + policy.task.horizon * (batch.outcomes.contact > 0.5)
-            until = until[:, None].astype(np.float64)
-        problem = Problem.of_observation(batch.observations, policy.task)
-        inputs = policy.inputs(problem, batch.actions[:, None], until)
+        policy, critic, buffer = self.policy, self.policy.critic, self.replay_buffer
+        assert buffer is not None
+        device = policy.device
+        inputs = buffer.plans(batch.at, self._inputs).to(device)
         critic.pairs.note_sizes(inputs.pairs)
         values = Values(*(each[:, 0] for each in critic(inputs)))
-        following = self._following(batch)
-        device = policy.device
+        following = self._following(batch.at)
         ended = torch.from_numpy(batch.ended).to(device)
         goes_on = (1.0 - ended) * self.gamma if following is not None else torch.zeros_like(ended)
         known = torch.from_numpy(np.isfinite(batch.outcomes.success)).to(device)
@@ -393,21 +380,40 @@ class ViaQ(PlanAlgorithm):
         own = critic.clearance_term(values.self_clearance).detach()
         obstacles = (outcomes.lower > 0.5) & (outcomes.clearance < own - OWN_SHARE * weight)
         apart = torch.where(obstacles, apart, apart.clamp(max=0.0))
-        return _mean(_smooth_l1(apart, torch.zeros_like(apart), beta=0.2), known)
+        weight_of_error = torch.where(apart > 0.0, TOO_HIGH, 1.0)
+        return _mean(weight_of_error * _smooth_l1(apart, torch.zeros_like(apart), beta=0.2), known)
+
+    def _inputs(self, at: At) -> PlanInputs:
+        """Return the critic's inputs for stored decisions."""
+        policy, buffer = self.policy, self.replay_buffer
+        assert buffer is not None
+        until = None
+        if policy.replanning:
+            # After a contact, the clearance is that of the movement up to the next decision.
+            contact = buffer.outcomes[at][:, Outcomes._fields.index("contact")] > 0.5
+            until = (buffer.elapsed[at] + policy.task.horizon * contact)[:, None].astype(np.float64)
+        observations = {name: part[at] for name, part in buffer.observations.items()}
+        problem = Problem.of_observation(observations, policy.task)
+        return policy.inputs(problem, buffer.actions[at][:, None], until)
+
+    def _next_inputs(self, at: At) -> PlanInputs:
+        """Return the critic's inputs for a few candidates after stored decisions; the first one keeps the plan."""
+        policy, buffer = self.policy, self.replay_buffer
+        assert buffer is not None
+        every = candidate_actions(policy.task, policy.candidates, replanning=True)
+        number = at[0] * buffer.n_envs + at[1]  # other candidates for each decision, but always the same
+        chosen = (number[:, None] * self.next_candidates + np.arange(self.next_candidates)) % len(every)
+        chosen[:, 0] = 0
+        observations = {name: part[at] for name, part in buffer.next_observations.items()}
+        return policy.inputs(Problem.of_observation(observations, policy.task), every[chosen])
 
     @torch.no_grad()
-    def _following(self, batch: OutcomeSamples) -> Values | None:
-        """Return the predictions of the target critic for the best of a few candidates after each decision."""
-        policy, critic = self.policy, self.policy.critic_target
-        if critic is None or not self.gamma:
+    def _following(self, at: At) -> Values | None:
+        """Return the predictions of the target critic for the best of a few candidates after stored decisions."""
+        critic, buffer = self.policy.critic_target, self.replay_buffer
+        if critic is None or buffer is None or not self.gamma:
             return None
-        every = candidate_actions(policy.task, policy.candidates, replanning=True)
-        shape = len(batch.ended), self.next_candidates
-        chosen = np.random.randint(min(1, len(every) - 1), len(every), size=shape)  # noqa: NPY002 - as SB3
-        chosen[:, 0] = 0  # the action that keeps the plan
-        values = critic(
-            policy.inputs(Problem.of_observation(batch.next_observations, policy.task), every[chosen])
-        )
+        values = critic(buffer.next_plans(at, self._next_inputs).to(self.policy.device))
         worth = critic.value(values)
         worth[:, 0] += KEEP  # as the policy prefers it
         best = worth.argmax(dim=1, keepdim=True)
@@ -453,6 +459,9 @@ def _smooth_l1(values: Tensor, target: Tensor, beta: float) -> Tensor:
 ALGORITHMS["viaq"] = ViaQ
 
 
+At = tuple[NDArray[np.int64], NDArray[np.int64]]  # Rows of a replay buffer, and environments, shape (B,) each
+
+
 class Outcomes(NamedTuple):
     """Outcomes of N decisions, shape (N,) each; NaN if the environment reports only the sum of the terms."""
 
@@ -465,16 +474,42 @@ class Outcomes(NamedTuple):
 
 
 class OutcomeSamples(NamedTuple):
-    """Sampled decisions: B observations by name, actions of shape (B, m), all other fields of shape (B,)."""
+    """Sampled decisions, all fields of shape (B,)."""
 
-    observations: dict[str, Single]
-    actions: Single
-    next_observations: dict[str, Single]
+    at: At
     ended: Single
     reward: Single
-    # Duration of the executed part of the plan, [s]; infinite if the plan was executed to its end
-    elapsed: Single
     outcomes: Outcomes
+
+
+class SeenPlans:
+    """Critic's inputs for stored decisions, computed once for each of them, as many updates learn from it.
+
+    Args:
+        shape: Numbers of rows and of environments of a replay buffer.
+    """
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.known = np.zeros(shape, np.bool_)
+        self._inputs: PlanInputs | None = None
+
+    def __call__(self, at: At, look: Callable[[At], PlanInputs]) -> PlanInputs:
+        """Return the inputs for some decisions; `look` computes those that are not known yet."""
+        new = ~self.known[at]
+        if new.any():
+            some = at[0][new], at[1][new]
+            found = look(some)
+            if self._inputs is None:
+                self._inputs = tree_map(self._room, found)
+            for kept, part in zip(tree_leaves(self._inputs), tree_leaves(found), strict=True):
+                kept[some] = part
+            self.known[some] = True
+        inputs: PlanInputs = tree_map(lambda kept: kept[at], self._inputs)
+        return inputs
+
+    def _room(self, part: Tensor) -> Tensor:
+        """Return room for a part of the inputs, which is given for some decisions, for all of them."""
+        return part.new_zeros((*self.known.shape, *part.shape[1:]))
 
 
 class OutcomeReplayBuffer(DictReplayBuffer):
@@ -487,6 +522,8 @@ class OutcomeReplayBuffer(DictReplayBuffer):
         self.outcomes = np.full(
             (self.buffer_size, self.n_envs, len(Outcomes._fields)), np.nan, dtype=np.float32
         )
+        # Of the decisions, and of candidates after them
+        self.plans, self.next_plans = (SeenPlans((self.buffer_size, self.n_envs)) for _ in range(2))
 
     def add(
         self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]
@@ -496,6 +533,8 @@ class OutcomeReplayBuffer(DictReplayBuffer):
         for i, info in enumerate(infos):
             self.elapsed[self.pos, i] = info.get(ELAPSED, np.inf)
             self.outcomes[self.pos, i] = outcome_of(info, float(reward[i]), before[i])
+        for seen in (self.plans, self.next_plans):
+            seen.known[self.pos] = False
         super().add(obs, next_obs, action, reward, done, infos)
 
     def begin(self) -> None:
@@ -516,12 +555,9 @@ class OutcomeReplayBuffer(DictReplayBuffer):
         rows = np.random.randint(0, self.size(), size=batch_size)  # noqa: NPY002 - as SB3
         at = rows, np.random.randint(0, self.n_envs, size=batch_size)  # noqa: NPY002
         return OutcomeSamples(
-            {name: part[at] for name, part in self.observations.items()},
-            self.actions[at],
-            {name: part[at] for name, part in self.next_observations.items()},
+            at,
             np.asarray(self.dones[at] * (1.0 - self.timeouts[at]), dtype=np.float32),
             self.rewards[at],
-            self.elapsed[at],
             Outcomes(*self.outcomes[at].T),
         )
 
@@ -564,6 +600,11 @@ class PlanInputs(NamedTuple):
     actions: Tensor  # Shape (B, H, m)
     effort: Tensor  # Shape (B, H, EFFORT)
     pairs: Pairs  # Nearest pairs of spheres and obstacles
+
+    def to(self, device: torch.device) -> PlanInputs:
+        """Return the same inputs on a device; geometry is computed on the processor, networks may be elsewhere."""
+        moved: PlanInputs = tree_map(lambda part: part.to(device), self)
+        return moved
 
 
 class _Saturated(torch.autograd.Function):

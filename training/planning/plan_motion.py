@@ -87,6 +87,7 @@ ROUNDS = 6  # Number of durations that are tried in motion and among moving obst
 # Factor from one of these durations to the next, and from the straight movement to the first
 LONGER = 1.3
 SPARE = 1e-3  # Clearance that movements keep beyond the margin where their ends have it, [m]
+COARSE = 0.01  # Excess of an arm's spheres above which a contact may be one of the spheres only, [m]
 ROUNDING = 1e-6  # Rounding error of clearances, [m]
 # Required clearances of a path of OMPL in each attempt, until one can be made smooth, [m]
 OMPL_MARGINS = (0.010, 0.004, 0.001, 0.001)
@@ -514,7 +515,11 @@ def _fault(problem: _Problem) -> tuple[str, float]:
             called = f" {problem.names[row]!r}" if problem.names and problem.names[row] else ""
             touches = "in contact with" if apart < 0.0 else "nearer than the margin to"
             which = f"the {name} is {touches} obstacle {row}{called}"
-        return f"{which}, clearance {1e3 * apart:.1f} mm", most
+        which += f", clearance {1e3 * apart:.1f} mm"
+        if arm.excess > COARSE and -arm.excess < apart < 0.0:
+            reach = f"spheres reach up to {1e3 * arm.excess:.0f} mm beyond the arm's geoms"
+            which += f" ({reach}; load_arm(..., tolerance=0.005) brings most of them closer)"
+        return which, most
     if problem.in_motion:
         moving = joint_motion(space, ends[:1], problem.velocity[None], problem.acceleration[None])
         torque = motion_torques(arm.chain, *moving)[0]
