@@ -354,12 +354,14 @@ class ViaQ(PlanAlgorithm):
         if following is not None:
             arrival = torch.where(ended > 0.5, arrival, self.gamma * torch.sigmoid(following.arrival))
             effort = effort + goes_on * following.effort_terms
-        carried_out = known & ((contact + outcomes.success > 0.0) | (ended < 0.5))
+        # The effort of a movement that stops early is not that of the plan.
+        planned = known & ((outcomes.success > 0.5) | (ended < 0.5))
+        carried_out = planned | (known & (contact > 0.5))
         losses = {
             "clearance": self._clearance_loss(values, outcomes, known),
             "contact": CONTACT_WEIGHT * _mean(_cross_entropy(values.no_contact, 1.0 - contact), carried_out),
             "arrival": _mean(_cross_entropy(values.arrival, arrival), known & (contact < 0.5)),
-            "effort": 10.0 * _mean(_smooth_l1(values.effort_terms, effort, beta=0.1), known),
+            "effort": 10.0 * _mean(_smooth_l1(values.effort_terms, effort, beta=0.1), planned),
         }
         if not bool(known.all()):
             target = torch.from_numpy(batch.reward).to(device)
