@@ -34,7 +34,7 @@ from viapoint.envs.rewards import TERMS
 from viapoint.training import GeometrySearch, ViaQ, ViaRank, ViaVecEnv, evaluate, load_agent
 from viapoint.training.agents import viaq
 from viapoint.training.agents.agent import SAC
-from viapoint.training.agents.pairs import CLEAR, LENGTHS, NO_OBSTACLE, pairs_of
+from viapoint.training.agents.pairs import CLEAR, LENGTHS, NO_OBSTACLE, REFINED, pairs_of
 from viapoint.training.planning.baselines import agent_method
 from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.candidates import best_duration, candidate_actions, sobol_actions
@@ -167,7 +167,7 @@ def test_as_many_proposals_are_checked_as_one_says(learned):
 
 def test_the_outcome_is_known_only_where_the_terms_sum_to_the_reward():
     info = dict(zip(TERMS, (1.0, 0.0, 0.1, 0.0, -0.2, -0.3, 0.0), strict=True))
-    np.testing.assert_allclose(viaq.outcome_of(info, 0.6), (1.0, 0.0, 0.1, 1.0, 0.0, -0.5))
+    np.testing.assert_allclose(viaq.outcome_of(info, 0.6), (1.0, 0.0, 0.1, 1.0, -0.5))
     assert np.isnan([viaq.outcome_of(info, 0.7), viaq.outcome_of({}, 0.6)]).all()
 
 
@@ -226,12 +226,14 @@ def test_margins_do_not_depend_on_the_order_of_obstacles_and_are_constant_withou
     assert (margins(policy, empty) == NO_OBSTACLE).all()
 
 
-def test_the_margin_is_the_least_of_the_margins_from_each_obstacle():
-    task = registered_task(PLANE)
-    policy, problem = policy_of(task), problem_of(task, NUMBER)
+def test_the_nearest_pairs_of_a_movement_are_among_those_of_each_obstacle():
+    task, problem, _, moves = movements(PANDA)
     rows = range(problem.obstacles.kind.shape[1])
-    alone = [margins(policy, with_rows(problem, [row])) for row in rows]
-    np.testing.assert_allclose(margins(policy, problem), np.min(alone, axis=0), atol=1e-5)
+    alone = [pairs_of(task, with_rows(problem, [row]), moves, EVERY).features for row in rows]
+    found = pairs_of(task, problem, moves, EVERY)
+    first = found.features[:, :, :REFINED, None]  # others are not moved to their closest approach
+    same = (first == torch.cat(alone, dim=2)[:, :, None]).all(dim=-1).any(dim=-1)
+    assert same[found.present[:, :, :REFINED]].all()
 
 
 @pytest.mark.parametrize("env_id", [PLANE, PANDA])
@@ -537,7 +539,7 @@ def test_each_decision_is_looked_at_once_however_often_it_is_learned_from(small,
 
 
 def test_a_clearance_that_is_predicted_too_high_weighs_more(small):
-    outcomes = viaq.Outcomes(*torch.tensor([[0.0], [0.0], [0.0], [1.0], [0.0], [0.0]]))
+    outcomes = viaq.Outcomes(*torch.tensor([[0.0], [0.0], [0.0], [1.0], [0.0]]))
 
     def loss(margin):
         values = viaq.Values(*torch.full((6, 1), margin))
@@ -546,18 +548,23 @@ def test_a_clearance_that_is_predicted_too_high_weighs_more(small):
     assert loss(0.004) / loss(-0.004) == pytest.approx(viaq.TOO_HIGH)
 
 
-def test_what_follows_counts_only_where_an_episode_goes_on(small):
-    model, _ = small(MOVING, n_obstacles=1)
-    model.learn(128)
+def effort_loss(model, ended, success=1.0):
+    np.random.seed(0)  # noqa: NPY002 - of the replay buffer
     batch = model.replay_buffer.sample_outcomes(64)
+    outcomes = batch.outcomes._replace(success=np.full_like(batch.ended, success))
+    some = batch._replace(ended=np.full_like(batch.ended, ended), outcomes=outcomes)
+    return model._losses(some)["effort"].item()
 
-    def effort(ended, gamma, success=1.0):
-        model.gamma, outcomes = gamma, batch.outcomes._replace(success=np.full_like(batch.ended, success))
-        some = batch._replace(ended=np.full_like(batch.ended, ended), outcomes=outcomes)
-        return model._losses(some)["effort"].item()
 
-    assert effort(1.0, 0.5) == effort(1.0, 1.0) != effort(0.0, 1.0)
-    assert effort(1.0, 1.0, success=0.0) == 0.0  # one that stops early costs less than its plan
+def test_what_follows_counts_only_where_an_episode_goes_on(small):
+    model = small(MOVING, n_obstacles=1)[0].learn(128)
+    goes_on, over = effort_loss(model, 0.0), effort_loss(model, 1.0)
+    assert effort_loss(model, 1.0, success=0.0) == over
+    model.gamma = 0.5
+    assert effort_loss(model, 1.0) == over
+    assert effort_loss(model, 0.0) != goes_on
+    whole = small(PLANE)[0].learn(64)  # one that stops early says nothing about its plan
+    assert effort_loss(whole, 1.0, success=0.0) == 0.0 < effort_loss(whole, 1.0)
 
 
 @pytest.mark.parametrize("temperature", [1e-3, 1e6])

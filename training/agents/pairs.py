@@ -22,13 +22,13 @@ from stable_baselines3.common.torch_layers import create_mlp
 from torch import Tensor, nn
 
 from viapoint.envs.common.arrays import Bool, Float, Int
-from viapoint.envs.geometry.clearance import Placed, place_group, self_clearance
+from viapoint.envs.geometry.clearance import Placed, place, place_group, self_clearance
 from viapoint.envs.geometry.compiled import compiled, inner, kernel
 from viapoint.envs.geometry.obstacles import ABSENT, KINDS, Obstacles, bounding_boxes
 from viapoint.envs.geometry.shapes import IN_TABLES, PLAIN_KINDS
 from viapoint.envs.task import Task
-from viapoint.training.planning.movements import INSTANTS, Setting, memory_of
-from viapoint.training.planning.problem import Moves, Problem, place_at, setting_of
+from viapoint.training.planning.movements import INSTANTS, Setting, joints_at, memory_of, place_hand
+from viapoint.training.planning.problem import Moves, Problem, movement_of, place_at, setting_of
 
 SCALE = 8.0  # Scale of lengths at the input of the network, [1/m]
 UNIT = 0.05  # Length of one output unit of the network, [m]
@@ -111,6 +111,7 @@ class Work(NamedTuple):
 
     position: Float  # Shape (D,)
     joints: Float  # Shape (J,)
+    path: Float  # Joints at each instant that is looked at, or positions if the hand is alone, shape (N, J)
     placed: Placed
     places: Float  # A sphere in the frame of an obstacle before, at and after its closest instant, shape (3, 3), [m]
     local: Float  # Shape (3,), [m]
@@ -216,6 +217,123 @@ def _along(places: Float, share: float, local: Float) -> None:
         local[axis] = places[1, axis] + share * (slope + share * curve)
 
 
+class Nearest(NamedTuple):
+    """Nearest pair of each obstacle and group of spheres: by its box, and by this box with round edges."""
+
+    gap: Float  # Gaps between sphere and box, shape (2, n, G), [m]
+    sphere: Int  # Spheres, shape (2, n, G)
+    instant: Int  # Instants, shape (2, n, G)
+    smallest: Float  # Smallest gaps in increasing order, shape (NEAREST,), [m]
+
+
+@inner
+def _largest_seen(nearest: Nearest) -> float:
+    """Return the largest gap of the NEAREST pairs so far: the network does not see others, [m]."""
+    smallest = nearest.smallest
+    smallest[:] = NOWHERE
+    for gap in nearest.gap.flat:
+        place = NEAREST
+        while place > 0 and gap < smallest[place - 1]:
+            place -= 1
+            if place + 1 < NEAREST:
+                smallest[place + 1] = smallest[place]
+        if place < NEAREST:
+            smallest[place] = gap
+    largest: float = smallest[-1]
+    return largest
+
+
+@inner
+def _look(
+    given: Given,
+    b: int,
+    row: int,
+    group: int,
+    instant: int,
+    time: float,
+    largest: float,
+    work: Work,
+    nearest: Nearest,
+) -> None:
+    """Keep the sphere of a group that is nearest to an obstacle at an instant, if it is nearer than those before.
+
+    Gaps above the `largest` that matters may be missed, [m].
+    """
+    spheres, placed, half = given.setting.spheres, work.placed, given.half[b, row]
+    _local(given, b, row, placed.ball[group], time, work.local)
+    bound = _gap(work.local, half, 0) - spheres.ball_radius[group]
+    if bound >= min(largest, max(nearest.gap[0, row, group], nearest.gap[1, row, group])):
+        return
+    place_group(spheres, group, placed)
+    for sphere in range(spheres.first[group], spheres.first[group + 1]):
+        _local(given, b, row, placed.centre[sphere], time, work.local)
+        for rounded in range(2):
+            apart = _gap(work.local, half, rounded) - spheres.radius[sphere]
+            if apart < nearest.gap[rounded, row, group]:
+                nearest.gap[rounded, row, group] = apart
+                nearest.sphere[rounded, row, group] = sphere
+                nearest.instant[rounded, row, group] = instant
+
+
+@inner
+def _number_that_count(
+    given: Given, b: int, h: int, instants: Int, until: float, work: Work
+) -> tuple[int, bool]:
+    """Fill in the path, and return the number of first instants that count, and False if it then leaves the reach."""
+    movement = movement_of(given.moves, b, h)
+    here = work.position if given.setting.hand_alone else work.joints
+    for k in range(len(instants)):
+        if k > 0 and movement.duration * instants[k] / (INSTANTS - 1) > until:
+            return k, True
+        if not joints_at(given.setting, movement, instants[k], work.position, work.joints):
+            return k, False
+        for axis in range(len(here)):
+            work.path[k, axis] = here[axis]
+    return len(instants), True
+
+
+@inner
+def _look_at_all(
+    given: Given, b: int, h: int, instants: Int, least: Float, work: Work, nearest: Nearest
+) -> None:
+    """Fill in the nearest pairs of a movement at instants within reach, and its least clearance from itself.
+
+    Neighbours come late, so that most parts of the arm are soon known to be farther away than before, and the start,
+    where nothing is near, is last.
+    """
+    setting, moves, kinds = given.setting, given.moves, given.obstacles.kind
+    order, spheres = moves.table.order, setting.spheres
+    for i in range(1, len(order) + 1):
+        k = order[i % len(order)]
+        if k >= len(instants):
+            continue
+        if setting.hand_alone:
+            place_hand(work.path[k], work.placed)
+        else:
+            place(setting.chain, spheres, work.path[k], work.placed)
+        least[b, h] = self_clearance(spheres, work.placed, least[b, h], -CLEAR)
+        time = moves.duration[b, h] * instants[k] / (INSTANTS - 1)
+        largest = _largest_seen(nearest)
+        for row in range(kinds.shape[1]):
+            for group in range(len(spheres.link)):
+                if kinds[b, row] != ABSENT and spheres.link[group] != 0:
+                    _look(given, b, row, group, instants[k], time, largest, work, nearest)
+
+
+@inner
+def _take_nearest(nearest: Nearest) -> tuple[int, int, int]:
+    """Return the nearest pair by its place in the arrays, and remove it; three times -1 if none is left."""
+    least, rounded, row, group = NOWHERE, -1, -1, -1
+    for way in range(2):
+        for i in range(nearest.gap.shape[1]):
+            for j in range(nearest.gap.shape[2]):
+                if nearest.gap[way, i, j] < least:
+                    least, rounded, row, group = nearest.gap[way, i, j], way, i, j
+    if row >= 0:
+        nearest.gap[rounded, row, group] = NOWHERE
+    return rounded, row, group
+
+
 @compiled
 def _gather(
     given: Given,
@@ -229,74 +347,37 @@ def _gather(
 ) -> None:
     """Fill in the nearest pairs of movements, see :func:`pairs_of`."""
     setting, moves, obstacles = given.setting, given.moves, given.obstacles
-    spheres = setting.spheres
     number, plans = moves.duration.shape
-    rows, groups = obstacles.kind.shape[1], len(spheres.link)
     memory = memory_of(setting, moves.table, moves.start.shape[1])
-    work = Work(memory.position, memory.joints, memory.placed, np.empty((3, 3)), np.empty(3))
-    placed, local = memory.placed, work.local
-    gap = np.empty((2, rows, groups))
-    nearest_sphere = np.empty(gap.shape, np.int64)
-    nearest_instant = np.empty(gap.shape, np.int64)
-    for b in range(number):
-        for h in range(plans):
-            gap[:] = NOWHERE
-            last = 0  # last instant that counts
-            for k in range(len(instants)):
-                instant = instants[k]
-                time = moves.duration[b, h] * instant / (INSTANTS - 1)
-                if k > 0 and time > until[b, h]:
-                    break
-                if not place_at(setting, moves, b, h, instant, work.position, work.joints, placed):
-                    inside[b, h] = False
-                    break
-                last = instant
-                least[b, h] = self_clearance(spheres, placed, least[b, h], -CLEAR)
-                for row in range(rows):
-                    if obstacles.kind[b, row] == ABSENT:
-                        continue
-                    half = given.half[b, row]
-                    for group in range(groups):
-                        if spheres.link[group] == 0:
-                            continue
-                        _local(given, b, row, placed.ball[group], time, local)
-                        bound = _gap(local, half, 0) - spheres.ball_radius[group]
-                        if bound >= max(gap[0, row, group], gap[1, row, group]):
-                            continue
-                        place_group(spheres, group, placed)
-                        for sphere in range(spheres.first[group], spheres.first[group + 1]):
-                            _local(given, b, row, placed.centre[sphere], time, local)
-                            for rounded in range(2):
-                                apart = _gap(local, half, rounded) - spheres.radius[sphere]
-                                if apart < gap[rounded, row, group]:
-                                    gap[rounded, row, group] = apart
-                                    nearest_sphere[rounded, row, group] = sphere
-                                    nearest_instant[rounded, row, group] = instant
-            for pair in range(NEAREST):
-                nearest, rounded, row, group = NOWHERE, 0, -1, -1
-                for way in range(2):
-                    for i in range(rows):
-                        for j in range(groups):
-                            if gap[way, i, j] < nearest:
-                                nearest, rounded, row, group = gap[way, i, j], way, i, j
-                if row < 0:
-                    break
-                gap[rounded, row, group] = NOWHERE
-                sphere = nearest_sphere[rounded, row, group]
-                instant = nearest_instant[rounded, row, group]
-                _place_sphere(given, b, h, row, group, sphere, instant, work, work.places[1])
-                if pair < REFINED and inside[b, h]:
-                    _go_closest(given, b, h, row, group, sphere, instant, last, rounded, work)
-                half = given.half[b, row]
-                gaps[b, h, pair] = _gap(work.places[1], half, 0)
-                kind = obstacles.kind[b, row]
-                for axis in range(3):
-                    there = work.places[1, axis]
-                    # Kinds without a table of vertices or points look the same when an axis is reversed.
-                    features[b, h, pair, axis] = there if kind in IN_TABLES else abs(there)
-                    features[b, h, pair, 3 + axis] = half[axis]
-                features[b, h, pair, 6] = spheres.radius[sphere]
-                features[b, h, pair, LENGTHS + columns[kind]] = 1.0
+    own = memory.position, memory.joints, memory.path, memory.placed
+    work = Work(*own, np.empty((3, 3)), np.empty(3))
+    gap = np.empty((2, obstacles.kind.shape[1], len(setting.spheres.link)))
+    nearest = Nearest(gap, np.empty(gap.shape, np.int64), np.empty(gap.shape, np.int64), np.empty(NEAREST))
+    for each in range(number * plans):
+        b, h = each // plans, each % plans
+        gap[:] = NOWHERE
+        count, inside[b, h] = _number_that_count(given, b, h, instants, until[b, h], work)
+        last = instants[max(count - 1, 0)]  # instant
+        _look_at_all(given, b, h, instants[:count], least, work, nearest)
+        for pair in range(NEAREST):
+            rounded, row, group = _take_nearest(nearest)
+            if row < 0:
+                break
+            sphere = nearest.sphere[rounded, row, group]
+            instant = nearest.instant[rounded, row, group]
+            _place_sphere(given, b, h, row, group, sphere, instant, work, work.places[1])
+            if pair < REFINED and inside[b, h]:
+                _go_closest(given, b, h, row, group, sphere, instant, last, rounded, work)
+            half = given.half[b, row]
+            gaps[b, h, pair] = _gap(work.places[1], half, 0)
+            kind = obstacles.kind[b, row]
+            for axis in range(3):
+                there = work.places[1, axis]
+                # Kinds without a table of vertices or points look the same when an axis is reversed.
+                features[b, h, pair, axis] = there if kind in IN_TABLES else abs(there)
+                features[b, h, pair, 3 + axis] = half[axis]
+            features[b, h, pair, 6] = setting.spheres.radius[sphere]
+            features[b, h, pair, LENGTHS + columns[kind]] = 1.0
 
 
 class PairNetwork(nn.Module):

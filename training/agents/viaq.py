@@ -354,14 +354,17 @@ class ViaQ(PlanAlgorithm):
         if following is not None:
             arrival = torch.where(ended > 0.5, arrival, self.gamma * torch.sigmoid(following.arrival))
             effort = effort + goes_on * following.effort_terms
-        # The effort of a movement that stops early is not that of the plan.
-        planned = known & ((outcomes.success > 0.5) | (ended < 0.5))
-        carried_out = planned | (known & (contact > 0.5))
+        went_on = known & ((outcomes.success > 0.5) | (ended < 0.5))
+        touched = known & (contact > 0.5)
+        # A movement that stops early takes less effort than its plan, so that failures would make rough plans cheap.
+        # Where plans are revised, they count: without them, nothing ties down the values of later decisions.
+        effort_counts = known if policy.replanning else went_on
         losses = {
             "clearance": self._clearance_loss(values, outcomes, known),
-            "contact": CONTACT_WEIGHT * _mean(_cross_entropy(values.no_contact, 1.0 - contact), carried_out),
+            "contact": CONTACT_WEIGHT
+            * _mean(_cross_entropy(values.no_contact, 1.0 - contact), went_on | touched),
             "arrival": _mean(_cross_entropy(values.arrival, arrival), known & (contact < 0.5)),
-            "effort": 10.0 * _mean(_smooth_l1(values.effort_terms, effort, beta=0.1), planned),
+            "effort": 10.0 * _mean(_smooth_l1(values.effort_terms, effort, beta=0.1), effort_counts),
         }
         if not bool(known.all()):
             target = torch.from_numpy(batch.reward).to(device)
@@ -471,7 +474,6 @@ class Outcomes(NamedTuple):
     contact: Array  # 1 if the arm touched an obstacle, otherwise 0
     clearance: Array  # Clearance term of the reward, summed over the episode so far
     lower: Array  # 1 if this decision lowered that sum, so that no earlier decision accounts for it
-    goal_error: Array  # Goal-error term of the reward
     effort_terms: Array  # Sum of the terms for smoothness and duration
 
 
@@ -575,13 +577,13 @@ def outcome_of(info: Mapping[str, Any], reward: float, before: float = np.nan) -
     terms = [float(info[name]) for name in TERMS]
     if abs(sum(terms) - reward) > REWARD_TOLERANCE:
         return unknown
-    success, collision, clearance, goal_error, smoothness, duration, _ = terms
+    success, collision, clearance, _, smoothness, duration, _ = terms
     succeeded = bool(info.get("is_success", success > 0.0))
     contact = bool(info.get("collision", collision < 0.0))
     first = bool(np.isnan(before))
     lower = first or clearance < -LOWER
     so_far = clearance if first else before + clearance
-    return float(succeeded), float(contact), so_far, float(lower), goal_error, smoothness + duration
+    return float(succeeded), float(contact), so_far, float(lower), smoothness + duration
 
 
 class Values(NamedTuple):
