@@ -34,7 +34,7 @@ from viapoint.envs.rewards import TERMS
 from viapoint.training import GeometrySearch, ViaQ, ViaRank, ViaVecEnv, evaluate, load_agent
 from viapoint.training.agents import viaq
 from viapoint.training.agents.agent import SAC
-from viapoint.training.agents.pairs import CLEAR, LENGTHS, NO_OBSTACLE, REFINED, pairs_of
+from viapoint.training.agents.pairs import CLEAR, LENGTHS, NO_OBSTACLE, pairs_of
 from viapoint.training.planning.baselines import agent_method
 from viapoint.training.planning.beliefs import Sight, thick_points
 from viapoint.training.planning.candidates import best_duration, candidate_actions, sobol_actions
@@ -78,7 +78,6 @@ def test_the_algorithm_is_used_as_those_of_stable_baselines(make, tmp_path):
 
 
 def test_a_planned_movement_is_the_one_that_an_environment_executes():
-    """Also of an observation of lists."""
     shapes = ("capsule", "box", "cylinder")
     env = gym.make(PLANE, shapes=shapes).unwrapped
     agent = ViaQ("ViaQPolicy", ViaVecEnv(PLANE, 4, seed=0, threads=1, shapes=shapes), seed=0)
@@ -111,11 +110,9 @@ def test_it_goes_on_in_other_scenes_of_its_task_only(made):
     "settings",
     [
         {"policy_kwargs": {"candidates": 1, "refinements": 0, "width": 1, "instants": 2}},
-        {"policy_kwargs": {**FEW, "per_refinement": 1, "checks": 1}},
-        {"policy_kwargs": {**FEW, "checks": 10_000}},
-        {"explore_uniformly": 0.0, "explore_candidates": 2, "next_candidates": 1},
+        {"policy_kwargs": {**FEW, "per_refinement": 1, "checks": 10_000}},
+        {"explore_uniformly": 0.0, "explore_candidates": 2, "next_candidates": 1, "gamma": 0.0},
         {"explore_uniformly": np.int64(1), "next_candidates": 500},
-        {"gamma": 0.0},
     ],
 )
 @pytest.mark.parametrize("env_id", [REACH, MOVING])
@@ -231,9 +228,8 @@ def test_the_nearest_pairs_of_a_movement_are_among_those_of_each_obstacle():
     rows = range(problem.obstacles.kind.shape[1])
     alone = [pairs_of(task, with_rows(problem, [row]), moves, EVERY).features for row in rows]
     found = pairs_of(task, problem, moves, EVERY)
-    first = found.features[:, :, :REFINED, None]  # others are not moved to their closest approach
-    same = (first == torch.cat(alone, dim=2)[:, :, None]).all(dim=-1).any(dim=-1)
-    assert same[found.present[:, :, :REFINED]].all()
+    same = (found.features[:, :, :, None] == torch.cat(alone, dim=2)[:, :, None]).all(dim=-1)
+    assert same.any(dim=-1)[found.present].all()
 
 
 @pytest.mark.parametrize("env_id", [PLANE, PANDA])
@@ -602,16 +598,16 @@ def test_candidates_are_different_allowed_and_begin_with_the_straight_movement(e
     assert slope == pytest.approx(task.weights.duration, rel=0.05)
 
 
-def test_the_nearest_pairs_are_those_of_the_closest_approach_between_the_instants():
+def test_the_nearest_pairs_are_those_of_the_closest_approach():
     task, problem, _, _ = movements(PLANE, 60, shapes=("box",))
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 32, task.action.size))
-    pairs = pairs_of(task, problem, moves_of(task, problem, actions), np.arange(0, INSTANTS, 3))
+    pairs = pairs_of(task, problem, moves_of(task, problem, actions), EVERY)
     radius = pairs.features[..., 6]
     nearest = torch.where(pairs.present, pairs.distance - radius, 1.0).amin(dim=-1).numpy()
     clearance = plan_clearances(task, problem, actions, 0.02, -0.05, exact=True)
     near = (np.abs(clearance) < 0.01) & pairs.inside.numpy()
     assert near.sum() > 100
-    assert np.quantile(np.abs(nearest - clearance)[near], 0.95) < 1e-3
+    assert np.quantile(np.abs(nearest - clearance)[near], 0.95) < 1.5e-3
 
 
 @pytest.fixture(scope="module")

@@ -27,15 +27,11 @@ from viapoint.envs.geometry.compiled import compiled, inner, kernel
 from viapoint.envs.geometry.obstacles import ABSENT, KINDS, Obstacles, bounding_boxes
 from viapoint.envs.geometry.shapes import IN_TABLES, PLAIN_KINDS
 from viapoint.envs.task import Task
-from viapoint.training.planning.movements import INSTANTS, Setting, joints_at, memory_of, place_hand
-from viapoint.training.planning.problem import Moves, Problem, movement_of, place_at, setting_of
+from viapoint.training.planning.movements import INSTANTS, Memory, Setting, joints_at, memory_of, place_hand
+from viapoint.training.planning.problem import Moves, Problem, movement_of, setting_of
 
 SCALE = 8.0  # Scale of lengths at the input of the network, [1/m]
 UNIT = 0.05  # Length of one output unit of the network, [m]
-# Number of the nearest pairs whose closest approach is found between the instants that are looked at
-REFINED = 6
-STEPS = 2  # Greatest number of instants by which it may lie beside the nearest of them
-PARTS = 8  # Parts in which the way to the next instant is looked at
 NEAREST = 16  # Number of pairs of a movement that the network sees
 CLEAR = 0.1  # Greatest clearance of the arm from itself that matters, [m]
 AT_FIRST = 0.1  # Distance from the box at which the margin is about 0 before training, [m]
@@ -106,17 +102,6 @@ class Given(NamedTuple):
     half: Float  # Their half lengths, shape (B, n, 3), [m]
 
 
-class Work(NamedTuple):
-    """Memory of compiled functions."""
-
-    position: Float  # Shape (D,)
-    joints: Float  # Shape (J,)
-    path: Float  # Joints at each instant that is looked at, or positions if the hand is alone, shape (N, J)
-    placed: Placed
-    places: Float  # A sphere in the frame of an obstacle before, at and after its closest instant, shape (3, 3), [m]
-    local: Float  # Shape (3,), [m]
-
-
 @inner
 def _local(given: Given, b: int, row: int, point: Float, time: float, local: Float) -> None:
     """Fill in a point in the frame of an obstacle at a time, shape (3,), [m]."""
@@ -141,89 +126,14 @@ def _gap(local: Float, half: Float, rounded: int) -> float:
     return distance
 
 
-@inner
-def _place_sphere(
-    given: Given, b: int, h: int, row: int, group: int, sphere: int, instant: int, work: Work, local: Float
-) -> bool:
-    """Fill in a sphere's centre in the frame of an obstacle at an instant, and return True within reach."""
-    moves, placed = given.moves, work.placed
-    if not place_at(given.setting, moves, b, h, instant, work.position, work.joints, placed):
-        return False
-    place_group(given.setting.spheres, group, placed)
-    _local(given, b, row, placed.centre[sphere], moves.duration[b, h] * instant / (INSTANTS - 1), local)
-    return True
-
-
-@inner
-def _go_closest(
-    given: Given,
-    b: int,
-    h: int,
-    row: int,
-    group: int,
-    sphere: int,
-    instant: int,
-    last: int,
-    rounded: int,
-    work: Work,
-) -> None:
-    """Move the middle of the places, a sphere's centre at an instant, to where sphere and obstacle are closest.
-
-    The search goes to the nearest instants beside it, up to the last one that counts, and then along a parabola through
-    the places at three instants.
-    """
-    places, half = work.places, given.half[b, row]
-    least = _gap(places[1], half, rounded)
-    before, after = False, False  # True if the place beside is known
-    for step in range(-1, 2, 2):
-        for _ in range(STEPS):
-            other = instant + step
-            if other < 0 or other > last:
-                break
-            if not _place_sphere(given, b, h, row, group, sphere, other, work, places[1 + step]):
-                break
-            beside = _gap(places[1 + step], half, rounded)
-            nearer = beside < least
-            if nearer:  # the place in the middle becomes the one behind, and this one that in the middle
-                for axis in range(3):
-                    places[1 - step, axis] = places[1, axis]
-                    places[1, axis] = places[1 + step, axis]
-            if step < 0:
-                before, after = not nearer, after or nearer
-            else:
-                before, after = before or nearer, not nearer
-            if not nearer:
-                break
-            least, instant = beside, other
-    if not (before and after):
-        return
-    best = 0.0
-    for k in range(-PARTS, PARTS + 1):
-        _along(places, k / PARTS, work.local)
-        apart = _gap(work.local, half, rounded)
-        if apart < least:
-            least, best = apart, k / PARTS
-    _along(places, best, work.local)
-    for axis in range(3):
-        places[1, axis] = work.local[axis]
-
-
-@kernel
-def _along(places: Float, share: float, local: Float) -> None:
-    """Fill in the place on a parabola through three places, at a share of -1 to 1 from the middle."""
-    for axis in range(3):
-        slope = 0.5 * (places[2, axis] - places[0, axis])
-        curve = 0.5 * (places[2, axis] + places[0, axis]) - places[1, axis]
-        local[axis] = places[1, axis] + share * (slope + share * curve)
-
-
 class Nearest(NamedTuple):
     """Nearest pair of each obstacle and group of spheres: by its box, and by this box with round edges."""
 
     gap: Float  # Gaps between sphere and box, shape (2, n, G), [m]
-    sphere: Int  # Spheres, shape (2, n, G)
-    instant: Int  # Instants, shape (2, n, G)
+    radius: Float  # Radii of the spheres, shape (2, n, G), [m]
+    centre: Float  # Centres of the spheres in the frame of the obstacle, shape (2, n, G, 3), [m]
     smallest: Float  # Smallest gaps in increasing order, shape (NEAREST,), [m]
+    local: Float  # Memory for a point in the frame of an obstacle, shape (3,), [m]
 
 
 @inner
@@ -245,79 +155,72 @@ def _largest_seen(nearest: Nearest) -> float:
 
 @inner
 def _look(
-    given: Given,
-    b: int,
-    row: int,
-    group: int,
-    instant: int,
-    time: float,
-    largest: float,
-    work: Work,
-    nearest: Nearest,
+    given: Given, b: int, row: int, group: int, time: float, largest: float, placed: Placed, nearest: Nearest
 ) -> None:
-    """Keep the sphere of a group that is nearest to an obstacle at an instant, if it is nearer than those before.
+    """Keep the sphere of a group that is nearest to an obstacle at a time, if it is nearer than those before.
 
     Gaps above the `largest` that matters may be missed, [m].
     """
-    spheres, placed, half = given.setting.spheres, work.placed, given.half[b, row]
-    _local(given, b, row, placed.ball[group], time, work.local)
-    bound = _gap(work.local, half, 0) - spheres.ball_radius[group]
+    spheres, half, local = given.setting.spheres, given.half[b, row], nearest.local
+    _local(given, b, row, placed.ball[group], time, local)
+    bound = _gap(local, half, 0) - spheres.ball_radius[group]
     if bound >= min(largest, max(nearest.gap[0, row, group], nearest.gap[1, row, group])):
         return
     place_group(spheres, group, placed)
     for sphere in range(spheres.first[group], spheres.first[group + 1]):
-        _local(given, b, row, placed.centre[sphere], time, work.local)
+        _local(given, b, row, placed.centre[sphere], time, local)
         for rounded in range(2):
-            apart = _gap(work.local, half, rounded) - spheres.radius[sphere]
-            if apart < nearest.gap[rounded, row, group]:
-                nearest.gap[rounded, row, group] = apart
-                nearest.sphere[rounded, row, group] = sphere
-                nearest.instant[rounded, row, group] = instant
+            gap = _gap(local, half, rounded) - spheres.radius[sphere]
+            if gap < nearest.gap[rounded, row, group]:
+                nearest.gap[rounded, row, group] = gap
+                nearest.radius[rounded, row, group] = spheres.radius[sphere]
+                for axis in range(3):
+                    nearest.centre[rounded, row, group, axis] = local[axis]
 
 
 @inner
 def _number_that_count(
-    given: Given, b: int, h: int, instants: Int, until: float, work: Work
+    given: Given, b: int, h: int, instants: Int, until: float, memory: Memory
 ) -> tuple[int, bool]:
     """Fill in the path, and return the number of first instants that count, and False if it then leaves the reach."""
     movement = movement_of(given.moves, b, h)
-    here = work.position if given.setting.hand_alone else work.joints
+    here = memory.position if given.setting.hand_alone else memory.joints
     for k in range(len(instants)):
         if k > 0 and movement.duration * instants[k] / (INSTANTS - 1) > until:
             return k, True
-        if not joints_at(given.setting, movement, instants[k], work.position, work.joints):
+        if not joints_at(given.setting, movement, instants[k], memory.position, memory.joints):
             return k, False
         for axis in range(len(here)):
-            work.path[k, axis] = here[axis]
+            memory.path[k, axis] = here[axis]
     return len(instants), True
 
 
 @inner
 def _look_at_all(
-    given: Given, b: int, h: int, instants: Int, least: Float, work: Work, nearest: Nearest
+    given: Given, b: int, h: int, instants: Int, least: Float, memory: Memory, nearest: Nearest
 ) -> None:
     """Fill in the nearest pairs of a movement at instants within reach, and its least clearance from itself.
 
     Neighbours come late, so that most parts of the arm are soon known to be farther away than before, and the start,
     where nothing is near, is last.
     """
-    setting, moves, kinds = given.setting, given.moves, given.obstacles.kind
+    setting, moves, kinds, placed = given.setting, given.moves, given.obstacles.kind, memory.placed
     order, spheres = moves.table.order, setting.spheres
     for i in range(1, len(order) + 1):
         k = order[i % len(order)]
         if k >= len(instants):
             continue
         if setting.hand_alone:
-            place_hand(work.path[k], work.placed)
+            place_hand(memory.path[k], placed)
         else:
-            place(setting.chain, spheres, work.path[k], work.placed)
-        least[b, h] = self_clearance(spheres, work.placed, least[b, h], -CLEAR)
+            place(setting.chain, spheres, memory.path[k], placed)
+        least[b, h] = self_clearance(spheres, placed, least[b, h], -CLEAR)
         time = moves.duration[b, h] * instants[k] / (INSTANTS - 1)
         largest = _largest_seen(nearest)
         for row in range(kinds.shape[1]):
             for group in range(len(spheres.link)):
                 if kinds[b, row] != ABSENT and spheres.link[group] != 0:
-                    _look(given, b, row, group, instants[k], time, largest, work, nearest)
+                    _look(given, b, row, group, time, largest, placed, nearest)
 
 
 @inner
@@ -346,38 +249,30 @@ def _gather(
     inside: Bool,
 ) -> None:
     """Fill in the nearest pairs of movements, see :func:`pairs_of`."""
-    setting, moves, obstacles = given.setting, given.moves, given.obstacles
+    setting, moves, kinds = given.setting, given.moves, given.obstacles.kind
     number, plans = moves.duration.shape
     memory = memory_of(setting, moves.table, moves.start.shape[1])
-    own = memory.position, memory.joints, memory.path, memory.placed
-    work = Work(*own, np.empty((3, 3)), np.empty(3))
-    gap = np.empty((2, obstacles.kind.shape[1], len(setting.spheres.link)))
-    nearest = Nearest(gap, np.empty(gap.shape, np.int64), np.empty(gap.shape, np.int64), np.empty(NEAREST))
+    shape = 2, kinds.shape[1], len(setting.spheres.link)
+    centre = np.empty((*shape, 3))
+    nearest = Nearest(np.empty(shape), np.empty(shape), centre, np.empty(NEAREST), np.empty(3))
     for each in range(number * plans):
         b, h = each // plans, each % plans
-        gap[:] = NOWHERE
-        count, inside[b, h] = _number_that_count(given, b, h, instants, until[b, h], work)
-        last = instants[max(count - 1, 0)]  # instant
-        _look_at_all(given, b, h, instants[:count], least, work, nearest)
+        nearest.gap[:] = NOWHERE
+        count, inside[b, h] = _number_that_count(given, b, h, instants, until[b, h], memory)
+        _look_at_all(given, b, h, instants[:count], least, memory, nearest)
         for pair in range(NEAREST):
             rounded, row, group = _take_nearest(nearest)
             if row < 0:
                 break
-            sphere = nearest.sphere[rounded, row, group]
-            instant = nearest.instant[rounded, row, group]
-            _place_sphere(given, b, h, row, group, sphere, instant, work, work.places[1])
-            if pair < REFINED and inside[b, h]:
-                _go_closest(given, b, h, row, group, sphere, instant, last, rounded, work)
-            half = given.half[b, row]
-            gaps[b, h, pair] = _gap(work.places[1], half, 0)
-            kind = obstacles.kind[b, row]
+            half, kind = given.half[b, row], kinds[b, row]
             for axis in range(3):
-                there = work.places[1, axis]
+                there = nearest.centre[rounded, row, group, axis]
                 # Kinds without a table of vertices or points look the same when an axis is reversed.
                 features[b, h, pair, axis] = there if kind in IN_TABLES else abs(there)
                 features[b, h, pair, 3 + axis] = half[axis]
-            features[b, h, pair, 6] = setting.spheres.radius[sphere]
+            features[b, h, pair, 6] = nearest.radius[rounded, row, group]
             features[b, h, pair, LENGTHS + columns[kind]] = 1.0
+            gaps[b, h, pair] = _gap(nearest.centre[rounded, row, group], half, 0)
 
 
 class PairNetwork(nn.Module):

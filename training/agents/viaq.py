@@ -97,7 +97,7 @@ class ViaQPolicy(PlanPolicy):
         *,
         task: Mapping[str, Any],
         width: int = 32,
-        instants: int = 32,
+        instants: int = INSTANTS,
         candidates: int = 256,
         refinements: int = 4,
         per_refinement: int = 64,
