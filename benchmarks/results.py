@@ -64,7 +64,7 @@ REACHES = [f"{name}, reaches" for name in INTERVALS]
 """Names of these variants."""
 PAGES = Path("docs/results.md"), Path("docs/results-sensed.md"), Path("docs/results-details.md")
 PICTURE = Path("docs/images/results.png")
-DETAILS = ("points:", "fitted:", "thick:plan_motion", "agent, seed", "untrained, ")
+DETAILS = ("points:", "cautious2048", "fitted:", "thick:plan_motion", "agent, seed", "untrained, ")
 """Beginnings of methods that are on other pages or in the file only."""
 SHOWN: dict[str, dict[str, Any]] = {
     "plan_motion": METHOD_STYLES["plan_motion"],
