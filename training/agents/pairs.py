@@ -142,13 +142,13 @@ def _largest_seen(nearest: Nearest) -> float:
     smallest = nearest.smallest
     smallest[:] = NOWHERE
     for gap in nearest.gap.flat:
-        place = NEAREST
-        while place > 0 and gap < smallest[place - 1]:
-            place -= 1
-            if place + 1 < NEAREST:
-                smallest[place + 1] = smallest[place]
-        if place < NEAREST:
-            smallest[place] = gap
+        rank = NEAREST
+        while rank > 0 and gap < smallest[rank - 1]:
+            rank -= 1
+            if rank + 1 < NEAREST:
+                smallest[rank + 1] = smallest[rank]
+        if rank < NEAREST:
+            smallest[rank] = gap
     largest: float = smallest[-1]
     return largest
 

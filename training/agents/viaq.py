@@ -631,10 +631,10 @@ class ViaQCritic(nn.Module):
     """Network that predicts the value of plans from their margin and effort.
 
     The margin m(s, a) is learned (see :mod:`viapoint.training.agents.pairs`). Kinematics says whether the movement
-    stays within reach and joint ranges, and how far the arm is from itself, s(a):
+    stays within reach and joint ranges, and how far the arm is from itself, o(s, a):
 
-        P(clear) = sigmoid(k m + b) sigmoid(k' s + b'),  P(success) = P(clear) sigmoid(d + r(s, a)),
-        Q(s, a) = w_s P(success) - w_c (1 - P(clear)) - w_g (1 - P(success)) + w_m clip(min(m, s)) + e(s, a)
+        P(clear) = sigmoid(k m + b) sigmoid(k' o + b'),  P(success) = P(clear) sigmoid(l + c(s, a)),
+        Q(s, a) = w_s P(success) - w_c (1 - P(clear)) - w_g (1 - P(success)) + w_m clip(min(m, o)) + e(s, a)
 
     Args:
         task: Task of the environment.
@@ -647,7 +647,7 @@ class ViaQCritic(nn.Module):
         ends = (4 * dimension + 3) if task.replanning else (2 * dimension + 1)
         self.replanning = task.replanning
         self.pairs = PairNetwork(task.shapes, width)
-        self.arrival = nn.Parameter(torch.tensor(2.0))  # Logit d of arrival of a movement within reach
+        self.arrival = nn.Parameter(torch.tensor(2.0))  # Logit l of arrival of a movement within reach
         self.rest = nn.Sequential(*create_mlp(ends + EFFORT + (0 if task.replanning else size), 2, [64, 64]))
         for parameter in self.rest[-1].parameters():
             nn.init.zeros_(parameter)
