@@ -355,14 +355,13 @@ class ViaQ(PlanAlgorithm):
             arrival = torch.where(ended > 0.5, arrival, self.gamma * torch.sigmoid(following.arrival))
             effort = effort + goes_on * following.effort_terms
         went_on = known & ((outcomes.success > 0.5) | (ended < 0.5))
-        touched = known & (contact > 0.5)
+        carried_out = went_on | (known & (contact > 0.5))
         # A movement that stops early takes less effort than its plan, so that failures would make rough plans cheap.
         # Where plans are revised, they count: without them, nothing ties down the values of later decisions.
         effort_counts = known if policy.replanning else went_on
         losses = {
             "clearance": self._clearance_loss(values, outcomes, known),
-            "contact": CONTACT_WEIGHT
-            * _mean(_cross_entropy(values.no_contact, 1.0 - contact), went_on | touched),
+            "contact": CONTACT_WEIGHT * _mean(_cross_entropy(values.no_contact, 1.0 - contact), carried_out),
             "arrival": _mean(_cross_entropy(values.arrival, arrival), known & (contact < 0.5)),
             "effort": 10.0 * _mean(_smooth_l1(values.effort_terms, effort, beta=0.1), effort_counts),
         }
