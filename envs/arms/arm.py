@@ -157,11 +157,12 @@ class Arm:
         """Return controls of the actuators that track motions of the joints at T physics steps, shape (N, T, J).
 
         The torque of an actuator is control - stiffness * position - damping * velocity. So its control is the torque
-        of the motion, plus stiffness and damping times the references. Torques are computed every `stride` steps; those
-        in between are interpolated linearly.
+        of the motion, plus stiffness and damping times the references. MuJoCo's integrator moves the joints by the
+        velocity of the next step, and damps that one: it belongs to a time half a step later. Torques are computed
+        every `stride` steps; those in between are interpolated linearly.
         """
         motion = [np.ascontiguousarray(part) for part in (position, velocity, acceleration)]
-        return _controls(self.chain, self.stiffness, self.damping, stride, *motion)
+        return _controls(self.chain, self.stiffness, self.damping, self.timestep, stride, *motion)
 
 
 def arm_from_xml(
@@ -265,7 +266,7 @@ def asset(file: str) -> str:
 
 @compiled
 def _controls(
-    chain: Chain, stiffness: Float, damping: Float, stride: int, q: Float, v: Float, a: Float
+    chain: Chain, stiffness: Float, damping: Float, timestep: float, stride: int, q: Float, v: Float, a: Float
 ) -> Float:
     """Return controls, see :meth:`Arm.controls`."""
     number, steps, joints = q.shape
@@ -287,7 +288,9 @@ def _controls(
                 for j in range(joints):
                     torque = before[j] + share * (after[j] - before[j])
                     servo = stiffness[j] * q[i, k, j] + damping[j] * v[i, k, j]
-                    out[i, k, j] = torque + servo
+                    # The integrator damps the next velocity, which is the reference half a step later.
+                    late = 0.5 * timestep * a[i, k, j]
+                    out[i, k, j] = torque + servo + (damping[j] + chain.damping[j]) * late
             for j in range(joints):
                 before[j] = after[j]
     return out

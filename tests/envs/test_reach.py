@@ -95,7 +95,7 @@ def test_the_rollout_is_the_movement_that_info_tells_of():
     assert rollout.clearance.min() == pytest.approx(info["min_clearance"])
     error = np.linalg.norm(rollout.hand[:, :2] - rollout.planned, axis=-1)
     assert np.sqrt((error**2).mean()) == pytest.approx(info["tracking_error"])
-    assert info["tracking_error"] < 2e-3
+    assert info["tracking_error"] < 2e-5
     assert len(rollout.time) == env.physics_steps
 
 
