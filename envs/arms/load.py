@@ -226,7 +226,8 @@ def _load(
         notes.append(f"{WARNING}damping of {some} is left out: it takes {STUCK:g} times the torque limit")
         whole.dof_damping[dofs[stuck]] = 0.0
     parsed = _parse(whole, names, chosen, notes)
-    drawn = np.random.default_rng(0).uniform(*ranges.T, (NEAR_LOOKED_AT, len(names)))
+    low, high = ranges.T
+    drawn = np.random.default_rng(0).uniform(low, high, (NEAR_LOOKED_AT, len(names)))
     exclude = _excluded(parsed, urdf.never_touch)
     views = _compared(parsed, ranges, drawn, given["home"], exclude, notes)
     home = views[0].configuration
