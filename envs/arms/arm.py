@@ -77,7 +77,9 @@ class Arm:
     """Space in which movements are planned by default."""
     timestep: float
     """Length of a physics step, [s]."""
-    steerable_share: float = 0.99
+    bandwidth: float
+    """Natural frequency of the joint servos, [rad/s]."""
+    steerable_share: float
     """Share of states in which the torque limits allow the greatest acceleration in control steps."""
     continuous: tuple[str, ...] = ()
     """Names of joints that turn without end in the file; goals of planning are taken modulo a turn."""
@@ -184,8 +186,8 @@ def arm_from_xml(
 
     The joints are hinges and slides from the base to the tool, which is a site; all other bodies move with one of them.
     A body and those of the link before that carry it may pass through one another, and so may pairs in `exclude`, which
-    has the reason, and pairs for which `touch` is False wherever their spheres overlap; by default, spheres decide. The
-    servos of the joints are critically damped; `bandwidth` is their natural frequency, [rad/s].
+    has the reason. With `touch`, so may pairs for which it is False wherever their spheres overlap. The servos of the
+    joints are critically damped; `bandwidth` is their natural frequency, [rad/s].
 
     Raises:
         ValueError: Bodies that are apart at home cannot be told apart.
@@ -203,19 +205,17 @@ def arm_from_xml(
             if links.get(carrier.name, 0) == link - 1 > 0:
                 carried[frozenset((carrier.name, body))] = "consecutive links"
     exclude = {**carried, **(exclude or {})}
-    names, spheres, left_out, excess = cover(chain, capsules, links, home[None], exclude)
-    # Pairs that touch in none of many configurations are not compared, either.
     ranges = np.array([model.joint(each).range for each in joints])
     low, high = ranges.T
     drawn = np.random.default_rng(0).uniform(low, high, (COMPARED, len(ranges)))
-    overlap: Any = overlapping(chain, spheres, drawn, touch is not None)
-    kept = overlap.any(axis=0)
-    for row, (first, second) in enumerate(spheres.pairs):
-        if touch is not None:  # spheres reach beyond the geoms, which may be apart where spheres overlap
-            kept[row] = any(touch(names[first], names[second], each) for each in drawn[overlap[:, row]])
-        if not kept[row]:
-            pair = frozenset((names[first], names[second]))
-            exclude[pair] = f"in contact in none of {COMPARED:,} configurations"
+    if touch is not None:
+        names, spheres, _, _ = cover(chain, capsules, links, home[None], exclude)
+        overlap: Any = overlapping(chain, spheres, drawn)
+        for pair, found in zip(spheres.pairs, overlap.T, strict=True):
+            first, second = (names[group] for group in pair)
+            # Spheres reach beyond the geoms, which may be apart where spheres overlap.
+            if not any(touch(first, second, each) for each in drawn[found]):
+                exclude[frozenset((first, second))] = f"in contact in none of {COMPARED:,} configurations"
 
     def room(first: str, second: str, configuration: Float) -> bool:
         """Return True if the capsules of two bodies are ROOM apart in a configuration."""
@@ -226,8 +226,8 @@ def arm_from_xml(
 
     covered = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, COVERED) >= 0
     views = np.concatenate((home[None], drawn[: VIEWS if covered else 0]))
-    _, spheres, left_out, excess = cover(chain, capsules, links, views, exclude, room)
-    inertia = greatest_inertia(data, joints, ranges)
+    names, spheres, left_out, excess = cover(chain, capsules, links, views, exclude, room)
+    inertia, _ = greatest_loads(data, joints, ranges)
     # Much damping makes a joint as slow to return as much inertia does.
     inertia = np.maximum(inertia, 0.5 * chain.damping / bandwidth)
     stiffness = inertia * bandwidth**2
@@ -249,6 +249,7 @@ def arm_from_xml(
         damping=np.maximum(2.0 * inertia * bandwidth - chain.damping, 0.0),
         space=space,
         timestep=float(model.opt.timestep),
+        bandwidth=bandwidth,
         steerable_share=steerable_share,
     )
 
@@ -418,20 +419,27 @@ def _add_actuators(spec: mujoco.MjSpec, arm: Arm) -> None:
             servo.forcerange = -arm.torque_limit[j], arm.torque_limit[j]
 
 
-def greatest_inertia(data: mujoco.MjData, joints: Sequence[str], ranges: Float) -> Float:
-    """Return the greatest inertia that each joint sees in some configurations, shape (J,), [kg m^2] or [kg]."""
+def greatest_loads(data: mujoco.MjData, joints: Sequence[str], ranges: Float) -> tuple[Float, Float]:
+    """Return the greatest inertia, [kg m^2] or [kg], and weight, [N m] or [N], that each joint sees, shape (J,) each.
+
+    Some random configurations within the ranges of the joints, shape (J, 2), are looked at.
+    """
     model = data.model
     low, high = ranges.T
     dofs = [int(model.joint(name).dofadr[0]) for name in joints]
     full = np.zeros((model.nv, model.nv))
-    greatest = np.zeros(len(joints))
+    gravity = np.zeros(model.nv)
+    inertia = np.zeros(len(joints))
+    weight = np.zeros(len(joints))
     for configuration in np.random.default_rng(0).uniform(low, high, (SAMPLED, len(joints))):
         move(data, joints, configuration)
         mujoco.mj_comPos(model, data)
         mujoco.mj_crb(model, data)
         mujoco.mj_fullM(model, data, full)
-        greatest = np.maximum(greatest, np.diag(full)[dofs])
-    return greatest
+        mujoco.mj_rne(model, data, 0, gravity)
+        inertia = np.maximum(inertia, np.diag(full)[dofs])
+        weight = np.maximum(weight, np.abs(gravity[dofs]))
+    return inertia, weight
 
 
 def _reach(chain: Chain, spheres: Spheres, joint_range: Float) -> Float:

@@ -20,7 +20,6 @@ LONGEST_STEP = 0.5  # Greatest error that one iteration corrects, [m] and [rad] 
 DAMPING = 1e-2  # Damping for errors of 1; it falls with the error, so that the last iterations converge fast
 STALLED = 1e-9  # Greatest step of the joints that ends the iterations, [rad]
 SAME = 1e-3  # Greatest difference of joints in solutions that count as the same, [rad]
-INSIDE = 1e-6  # Least distance from the limits of joints from which the nearest place is looked for, [rad]
 PATIENCE = 4  # Factor on the number of seeds where the first ones find nothing
 # Way of a joint beyond its range that counts as rounding, [rad] or [m]: limits in files may have five digits
 RANGE_TOLERANCE = 1e-5
@@ -317,16 +316,10 @@ def inverse_kinematics(
         begin = rng.uniform(low, high, (PATIENCE * number, len(low)))
         found = _solutions(arm, position, axes, begin, first)
     if not found:
-        from scipy.optimize import least_squares  # here, because it is rarely needed
-
-        nearest = begin[np.linalg.norm(arm.hand(begin) - position, axis=-1).argmin()]
-        descend(arm.chain, arm.joint_range, position, np.eye(3), False, nearest)
-        inside = np.clip(nearest, low + INSIDE, high - INSIDE)
-        place = least_squares(lambda joints: arm.hand(joints) - position, inside, bounds=(low, high))
-        away = float(np.linalg.norm(place.fun))
+        away = min(descend(chain, arm.joint_range, position, np.eye(3), False, each) for each in begin)
         pose = "position" if quaternion is None else "pose"
         nearest = f"the nearest place found is {1e3 * away:.1f} mm away"
-        if quaternion is not None and away < PLACE_TOLERANCE:
+        if quaternion is not None and away == 0.0:
             nearest = "its position can be, but not with this orientation"
         raise UnreachableError(f"the {pose} {position.tolist()} m cannot be reached: {nearest}")
     found.sort(key=lambda each: float(np.abs(each - first).max()))

@@ -300,21 +300,6 @@ def _all_frames(chain: Chain, joints: Float) -> tuple[Float, Float]:
 
 
 @compiled
-def _all_tools(chain: Chain, joints: Float) -> tuple[Float, Float]:
-    """Return places and axes of the tool for N configurations, see :func:`forward`."""
-    number, last = joints.shape
-    rotation = np.empty((last + 1, 3, 3))
-    origin = np.empty((last + 1, 3))
-    places, axes = np.empty((number, 3)), np.empty((number, 3, 3))
-    for n in range(number):
-        places[n, 0], places[n, 1], places[n, 2] = tool_position(chain, joints[n], rotation, origin)
-        for column in range(3):
-            axis = rotated(rotation[last], _row(chain.tool_rotation.T, column))
-            axes[n, 0, column], axes[n, 1, column], axes[n, 2, column] = axis
-    return places, axes
-
-
-@compiled
 def motion_torques(chain: Chain, q: Float, v: Float, a: Float) -> Float:
     """Return the torques of N motions of shape (N, J) each; :func:`torques` checks its arguments, this one does not."""
     torque = np.empty_like(q)
@@ -331,9 +316,14 @@ def _flat(name: str, chain: Chain, joints: Float) -> tuple[Float, tuple[int, ...
 
 def forward(chain: Chain, joints: Float) -> tuple[Float, Float]:
     """Return places of the tool, (..., 3), [m], and its axes as columns, (..., 3, 3), for joints (..., J)."""
-    flat, batch = _flat("joints", chain, joints)
-    places, axes = _all_tools(chain, flat)
-    return places.reshape(*batch, 3), axes.reshape(*batch, 3, 3)
+    rotation, origin = link_poses(chain, joints)
+    last = rotation[..., -1, :, :]
+    place = origin[..., -1, :]
+    axes = np.zeros_like(last)
+    for axis in range(3):  # in the order of :func:`tool_position`, so that places are equal to the last bit
+        place = place + last[..., axis] * chain.tool_origin[axis]
+        axes = axes + last[..., axis, None] * chain.tool_rotation[axis]
+    return place, axes
 
 
 def link_poses(chain: Chain, joints: Float) -> tuple[Float, Float]:

@@ -8,7 +8,7 @@ import os
 import re
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from viapoint.envs.arms.arm import HIDDEN_GROUP, VIEWS, Arm, arm_from_xml, asset, greatest_inertia, move
+from viapoint.envs.arms.arm import HIDDEN_GROUP, VIEWS, Arm, arm_from_xml, asset, greatest_loads, move
 from viapoint.envs.arms.capsule_fit import FittedCapsule, cover_geom, split
 from viapoint.envs.arms.choices import (
     GROUNDS,
@@ -44,7 +44,7 @@ LEAST_GAP = 0.002  # Distance of bodies at home below which another home is look
 DEFAULT_VELOCITY_LIMIT = 2.0  # Velocity limit of joints without one, [rad/s] or [m/s]
 WEIGHTS, ACCELERATION, LEAST_TORQUE = 3.0, 5.0, 1.0
 """Torque limit of joints without one: multiple of what gravity needs, acceleration [rad/s^2], and least one, [N m]."""
-WEIGHED = 200  # Number of configurations in which the arm is weighed
+WEIGHED = 200  # Number of configurations in which an arm of guessed masses is weighed
 NEAR_LOOKED_AT = 1000  # Number of configurations in which bodies that are always near are looked at
 NEAR = 0.03  # Distance within which bodies are near in at least half of the configurations, [m]
 LEAST_TOLERANCE = 0.005  # Least tolerance of fitted capsules, [m]
@@ -91,6 +91,13 @@ class Parsed(NamedTuple):
     def named(self, pair: Pair) -> frozenset[str]:
         """Return the names of a pair of bodies."""
         return frozenset(self.names[body] for body in pair)
+
+
+class View(NamedTuple):
+    """Configuration of the arm in which capsules are looked at."""
+
+    configuration: Float  # Positions of the joints, shape (J,)
+    distances: dict[Pair, float]  # Distances of the pairs of bodies that are compared there, [m]
 
 
 def load_arm(
@@ -149,11 +156,7 @@ def load_arm(
     if not isinstance(packages, str | Path | Sequence):
         raise ValueError(f"packages must be a folder or several, got {packages!r}")
     folders = (packages,) if isinstance(packages, str | Path) else tuple(packages)
-    written = read_arm(file)
-    spec, own_name, urdf = _read(file, folders)
-    usual = own_name if written is None else written.name
-    name = usual if name is None else name
-    if not isinstance(name, str) or not name:
+    if name is not None and (not isinstance(name, str) or not name):
         raise ValueError(f"name must be a string of one or more characters, got {name!r}")
     given = {
         "tool": tool,
@@ -166,14 +169,17 @@ def load_arm(
         "velocity_limit": velocity_limit,
         "tolerance": number_of_at_least("tolerance", tolerance, LEAST_TOLERANCE, MAX_TOLERANCE),
     }
-    notes = list(urdf.notes)
-    whole = _compiled(spec, notes)
-    arguments = {**given, "name": name, "notes": notes, "urdf": urdf[3:]}
-    known_as = f"{name} {spec.modelname}"
+    written = read_arm(file)
     if written is None:
+        spec, own_name, urdf = _read(file, folders)
+        name = name or own_name
+        notes = list(urdf.notes)
+        whole = _compiled(spec, notes)
+        known_as = f"{name} {spec.modelname}"
+        arguments = {**given, "name": name, "notes": notes, "urdf": urdf[3:]}
         arm = cached_arm(whole, arguments, lambda: _load(whole, name, known_as, urdf, notes, given))
     else:
-        arm = _with_limits(replace(written, name=name), given)
+        arm = _with_limits(replace(written, name=name or written.name), given)
     weak = np.abs(torques(arm.chain, arm.home, np.zeros(1), np.zeros(1))) > arm.torque_limit
     if given["torque_limit"] is not None and weak.any():
         some = ", ".join(itertools.compress(arm.joint_names, weak))
@@ -204,19 +210,7 @@ def _load(
     """Return the arm of a model and the given arguments; see :func:`load_arm`."""
     chosen = choose_tool(whole, given["tool"], given["base"], notes)
     notes.insert(0, f"tool: {chosen.name!r}")
-    names = given["joints"]
-    if names is None:
-        chain = chain_joints(whole, chosen.body, 0 if given["base"] is None else whole.body(given["base"]).id)
-        if not chain:
-            raise ValueError(f"no joint moves the tool {chosen.name!r}; name another one with tool=")
-        names = tuple(arm_joints(whole, chain, notes))
-        if len(names) < MIN_JOINTS:
-            fixed = "".join(f"; {note}" for note in notes if note.startswith("fixed: "))
-            raise ValueError(
-                f"an arm has {MIN_JOINTS} or more joints, and {len(names)} are left of {', '.join(chain)}{fixed}; give "
-                "joints=, or limits of sliding joints in the file"
-            )
-        notes.append(f"joints: {', '.join(names)}")
+    names = given["joints"] or _usual_joints(whole, chosen, given["base"], notes)
     try:
         numbers = [whole.joint(each).id for each in names]
     except KeyError as error:  # the message tells the names that there are
@@ -232,39 +226,18 @@ def _load(
         notes.append(f"{WARNING}damping of {some} is left out: it takes {STUCK:g} times the torque limit")
         whole.dof_damping[dofs[stuck]] = 0.0
     parsed = _parse(whole, names, chosen, notes)
-    # Pairs that cannot touch are not compared: those of the file, and those that are always near and always apart.
-    exclude = _excluded(parsed, urdf.never_touch)
-    never = f"in contact in none of {NEAR_LOOKED_AT:,} configurations, though always near"
-    pairs = [pair for pair in parsed.pairs if pair not in exclude]
     low, high = ranges.T
     drawn = np.random.default_rng(0).uniform(low, high, (NEAR_LOOKED_AT, len(names)))
-    looked_at = np.array([_distances(parsed, each, pairs) for each in drawn[:VIEWS]])
-    near = itertools.compress(pairs, np.median(looked_at, axis=0) < NEAR)
-    exclude |= dict.fromkeys(_apart(parsed, near, drawn), never)
-    movable = set(itertools.compress(pairs, looked_at.max(axis=0) > 0.0))
-    compared = [pair for pair in pairs if pair in movable and pair not in exclude]
-    home = _home(parsed, ranges, given["home"], compared, notes)
+    exclude = _excluded(parsed, urdf.never_touch)
+    views = _compared(parsed, ranges, drawn, given["home"], exclude, notes)
+    home = views[0].configuration
     origin = np.zeros(3) if given["origin"] is None else finite_array("origin", given["origin"], (3,))
-    # Bodies that are near at home are not compared, either, or get smaller capsules.
-    at_home = dict(zip(pairs, _distances(parsed, home, pairs).tolist(), strict=True))
-    close = [pair for pair in pairs if pair not in exclude and 0.0 < at_home[pair] < LEAST_GAP]
-    exclude |= dict.fromkeys(_apart(parsed, close, drawn), never)
-    touching = [pair for pair in pairs if pair not in exclude and at_home[pair] <= 0.0]
-    exclude |= dict.fromkeys(touching, "in contact at home")
-    avoidable = [pair for pair in touching if pair in movable]  # they are apart elsewhere
-    if given["home"] is not None and avoidable:
-        some = "; ".join(" and ".join(sorted(parsed.named(pair))) for pair in avoidable)
-        notes.append(f"{WARNING}in contact at the given home, and not compared in any plan: {some}")
-    compared = [pair for pair in pairs if pair not in exclude]
-    views = [(home, {pair: at_home[pair] for pair in compared})]
-    for configuration, row in zip(drawn, looked_at, strict=False):
-        there = dict(zip(pairs, row.tolist(), strict=True))
-        views.append((configuration, {pair: there[pair] for pair in compared if there[pair] >= PASSING}))
     xml, excess = _fitted(parsed, ranges, origin, views, given["tolerance"])
     bodies = {known: body for body, known in parsed.names.items()}
 
     def touch(first: str, second: str, configuration: Float) -> bool:
-        return bool(_distances(parsed, configuration, [(bodies[first], bodies[second])])[0] <= 0.0)
+        pair = bodies[first], bodies[second]
+        return _distances(parsed, configuration, [pair])[pair] <= 0.0
 
     arm = arm_from_xml(
         name,
@@ -296,6 +269,22 @@ def _load(
     )
 
 
+def _usual_joints(model: mujoco.MjModel, tool: Tool, base: str | None, notes: list[str]) -> Names:
+    """Return the names of the joints from the base to the tool that belong to the arm."""
+    chain = chain_joints(model, tool.body, 0 if base is None else model.body(base).id)
+    if not chain:
+        raise ValueError(f"no joint moves the tool {tool.name!r}; name another one with tool=")
+    names = tuple(arm_joints(model, chain, notes))
+    if len(names) < MIN_JOINTS:
+        fixed = "".join(f"; {note}" for note in notes if note.startswith("fixed: "))
+        raise ValueError(
+            f"an arm has {MIN_JOINTS} or more joints, and {len(names)} are left of {', '.join(chain)}{fixed}; give "
+            "joints=, or limits of sliding joints in the file"
+        )
+    notes.append(f"joints: {', '.join(names)}")
+    return names
+
+
 def read_model(file: str | Path) -> mujoco.MjModel:
     """Return the model of an MJCF or URDF file for drawings; visual meshes may be missing.
 
@@ -315,15 +304,14 @@ def read_model(file: str | Path) -> mujoco.MjModel:
 
 def _read(file: Any, packages: Packages, visual: bool = False) -> tuple[mujoco.MjSpec, str, Urdf]:
     """Return a specification that may be changed, its name, and what MuJoCo does not take from a URDF."""
-    nothing = Urdf("", "", {}, {}, (), ())
     if isinstance(file, mujoco.MjSpec):
-        return file.copy(), file.modelname, nothing
+        return file.copy(), file.modelname, Urdf()
     if not isinstance(file, str | os.PathLike) or isinstance(os.fspath(file), bytes):
         raise TypeError(f"file must be the name or the text of an MJCF file, or an MjSpec, got {file!r:.60}")
     text = os.fspath(file)
     is_text = text.lstrip().startswith("<")
     path = Path(text).expanduser()
-    urdf = nothing._replace(text=text if is_text else "")
+    urdf = Urdf(text if is_text else "")
     if not is_text and not path.is_file():
         raise ValueError(f"there is no file {text!r}")
     if is_text and _is_urdf(text):
@@ -338,7 +326,8 @@ def _read(file: Any, packages: Packages, visual: bool = False) -> tuple[mujoco.M
         else:
             spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise ValueError(f"MuJoCo cannot read {text!r:.60} as MJCF or URDF: {error}") from None
+        what = "the text" if is_text else path.name
+        raise ValueError(f"MuJoCo cannot read {what} as MJCF or URDF: {error}") from None
     named_after_model = is_text or path.stem.lower() in GENERIC_NAMES
     return spec, urdf.name or (spec.modelname if named_after_model else path.stem), urdf
 
@@ -480,8 +469,8 @@ def _torques(
     known = known_limits(KNOWN_TORQUES, arm, len(joints))
     needed: Any = 0.0
     if known is None and (found <= 0.0).any():
-        needed = ACCELERATION * greatest_inertia(mujoco.MjData(model), joints, ranges)
-        needed = np.maximum(needed, WEIGHTS * _greatest_weight(model, joints)).clip(LEAST_TORQUE)
+        inertia, weight = greatest_loads(mujoco.MjData(model), joints, ranges)
+        needed = np.maximum(ACCELERATION * inertia, WEIGHTS * weight).clip(LEAST_TORQUE)
     how = f"{WEIGHTS:g} times what the arm's weight needs, at least enough for {ACCELERATION:g} rad/s^2 (slides m/s^2)"
     return _completed("torque", joints, found, known, needed, f"{how}; give torque_limit", notes)
 
@@ -497,18 +486,6 @@ def _completed(
     elif some:
         notes.append(f"{WARNING}the file has no {what} limits of {some}; they get {how}")
     return np.where(missing, default if known is None else known, limits)
-
-
-def _greatest_weight(model: mujoco.MjModel, joints: Names) -> Float:
-    """Return the greatest torques that gravity needs in random configurations, shape (J,)."""
-    data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    dofs = [int(model.joint(name).dofadr[0]) for name in joints]
-    greatest = np.zeros(len(joints))
-    for _ in range(WEIGHED):
-        move(data, joints, rng.uniform(-np.pi, np.pi, len(joints)))
-        mujoco.mj_forward(model, data)
-        greatest = np.maximum(greatest, np.abs(data.qfrc_bias[dofs]))
-    return greatest
 
 
 def _actuator_torque(model: mujoco.MjModel, index: int) -> float:
@@ -529,7 +506,7 @@ def _symmetric_limit(limits: Float) -> float:
 
 
 def _velocities(
-    model: mujoco.MjModel, joints: Names, given: Any, in_urdf: dict[str, float], arm: str, notes: list[str]
+    model: mujoco.MjModel, joints: Names, given: Any, in_urdf: Mapping[str, float], arm: str, notes: list[str]
 ) -> Float:
     """Return the velocity limit of each joint, shape (J,)."""
     found = np.array([in_urdf.get(name, 0.0) for name in joints])
@@ -561,7 +538,7 @@ def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[Pair], notes: l
         return home
 
     def apart(configuration: Float) -> float:
-        return float(_distances(parsed, configuration, pairs).min(initial=1.0))
+        return min(_distances(parsed, configuration, pairs).values(), default=1.0)
 
     candidates = {"zeros": np.zeros(len(joints)), "the middle of the ranges": 0.5 * (low + high)}
     if model.nkey:
@@ -689,80 +666,111 @@ def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> dict[Pa
     return found
 
 
+def _compared(
+    parsed: Parsed, ranges: Float, drawn: Float, given: Any, exclude: dict[Pair, str], notes: list[str]
+) -> list[View]:
+    """Return home and other configurations with the distances of the pairs that are compared.
+
+    Pairs that cannot touch are excluded with the reason: those that are near and apart in all `drawn` configurations,
+    shape (N, J), and those in contact at home.
+    """
+    never = f"in contact in none of {len(drawn):,} configurations, though always near"
+    pairs = [pair for pair in parsed.pairs if pair not in exclude]
+    looked_at = [View(each, _distances(parsed, each, pairs)) for each in drawn[:VIEWS]]
+    away = {pair: [view.distances[pair] for view in looked_at] for pair in pairs}
+    near = [pair for pair in pairs if np.median(away[pair]) < NEAR]
+    exclude |= dict.fromkeys(_apart(parsed, near, drawn), never)
+    movable = {pair for pair in pairs if max(away[pair]) > 0.0}
+    compared = [pair for pair in pairs if pair in movable and pair not in exclude]
+    home = _home(parsed, ranges, given, compared, notes)
+    at_home = _distances(parsed, home, pairs)
+    close = [pair for pair in pairs if pair not in exclude and 0.0 < at_home[pair] < LEAST_GAP]
+    exclude |= dict.fromkeys(_apart(parsed, close, drawn), never)
+    touching = [pair for pair in pairs if pair not in exclude and at_home[pair] <= 0.0]
+    exclude |= dict.fromkeys(touching, "in contact at home")
+    avoidable = [pair for pair in touching if pair in movable]  # they are apart elsewhere
+    if given is not None and avoidable:
+        some = "; ".join(" and ".join(sorted(parsed.named(pair))) for pair in avoidable)
+        notes.append(f"{WARNING}in contact at the given home, and not compared in any plan: {some}")
+    compared = [pair for pair in pairs if pair not in exclude]
+    views = [View(home, {pair: at_home[pair] for pair in compared})]
+    for joints, there in looked_at:
+        views.append(View(joints, {pair: there[pair] for pair in compared if there[pair] >= PASSING}))
+    return views
+
+
 def _fitted(
-    parsed: Parsed,
-    ranges: Float,
-    origin: Float,
-    views: Sequence[tuple[Float, dict[Pair, float]]],
-    tolerance: float,
+    parsed: Parsed, ranges: Float, origin: Float, views: Sequence[View], tolerance: float
 ) -> tuple[str, float]:
     """Return the text of the arm's model, and the greatest excess of its capsules, [m].
 
     Capsules of bodies that are apart at home must be apart there, too: those that are not are split. So are those of
     pairs with room between them in other configurations, as far as that is worth it.
 
-    Args:
-        parsed: Arm in the form of its file.
-        ranges: Range of each joint, shape (J, 2).
-        origin: Point of the file's world that becomes the origin, [m].
-        views: Configurations, home first, and distances of pairs of bodies that are compared there, [m].
-        tolerance: Greatest excess of capsules, as far as that is possible, [m].
-
     Raises:
         ValueError: Bodies are too close at home for that.
     """
-    model = parsed.model
     fits: dict[int, list[FittedCapsule]] = {}
     for body, geoms in parsed.geoms.items():
         fits[body] = []
         for geom in geoms:
-            fits[body] += cover_geom(model, geom, tolerance)
+            fits[body] += cover_geom(parsed.model, geom, tolerance)
     while True:
         xml = _write(parsed, ranges, origin, fits)
         capsules = mujoco.MjModel.from_xml_string(xml)
-        data = mujoco.MjData(capsules)
-        begin = {body: int(capsules.body(parsed.names[body]).geomadr[0]) for body in fits}
-        coarse: set[tuple[int, int]] = set()
-        for place, (configuration, distances) in enumerate(views):
-            move(data, parsed.joints, configuration)
-            for (first, second), distance in distances.items():
-                least = min(LEFT_SHARE * distance, LEFT_MOST)
-                for i, j in itertools.product(range(len(fits[first])), range(len(fits[second]))):
-                    both = begin[first] + i, begin[second] + j
-                    if mujoco.mj_geomDistance(capsules, data, *both, 0.01, None) >= least:
-                        continue
-                    one, other = fits[first][i].excess, fits[second][j].excess
-                    if place and max(one, other) < WORTH:
-                        continue
-                    if max(one, other) < LEAST_EXCESS:
-                        raise ValueError(
-                            f"the bodies {parsed.names[first]!r} and {parsed.names[second]!r} are "
-                            f"{1e3 * distance:.2g} mm apart at home, too close for the capsules around them: give "
-                            "another home, or exclude their contact in the file"
-                        )
-                    coarse.add((first, i) if one >= other else (second, j))
+        coarse = set()
+        for view in views:
+            at_home = view is views[0]
+            for pair, (body, index) in _close_capsules(parsed, capsules, fits, view):
+                excess = fits[body][index].excess
+                if excess >= (LEAST_EXCESS if at_home else WORTH):
+                    coarse.add((body, index))
+                elif at_home:
+                    raise ValueError(
+                        f"the bodies {' and '.join(parsed.names[each] for each in pair)} are "
+                        f"{1e3 * view.distances[pair]:.2g} mm apart at home, too close for the capsules around them: "
+                        "give another home, or exclude their contact in the file"
+                    )
         if not coarse:
             return xml, max(capsule.excess for some in fits.values() for capsule in some)
         for body, index in sorted(coarse, reverse=True):
-            fits[body] += split(model, fits[body].pop(index))
+            fits[body] += split(parsed.model, fits[body].pop(index))
 
 
-def _apart(parsed: Parsed, pairs: Iterable[Pair], configurations: Float) -> list[Pair]:
+def _close_capsules(
+    parsed: Parsed, model: mujoco.MjModel, fits: dict[int, list[FittedCapsule]], view: View
+) -> Iterator[tuple[Pair, tuple[int, int]]]:
+    """Yield pairs of bodies that are apart, though capsules of them are not, with body and index of the coarser one."""
+    data = mujoco.MjData(model)
+    move(data, parsed.joints, view.configuration)
+    begin = {body: int(model.body(parsed.names[body]).geomadr[0]) for body in fits}
+    for pair, distance in view.distances.items():
+        first, second = pair
+        least = min(LEFT_SHARE * distance, LEFT_MOST)
+        for i, j in itertools.product(range(len(fits[first])), range(len(fits[second]))):
+            geoms = begin[first] + i, begin[second] + j
+            if mujoco.mj_geomDistance(model, data, *geoms, 0.01, None) < least:
+                is_first = fits[first][i].excess >= fits[second][j].excess
+                yield pair, ((first, i) if is_first else (second, j))
+
+
+def _apart(parsed: Parsed, pairs: list[Pair], configurations: Float) -> list[Pair]:
     """Return the pairs of bodies that are in contact in none of some configurations, shape (N, J)."""
-    pairs = list(pairs)
     for joints in configurations:
-        pairs = list(itertools.compress(pairs, _distances(parsed, joints, pairs) > 0.0))
+        there = _distances(parsed, joints, pairs)
+        pairs = [pair for pair in pairs if there[pair] > 0.0]
     return pairs
 
 
-def _distances(parsed: Parsed, joints: Float, pairs: Sequence[Pair]) -> Float:
-    """Return the distances of P pairs of bodies in a configuration, shape (P,), [m]; at most 0.1."""
+def _distances(parsed: Parsed, joints: Float, pairs: Sequence[Pair]) -> dict[Pair, float]:
+    """Return the distances of pairs of bodies in a configuration, [m], at most 0.1."""
     move(parsed.moved, parsed.joints, joints)
-    found = np.full(len(pairs), 0.1)
-    for i, (first, second) in enumerate(pairs):
+    found = dict.fromkeys(pairs, 0.1)
+    for pair in pairs:
+        first, second = pair
         for one, other in itertools.product(parsed.geoms[first], parsed.geoms[second]):
             away = mujoco.mj_geomDistance(parsed.model, parsed.moved, one, other, 0.1, None)
-            found[i] = min(found[i], away)
+            found[pair] = min(found[pair], away)
     return found
 
 

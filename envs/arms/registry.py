@@ -7,44 +7,18 @@ import functools
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
+from viapoint.envs.arms.arm import Arm, asset
 from viapoint.envs.arms.load import load_arm
 
 ARM_FILES = (".xml", ".urdf")  # Suffixes of files of arms
-
-
-# Arguments of :func:`arm_from_xml` for the built-in arms, whose files are in the assets
-_BUILT_IN: dict[str, dict[str, Any]] = {
-    "planar": {  # the right arm of an adult in the horizontal plane, its shoulder at the origin
-        "joints": ("shoulder", "elbow"),
-        "home": (0.6, 1.5),
-        "velocity_limit": (np.inf, np.inf),
-        "torque_limit": (60.0, 45.0),
-        "space": "hand",
-        "bandwidth": 40.0,
-    },
-    "panda": {  # the Franka Emika Panda with its hand, its base at the origin
-        "joints": tuple(f"joint{number}" for number in range(1, 8)),
-        "home": (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785),  # Franka's ready pose
-        "velocity_limit": (2.175,) * 4 + (2.61,) * 3,
-        "torque_limit": (87.0,) * 4 + (12.0,) * 3,
-        "steerable_share": 0.95,  # as fast as agents were trained with
-        # Capsules of wrist and flange are always within 2 cm, though the links never touch: the 59 spheres of VAMP's
-        # model (panda_spherized.urdf) leave them at least 7 mm apart, whatever the joint positions.
-        "exclude": {
-            frozenset(("link0", "link1")): "consecutive links",
-            frozenset(("link5", "link7")): "never in contact, though their capsules overlap",
-        },
-    },
-}
+# Arms of the assets: the right arm of an adult in the horizontal plane, and the Franka Emika Panda with its hand
+BUILT_IN = ("planar", "panda")
 _OWN: dict[str, Arm] = {}
 
 
 def arm_names() -> tuple[str, ...]:
     """Return the names of all arms."""
-    return (*_BUILT_IN, *_OWN)
+    return (*BUILT_IN, *_OWN)
 
 
 def register_arm(arm: Arm) -> None:
@@ -63,7 +37,7 @@ def register_arm(arm: Arm) -> None:
     """
     if not isinstance(arm, Arm):
         raise TypeError(f"arm must be an Arm, as load_arm returns it, got {arm!r:.60}")
-    if arm.name in _BUILT_IN:
+    if arm.name in BUILT_IN:
         raise ValueError(f"there is a built-in arm of the name {arm.name!r}; give another one")
     if not arm.name or arm.name.endswith(ARM_FILES):
         raise ValueError(
@@ -86,7 +60,7 @@ def arm_of(arm: Any) -> Arm:
     if isinstance(arm, Arm):
         return arm
     name = str(arm) if isinstance(arm, str | Path) else ""
-    if name in _BUILT_IN:
+    if name in BUILT_IN:
         return _built_in(name)
     if name in _OWN:
         return _OWN[name]
@@ -104,7 +78,7 @@ def arm_of(arm: Any) -> Arm:
 @functools.cache
 def _built_in(name: str) -> Arm:
     """Return a built-in arm."""
-    return arm_from_xml(name, asset(f"{name}.xml"), tool="hand", **_BUILT_IN[name])
+    return load_arm(asset(f"{name}.xml"))
 
 
 @functools.lru_cache(maxsize=16)

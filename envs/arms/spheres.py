@@ -59,7 +59,7 @@ def cover(
             for (_, inner), (_, outer) in zip(capsules[name], covers, strict=True):
                 beyond = max(beyond, outer - inner)
         spheres = grouped(centres, radii, [links[name] for name in names], pairs)
-        overlap: Any = overlapping(chain, spheres, views, True)
+        overlap: Any = overlapping(chain, spheres, views)
         close = spheres.pairs[overlap[0]]
         coarse = {names[group] for group in close.flat}
         for view, row in np.argwhere(overlap)[len(close) :]:
@@ -176,19 +176,13 @@ def _bounding_ball(start: Float, centre: Float, radius: Float) -> Float:
 
 
 @compiled
-def overlapping(chain: Chain, spheres: Spheres, joints: Float, every: bool) -> Bool:
-    """Return True where pairs of groups overlap in N configurations, shape (N, P).
-
-    Without `every`, a pair is looked at until it overlaps once.
-    """
-    found = np.zeros((len(joints), len(spheres.pairs)), np.bool_)
-    done = np.zeros(len(spheres.pairs), np.bool_)
+def overlapping(chain: Chain, spheres: Spheres, joints: Float) -> Bool:
+    """Return True where pairs of groups overlap in N configurations, shape (N, P)."""
+    found = np.empty((len(joints), len(spheres.pairs)), np.bool_)
     placed = memory(chain, spheres)
     for n in range(len(joints)):
         place(chain, spheres, joints[n], placed)
-        for pair in range(len(done)):
-            if not done[pair]:
-                least, _, _ = nearest_spheres(spheres, placed, pair, 0.0, 0.0)
-                found[n, pair] = least < 0.0
-                done[pair] = found[n, pair] and not every
+        for pair in range(len(spheres.pairs)):
+            least, _, _ = nearest_spheres(spheres, placed, pair, 0.0, 0.0)
+            found[n, pair] = least < 0.0
     return found

@@ -23,11 +23,10 @@ import mujoco
 import numpy as np
 
 from viapoint.envs.arms.arm import Arm, arm_from_xml, asset
-from viapoint.envs.arms.spheres import LeftOut
 
 MARK = "viapoint_arm"  # Name of the text element with the choices
 # Fields of an arm that it is made with, and those that its file adds
-ARGUMENTS = ("home", "velocity_limit", "torque_limit", "space", "steerable_share")
+ARGUMENTS = ("home", "velocity_limit", "torque_limit", "space", "bandwidth", "steerable_share")
 ADDED = ("left_out", "excess", "continuous", "notes")
 COPY = "arm.xml"  # Name of a copy in the folder of a run or a model
 
@@ -82,25 +81,34 @@ def _element(choices: str) -> str:
 
 
 def read_arm(file: Any) -> Arm | None:
-    """Return the arm of a file of :func:`write_arm`, or of its text; None for everything else."""
+    """Return the arm of a file of :func:`write_arm`, or of its text; None for everything else.
+
+    Raises:
+        ValueError: Someone changed the file, and it is no arm any more.
+    """
     text = str(file)
     if not text.lstrip().startswith("<"):
         path = Path(text).expanduser()
         text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     if MARK not in text:
         return None
-    mark = ET.fromstring(text).find(f"custom/text[@name='{MARK}']")
+    try:
+        mark = ET.fromstring(text).find(f"custom/text[@name='{MARK}']")
+    except ET.ParseError:  # MuJoCo tells what is wrong
+        mark = None
     if mark is None:
         return None
     data = mark.attrib["data"]
-    choices: dict[str, Any] = json.loads(data)
-    left_out = tuple(LeftOut(*each) for each in choices["left_out"])
-    exclude = {frozenset((pair.first, pair.second)): pair.reason for pair in left_out}
-    kept = {each: choices[each] for each in ("joints", *ARGUMENTS) if each in choices}  # old: fewer
     xml = text.replace(_element(data), "")
-    arm = arm_from_xml(choices["name"], xml, tool="hand", exclude=exclude, **kept)
-    texts: dict[str, Any] = {each: tuple(choices[each]) for each in ("continuous", "notes")}
-    return replace(arm, left_out=left_out, excess=choices["excess"], **texts)
+    try:
+        choices: dict[str, Any] = json.loads(data)
+        exclude = {frozenset((first, second)): reason for first, second, reason in choices["left_out"]}
+        kept = {each: choices[each] for each in ("joints", *ARGUMENTS) if each in choices}  # old: fewer
+        arm = arm_from_xml(choices["name"], xml, tool="hand", exclude=exclude, **kept)
+        texts: dict[str, Any] = {each: tuple(choices[each]) for each in ("continuous", "notes")}
+        return replace(arm, excess=choices["excess"], **texts)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{MARK} in the file is not what write_arm wrote: {error}") from None
 
 
 def cached_arm(model: mujoco.MjModel, arguments: dict[str, Any], make: Callable[[], Arm]) -> Arm:
@@ -114,7 +122,7 @@ def cached_arm(model: mujoco.MjModel, arguments: dict[str, Any], make: Callable[
     digest.update(json.dumps(arguments, sort_keys=True, default=_plain).encode())
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "viapoint" / "arms"
     path = folder / f"{digest.hexdigest()}.xml"
-    with suppress(OSError, KeyError, TypeError, ValueError, ET.ParseError):
+    with suppress(OSError, ValueError):
         stored = read_arm(path)
         if stored is not None:
             return stored

@@ -6,9 +6,12 @@ import functools
 import itertools
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -37,20 +40,22 @@ Find = Callable[[str], Path]  # Function that returns the place of a mesh
 
 
 class Urdf(NamedTuple):
-    """Content of a URDF file."""
+    """Content of a URDF file; nothing of an MJCF file."""
 
-    text: str  # Text for MuJoCo
-    name: str  # Name of the robot
-    assets: dict[str, bytes]  # Meshes that MuJoCo cannot read as they are, by the names in the text
-    velocity_limits: dict[str, float]  # Velocity limits of joints by name, [rad/s] or [m/s]
-    never_touch: tuple[tuple[str, str], ...]  # Pairs of links that an SRDF file beside it does not compare
-    notes: tuple[str, ...]  # Parts that were left out
+    text: str = ""  # Text for MuJoCo
+    name: str = ""  # Name of the robot
+    assets: Mapping[str, bytes] = {}  # Meshes that MuJoCo cannot read as they are, by the names in the text
+    velocity_limits: Mapping[str, float] = {}  # Velocity limits of joints by name, [rad/s] or [m/s]
+    # Pairs of links that an SRDF file beside it does not compare
+    never_touch: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()  # Parts that were left out
 
 
 def read_urdf(path: Path, packages: Packages, visual: bool = False) -> Urdf:
     """Return the content of a URDF file; paths of meshes, which :func:`_find` looks for, become absolute ones.
 
-    Geoms that are only `visual` are kept for drawings. Elsewhere they would count for links without others.
+    Geoms that are only `visual` are kept for drawings, except those that MuJoCo cannot read. Elsewhere they would count
+    for links without others.
 
     Raises:
         ValueError: The file is no URDF, or a mesh for collisions is missing.
@@ -66,11 +71,10 @@ def read_urdf(path: Path, packages: Packages, visual: bool = False) -> Urdf:
         raise ValueError(f"{path.name}: {error}") from None
     notes: list[str] = []
     assets: dict[str, bytes] = {}
-    for name in LEFT_OUT if visual else (*LEFT_OUT, "material"):
-        for element in root.findall(name):
-            root.remove(element)
+    _remove(root, *LEFT_OUT)
+    if not visual:
+        _remove(root, "material")
     velocity = {}
-    unseen: list[str] = []
     left_out: dict[str, list[str]] = {}  # Names of links by the faults of their collision geoms
     find = functools.partial(_find, path, packages)
     for element in (*root.findall("link"), *root.findall("joint")):
@@ -78,7 +82,9 @@ def read_urdf(path: Path, packages: Packages, visual: bool = False) -> Urdf:
         try:
             if element.tag == "link":
                 _mend_inertia(element, notes)
-                unseen += _prepare_link(element, find, assets, visual, left_out)
+                if not visual:
+                    _remove(element, "visual")
+                _prepare_link(element, find, assets, left_out)
             else:
                 velocity[name] = _prepare_joint(element, notes)
         except ValueError as error:
@@ -94,10 +100,15 @@ def read_urdf(path: Path, packages: Packages, visual: bool = False) -> Urdf:
     compiler.attrib.pop("meshdir", None)
     compiler.attrib.update(COMPILER)
     text = ET.tostring(root, encoding="unicode")
-    if unseen:
-        notes.append(f"visual geoms that are not drawn: {len(unseen)}, the first because {unseen[0]}")
     never_touch = _srdf(path, root, notes)
     return Urdf(text, root.get("name") or path.stem, assets, velocity, never_touch, tuple(notes))
+
+
+def _remove(element: ET.Element, *names: str) -> None:
+    """Remove the children of some names from an element."""
+    for name in names:
+        for child in element.findall(name):
+            element.remove(child)
 
 
 def _root(path: Path) -> ET.Element:
@@ -110,18 +121,19 @@ def _root(path: Path) -> ET.Element:
     try:
         return ET.fromstring(content)
     except ET.ParseError as error:
-        if "unbound prefix" not in str(error):
-            raise ValueError(f"{path} is not XML: {error}") from None
-    return ET.fromstring(re.sub(rb"(</?|\s)[\w.-]+:([\w.-]+)(?=[\s=/>])", rb"\1\2", content))
+        fault = error
+    with suppress(ET.ParseError):
+        return ET.fromstring(re.sub(rb"(</?|\s)[\w.-]+:([\w.-]+)(?=[\s=/>])", rb"\1\2", content))
+    raise ValueError(f"{path} is not XML: {fault}")
 
 
 def _check_tree(root: ET.Element) -> None:
-    """Check that no name is repeated, and that each link has at most one parent.
+    """Check that no name is repeated, and that joints connect links to a tree.
 
     MuJoCo's messages on these do not name the link.
 
     Raises:
-        ValueError: It is not so, or a joint connects a link that there is not.
+        ValueError: It is not so.
     """
     for tag in ("link", "joint"):
         names = [each.get("name", "") for each in root.findall(tag)]
@@ -129,27 +141,22 @@ def _check_tree(root: ET.Element) -> None:
             if names.count(name) > 1:
                 raise ValueError(f"names of {tag}s must differ, got {name!r} {names.count(name)} times")
     links = {link.get("name") for link in root.findall("link")}
-    above: dict[str, tuple[str, str]] = {}  # Joints, and links before them, by the links that they lead to
+    above: dict[str, str] = {}  # Joints by the links that they lead to
+    parents: dict[str, list[str]] = {}
     for joint in root.findall("joint"):
         name = joint.get("name", "")
-        ends: dict[str, str] = {}
+        ends = {element.tag: element.get("link", "") for element in joint}
         for end in ("parent", "child"):
-            element = joint.find(end)
-            ends[end] = "" if element is None else element.get("link", "")
-            if ends[end] not in links:
-                raise ValueError(f"the {end} of joint {name!r} must be a link of the file, got {ends[end]!r}")
-        if ends["child"] in above:
-            other, _ = above[ends["child"]]
+            link = ends.get(end, "")
+            if link not in links:
+                raise ValueError(f"the {end} of joint {name!r} must be a link of the file, got {link!r}")
+        other = above.setdefault(ends["child"], name)
+        if other != name:
             raise ValueError(
                 f"link {ends['child']!r} must be the child of one joint, got {other!r} and {name!r}"
             )
-        above[ends["child"]] = name, ends["parent"]
-    for link in above:
-        passed = [link]
-        while passed[-1] in above:
-            passed.append(above[passed[-1]][1])
-            if passed[-1] in passed[:-1]:
-                raise ValueError(f"links must be a tree, got a ring: {', '.join(passed)}")
+        parents[ends["child"]] = [ends["parent"]]
+    TopologicalSorter(parents).prepare()  # a ring is an error, which names its links
 
 
 def _prepare_joint(joint: ET.Element, notes: list[str]) -> float:
@@ -177,25 +184,21 @@ def _prepare_joint(joint: ET.Element, notes: list[str]) -> float:
 
 
 def _prepare_link(
-    link: ET.Element, find: Find, assets: dict[str, bytes], visual: bool, left_out: dict[str, list[str]]
-) -> list[str]:
-    """Leave out geoms of a link that cannot be used, and return the faults of visual ones."""
-    faults = []
+    link: ET.Element, find: Find, assets: dict[str, bytes], left_out: dict[str, list[str]]
+) -> None:
+    """Leave out geoms of a link that cannot be used, and add it to the links of their faults if they collide."""
     for part in (*link.findall("visual"), *link.findall("collision")):
         collides = part.tag == "collision"
         try:
-            fault = _prepared(part.find("geometry"), find, assets if collides or visual else None)
+            fault = _prepared(part.find("geometry"), find, assets)
         except ValueError as error:
             if collides:
                 raise
             fault = str(error)
-        if fault and collides:
-            left_out.setdefault(fault, []).append(link.get("name", ""))
-        elif fault:
-            faults.append(fault)
-        if fault or not (collides or visual):
+        if fault:
             link.remove(part)
-    return faults
+            if collides:
+                left_out.setdefault(fault, []).append(link.get("name", ""))
 
 
 def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
@@ -220,7 +223,7 @@ def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
             notes.append(f"inertia of {name}, which is missing or not positive: that of a ball of {BALL:g} m")
 
 
-def _prepared(geometry: ET.Element | None, find: Find, assets: dict[str, bytes] | None) -> str:
+def _prepared(geometry: ET.Element | None, find: Find, assets: dict[str, bytes]) -> str:
     """Make the path of a mesh absolute, and return what is wrong with a geometry, empty for nothing."""
     if geometry is None:
         return "no geometry"
@@ -243,7 +246,7 @@ def _prepared(geometry: ET.Element | None, find: Find, assets: dict[str, bytes] 
         is_binary_stl = found.suffix.lower() == ".stl" and begin[:5].lower() != b"solid"
         if is_binary_stl and not any(begin[80:]):  # the number of triangles
             return f"there is no triangle in {found.name}"
-        if assets is not None and not is_binary_stl:
+        if not is_binary_stl:
             _add_rewritten(element, found, assets)
     return ""
 
@@ -274,20 +277,24 @@ def _find(path: Path, packages: Packages, file: str) -> Path:
     """Return the place of a mesh of a URDF.
 
     A relative path begins at the URDF. `package://NAME/REST`, then REST, then what is left without the first folder of
-    it, and so on, are looked for in the folders of `packages` and above the URDF: copies often have other names.
+    it, and so on, are looked for in the folders of `packages` and above the URDF: copies often have other names. In
+    addresses, a space may be `%20`.
 
     Raises:
         ValueError: There is no such file.
     """
-    parts = file.removeprefix("package://").removeprefix("file://").split("/")
-    places = [] if file.startswith("package://") else [path.parent / "/".join(parts)]
+    in_package = file.startswith("package://")
+    written = file.removeprefix("package://").removeprefix("file://")
     folders = [*(Path(each).expanduser() for each in packages), *path.resolve().parents]
-    for first in range(len(parts)):
-        rest = "/".join(part for part in parts[first:] if part != "..")
-        places += [folder / rest for folder in folders]
-    for place in places:
-        if place.is_file():
-            return place
+    for name in dict.fromkeys((written, unquote(written))):
+        parts = name.split("/")
+        places = [] if in_package else [path.parent / name]
+        for first in range(len(parts)):
+            rest = "/".join(part for part in parts[first:] if part != "..")
+            places += [folder / rest for folder in folders]
+        for place in places:
+            if place.is_file():
+                return place
     raise ValueError(f"there is no file {file!r}; name folders to look in with packages=")
 
 

@@ -17,7 +17,6 @@ DENT = 1e-6  # Depth of a vertex below the hull from which a mesh is not convex,
 COPLANAR = 2e-7
 """Distance between neighbouring faces within which they are one face, as a share of the mesh's size: several times the
 rounding of vertices in single precision."""
-HULL_HINT = "ConvexMesh.hull(vertices) is the convex hull"  # Hint of error messages
 LEAF = 16  # Greatest number of points of a leaf of the tree
 SLIVER = 1e-12
 """Area of triangles that are left out, as a share of the square of the mesh's size; their neighbours cover them."""
@@ -118,13 +117,11 @@ def _from_triangle(
     return dx, dy, dz
 
 
-def build_mesh(vertices: Float, faces: Int | None) -> Meshes:
+def build_mesh(vertices: Float) -> Meshes:
     """Return the convex mesh of vertices, shape (V, 3), [m], with the triangles of their hull.
 
-    Given faces, shape (F, 3), must be closed and convex.
-
     Raises:
-        ValueError: The vertices lie in a plane, or the mesh is open or not convex.
+        ValueError: The vertices lie in a plane, or one is inside the hull.
     """
     hull = convex_hull(vertices, COPLANAR)
     corners, normals = vertices[hull.simplices], hull.equations[:, :3]
@@ -133,10 +130,9 @@ def build_mesh(vertices: Float, faces: Int | None) -> Meshes:
         depth = ((corners[:, 0] - vertices[vertex]) * normals).sum(axis=1).min()
         if depth > DENT * size:
             raise ValueError(
-                f"vertices must be convex: vertex {vertex} lies {depth:.3g} m inside; {HULL_HINT}"
+                f"vertices must be convex: vertex {vertex} lies {depth:.3g} m inside; ConvexMesh.hull(vertices) is "
+                "the convex hull"
             )
-    if faces is not None:
-        _check_faces(vertices, faces, hull.volume, DENT * size**3)
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     clockwise = (area * normals).sum(axis=1) < 0.0  # Qhull does not order corners
     corners[clockwise] = corners[clockwise, ::-1]
@@ -166,19 +162,6 @@ def convex_hull(vertices: Float, coplanar: float = 0.0) -> Any:
     if not finite:
         raise ValueError("vertices must have a hull with finite planes; give them in metres")
     return hull
-
-
-def _check_faces(vertices: Float, faces: Int, volume: float, tolerance: float) -> None:
-    """Check that triangles are closed, look to one side, and contain the volume of the hull, [m^3]."""
-    edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]])).tolist()
-    known = {(first, second) for first, second in edges}
-    if len(known) < len(edges) or any((second, first) not in known for first, second in known):
-        raise ValueError(f"faces must be closed: each edge belongs to two, in both directions; {HULL_HINT}")
-    inside = np.linalg.det(vertices[faces]).sum() / 6.0
-    if abs(abs(inside) - volume) > tolerance:
-        raise ValueError(
-            f"faces must be convex, but contain {abs(inside):.4g} of the {volume:.4g} m^3 of their hull; {HULL_HINT}"
-        )
 
 
 def join_meshes(meshes: Iterable[Meshes]) -> Meshes:

@@ -17,7 +17,7 @@ import numpy as np
 
 from viapoint.envs.common.arrays import Float, frame_matrices, frozen, quaternion_to
 from viapoint.envs.common.mujoco_check import mujoco
-from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, unit_quaternion
+from viapoint.envs.common.validation import finite_array, number_of_at_least, unit_quaternion
 from viapoint.envs.geometry.compiled import TINY, Vector, inlined, kernel
 from viapoint.envs.geometry.meshes import (
     FAR,
@@ -249,7 +249,7 @@ class Shape:
         values: dict[str, Any] = {"shape": self.kind}
         for each in self.parameters():
             value = getattr(self, each)
-            if each in ("name", "velocity", "faces") and not np.any(value):
+            if each in ("name", "velocity") and not np.any(value):
                 continue
             values[each] = value.tolist() if isinstance(value, np.ndarray) else value
         return values
@@ -409,8 +409,6 @@ class ConvexMesh(Shape):
 
     vertices: Any
     """Shape (V, 3), [m]."""
-    faces: Any = None
-    """Triangles as indices of vertices, shape (F, 3), which are checked; None for those of the convex hull."""
 
     @classmethod
     def hull(cls, points: Any, **others: Any) -> Self:
@@ -425,15 +423,7 @@ class ConvexMesh(Shape):
 
     def _complete(self) -> None:
         self._set("vertices", finite_array("vertices", self.vertices, (None, 3)))
-        if self.faces is not None:
-            faces = as_real_array(self.faces)
-            last = len(self.vertices) - 1
-            if faces is None or faces.dtype.kind not in "iu" or faces.ndim != 2 or faces.shape[1] != 3:
-                raise ValueError(f"faces must be whole numbers of shape (F, 3), got {self.faces!r:.60}")
-            if not len(faces) or faces.min() < 0 or faces.max() > last:
-                raise ValueError(f"faces must be indices of vertices, from 0 to {last}")
-            self._set("faces", faces.astype(np.int64))
-        self._set("mesh", build_mesh(np.array(self.vertices), self.faces))
+        self._set("mesh", build_mesh(np.array(self.vertices)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -494,7 +484,7 @@ SHAPES: tuple[type[Shape], ...] = (Sphere, Capsule, Cylinder, Box, HalfSpace, Co
 REGISTERED_MESHES: dict[str, ConvexMesh] = {}  # Meshes with a name of their own, see :func:`register_mesh`
 
 
-def register_mesh(name: str, vertices: Any, faces: Any = None) -> None:
+def register_mesh(name: str, vertices: Any) -> None:
     """Register a convex mesh under a name, so that scenes and observations may contain it.
 
     The name is then a shape: dictionaries take it as `shape`, environments in `shapes`. Registering the same mesh again
@@ -502,8 +492,7 @@ def register_mesh(name: str, vertices: Any, faces: Any = None) -> None:
 
     Args:
         name: Identifier, which no other shape has.
-        vertices: Vertices, or anything else of :class:`ConvexMesh`, shape (V, 3), [m].
-        faces: Triangles, shape (F, 3); None for those of the convex hull.
+        vertices: Vertices of a convex mesh, shape (V, 3), [m].
 
     Example:
         >>> from viapoint.envs.geometry.shapes import as_obstacle, register_mesh
@@ -514,7 +503,7 @@ def register_mesh(name: str, vertices: Any, faces: Any = None) -> None:
     """
     if not (isinstance(name, str) and name.isidentifier()):
         raise ValueError(f"the name of a mesh must be an identifier such as 'rock', got {name!r}")
-    mesh = ConvexMesh(vertices, faces)
+    mesh = ConvexMesh(vertices)
     known = REGISTERED_MESHES.get(name)
     if name in KINDS or (known is not None and not np.array_equal(known.vertices, mesh.vertices)):
         raise ValueError(f"another shape has the name {name!r}; give this mesh another one")
