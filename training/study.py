@@ -28,12 +28,11 @@ from stable_baselines3.common.callbacks import ConvertCallback
 from viapoint.envs.common.validation import is_number
 from viapoint.envs.task import Task
 from viapoint.training import files
-from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
 from viapoint.training.agents.model_io import check_arguments, check_hyperparameters, load_model, untrained
 from viapoint.training.checks import check_env_kwargs, check_folder, check_whole, named_path, unknown_name
-from viapoint.training.cli.doctor import explain_import_error
 from viapoint.training.configs import StudyConfig, TrainConfig
 from viapoint.training.evaluation import across_seeds, evaluate_methods, wilson
+from viapoint.training.extras import explain_import_error
 from viapoint.training.planning.baselines import Method, agent_method, factory, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plots import success_of_rows
