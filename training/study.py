@@ -117,12 +117,6 @@ class Trial:
         hyperparameters = {**config.hyperparameters, "policy_kwargs": {**usual, **own}}
         return dataclasses.replace(config, hyperparameters=hyperparameters)
 
-    @property
-    def key(self) -> str:
-        """Name of a search that changes with its description."""
-        plain = json.dumps(dataclasses.asdict(self), sort_keys=True)
-        return f"{self.row}-{hashlib.sha256(plain.encode()).hexdigest()[:10]}"
-
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
@@ -616,7 +610,8 @@ def _run_search(search: Trial, folder: Path, workers: int | None, told: Told) ->
         except Exception as error:  # settings that cannot be trained do not end a search
             tune.report({"success": 0.0, "decisions": total, "error": _one_line(error)})
 
-    path = folder / "tune" / f"search-{search.key}"
+    described = json.dumps(dataclasses.asdict(search), sort_keys=True).encode()
+    path = folder / "tune" / f"search-{search.row}-{hashlib.sha256(described).hexdigest()[:10]}"
     if tune.Tuner.can_restore(path):
         tuner = tune.Tuner.restore(str(path), work, resume_unfinished=True, restart_errored=True)
     else:
