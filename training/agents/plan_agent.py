@@ -83,17 +83,14 @@ class PlanPolicy(BasePolicy):
         """Number of candidates of a decision, those of all rounds among them."""
         return self.candidates + self.refinements * self.per_refinement
 
-    def _check_candidates(self) -> None:
-        """Check the number of candidates of a decision; ValueError if there are too many."""
-        whole_number("number of all candidates", self.all_candidates, 1, MOST_CANDIDATES)
-
     @property
     def can_refine(self) -> bool:
         """True for tasks whose movements begin at rest and have via-points, which can be refined."""
         return not self.replanning and self.task.n_via > 0
 
-    def _make_optimizer(self, network: torch.nn.Module, lr_schedule: Any) -> None:
-        """Create the optimizer of the network."""
+    def _set_up(self, network: torch.nn.Module, lr_schedule: Any) -> None:
+        """Check the number of candidates of a decision, and create the optimizer of the network."""
+        whole_number("number of all candidates", self.all_candidates, 1, MOST_CANDIDATES)
         self.optimizer = self.optimizer_class(
             network.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]

@@ -113,14 +113,13 @@ class ViaQPolicy(PlanPolicy):
         self.per_refinement = per_refinement
         self.checks = checks
         self.refine = refine
-        self._check_candidates()
         self.critic = ViaQCritic(self.task, width=self.width)
         self.critic_target: ViaQCritic | None = None
         if self.replanning:  # values of later decisions are learned from a critic that changes slowly
             self.critic_target = ViaQCritic(self.task, width=self.width)
             self.critic_target.load_state_dict(self.critic.state_dict())
             self.critic_target.requires_grad_(False)
-        self._make_optimizer(self.critic, lr_schedule)
+        self._set_up(self.critic, lr_schedule)
 
     @property
     def network(self) -> ViaQCritic:

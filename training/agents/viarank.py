@@ -104,18 +104,9 @@ class ViaRankPolicy(PlanPolicy):
     """
 
     OWN = (
-        "width",
-        "instants",
-        "nearest",
-        "candidates",
-        "refinements",
-        "per_refinement",
-        "refine",
-        "caution",
-        "effort",
-        "belief",
-        "depths",
-    )
+        "width", "instants", "nearest", "candidates", "refinements", "per_refinement", "refine",
+        "caution", "effort", "belief", "depths",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -152,11 +143,10 @@ class ViaRankPolicy(PlanPolicy):
         self.caution: float = usual["caution"] if caution is None else caution
         self.effort: float = usual["effort"] if effort is None else effort
         self.depths: tuple[float, ...] = usual["depths"] if depths is None else tuple(depths)
-        self._check_candidates()
         sensor = self.task.sensor
         assert sensor is not None
         self.network = SightNetwork(sensor, width=width, beliefs=1 + len(self.depths))
-        self._make_optimizer(self.network, lr_schedule)
+        self._set_up(self.network, lr_schedule)
 
     def _check_setting(self, name: str, value: Any) -> None:
         super()._check_setting(name, value)
