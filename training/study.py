@@ -37,7 +37,6 @@ from viapoint.training.planning.baselines import Method, agent_method, factory, 
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plots import success_of_rows
 from viapoint.training.rollout import whole_task
-from viapoint.training.runs import Run
 from viapoint.training.scene_sets import SEEDS, SETS, FrozenScenes, scenes_for, shipped_set
 from viapoint.training.trainer import train_or_resume
 
@@ -516,8 +515,6 @@ def _asked(trial: Trial) -> Record:
     """Return what identifies a trial as plain values."""
     plain: Record = files.as_plain(trial)
     plain["scenes"] = {name: frozen.sha256 for name, frozen in _sets(trial).items()}
-    if not trial.parameters:
-        del plain["parameters"], plain["trials"], plain["first"]  # of searches
     return plain
 
 
@@ -596,9 +593,9 @@ def _run_search(search: Trial, folder: Path, workers: int | None, told: Told) ->
     def work(config: Values) -> None:
         reported = 1  # the validation before training says nothing about it
 
-        def report(*_: object) -> bool:
+        def report(given: Values, _: object) -> bool:
             nonlocal reported
-            for each in Run(settings.folder).curve[reported:]:
+            for each in given["callback"].curve[reported:]:  # of the callback that validates
                 tune.report({"success": each["success"]["rate"], "decisions": each["decisions"]})
                 reported += 1
             return True
