@@ -130,13 +130,6 @@ def shipped_path(env_id: str) -> Path:
     return SHIPPED / f"{env_id.removeprefix('viapoint/')}.npz"
 
 
-def shipped_sets(path: Path) -> dict[str, FrozenScenes]:
-    """Return the sets of a shipped file by their names."""
-    with np.load(path, allow_pickle=False) as archive:
-        names = [name for name in SETS if _place(name, "task") in archive]
-    return {name: load(path, name) for name in names}
-
-
 def shipped_set(name: str, task: Task) -> FrozenScenes | None:
     """Return the shipped set whose scenes are those of a task, or None if there is none."""
     for path in sorted(SHIPPED.glob("*.npz")):

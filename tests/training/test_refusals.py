@@ -347,6 +347,7 @@ def test_folders_that_are_no_runs(tmp_path):
 COMMANDS = [
     ("trian", "did you mean 'train'"),
     ("train --env viapoint/PlanarObstacle-v0", "did you mean 'viapoint/PlanarObstacles-v0'"),
+    ("train --algo dqn", "('viaq', 'viarank', 'sac', 'td3', 'ppo', 'tqc')"),
     ("train --n-timesteps -5", "--n-timesteps must be a whole number, from 1"),
     ("train --n-timesteps 1e5", "--n-timesteps: must be a whole number, got '1e5'"),
     ("train --n-timesteps 16 --n-envs 16 --out=", "--out: must be a path, got ''"),
