@@ -16,6 +16,7 @@ import contextlib
 import dataclasses
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,9 +44,9 @@ from viapoint.training.scene_sets import (
     SCENE_PARTS,
     SETS,
     FrozenScenes,
+    load,
     save_sets,
     shipped_path,
-    shipped_sets,
 )
 
 SEEDS = {"validation": 11, "test": 12, "hard": 13, "uniform": 14}  # First part of seeds
@@ -196,6 +197,13 @@ def rounded(scenes: Scenes) -> Scenes:
 def _single(record: Any, names: Sequence[str]) -> dict[str, Any]:
     """Return fields of a record in numbers that single precision represents."""
     return {name: getattr(record, name).astype(np.float32).astype(np.float64) for name in names}
+
+
+def shipped_sets(path: Path) -> dict[str, FrozenScenes]:
+    """Return the sets of a shipped file by their names."""
+    with np.load(path, allow_pickle=False) as archive:
+        names = [name for name in SETS if f"{name}/task" in archive]
+    return {name: load(path, name) for name in names}
 
 
 def together(parts: Sequence[FrozenScenes]) -> FrozenScenes:

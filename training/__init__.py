@@ -37,6 +37,6 @@ else:
         try:
             return _get(name)
         except ModuleNotFoundError as error:
-            from viapoint.training.cli.doctor import explain_import_error
+            from viapoint.training.extras import explain_import_error
 
             raise ImportError(explain_import_error(error, f"viapoint.training.{name}")) from error

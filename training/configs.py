@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
@@ -43,10 +43,13 @@ KINDS = {int: "a whole number", float: "a number", Path: "a path", str: "a text"
 
 @REGISTRY.primitive_rule
 def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """Return the form of a number, path or text, or of one that may be left out."""
+    """Return the form of a number, path or text, or of one of these or of a choice that may be left out."""
     kinds = set(get_args(info.type)) or {info.type}
     kind: Any = next((each for each in KINDS if each in kinds), None)  # a path before a text
-    if kind is None or not kinds <= {NoneType, *KINDS}:
+    choices = next((get_args(each) for each in kinds if get_origin(each) is Literal), None)
+    if choices is not None:  # tyro would list those that may be left out in random order
+        kind = str
+    elif kind is None or not kinds <= {NoneType, *KINDS}:
         return None
 
     def read(words: list[str]) -> Any:
@@ -57,10 +60,11 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
 
     return PrimitiveConstructorSpec(
         nargs=1,
-        metavar=kind.__name__.upper(),
+        metavar="{" + ",".join(choices) + "}" if choices else kind.__name__.upper(),
         instance_from_str=read,
         is_instance=lambda value: value is None or isinstance(value, kind),
         str_from_instance=lambda value: ["none" if value is None else str(value)],
+        choices=choices,
     )
 
 

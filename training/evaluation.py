@@ -1,4 +1,4 @@
-"""Evaluation of agents and baselines on the same scenes, with every outcome, intervals and paired comparisons."""
+"""Evaluation of agents and baselines on the same scenes, with every outcome and intervals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from viapoint.envs.common.arrays import Float, Observation
 from viapoint.envs.common.validation import finite_array
 from viapoint.envs.outcome import Outcome
 from viapoint.envs.registration import check_registered
-from viapoint.envs.scenes.scene import NEVER, Scenes
+from viapoint.envs.scenes.scene import Scenes
 from viapoint.training import report
 from viapoint.training.agents.agent import load_agent
 from viapoint.training.agents.model_io import check_same_task, untrained
@@ -53,8 +53,6 @@ class MethodResult:
     """Wall times of single decisions, [s]; one number, the mean of a batch, for a slow method."""
     band: NDArray[np.int64]  # Index into BANDS of each scene, -1 if the share is unknown, shape (n,)
     family: NDArray[np.str_]  # Scene family of each scene, '' for the training distribution, shape (n,)
-    distance: Float
-    """Distance from start to goal, shape (n,), [m]; NaN if the target jumps, as the shortest path is unknown."""
     partial: bool  # True if Ctrl-C ended it: scenes or decision times are missing
 
     @property
@@ -80,11 +78,6 @@ class MethodResult:
             summary[name] = _quantile(self.outcomes[name])
         for name in ("jerk_ratio", "duration", "path_length"):
             summary[name] = _quantile(self.outcomes[name][success])
-        summary["spl"] = None
-        if len(success) and np.isfinite(self.distance).all():
-            # SPL = mean(S l / max(p, l)): Anderson et al. 2018, arXiv 1807.06757
-            weight = self.distance / np.maximum(self.outcomes["path_length"], self.distance)
-            summary["spl"] = float((success * weight).mean())
         summary["decision_time"] = _quantile(self.decision_times)
         several = len(self.decision_times) > 1
         summary["decision_time_98"] = _quantile(self.decision_times, 0.98) if several else None
@@ -133,13 +126,7 @@ class EvaluationResult:
         return report.markdown(self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return metrics, comparisons with the first method, and every outcome, as JSON can represent them."""
-        first, *others = self.results
-        compared = {}
-        for each in others:
-            number = min(len(first.success), len(each.success))  # of an evaluation that was interrupted
-            pairs = each.success[:number], first.success[:number]
-            compared[each.name] = mcnemar(*pairs) if number else None
+        """Return metrics and every outcome, as JSON can represent them."""
         outcomes: dict[str, dict[str, list[Any]]] = {result.name: {} for result in self.results}
         for result in self.results:
             for name, values in result.outcomes.items():
@@ -153,7 +140,6 @@ class EvaluationResult:
             "sha256": self.sha256,
             "partial": self.partial,
             "methods": {result.name: result.summary() for result in self.results},
-            "compared_with_first": compared,
             "outcomes": outcomes,
         }
 
@@ -312,16 +298,12 @@ def _evaluate_one(
     nothing = {name: np.zeros(0) for name in (*Outcome._fields, "action")}
     outcomes = joined(pieces) if pieces else nothing
     done = len(outcomes["is_success"])
-    hand = simulation.task.arm.hand
-    away = np.linalg.norm(hand(frozen.scenes.goal) - hand(frozen.scenes.start), axis=-1)
-    away[(frozen.scenes.jump_times < NEVER).any(axis=-1)] = np.nan  # the shortest path is unknown
     return MethodResult(
         name=method.name,
         outcomes=outcomes,
         decision_times=times,
         band=frozen.band[:done],
         family=frozen.family[:done],
-        distance=away[:done],
         partial=interrupted,
     )
 
@@ -388,22 +370,6 @@ def wilson(successes: int, trials: int) -> Interval:
     test = stats.binomtest(successes, trials)
     low, high = test.proportion_ci(CONFIDENCE, method="wilson")
     return float(test.statistic), float(low), float(high)
-
-
-def mcnemar(first: ArrayLike, second: ArrayLike) -> dict[str, float]:
-    """Compare the successes of two methods on the same N > 0 scenes, shape (N,), by the exact McNemar test.
-
-    The result holds `difference`, the success rate of the first minus that of the second; `only_first` and
-    `only_second`, numbers b and c of scenes in which one alone succeeded; and the two-sided `p_value`: if both are
-    equally good, b is binomial(b + c, 1/2). Source: McNemar 1947, Psychometrika 12, 153-157.
-    """
-    a, b = np.asarray(first), np.asarray(second)
-    only_first = int((a > b).sum())
-    only_second = int((b > a).sum())
-    differing = only_first + only_second
-    p_value = float(stats.binomtest(only_first, differing).pvalue) if differing else 1.0
-    result = {"difference": float(a.mean() - b.mean()), "only_first": only_first, "only_second": only_second}
-    return {**result, "p_value": p_value}
 
 
 def across_seeds(

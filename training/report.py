@@ -24,7 +24,6 @@ NUMBERS = {
     "clearance [mm]": ("min_clearance", 1e3, 1),
     "goal error [mm, mrad]": ("goal_error", 1e3, 2),
     "jerk ratio": ("jerk_ratio", 1.0, 2),
-    "SPL": ("spl", 1.0, 3),
     "duration [s]": ("duration", 1.0, 2),
     "decision [ms]": ("decision_time", 1e3, 2),
     "98 % of them [ms]": ("decision_time_98", 1e3, 2),
@@ -34,9 +33,8 @@ NOTES = (
     "physics step, joint limits kept; with its 95 % Wilson interval. Share: success among scenes of that "
     "solution share, the fraction of random actions whose plan is clear; in hard sets also among scenes of "
     "each family. Clearance and goal error are medians of all scenes, jerk ratio (to the straight movement) "
-    "and duration of the successes. SPL: success weighted by straight distance over path length. Decision: "
-    "median wall time of single decisions, and their 98th percentile; where that is missing, the mean in a "
-    "batch."
+    "and duration of the successes. Decision: median wall time of single decisions, and their 98th "
+    "percentile; where that is missing, the mean in a batch."
 )
 HEADINGS, COLUMN = 18, 14  # Widths in a terminal, [characters]
 

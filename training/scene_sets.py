@@ -69,16 +69,6 @@ class FrozenScenes:
         return np.where(np.isnan(self.share), -1, band).astype(np.int64)
 
     @property
-    def hidden(self) -> Float:
-        """Share of obstacles that the sensor does not see at all in each scene, shape (N,); NaN without a sensor."""
-        task = Task.of(**self.task)
-        if task.sensor is None:
-            return np.full(self.share.shape, np.nan)
-        rotation, origin = task.sensor.pose(task.arm, self.scenes.start)
-        hidden = task.sensor.hidden(rotation, origin, self.scenes.obstacles)
-        return np.asarray(hidden.sum(axis=1) / np.maximum(self.scenes.obstacles.present.sum(axis=1), 1))
-
-    @property
     def sha256(self) -> str:
         """Hash of task, scenes, shares and families; the compression of the file does not count."""
         digest = hashlib.sha256(json.dumps(self.task, sort_keys=True).encode())
@@ -138,13 +128,6 @@ def _place(name: str, part: str) -> str:
 def shipped_path(env_id: str) -> Path:
     """Return the path of the file that holds the shipped sets of an environment."""
     return SHIPPED / f"{env_id.removeprefix('viapoint/')}.npz"
-
-
-def shipped_sets(path: Path) -> dict[str, FrozenScenes]:
-    """Return the sets of a shipped file by their names."""
-    with np.load(path, allow_pickle=False) as archive:
-        names = [name for name in SETS if _place(name, "task") in archive]
-    return {name: load(path, name) for name in names}
 
 
 def shipped_set(name: str, task: Task) -> FrozenScenes | None:

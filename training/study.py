@@ -28,17 +28,15 @@ from stable_baselines3.common.callbacks import ConvertCallback
 from viapoint.envs.common.validation import is_number
 from viapoint.envs.task import Task
 from viapoint.training import files
-from viapoint.training.agents import viaq as _viaq  # noqa: F401 - it and its imports fill the table of algorithms
 from viapoint.training.agents.model_io import check_arguments, check_hyperparameters, load_model, untrained
 from viapoint.training.checks import check_env_kwargs, check_folder, check_whole, named_path, unknown_name
-from viapoint.training.cli.doctor import explain_import_error
 from viapoint.training.configs import StudyConfig, TrainConfig
 from viapoint.training.evaluation import across_seeds, evaluate_methods, wilson
+from viapoint.training.extras import explain_import_error
 from viapoint.training.planning.baselines import Method, agent_method, factory, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.plots import success_of_rows
 from viapoint.training.rollout import whole_task
-from viapoint.training.runs import Run
 from viapoint.training.scene_sets import SEEDS, SETS, FrozenScenes, scenes_for, shipped_set
 from viapoint.training.trainer import train_or_resume
 
@@ -117,12 +115,6 @@ class Trial:
         usual = config.preset.hyperparameters.get("policy_kwargs", {})
         hyperparameters = {**config.hyperparameters, "policy_kwargs": {**usual, **own}}
         return dataclasses.replace(config, hyperparameters=hyperparameters)
-
-    @property
-    def key(self) -> str:
-        """Name of a search that changes with its description."""
-        plain = json.dumps(dataclasses.asdict(self), sort_keys=True)
-        return f"{self.row}-{hashlib.sha256(plain.encode()).hexdigest()[:10]}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -523,8 +515,6 @@ def _asked(trial: Trial) -> Record:
     """Return what identifies a trial as plain values."""
     plain: Record = files.as_plain(trial)
     plain["scenes"] = {name: frozen.sha256 for name, frozen in _sets(trial).items()}
-    if not trial.parameters:
-        del plain["parameters"], plain["trials"], plain["first"]  # of searches
     return plain
 
 
@@ -603,9 +593,9 @@ def _run_search(search: Trial, folder: Path, workers: int | None, told: Told) ->
     def work(config: Values) -> None:
         reported = 1  # the validation before training says nothing about it
 
-        def report(*_: object) -> bool:
+        def report(given: Values, _: object) -> bool:
             nonlocal reported
-            for each in Run(settings.folder).curve[reported:]:
+            for each in given["callback"].curve[reported:]:  # of the callback that validates
                 tune.report({"success": each["success"]["rate"], "decisions": each["decisions"]})
                 reported += 1
             return True
@@ -617,7 +607,8 @@ def _run_search(search: Trial, folder: Path, workers: int | None, told: Told) ->
         except Exception as error:  # settings that cannot be trained do not end a search
             tune.report({"success": 0.0, "decisions": total, "error": _one_line(error)})
 
-    path = folder / "tune" / f"search-{search.key}"
+    described = json.dumps(dataclasses.asdict(search), sort_keys=True).encode()
+    path = folder / "tune" / f"search-{search.row}-{hashlib.sha256(described).hexdigest()[:10]}"
     if tune.Tuner.can_restore(path):
         tuner = tune.Tuner.restore(str(path), work, resume_unfinished=True, restart_errored=True)
     else:

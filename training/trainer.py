@@ -33,7 +33,6 @@ Callbacks = BaseCallback | Sequence[BaseCallback] | None
 # Form of the progress bar; narrow terminals cut its end, so success, the description, is first
 PROGRESS = "{desc}{percentage:.0f}%|{bar}| {elapsed}<{remaining}, {n_fmt}/{total_fmt} decisions"
 LOG_EVERY = 1_000  # Decisions between two entries of the log
-LONG = 100  # Trainings that are so many times as long as usual may be a mistake
 RATES = ("collision", "reachable")  # Metrics that are true or false
 # Metrics of a validation in the log and in the learning curve; medians in [m], [s], and [rad] for errors of joints
 VALIDATED = ("success", "collision", "min_clearance", "goal_error", "jerk_ratio", "duration")
@@ -125,15 +124,12 @@ def train_or_resume(config: TrainConfig, callback: Callbacks = None) -> Run:
 
 
 def _warn(config: TrainConfig) -> None:
-    """Print what a training of a resolved configuration can hardly learn, and that it takes very long."""
+    """Print what a training of a resolved configuration can hardly learn."""
     starts = config.hyperparameters.get("learning_starts", 0)
     if config.total_timesteps <= starts:
         reason = f"learning starts after {starts} decisions (learning_starts)"
         told = f"n_timesteps={config.total_timesteps}: the network is not updated once, as {reason}"
         print(told, file=sys.stderr)
-    times = config.total_timesteps / config.preset.n_timesteps
-    if times >= LONG:
-        print(f"n_timesteps={config.total_timesteps}: {times:,.0f} times as many as usual", file=sys.stderr)
     if not config.task.n_via and config.task.n_obstacles[1] and not config.task.stepwise:
         print("n_via=0: all movements are straight, and none can pass around an obstacle", file=sys.stderr)
 

@@ -22,11 +22,12 @@ from viapoint.training.scene_sets import (
     scenes_for,
     shipped_path,
     shipped_set,
-    shipped_sets,
 )
 
 FILES = sorted(shipped_path(PLANE).parent.glob("*.npz"))
-SHIPPED = {f"{path.stem} {name}": frozen for path in FILES for name, frozen in shipped_sets(path).items()}
+SHIPPED = {
+    f"{path.stem} {name}": frozen for path in FILES for name, frozen in make.shipped_sets(path).items()
+}
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +193,6 @@ def test_arrays_that_do_not_fit_together_are_refused(some, tmp_path, name, forge
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_no_scene_is_in_two_sets(path):
-    sets = shipped_sets(path).values()
+    sets = make.shipped_sets(path).values()
     ends = np.concatenate([np.hstack((each.scenes.start, each.scenes.goal)) for each in sets])
     assert len(np.unique(ends, axis=0)) == len(ends)

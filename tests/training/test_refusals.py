@@ -297,9 +297,8 @@ def test_calls(call, tmp_path, monkeypatch):
 
 
 COPIES = [
-    (lambda env: (env.set_options([{"start": 0.0}, *[{}] * 5]), env.reset()), ValueError),
-    (lambda env: (env.set_options([{}] * 5), env.reset()), ValueError),
-    (lambda env: (env.set_options(5), env.reset()), ValueError),
+    (lambda env: (env.set_options({"start": 0.0}), env.reset()), ValueError),
+    *((lambda env, given=given: env.set_options(given), ValueError) for given in ([{}] * 6, 5)),
     (lambda env: env.get_attr("num_envs", 6), IndexError),
     (lambda env: env.env_method("__str__", indices=[0, -7]), IndexError),
     (lambda env: env.env_is_wrapped(gym.Wrapper, indices=[9]), IndexError),
@@ -348,6 +347,7 @@ def test_folders_that_are_no_runs(tmp_path):
 COMMANDS = [
     ("trian", "did you mean 'train'"),
     ("train --env viapoint/PlanarObstacle-v0", "did you mean 'viapoint/PlanarObstacles-v0'"),
+    ("train --algo dqn", "('viaq', 'viarank', 'sac', 'td3', 'ppo', 'tqc')"),
     ("train --n-timesteps -5", "--n-timesteps must be a whole number, from 1"),
     ("train --n-timesteps 1e5", "--n-timesteps: must be a whole number, got '1e5'"),
     ("train --n-timesteps 16 --n-envs 16 --out=", "--out: must be a path, got ''"),
@@ -361,12 +361,11 @@ COMMANDS = [
     ("evaluate", "--env"),
     ("plan --position 0.4 0.3", "--position needs 3 numbers for panda, x y z, got 2"),
     ("plan --goal 0.4 0.3", "--goal needs 7 numbers"),
-    ("evaluate --baselines straight --agent", "--agent needs a name"),
     ("plan --arm panda --velocity-limit 0.3 --position 0.4 0.3 0.3", "--velocity-limit"),
     ("plan --arm nowhere.xml --position 0.4 0.3 0.3", "nowhere.xml"),
     ("plan --arm panda --goal 0 0 0 -1 0 1 0 --quaternion 0 1 0 0", "--quaternion"),
     ("record", "name an agent"),
-    (f"evaluate --baselines straight {PLANE}", "(first, or as --agent NAME)"),
+    (f"evaluate --baselines straight {PLANE}", "as the first word"),
     ("plan --position 0.4 0.3 0.3 --rate 0", "--rate must be"),
     ("plan --position 0.4 0.3 0.3 --scene full/notes.txt", "notes.txt: "),
     ("evaluate --scenes motionbenchmaker --baselines nothing", "plan_motion+ompl"),

@@ -191,17 +191,13 @@ class Agent(BaseAlgorithm):
         model.trainable = env is not None
         return model
 
-    @staticmethod
-    def check_buffer(buffer: Any) -> None:
-        """Check the class of a replay buffer; ValueError if it does not apply."""
+    def _setup_model(self) -> None:
+        buffer = getattr(self, "replay_buffer_class", None)
         if buffer is not None and issubclass(buffer, HerReplayBuffer):
             raise ValueError(
                 "HerReplayBuffer does not apply: the observation has no achieved_goal, and the reward of another goal "
                 "depends on contact and jerk of a movement that was not made; leave replay_buffer_class out"
             )
-
-    def _setup_model(self) -> None:
-        self.check_buffer(getattr(self, "replay_buffer_class", None))
         super()._setup_model()  # type: ignore[safe-super]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:

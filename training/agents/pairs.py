@@ -53,15 +53,7 @@ class Pairs(NamedTuple):
     inside: Tensor  # True for movements within reach and joint ranges, shape (B, H)
 
 
-def pairs_of(
-    task: Task,
-    problem: Problem,
-    moves: Moves,
-    instants: Int,
-    until: Float | None = None,
-    *,
-    exact: bool = False,
-) -> Pairs:
+def pairs_of(task: Task, problem: Problem, moves: Moves, instants: Int, until: Float | None = None) -> Pairs:
     """Return the nearest pairs of H movements in each of B problems.
 
     Args:
@@ -70,14 +62,12 @@ def pairs_of(
         moves: Movements.
         instants: Instants that are looked at, some of 0 to INSTANTS - 1 in increasing order.
         until: Time after which instants do not count, shape (B, H), [s]; the first instant always counts.
-        exact: True for movements as they are executed, see :func:`~viapoint.training.planning.problem.moves_of`.
     """
     obstacles = problem.obstacles
     columns = np.array([task.shapes.index(kind) if kind in task.shapes else 0 for kind in KINDS])
     number, plans = moves.duration.shape
     late = np.full((number, plans), np.inf) if until is None else until
-    setting = setting_of(task, obstacles, exact=exact)
-    given = Given(setting, moves, obstacles, *bounding_boxes(obstacles))
+    given = Given(setting_of(task, obstacles), moves, obstacles, *bounding_boxes(obstacles))
     features = np.zeros((number, plans, NEAREST, LENGTHS + len(task.shapes)), np.float32)
     gaps = np.full((number, plans, NEAREST), NOWHERE)
     least = np.full((number, plans), CLEAR)
@@ -305,9 +295,8 @@ class PairNetwork(nn.Module):
         """Return the margin of each movement, shape (B, H), [m]; NO_OBSTACLE for scenes without obstacles."""
         place, half = pairs.features[..., :3], pairs.features[..., 3:6]
         radius, kind = pairs.features[..., 6:LENGTHS], pairs.features[..., LENGTHS:]
-        limits = torch.where(
-            self.largest > 0.0, self.largest, NOWHERE
-        )  # none where training had no such kind
+        # Kinds that training did not have are without limit.
+        limits = torch.where(self.largest > 0.0, self.largest, NOWHERE)
         spare = (half - kind @ limits).clamp(min=0.0)
         place = torch.where(spare > 0.0, (place - spare).clamp(min=0.0), place)
         lengths = torch.cat((place, half - spare, radius), dim=-1)

@@ -20,16 +20,15 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import Tensor
 
 from viapoint.envs.common.arrays import Observation
-from viapoint.envs.common.validation import is_number, whole_number
+from viapoint.envs.common.validation import whole_number
 from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent, checked_observation
 from viapoint.training.agents.model_io import LIMITS, check_arguments, check_same_task
-from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.checks import unknown_name
 from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
-from viapoint.training.planning.movements import FINE_INSTANTS
-from viapoint.training.planning.problem import Numbers, Problem, moves_of
+from viapoint.training.planning.problem import Numbers, Problem
+from viapoint.training.planning.search import CLEARANCE_MARGIN, plan_clearances
 from viapoint.training.vec_env import check_spaces, check_unwrapped
 
 N_ELITES = 8  # Number of candidates around which each round of refinement samples
@@ -84,17 +83,14 @@ class PlanPolicy(BasePolicy):
         """Number of candidates of a decision, those of all rounds among them."""
         return self.candidates + self.refinements * self.per_refinement
 
-    def _check_candidates(self) -> None:
-        """Check the number of candidates of a decision; ValueError if there are too many."""
-        whole_number("number of all candidates", self.all_candidates, 1, MOST_CANDIDATES)
-
     @property
     def can_refine(self) -> bool:
         """True for tasks whose movements begin at rest and have via-points, which can be refined."""
         return not self.replanning and self.task.n_via > 0
 
-    def _make_optimizer(self, network: torch.nn.Module, lr_schedule: Any) -> None:
-        """Create the optimizer of the network."""
+    def _set_up(self, network: torch.nn.Module, lr_schedule: Any) -> None:
+        """Check the number of candidates of a decision, and create the optimizer of the network."""
+        whole_number("number of all candidates", self.all_candidates, 1, MOST_CANDIDATES)
         self.optimizer = self.optimizer_class(
             network.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]
@@ -121,7 +117,10 @@ class PlanPolicy(BasePolicy):
         for each in range(self.refinements):
             best = min(N_ELITES, actions.shape[1])
             top = np.argpartition(-value, best - 1, axis=1)[:, :best]
-            some = self.around(np.take_along_axis(actions, top[..., None], axis=1), each)
+            elites = np.take_along_axis(actions, top[..., None], axis=1)
+            centres = elites[:, np.arange(self.per_refinement) % best]
+            steps = normal_steps(self.per_refinement, self.task.action.size, each) * (SPREAD * 0.5**each)
+            some = np.clip(centres + steps, -1.0, 1.0).astype(np.float32)
             actions = np.concatenate((actions, some), axis=1)
             value = np.concatenate((value, values(some)), axis=1)
         return actions, value
@@ -138,7 +137,9 @@ class PlanPolicy(BasePolicy):
         first, count = 0, 1
         while rows.size and first < order.shape[1]:
             some = order[rows, first : first + count]
-            within = self._within_reach(problem.take(rows), actions[rows[:, None], some])
+            alone = problem.take(rows)._replace(obstacles=no_obstacles(len(rows)))
+            looked_at = actions[rows[:, None], some]
+            within = plan_clearances(self.task, alone, looked_at, CLEARANCE_MARGIN, 0.0, exact=True) > 0.0
             found = within.any(axis=1)
             best[rows[found]] = some[found, within[found].argmax(axis=1)]
             rows = rows[~found]
@@ -146,20 +147,6 @@ class PlanPolicy(BasePolicy):
             # Candidates of a round are close together: where the best is out of reach, so are many of the next.
             count = LOOKED_AT
         return best
-
-    def _within_reach(self, problem: Problem, actions: Numbers) -> NDArray[np.bool_]:
-        """Return True, shape (B, H), for actions (B, H, m) with movements within reach and clear of the arm itself."""
-        alone = problem._replace(obstacles=no_obstacles(len(actions)))
-        moves = moves_of(self.task, alone, actions, exact=True)
-        pairs = pairs_of(self.task, alone, moves, np.arange(FINE_INSTANTS), exact=True)
-        return np.asarray(pairs.inside & (pairs.self_clearance > 0.0))
-
-    def around(self, centres: Numbers, each: int) -> Numbers:
-        """Return candidates of a round around some of shape (B, ., m), shape (B, per_refinement, m)."""
-        number = self.per_refinement
-        steps = normal_steps(number, self.task.action.size, each) * (SPREAD * 0.5**each)
-        around = centres[:, np.arange(number) % centres.shape[1]]
-        return np.clip(around + steps, -1.0, 1.0).astype(np.float32)
 
     @abstractmethod
     def decide(self, observation: Observation) -> Numbers:
@@ -205,15 +192,12 @@ class PlanAlgorithm(Agent, OffPolicyAlgorithm):
         **kwargs: Any,
     ) -> None:
         if "replay_buffer_class" in kwargs:
-            self.check_buffer(kwargs["replay_buffer_class"])
             raise ValueError(
                 f"{type(self).__name__} has a replay buffer of its own; leave replay_buffer_class out"
             )
-        given = {**vars(self), "policy_kwargs": policy_kwargs}
-        if is_number(learning_rate):
-            given["learning_rate"] = learning_rate
+        given = {**vars(self), "policy_kwargs": policy_kwargs, "learning_rate": learning_rate}
+        given |= {name: value for name, value in kwargs.items() if name in LIMITS}
         check_arguments(type(self), given)
-        check_arguments(type(self), {name: value for name, value in kwargs.items() if name in LIMITS})
         super().__init__(
             policy,
             env,

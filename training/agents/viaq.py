@@ -113,14 +113,13 @@ class ViaQPolicy(PlanPolicy):
         self.per_refinement = per_refinement
         self.checks = checks
         self.refine = refine
-        self._check_candidates()
         self.critic = ViaQCritic(self.task, width=self.width)
         self.critic_target: ViaQCritic | None = None
         if self.replanning:  # values of later decisions are learned from a critic that changes slowly
             self.critic_target = ViaQCritic(self.task, width=self.width)
             self.critic_target.load_state_dict(self.critic.state_dict())
             self.critic_target.requires_grad_(False)
-        self._make_optimizer(self.critic, lr_schedule)
+        self._set_up(self.critic, lr_schedule)
 
     @property
     def network(self) -> ViaQCritic:
@@ -137,7 +136,7 @@ class ViaQPolicy(PlanPolicy):
         if problem.time_left is not None:
             spare = np.clip(problem.time_left[:, None] - moves.duration - SETTLING, -SPARE, SPARE)
         effort = np.stack((moves.rough, moves.relative, np.log(moves.relative), spare), axis=-1)
-        instants = np.linspace(0, INSTANTS - 1, min(self.instants, INSTANTS)).round().astype(np.int64)
+        instants = np.linspace(0, INSTANTS - 1, self.instants).round().astype(np.int64)
         pairs = pairs_of(self.task, problem, moves, instants, until)
         ends = seen_ends(self.task, problem)
         return PlanInputs(_tensor(ends), _tensor(actions), _tensor(effort), pairs)
@@ -269,7 +268,7 @@ class ViaQ(PlanAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ViaQPolicy": ViaQPolicy}
     LARGEST_GRADIENT = 10.0
     policy: ViaQPolicy
-    replay_buffer: OutcomeReplayBuffer | None
+    replay_buffer: OutcomeReplayBuffer
 
     def __init__(
         self,
@@ -314,7 +313,7 @@ class ViaQ(PlanAlgorithm):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         before = self._last_obs
         prepared = super()._setup_learn(*args, **kwargs)
-        if self._last_obs is not before and self.replay_buffer is not None:  # the environment was reset
+        if self._last_obs is not before:  # the environment was reset
             self.replay_buffer.begin()  # the running episodes are others
         return prepared
 
@@ -327,7 +326,6 @@ class ViaQ(PlanAlgorithm):
         return task
 
     def _sampled_losses(self, batch_size: int) -> dict[str, Tensor]:
-        assert self.replay_buffer is not None
         losses = self._losses(self.replay_buffer.sample_outcomes(batch_size))
         return {f"{name}_loss": loss for name, loss in losses.items()}
 
@@ -339,10 +337,9 @@ class ViaQ(PlanAlgorithm):
 
     def _losses(self, batch: OutcomeSamples) -> dict[str, Tensor]:
         """Return the losses of the predictions of the critic by name."""
-        policy, critic, buffer = self.policy, self.policy.critic, self.replay_buffer
-        assert buffer is not None
+        policy, critic = self.policy, self.policy.critic
         device = policy.device
-        inputs = buffer.plans(batch.at, self._inputs).to(device)
+        inputs = self.replay_buffer.plans(batch.at, self._inputs).to(device)
         critic.pairs.note_sizes(inputs.pairs)
         values = Values(*(each[:, 0] for each in critic(inputs)))
         following = self._following(batch.at)
@@ -390,7 +387,6 @@ class ViaQ(PlanAlgorithm):
     def _inputs(self, at: At) -> PlanInputs:
         """Return the critic's inputs for stored decisions."""
         policy, buffer = self.policy, self.replay_buffer
-        assert buffer is not None
         until = None
         if policy.replanning:
             # After a contact, the clearance is that of the movement up to the next decision.
@@ -403,7 +399,6 @@ class ViaQ(PlanAlgorithm):
     def _next_inputs(self, at: At) -> PlanInputs:
         """Return the critic's inputs for a few candidates after stored decisions; the first one keeps the plan."""
         policy, buffer = self.policy, self.replay_buffer
-        assert buffer is not None
         every = candidate_actions(policy.task, policy.candidates, replanning=True)
         number = at[0] * buffer.n_envs + at[1]  # other candidates for each decision, but always the same
         chosen = (number[:, None] * self.next_candidates + np.arange(self.next_candidates)) % len(every)
@@ -414,10 +409,10 @@ class ViaQ(PlanAlgorithm):
     @torch.no_grad()
     def _following(self, at: At) -> Values | None:
         """Return the predictions of the target critic for the best of a few candidates after stored decisions."""
-        critic, buffer = self.policy.critic_target, self.replay_buffer
-        if critic is None or buffer is None or not self.gamma:
+        critic = self.policy.critic_target
+        if critic is None:
             return None
-        values = critic(buffer.next_plans(at, self._next_inputs).to(self.policy.device))
+        values = critic(self.replay_buffer.next_plans(at, self._next_inputs).to(self.policy.device))
         worth = critic.value(values)
         worth[:, 0] += KEEP  # as the policy prefers it
         best = worth.argmax(dim=1, keepdim=True)
@@ -502,17 +497,14 @@ class SeenPlans:
         if new.any():
             some = at[0][new], at[1][new]
             found = look(some)
-            if self._inputs is None:
-                self._inputs = tree_map(self._room, found)
+            if self._inputs is None:  # room for the inputs of all decisions
+                shape = self.known.shape
+                self._inputs = tree_map(lambda part: part.new_zeros((*shape, *part.shape[1:])), found)
             for kept, part in zip(tree_leaves(self._inputs), tree_leaves(found), strict=True):
                 kept[some] = part
             self.known[some] = True
         inputs: PlanInputs = tree_map(lambda kept: kept[at], self._inputs)
         return inputs
-
-    def _room(self, part: Tensor) -> Tensor:
-        """Return room for a part of the inputs, which is given for some decisions, for all of them."""
-        return part.new_zeros((*self.known.shape, *part.shape[1:]))
 
 
 class OutcomeReplayBuffer(DictReplayBuffer):
@@ -546,11 +538,9 @@ class OutcomeReplayBuffer(DictReplayBuffer):
 
     def _clearance_before(self) -> Single:
         """Return the clearance terms summed over each running episode, shape (N,); NaN at its first decision."""
-        begins, self._begins = self._begins, False
-        if begins or (not self.pos and not self.full):
-            return np.full(self.n_envs, np.nan, dtype=np.float32)
-        last = self.pos - 1
-        over = self.dones[last] > 0.5
+        last = self.pos - 1  # in a new buffer, a row of NaN
+        over = (self.dones[last] > 0.5) | self._begins
+        self._begins = False
         return np.where(over, np.nan, self.outcomes[last, :, Outcomes._fields.index("clearance")])
 
     def sample_outcomes(self, batch_size: int) -> OutcomeSamples:
@@ -570,19 +560,15 @@ def outcome_of(info: Mapping[str, Any], reward: float, before: float = np.nan) -
 
     The clearance terms of earlier decisions in the episode sum up to `before`; NaN for the first decision.
     """
-    unknown = (np.nan,) * len(Outcomes._fields)
-    if not all(name in info for name in TERMS):
-        return unknown
-    terms = [float(info[name]) for name in TERMS]
-    if abs(sum(terms) - reward) > REWARD_TOLERANCE:
-        return unknown
-    success, collision, clearance, _, smoothness, duration, _ = terms
-    succeeded = bool(info.get("is_success", success > 0.0))
-    contact = bool(info.get("collision", collision < 0.0))
+    terms = [float(info.get(name, np.nan)) for name in TERMS]
+    if not abs(sum(terms) - reward) <= REWARD_TOLERANCE:  # also where a term is missing
+        return (np.nan,) * len(Outcomes._fields)
+    _, _, clearance, _, smoothness, duration, _ = terms
     first = bool(np.isnan(before))
     lower = first or clearance < -LOWER
     so_far = clearance if first else before + clearance
-    return float(succeeded), float(contact), so_far, float(lower), smoothness + duration
+    effort = smoothness + duration
+    return float(info["is_success"]), float(info["collision"]), so_far, float(lower), effort
 
 
 class Values(NamedTuple):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 from scipy.optimize import minimize
 from scipy.special import expit, logit
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -104,18 +104,9 @@ class ViaRankPolicy(PlanPolicy):
     """
 
     OWN = (
-        "width",
-        "instants",
-        "nearest",
-        "candidates",
-        "refinements",
-        "per_refinement",
-        "refine",
-        "caution",
-        "effort",
-        "belief",
-        "depths",
-    )
+        "width", "instants", "nearest", "candidates", "refinements", "per_refinement", "refine",
+        "caution", "effort", "belief", "depths",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -152,11 +143,10 @@ class ViaRankPolicy(PlanPolicy):
         self.caution: float = usual["caution"] if caution is None else caution
         self.effort: float = usual["effort"] if effort is None else effort
         self.depths: tuple[float, ...] = usual["depths"] if depths is None else tuple(depths)
-        self._check_candidates()
         sensor = self.task.sensor
         assert sensor is not None
         self.network = SightNetwork(sensor, width=width, beliefs=1 + len(self.depths))
-        self._make_optimizer(self.network, lr_schedule)
+        self._set_up(self.network, lr_schedule)
 
     def _check_setting(self, name: str, value: Any) -> None:
         super()._check_setting(name, value)
@@ -205,17 +195,21 @@ class ViaRankPolicy(PlanPolicy):
         return self.assess(observation)[0]
 
     def assess(self, observation: Observation, truth: Obstacles | None = None) -> tuple[Float, Float]:
-        """Return the best actions of B observations, shape (B, m), and their predicted success, shape (B,).
+        """Return the best actions of B observations, shape (B, m), and their predicted success, shape (B,)."""
+        actions, success = self.best(*self.seen(observation, truth))
+        slope, offset = self.network.calibration.tolist()
+        return actions, expit(slope * logit(success) + offset)
+
+    def seen(self, observation: Observation, truth: Obstacles | None = None) -> tuple[Problem, Sight]:
+        """Return B problems as they are believed to be, and what has been seen.
 
         Privileged beliefs need the true obstacles of B scenes.
         """
-        problem = Problem.of_observation(observation, self.task)
+        problem = Problem.of_observation(observation, self.task)  # with the default belief
         sight = Sight.of(observation, self.task)
         if self.belief != DEFAULT_BELIEF:
             problem = problem._replace(obstacles=self.believed(sight, truth))
-        actions, success = self.best(problem, sight)
-        slope, offset = self.network.calibration.tolist()
-        return actions, expit(slope * logit(success) + offset)
+        return problem, sight
 
     def believed(self, sight: Sight, truth: Obstacles | None) -> Obstacles:
         """Return the obstacles that are believed to be there.
@@ -248,19 +242,6 @@ class ViaRankPolicy(PlanPolicy):
             chosen.append(actions[best])
             success.append(self.success(beliefs, some, actions[best][:, None])[0][:, 0])
         return np.concatenate(chosen).astype(np.float64), np.concatenate(success).astype(np.float64)
-
-
-class _NoBuffer(ReplayBuffer):
-    """Replay buffer that keeps nothing: the algorithm learns from scenes that are new, or under way in `env`."""
-
-    def __init__(
-        self, buffer_size: int, observation_space: Any, action_space: Any, *args: Any, **kwargs: Any
-    ):
-        nothing = spaces.Box(-1.0, 1.0, (1,), np.float32)
-        super().__init__(1, nothing, nothing)
-
-    def add(self, *args: Any, **kwargs: Any) -> None:
-        """Forget a transition."""
 
 
 class ViaRank(PlanAlgorithm):
@@ -319,12 +300,12 @@ class ViaRank(PlanAlgorithm):
             policy,
             env,
             learning_rate,
-            buffer_size=1,
+            buffer_size=1,  # it learns from scenes that are new, or under way in the environment
             learning_starts=learning_starts,
             batch_size=batch_size,
             gamma=1.0,
             gradient_steps=gradient_steps,
-            buffer=_NoBuffer,
+            buffer=DictReplayBuffer,
             policy_kwargs=policy_kwargs,
             train_freq=train_freq,
             **kwargs,
@@ -402,17 +383,12 @@ class ViaRank(PlanAlgorithm):
     def _under_way(self) -> tuple[Problem, Problem, Sight]:
         """Return the scenes of the environment and what has been seen of them so far, as :meth:`_drawn` does."""
         assert self.env is not None
-        task = self.policy.task
         observation: Any = self._last_obs
         every = self.env.get_attr("scenes")
         # A vector environment of this package has those of all copies, others have one each.
         scenes = every[0] if len(every[0].start) == self.n_envs else Scenes.together(every)
-        believed = Problem.of_observation(observation, task)
-        sight = Sight.of(observation, task)
-        truth = believed._replace(obstacles=scenes.obstacles)
-        if self.policy.belief != DEFAULT_BELIEF:
-            believed = believed._replace(obstacles=self.policy.believed(sight, truth.obstacles))
-        return truth, believed, sight
+        believed, sight = self.policy.seen(observation, scenes.obstacles)
+        return believed._replace(obstacles=scenes.obstacles), believed, sight
 
     @torch.no_grad()
     def _chosen(self, inputs: SightInputs, worth: NDArray[Any]) -> NDArray[np.int64]:

@@ -1,21 +1,17 @@
 """Command `doctor`: what works on this machine, and what to install where something does not."""
 
-import importlib.util
 import subprocess
 import sys
+
+from viapoint.training.extras import PACKAGES
 
 LIMIT = 180.0  # Time limit of a check, [s]; the first one compiles machine code
 VERSIONS = "import sys, {0}; print(sys.version[:7], *(f'{{m.__name__}} {{m.__version__}}' for m in ({0})))"
 ENV = "import gymnasium as g, viapoint.envs as v; e = g.make(v.ENV_IDS[1], render_mode='rgb_array'); e.reset(seed=0); "
 STEP = ENV + "print(f'{e.step(0 * e.action_space.sample())[4][\"duration\"]:.3f} s of movement')"
 AGENT = "from viapoint.training import load_agent; print(load_agent('viapoint/PlanarObstacles-v0').env_id)"
-EXTRAS = "from viapoint.training.cli.doctor import is_installed as f; "
+EXTRAS = "from viapoint.training.extras import is_installed as f; "
 EXTRAS += "print(*(n if f(n) else f'(no {{n}}: extra {{e}})' for n, e in {}))"
-# Packages that are imported where they are needed, and their extras; others belong to `training`
-PACKAGES = {
-    "torch": "training", "tensorboard": "training", "ompl": "planning", "viser": "live", "mjviser": "live",
-    "trimesh": "live", "minari": "minari", "h5py": "minari", "ray": "study", "optuna": "study",
-}  # fmt: skip
 CHECKS = {  # Script that fails, or prints what it found, and remedy, by the name of what is checked
     "packages": (VERSIONS.format("numpy, gymnasium, mujoco, numba"), "pip install . in a clone"),
     "MuJoCo": (STEP, "pip install 'mujoco>=4'"),
@@ -44,24 +40,3 @@ def outcome(script: str) -> tuple[bool, str]:
         return False, f"no answer within {LIMIT:.0f} s"
     said = (done.stderr if done.returncode else done.stdout).strip()
     return not done.returncode, (said or f"ended with code {done.returncode}").splitlines()[-1]
-
-
-def explain_import_error(error: ImportError, subject: str = "the command") -> str:
-    """Return one line on a failed import of `subject`: what to install if a package is missing."""
-    # A library that has found out itself says so without the name of a module.
-    missing = next((name for name in PACKAGES if f"{name} is not installed" in str(error)), "")
-    if isinstance(error, ModuleNotFoundError):
-        missing = (error.name or "").partition(".")[0]
-    if missing not in ("", "viapoint"):
-        extra = PACKAGES.get(missing, "training")
-        remedy = f"pip install '.[{extra}]' in a clone of the project"
-        return f"{subject} needs the extra `{extra}` (not installed: {missing}): {remedy}"
-    return f"{type(error).__name__}: {' '.join(str(error).split())} (viapoint doctor says more)"
-
-
-def is_installed(name: str) -> bool:
-    """Return True if a package is found; finders may raise errors instead of an answer."""
-    try:
-        return importlib.util.find_spec(name) is not None
-    except (ImportError, ValueError):
-        return False

@@ -27,7 +27,7 @@ from viapoint.envs.outcome import Rollout
 from viapoint.envs.scenes.options import OPTIONS, options_to_json, scene_options
 from viapoint.primitives import passage_durations
 from viapoint.training.agents.agent import Agent
-from viapoint.training.cli.doctor import is_installed
+from viapoint.training.extras import is_installed
 from viapoint.training.paper.movements import TARGETS, rows_of_lights
 from viapoint.training.planning.baselines import AgentMethod
 from viapoint.training.planning.candidates import candidate_actions
