@@ -69,6 +69,16 @@ class FrozenScenes:
         return np.where(np.isnan(self.share), -1, band).astype(np.int64)
 
     @property
+    def hidden(self) -> Float:
+        """Share of obstacles that the sensor does not see at all in each scene, shape (N,); NaN without a sensor."""
+        task = Task.of(**self.task)
+        if task.sensor is None:
+            return np.full(self.share.shape, np.nan)
+        rotation, origin = task.sensor.pose(task.arm, self.scenes.start)
+        hidden = task.sensor.hidden(rotation, origin, self.scenes.obstacles)
+        return np.asarray(hidden.sum(axis=1) / np.maximum(self.scenes.obstacles.present.sum(axis=1), 1))
+
+    @property
     def sha256(self) -> str:
         """Hash of task, scenes, shares and families; the compression of the file does not count."""
         digest = hashlib.sha256(json.dumps(self.task, sort_keys=True).encode())

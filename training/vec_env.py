@@ -134,22 +134,38 @@ class ViaVecEnv(VecEnv):
         """Number of physics steps so far."""
         return int(self.venv.unwrapped.physics_steps)
 
-    def set_options(self, options: Any = None) -> None:
-        """Set the options of the next reset, one mapping for all copies, as the vector environment takes it."""
-        if options is not None and not isinstance(options, Mapping):
-            raise ValueError(f"options must be one mapping for all copies, got {options!r}")
-        super().set_options(dict(options or {}))
-
     def reset(self) -> Observation:
         """Start a new episode in every copy, with the options of `set_options`, if any."""
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
-        options = self._options[0]
+        given: Any = self._options
         self._reset_options()  # refused ones must not be met again
-        observation: Observation = self.venv.reset(seed=seeds, options=options or None)[0]
+        whole = isinstance(given, Sequence) and len(given) == self.num_envs
+        if not whole or not all(isinstance(each, Mapping) for each in given):
+            raise ValueError(f"options must be a mapping, or a list of {self.num_envs}, got {given!r}")
+        begun: Any = slice(None)
+        if all(each is given[0] for each in given):  # as SB3 repeats a mapping
+            options = dict(given[0])
+            observation, _ = self.venv.reset(seed=seeds, options=options or None)
+            begun = options.get("reset_mask", begun)
+        else:
+            observation = self._reset_each(seeds, given)
         self._reset_seeds()  # a later reset goes on with the generators
-        begun = options.get("reset_mask", slice(None))
         self._returns[begun], self._lengths[begun] = 0.0, 0
-        return observation
+        started: Observation = observation
+        return started
+
+    def _reset_each(self, seeds: list[int | None] | None, given: Sequence[Mapping[str, Any]]) -> Observation:
+        """Start a new episode in every copy with options of its own, those of the same names together."""
+        names = [tuple(sorted(options)) for options in given]
+        if () in names or len(set(names)) > 1:  # all episodes must have begun before some are begun anew
+            observation, _ = self.venv.reset(seed=seeds)
+        for some in sorted(set(names) - {()}):
+            mask = np.array([each == some for each in names])
+            chosen = [options for options in given if tuple(sorted(options)) == some]
+            options: dict[str, Any] = {name: [each[name] for each in chosen] for name in some}
+            observation, _ = self.venv.reset(seed=seeds, options={**options, "reset_mask": mask})
+        started: Observation = observation
+        return started
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Store the actions of the next step, shape (N, m)."""

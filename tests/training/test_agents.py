@@ -741,11 +741,12 @@ def test_full_knowledge_is_the_best_belief() -> None:
     assert deep > thick + 0.1  # less than on an idle machine: its time is limited
 
 
-def test_sets_of_scenes_with_a_sensor_are_others_and_no_straight_movement_solves_them() -> None:
+def test_sets_of_scenes_are_solvable_and_partly_hidden() -> None:
     task = registered_task(SENSED)
     frozen = scenes_for("validation", task)
     known = registered_task(PLANE)
     assert not np.isin(frozen.scenes.start[:, 0], scenes_for("validation", known).scenes.start[:, 0]).any()
+    assert 0.1 < frozen.hidden.mean() < 0.5
     problem = Problem.of_scenes(frozen.scenes, task)
     straight = np.zeros((len(frozen.share), 1, task.action.size))
     assert (plan_clearances(task, problem, straight, 0.01, 0.0)[:, 0] < 0.01).all()

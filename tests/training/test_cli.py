@@ -190,8 +190,9 @@ def test_words_become_a_configuration():
     given = {"env_kwargs": {"n_via": 2, "timing": "learned"}, "hyperparameters": {"tau": 0.1}}
     assert config == TrainConfig(env=REACH, algo="sac", seed=3, n_timesteps=9, **given)
     assert cli.parse(shlex.split(config.command)[1:]) == config
-    config = cli.parse(shlex.split("evaluate runs/x --json a.json --baselines planner"))
-    assert config == EvaluateConfig(agent="runs/x", baselines=("planner",), json=Path("a.json"))
+    for named in ("--agent runs/x", "--agent=runs/x"):
+        config = cli.parse(shlex.split(f"evaluate --json a.json --baselines planner {named}"))
+        assert config == EvaluateConfig(agent="runs/x", baselines=("planner",), json=Path("a.json"))
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)

@@ -78,7 +78,7 @@ def test_a_dataset_replays_bit_for_bit(method, words, capsys):
 def test_episodes_are_those_of_the_method_and_have_names_by_default(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "straight").mkdir()  # a folder of this name is no agent
-    record("straight", "--env", PLANE, "--episodes", 2)
+    record("--env", PLANE, "--episodes", 2, "--agent=straight")
     dataset = minari.load_dataset("viapoint/PlanarObstacles/straight-v0")
     assert (folder / "viapoint/PlanarObstacles/straight-v0/data").is_dir()
     assert [np.abs(episode.actions).max() for episode in dataset.iterate_episodes()] == [0.0, 0.0]

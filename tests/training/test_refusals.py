@@ -297,8 +297,9 @@ def test_calls(call, tmp_path, monkeypatch):
 
 
 COPIES = [
-    (lambda env: (env.set_options({"start": 0.0}), env.reset()), ValueError),
-    *((lambda env, given=given: env.set_options(given), ValueError) for given in ([{}] * 6, 5)),
+    (lambda env: (env.set_options([{"start": 0.0}, *[{}] * 5]), env.reset()), ValueError),
+    (lambda env: (env.set_options([{}] * 5), env.reset()), ValueError),
+    (lambda env: (env.set_options(5), env.reset()), ValueError),
     (lambda env: env.get_attr("num_envs", 6), IndexError),
     (lambda env: env.env_method("__str__", indices=[0, -7]), IndexError),
     (lambda env: env.env_is_wrapped(gym.Wrapper, indices=[9]), IndexError),
@@ -364,8 +365,9 @@ COMMANDS = [
     ("plan --arm panda --velocity-limit 0.3 --position 0.4 0.3 0.3", "--velocity-limit"),
     ("plan --arm nowhere.xml --position 0.4 0.3 0.3", "nowhere.xml"),
     ("plan --arm panda --goal 0 0 0 -1 0 1 0 --quaternion 0 1 0 0", "--quaternion"),
+    ("evaluate --baselines straight --agent", "--agent needs a name"),
     ("record", "name an agent"),
-    (f"evaluate --baselines straight {PLANE}", "as the first word"),
+    (f"evaluate --baselines straight {PLANE}", "(first, or as --agent NAME)"),
     ("plan --position 0.4 0.3 0.3 --rate 0", "--rate must be"),
     ("plan --position 0.4 0.3 0.3 --scene full/notes.txt", "notes.txt: "),
     ("evaluate --scenes motionbenchmaker --baselines nothing", "plan_motion+ompl"),

@@ -137,13 +137,19 @@ def test_seeds_options_and_attributes(env):
     env.set_options(scenes[0])
     assert np.ptp(env.reset()["goal"], axis=0).max() == 0.0
     texts = [{**scene, "obstacles": obstacles_to_json(scene["obstacles"])} for scene in scenes]
-    for each in (scenes, texts):
-        env.set_options({name: [scene[name] for scene in each] for name in scenes[0]})
+    for options in (scenes, texts):
+        env.set_options(options)
         for name, part in env.reset().items():
             np.testing.assert_allclose(part, first[name], atol=1e-6)
     env.set_options({**texts[0], "reset_mask": np.arange(6) > 3})
     some = env.reset()["obstacles"]
     np.testing.assert_allclose(some, first["obstacles"][[0, 1, 2, 3, 0, 0]], atol=1e-6)
+    goals = [{"goal": scene["goal"]} for scene in scenes]
+    env.seed(5)
+    env.set_options([scenes[0], {}, goals[2], goals[3], {}, scenes[5]])  # as SB3's own environments allow
+    some = env.reset()
+    np.testing.assert_allclose(some["goal"][[0, 2, 3, 5]], first["goal"][[0, 2, 3, 5]], atol=1e-6)
+    np.testing.assert_allclose(some["obstacles"][[0, 1, 4, 5]], first["obstacles"][[0, 1, 4, 5]], atol=1e-6)
     assert env.get_attr("num_envs", [-1, 5]) == [6, 6]
     env.set_attr("mark", 1)
     assert env.get_attr("mark", indices=[2, 3]) == [1, 1]

@@ -49,7 +49,12 @@ from viapoint.training.planning.candidates import MOST_CANDIDATES, MOST_ROUNDS
 from viapoint.training.planning.movements import INSTANTS
 from viapoint.training.vec_env import ViaVecEnv, check_spaces, env_arguments
 
-EXTRACTOR = {"kind": "extractor", "name": "SceneExtractor"}  # In files, the only class that they may name
+ACTIVATIONS = (torch.nn.ReLU, torch.nn.Tanh, torch.nn.ELU, torch.nn.SiLU, torch.nn.GELU)
+# Classes that model files name, by kind and name
+CLASSES: dict[str, dict[str, type[torch.nn.Module]]] = {
+    "activation": {each.__name__: each for each in ACTIVATIONS},
+    "extractor": {"SceneExtractor": SceneExtractor},
+}
 FORMAT = 1  # Version of the two files
 # Learning algorithms by their names on the command line; the modules that define them add them
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {}
@@ -400,8 +405,9 @@ def _encode(value: Any) -> Any:
         return _encode(value.base_noise)
     if isinstance(value, NormalActionNoise):
         return {"kind": "normal", "sigma": float(np.max(value._sigma))}
-    if value is SceneExtractor:
-        return EXTRACTOR
+    for kind, classes in CLASSES.items():
+        if isinstance(value, type) and value in classes.values():
+            return {"kind": kind, "name": value.__name__}
     if isinstance(value, Mapping):
         return {str(name): _encode(each) for name, each in value.items()}
     if hasattr(value, "frequency"):  # SB3's TrainFreq
@@ -413,8 +419,6 @@ def _encode(value: Any) -> Any:
 
 def _decode(value: Any, size: int) -> Any:
     """Invert :func:`_encode`; `size` is the number of components of an action."""
-    if value == EXTRACTOR:
-        return SceneExtractor
     if isinstance(value, Mapping):
         kind = value.get("kind")
         if kind == "linear":
@@ -424,8 +428,10 @@ def _decode(value: Any, size: int) -> Any:
             if not sigma >= 0.0:
                 raise ValueError(f"sigma of action_noise must be 0 or more, got {sigma}")
             return NormalActionNoise(np.zeros(size), np.full(size, sigma))
+        if kind in CLASSES:
+            return CLASSES[kind][value["name"]]
         if kind is not None:
-            raise ValueError(f"must be of a kind linear or normal, or {EXTRACTOR}, got {dict(value)}")
+            raise ValueError(f"kind must be linear, normal, activation or extractor, got {kind!r}")
         return {name: _decode(each, size) for name, each in value.items()}
     if isinstance(value, list) and len(value) == 2 and isinstance(value[1], str):
         return tuple(value)

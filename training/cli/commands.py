@@ -51,7 +51,7 @@ def _named(config: AgentConfig, name: str | None) -> tuple[Agent | None, str, di
         raise ValueError(f"env must be {agent.env_id}, on which the agent was trained, got {config.env!r}")
     env_id, argument = configs.env_of_arm(config.arm, config.env if agent is None else agent.env_id)
     if env_id is None:
-        raise ValueError("name an agent, as the first word, or an environment: --env or --arm")
+        raise ValueError("name an agent (first, or as --agent NAME), or an environment: --env or --arm")
     env_kwargs = {**({} if agent is None else agent.env_kwargs), **argument, **config.env_kwargs}
     task = configs.task_with(env_id, env_kwargs)  # says what is wrong with an argument
     if agent is not None:

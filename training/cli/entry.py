@@ -111,6 +111,8 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
     if command not in COMMANDS:
         raise ValueError(f"{checks.unknown_name('command', command, COMMANDS)} (viapoint --help)")
     kind = kinds[command]
+    if issubclass(kind, configs.AgentConfig):
+        options = _agent_first(options)
     settings: dict[str, Any] = {"prog": f"viapoint {command}", "registry": configs.REGISTRY}
     if usual is not None:
         settings["default"] = usual
@@ -122,6 +124,20 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
         if not end.code:
             raise
         raise ValueError(_complaint(complaint.getvalue(), command, kind)) from None
+
+
+def _agent_first(options: Sequence[str]) -> list[str]:
+    """Return options with the agent at the front, a word by its place, which --agent NAME or --agent=NAME may name."""
+    words: list[str] = []
+    for word in options:
+        words += word.split("=", 1) if word.startswith("--agent=") else [word]
+    if "--agent" not in words:
+        return words
+    place = words.index("--agent")
+    name = words[place + 1 : place + 2]
+    if name in ([], [""]) or name[0].startswith("-"):
+        raise ValueError("--agent needs a name: a run folder, a model folder or the id of an environment")
+    return [*name, *words[:place], *words[place + 2 :]]
 
 
 def _check_resumed(config: TrainConfig, words: Sequence[str]) -> None:
