@@ -372,17 +372,8 @@ class Episodes:
             centres = obstacles.centre[:, None] + time * obstacles.velocity[:, None]
         resume = not task.whole_movement
         joints, contact, unstable = simulator.rollout(rows, controls, steps, centres, resume=resume)
-        executed = (
-            arm.chain,
-            arm.spheres,
-            arm.reach,
-            joints,
-            contact,
-            steps,
-            obstacles,
-            timestep,
-            self._placed,
-        )
+        body = arm.chain, arm.spheres, arm.reach
+        executed = *body, joints, contact, steps, obstacles, timestep, self._placed
         # Contacts between two physics steps
         for i, k, states in risky_steps(*executed, simulator.thinnest):
             if not contact[i, : k + 1].any():
@@ -497,8 +488,6 @@ class Episodes:
         """Return the length of the straight lines from target to target until a time for each episode, shape (n,)."""
         before = self.task.space.coordinates(self.scenes.goal)
         length = norm(before - self._start)
-        if not self.task.n_jumps[1]:
-            return length
         jumps, times = self.scenes.jumps, self.scenes.jump_times
         for k in range(jumps.shape[1]):
             jumped = times[:, k] <= time + 1e-9
