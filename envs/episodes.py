@@ -222,9 +222,7 @@ class Episodes:
             row = int(away.argmax())
             where = f"at {state.position[row]}, got {waypoints[row, 0]}"
             raise ValueError(f"plan {row} must begin where the arm is, {where}")
-        if self.task.whole_movement:
-            return Plan.at_rest(waypoints, durations)
-        if waypoints.shape != self.plan.waypoints.shape:
+        if not self.task.whole_movement and waypoints.shape != self.plan.waypoints.shape:
             raise ValueError(f"waypoints must have shape {self.plan.waypoints.shape}, got {waypoints.shape}")
         waypoints = np.concatenate((state.position[:, None], waypoints[:, 1:]), axis=1)
         return Plan(waypoints, durations, state.velocity, state.acceleration)

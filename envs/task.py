@@ -335,13 +335,12 @@ def _within_torques(steering: Steering, arm: Arm) -> Steering:
 def _checked_durations(space: SpaceName, given: Any) -> tuple[float, float]:
     """Return the shortest and longest duration of a movement, by default those of the space."""
     pair = DURATIONS[space] if given is None else given
+    finite_array("duration_range", pair, (2,))
     # In joint space a duration is relative to the shortest movement that the limits allow.
     least = SHORTEST_DURATION if space == "hand" else 1.0
-    low, high = finite_array("duration_range", pair, (2,)).tolist()
-    if not least <= low < high <= LONGEST_DURATION:
-        raise ValueError(
-            f"duration_range must increase, from {least:g} to {LONGEST_DURATION:g}, got {pair!r}"
-        )
+    low, high = (number_of_at_least("duration_range", each, least) for each in pair)
+    if not low < high <= LONGEST_DURATION:
+        raise ValueError(f"duration_range must increase, up to {LONGEST_DURATION:g}, got {pair!r}")
     return low, high
 
 

@@ -253,21 +253,19 @@ def _rows(name: str, value: Any, sampler: SceneSampler, shape: tuple[int, int, i
     """Return an option as rows of N scenes; rows of zeros stand behind the given ones."""
     number, most, size = shape
     label, found = f"options[{name!r}]", np.zeros(shape)
+    array = as_real_array(value)
     # Scenes with different numbers of rows are no array.
-    ragged = isinstance(value, list | tuple) and as_real_array(value) is None
-    if ragged and len(value) != number:
+    several = isinstance(value, list | tuple) if array is None else array.ndim == 3
+    if several and len(value) != number:
         raise ValueError(f"{label} must be one list of rows of numbers, or {number} lists, got {len(value)}")
-    for place, rows in enumerate(value) if ragged else [(slice(None), value)]:
-        array = finite_array(label, rows)
-        if array.size == 0:
+    for scene, rows in enumerate(value if several else [value] * number):
+        given = finite_array(label, rows)
+        if given.size == 0:
             continue
-        fits = array.ndim == 2 or (array.ndim == 3 and len(array) == number and not ragged)
-        if not fits or array.shape[-1] != size or array.shape[-2] > most:
-            raise ValueError(
-                f"{label} must have shape (n, {size}) or ({number}, n, {size}) with n at most {most}, got "
-                f"{array.shape}{f' in scene {place}' if ragged else ''}"
-            )
-        found[place][..., : array.shape[-2], :] = array
+        if given.ndim != 2 or given.shape[1] != size or len(given) > most:
+            allowed = f"up to {most} rows of {size} numbers"
+            raise ValueError(f"{label} must be {allowed}, got shape {given.shape} in scene {scene}")
+        found[scene, : len(given)] = given
     if found.any() and sampler.task.whole_movement:
         raise ValueError(f"{label} need several decisions, such as decide_at=('target',), not 'end'")
     return found

@@ -5,24 +5,9 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import (
-    GOAL,
-    JUMPS,
-    MOVING,
-    OTHER,
-    PANDA,
-    PANDA_MOVING,
-    PLANE,
-    UR5E,
-    events,
-    given,
-    play,
-    post,
-    same,
-)
+from helpers import GOAL, JUMPS, MOVING, OTHER, PANDA, PANDA_MOVING, PLANE, events, given, play, post, same
 
 from viapoint import primitives
-from viapoint.envs import load_arm
 from viapoint.envs.arms.kinematics import LIMIT_SHARE, slowdowns
 from viapoint.envs.events import FORESIGHT, LOOK, Event
 from viapoint.envs.outcome import SETTLING
@@ -267,18 +252,6 @@ def test_a_jump_that_is_no_reason_to_decide_is_noticed_on_arrival():
     assert [info["is_success"] for info in infos] == [False, True]
     env, _ = given(MOVING, jumps=[[0.2, *OTHER]], decide_at=())  # a task that draws no jumps
     assert play(env)[-1]["jerk_ratio"] == pytest.approx(infos[-1]["jerk_ratio"])
-
-
-def test_new_goals_of_continuous_joints_are_taken_modulo_a_turn():
-    text = UR5E.read_text().replace(' range="-6.2832 6.2832"', ' limited="false"')
-    arm = load_arm(text, velocity_limit=3.0)
-    env = gym.make_vec("viapoint/Reach-v0", num_envs=1, arm=arm, decide_at=("horizon",)).unwrapped
-    goal = arm.home + 0.5
-    turned = goal + 2.0 * np.pi * np.array([1, -1, 0, 1, 0, 0])
-    env.reset(options={"start": arm.home, "goal": arm.home + 0.2, "jumps": [[0.1, *turned]]})
-    np.testing.assert_allclose(env.scenes.jumps[0, 0, 1:], goal)
-    env.move_goals(turned[None])
-    np.testing.assert_allclose(env.scenes.goal[0], goal)
 
 
 @pytest.mark.parametrize("late", [3.0, 30.0])
