@@ -291,10 +291,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             gymnasium.error.ResetNeeded: An episode is over.
         """
         self._check_running()
-        over = self.terminated | self.truncated
-        if over.any():
+        if self._over.any():
             raise gym.error.ResetNeeded(
-                f"episode {int(over.argmax())} is over: call reset() before another plan"
+                f"episode {int(self._over.argmax())} is over: call reset() before another plan"
             )
         if self.task.stepwise:
             raise TypeError("an action steers the arm for one control step; plans need another decide_at")
@@ -458,6 +457,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         decision = decision._replace(truncated=decision.truncated | (self._decisions >= self._limit))
         self.terminated = decision.terminated
         self.truncated = decision.truncated
+        self._over = self._over | (active & (self.terminated | self.truncated))
         return decision
 
     def _restart(self, ended: Bool) -> None:
