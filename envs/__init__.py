@@ -4,11 +4,27 @@
 long.
 """
 
+import os
 from typing import TYPE_CHECKING
 
-import viapoint.envs.common.mujoco_check  # noqa: F401 - explains what is wrong with MuJoCo before others import it
 from viapoint.envs.registration import register_all
 from viapoint.primitives._lazy import lazy_imports
+
+try:
+    from mujoco import batch as _batch  # noqa: F401 - what is wrong is said before others import it
+except AttributeError as error:
+    # MuJoCo reads an attribute of None if the OpenGL library of MUJOCO_GL is missing.
+    if not os.environ.get("MUJOCO_GL"):
+        raise
+    raise ImportError(
+        f"MUJOCO_GL={os.environ['MUJOCO_GL']} asks MuJoCo for an OpenGL library that is not installed: "
+        "unset MUJOCO_GL, or install the library (Debian: apt-get install libegl1 libgl1, or libosmesa6 for osmesa)"
+    ) from error
+except ImportError as error:
+    raise ImportError(
+        f"MuJoCo 4 or newer is needed and could not be imported ({error}); where an older version was upgraded in "
+        "place, repair it with: pip install --force-reinstall 'mujoco>=4'"
+    ) from error
 
 if TYPE_CHECKING:
     from viapoint.envs.arms.arm import Arm as Arm

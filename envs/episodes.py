@@ -222,9 +222,7 @@ class Episodes:
             row = int(away.argmax())
             where = f"at {state.position[row]}, got {waypoints[row, 0]}"
             raise ValueError(f"plan {row} must begin where the arm is, {where}")
-        if self.task.whole_movement:
-            return Plan.at_rest(waypoints, durations)
-        if waypoints.shape != self.plan.waypoints.shape:
+        if not self.task.whole_movement and waypoints.shape != self.plan.waypoints.shape:
             raise ValueError(f"waypoints must have shape {self.plan.waypoints.shape}, got {waypoints.shape}")
         waypoints = np.concatenate((state.position[:, None], waypoints[:, 1:]), axis=1)
         return Plan(waypoints, durations, state.velocity, state.acceleration)
@@ -372,17 +370,8 @@ class Episodes:
             centres = obstacles.centre[:, None] + time * obstacles.velocity[:, None]
         resume = not task.whole_movement
         joints, contact, unstable = simulator.rollout(rows, controls, steps, centres, resume=resume)
-        executed = (
-            arm.chain,
-            arm.spheres,
-            arm.reach,
-            joints,
-            contact,
-            steps,
-            obstacles,
-            timestep,
-            self._placed,
-        )
+        body = arm.chain, arm.spheres, arm.reach
+        executed = *body, joints, contact, steps, obstacles, timestep, self._placed
         # Contacts between two physics steps
         for i, k, states in risky_steps(*executed, simulator.thinnest):
             if not contact[i, : k + 1].any():
@@ -497,8 +486,6 @@ class Episodes:
         """Return the length of the straight lines from target to target until a time for each episode, shape (n,)."""
         before = self.task.space.coordinates(self.scenes.goal)
         length = norm(before - self._start)
-        if not self.task.n_jumps[1]:
-            return length
         jumps, times = self.scenes.jumps, self.scenes.jump_times
         for k in range(jumps.shape[1]):
             jumped = times[:, k] <= time + 1e-9

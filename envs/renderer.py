@@ -114,7 +114,7 @@ class EpisodeRenderer:
         if self._view is None or self._screen is None:
             view = SceneView(self._episodes.simulator.single(), *self._size)
             if self._mode == "human":
-                self._screen = Window(view.model, *self._size, title="Viapoint")
+                self._screen = Window(view.model, *self._size)
             else:
                 factor = STILL_SUPERSAMPLING if self._mode == "rgb_array" else 1
                 self._screen = Canvas(view.model, *self._size, supersampling=factor)
@@ -421,7 +421,7 @@ class Canvas:
 class Window:
     """Window on the screen."""
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int, title: str) -> None:
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
         """Open the window.
 
         Raises:
@@ -445,7 +445,7 @@ class Window:
                 raise GLUnavailableError("render_mode='human' opens no window: the display does not answer")
             glfw.window_hint(glfw.VISIBLE, 1)
             glfw.window_hint(glfw.SAMPLES, 4)
-            self._window = glfw.create_window(width, height, title, None, None)
+            self._window = glfw.create_window(width, height, "Viapoint", None, None)
         if not self._window:
             raise GLUnavailableError(f"render_mode='human' cannot open a window: no OpenGL there; {INSTALL}")
         self._glfw.make_context_current(self._window)

@@ -17,6 +17,7 @@ from gymnasium.utils import EzPickle, seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from viapoint.envs.arms.inverse_kinematics import nearest_goals
 from viapoint.envs.common.arrays import Bool, Float, Int, Observation, as_dict, from_dict
 from viapoint.envs.common.validation import did_you_mean, finite_array, masked_rows, seeds_of, whole_number
 from viapoint.envs.episodes import Decision, Episodes, History
@@ -290,10 +291,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             gymnasium.error.ResetNeeded: An episode is over.
         """
         self._check_running()
-        over = self.terminated | self.truncated
-        if over.any():
+        if self._over.any():
             raise gym.error.ResetNeeded(
-                f"episode {int(over.argmax())} is over: call reset() before another plan"
+                f"episode {int(self._over.argmax())} is over: call reset() before another plan"
             )
         if self.task.stepwise:
             raise TypeError("an action steers the arm for one control step; plans need another decide_at")
@@ -324,6 +324,9 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         self._check_running()
         space = self.task.space
         goals = finite_array("goals", goals, (self.num_envs, space.dimension))
+        if self.task.space_name == "joints":
+            now_at = np.concatenate([each.metrics.joints for each in self._episodes])
+            goals = nearest_goals(self.task.arm, goals, now_at)
         inside = space.inside(goals)
         if not inside.all():
             row = int(inside.argmin())
@@ -379,7 +382,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
             )
         if not self.generators:
             self.generators = [np.random.default_rng() for _ in range(self.num_envs)]
-            self._np_random = self.generators[0]
+            self.np_random = self.generators[0]  # which has no seed
         for generator, place in zip(self.generators, state["generators"], strict=True):
             generator.bit_generator.state = place
         scenes = from_dict(self._episodes[0].scenes, state["scenes"])
@@ -454,6 +457,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         decision = decision._replace(truncated=decision.truncated | (self._decisions >= self._limit))
         self.terminated = decision.terminated
         self.truncated = decision.truncated
+        self._over = self._over | (active & (self.terminated | self.truncated))
         return decision
 
     def _restart(self, ended: Bool) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
+import mujoco
 import numpy as np
 
 from viapoint.envs.common.arrays import Bool, Float, Int, frame_matrices
-from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.geometry.meshes import (
     NO_CLOUDS,
     NO_MESHES,

@@ -13,10 +13,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, ClassVar, Self
 
+import mujoco
 import numpy as np
 
 from viapoint.envs.common.arrays import Float, frame_matrices, frozen, quaternion_to
-from viapoint.envs.common.mujoco_check import mujoco
 from viapoint.envs.common.validation import finite_array, number_of_at_least, unit_quaternion
 from viapoint.envs.geometry.compiled import TINY, Vector, inlined, kernel
 from viapoint.envs.geometry.meshes import (

@@ -96,7 +96,6 @@ def register_scene_family(
     plane: bool = False,
     kinds: tuple[str, ...] = (),
     n_obstacles: int = 1,
-    trained: bool = False,
 ) -> None:
     """Register a family of scenes under a name, which tasks then accept in `families`.
 
@@ -114,10 +113,9 @@ def register_scene_family(
         kinds: Kinds of obstacles that the family needs; others appear only if `room.kinds` has them.
         n_obstacles: Least number of obstacles that a task must have room for; `room.most` says how many it has room
             for.
-        trained: True if the family is one of those of training by default.
 
     Raises:
-        TypeError: The name is not a string, `build` is not a function of two arguments, or a flag is not a bool.
+        TypeError: The name is not a string, `build` is not a function of two arguments, or `plane` is not a bool.
         ValueError: The name is taken or empty, or a kind or number is not allowed.
 
     Example:
@@ -134,9 +132,8 @@ def register_scene_family(
     """
     if not isinstance(name, str):
         raise TypeError(f"name must be a string, got {name!r}")
-    for flag, value in (("plane", plane), ("trained", trained)):
-        if not isinstance(value, bool):
-            raise TypeError(f"{flag} must be True or False, got {value!r}")
+    if not isinstance(plane, bool):
+        raise TypeError(f"plane must be True or False, got {plane!r}")
     taken = scene_families(plane)
     if not name:
         raise ValueError("name must not be empty")
@@ -151,7 +148,7 @@ def register_scene_family(
         inspect.signature(build).bind(None, None)
     except (TypeError, ValueError) as error:
         raise TypeError(f"build must be a function build(rng, room), got {build!r}: {error}") from None
-    FAMILIES[plane, name] = SceneFamily(_checked(name, build), n_obstacles, tuple(kinds), trained)
+    FAMILIES[plane, name] = SceneFamily(_checked(name, build), n_obstacles, tuple(kinds))
 
 
 def _checked(name: str, build: Build) -> Build:

@@ -81,7 +81,7 @@ def draw_given(
             ends[name] = _end(name, options[name], sampler, obstacles, ends.get("start", home))
     scenes = resting(ends.get("start", home), ends.get("goal", home), obstacles)
     if "jumps" in options:
-        scenes = scenes._replace(jumps=_jumps(options["jumps"], sampler, number))
+        scenes = scenes._replace(jumps=_jumps(options["jumps"], sampler, scenes.goal))
     for name in ("turns", "reaches"):
         if name in options and shapes is None:
             raise ValueError(f"options[{name!r}] are those of options['obstacles'], which must be given, too")
@@ -90,13 +90,8 @@ def draw_given(
         scenes = scenes._replace(reach=reach)
     if "turns" in options:
         turns = _rows("turns", options["turns"], sampler, (number, sampler.rows, 4))
-        given = (turns != 0.0).any(axis=-1)
-        absent = given & ~obstacles.present
-        if absent.any():
-            row = int(absent.any(axis=0).argmax())
-            raise ValueError(f"options['turns']: obstacle {row} is not there, and cannot turn")
-        scenes.turn_time[given] = turns[given][:, 0]
-        scenes = scenes._replace(turn_velocity=turns[..., 1:].copy())
+        turn_time = np.where((turns != 0.0).any(axis=-1), turns[..., 0], NEVER)
+        scenes = scenes._replace(turn_time=turn_time, turn_velocity=turns[..., 1:].copy())
     # What is wrong with the given parts is said before others are drawn around them.
     check_scenes(scenes, arm, names, tuple(ends))
     sensor = sampler.task.sensor
@@ -234,9 +229,9 @@ def _solution(label: str, pose: Pose, arm: Arm, obstacles: Obstacles, near: Floa
     return np.asarray(found[int(free.argmax())])
 
 
-def _jumps(value: Any, sampler: SceneSampler, number: int) -> Float:
-    """Return given jumps of N scenes in joint positions, the absent ones last."""
-    joints = len(sampler.task.arm.home)
+def _jumps(value: Any, sampler: SceneSampler, goal: Float) -> Float:
+    """Return given jumps from goals, shape (N, J), in joint positions, the absent ones last."""
+    number, joints = goal.shape
     size = 2 if sampler.task.space_name == "hand" else joints
     given = _rows("jumps", value, sampler, (number, MOST_JUMPS, 1 + size))
     present = (given != 0.0).any(axis=-1)
@@ -246,28 +241,31 @@ def _jumps(value: Any, sampler: SceneSampler, number: int) -> Float:
         targets = _planar("target of options['jumps']", sampler.task.arm, targets)
     jumps[present] = np.concatenate((given[present][:, :1], targets), axis=-1)
     order = np.argsort(~present, axis=-1, kind="stable")  # absent rows may be between others
-    return np.take_along_axis(jumps, order[..., None], axis=1)
+    jumps = np.take_along_axis(jumps, order[..., None], axis=1)
+    for row in jumps.transpose(1, 0, 2):
+        there = (row != 0.0).any(axis=-1, keepdims=True)
+        goal = np.where(there, nearest_goals(sampler.task.arm, row[:, 1:], goal), goal)
+        row[:, 1:] = np.where(there, goal, 0.0)
+    return jumps
 
 
 def _rows(name: str, value: Any, sampler: SceneSampler, shape: tuple[int, int, int]) -> Float:
     """Return an option as rows of N scenes; rows of zeros stand behind the given ones."""
     number, most, size = shape
     label, found = f"options[{name!r}]", np.zeros(shape)
+    array = as_real_array(value)
     # Scenes with different numbers of rows are no array.
-    ragged = isinstance(value, list | tuple) and as_real_array(value) is None
-    if ragged and len(value) != number:
+    several = isinstance(value, list | tuple) if array is None else array.ndim == 3
+    if several and len(value) != number:
         raise ValueError(f"{label} must be one list of rows of numbers, or {number} lists, got {len(value)}")
-    for place, rows in enumerate(value) if ragged else [(slice(None), value)]:
-        array = finite_array(label, rows)
-        if array.size == 0:
+    for scene, rows in enumerate(value if several else [value] * number):
+        given = finite_array(label, rows)
+        if given.size == 0:
             continue
-        fits = array.ndim == 2 or (array.ndim == 3 and len(array) == number and not ragged)
-        if not fits or array.shape[-1] != size or array.shape[-2] > most:
-            raise ValueError(
-                f"{label} must have shape (n, {size}) or ({number}, n, {size}) with n at most {most}, got "
-                f"{array.shape}{f' in scene {place}' if ragged else ''}"
-            )
-        found[place][..., : array.shape[-2], :] = array
+        if given.ndim != 2 or given.shape[1] != size or len(given) > most:
+            allowed = f"up to {most} rows of {size} numbers"
+            raise ValueError(f"{label} must be {allowed}, got shape {given.shape} in scene {scene}")
+        found[scene, : len(given)] = given
     if found.any() and sampler.task.whole_movement:
         raise ValueError(f"{label} need several decisions, such as decide_at=('target',), not 'end'")
     return found

@@ -103,8 +103,6 @@ class Scenes(NamedTuple):
 
     def goals(self, time: Float) -> Float:
         """Return the targets, shape (N, J), at one time for each scene, shape (N,), [s]; a jump counts at once."""
-        if not self.jumps.any():
-            return self.goal.copy()
         number = (self.jump_times <= time[:, None] + ROUNDING).sum(axis=-1)
         targets = np.concatenate((self.goal[:, None], self.jumps[..., 1:]), axis=1)
         return np.asarray(targets[np.arange(len(targets)), number])
@@ -249,6 +247,7 @@ def _check_obstacles(scenes: Scenes, names: Sequence[Sequence[str]]) -> None:
         speed = norm(velocity)
         _refuse(present & (speed > FASTEST), f"must be at most {FASTEST:g} m/s fast", speed, names)
     _refuse(present & (turn_time <= 0.0), "must change its course after 0 s", turn_time, names)
+    _refuse(~present & (turn_time < NEVER), "is not there, and cannot turn", turn_time)
     begin, duration = scenes.reach[..., 0], scenes.reach[..., 1]
     reaches = present & scenes.reach.any(axis=-1)
     _refuse(~present & scenes.reach.any(axis=-1), "is not there, and cannot reach", duration)

@@ -170,6 +170,7 @@ def test_executed_actions_are_those_of_their_plans():
     for by_plan in (False, True):
         env = gym.make_vec(PLANE, num_envs=4, threads=1).unwrapped
         env.reset(seed=2)
+        env.step(np.zeros((4, 3)))  # the next episodes have begun
         actions = np.random.default_rng(0).uniform(-0.5, 0.5, (4, 3))
         space, scenes = env.task.space, env.scenes
         ends = space.coordinates(scenes.start), space.coordinates(scenes.goal)

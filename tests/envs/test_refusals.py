@@ -273,7 +273,7 @@ OF_ANOTHER_TYPE = [
     (lambda change: record(**change), [({"speed": 1},), ({"shapes": 1},)]),
     (ve.register_arm, [("small",)]),
     (family, [(3,), ("x", lambda rng: None), ("x", None)]),
-    (lambda flag: family("x", **flag), [({"plane": "yes"},), ({"trained": 1},)]),
+    (lambda flag: family("x", **flag), [({"plane": "yes"},)]),
     (ve.inverse_kinematics, [("panda", (0.5, 0.0, 0.4))]),
 ]
 ROWS = [

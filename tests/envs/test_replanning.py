@@ -250,6 +250,8 @@ def test_a_jump_that_is_no_reason_to_decide_is_noticed_on_arrival():
     infos = play(env)
     assert events(infos) == [Event.ARRIVAL, Event.ARRIVAL]
     assert [info["is_success"] for info in infos] == [False, True]
+    env, _ = given(MOVING, jumps=[[0.2, *OTHER]], decide_at=())  # a task that draws no jumps
+    assert play(env)[-1]["jerk_ratio"] == pytest.approx(infos[-1]["jerk_ratio"])
 
 
 @pytest.mark.parametrize("late", [3.0, 30.0])

@@ -257,9 +257,14 @@ def test_goals_of_continuous_joints_are_taken_modulo_a_turn() -> None:
     for each, way in ((wide, 2.0 * np.pi - 6.0), (arm, -6.0)):
         end = plan_motion(each, start, start - 6.0 * np.eye(6)[0], time_limit=0.0).waypoints[-1]
         assert np.allclose(end - start, way * np.eye(6)[0])
-        env = gym.make("viapoint/Reach-v0", arm=each)  # as in environments
-        env.reset(options={"start": start, "goal": start - 6.0 * np.eye(6)[0]})
-        assert np.allclose(env.unwrapped.scenes.goal[0], end)
+        env = gym.make("viapoint/Reach-v0", arm=each, decide_at=("target",)).unwrapped  # as in environments
+        goal = start - 6.0 * np.eye(6)[0]
+        env.reset(options={"start": start, "goal": goal})
+        assert np.allclose(env.scenes.goal[0], end)
+        env.reset(options={"start": start, "goal": start + 0.1, "jumps": [[0.1, *goal]]})
+        assert np.allclose(env.scenes.jumps[0, 0, 1:], end)
+        env.batch.move_goals([goal])
+        assert np.allclose(env.scenes.goal[0], end)
 
 
 def test_a_start_that_is_the_goal_is_a_plan() -> None:
