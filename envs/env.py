@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
+from types import FrameType
 from typing import Any
 
 import gymnasium as gym
@@ -41,6 +43,7 @@ class ReachEnv(gym.Env[Any, Any]):
         self.action_space = self.batch.single_action_space
         self.render_mode = self.batch.render_mode
         self._over = True
+        self._warned = False
 
     @property
     def task(self) -> Task:
@@ -109,12 +112,28 @@ class ReachEnv(gym.Env[Any, Any]):
 
     def render(self) -> Any:
         """Render the last movement in the render mode; after a reset, the scene."""
+        if not self._warned and not self.task.stepwise and _is_recorded():
+            self._warned = True
+            gym.logger.warn(
+                "RecordVideo keeps one frame of each step, and here a step is a movement: "
+                "viapoint.envs.RecordMovements with render_mode='rgb_array_list' keeps all frames"
+            )
         frames = self.batch.render()
         return None if frames is None else frames[0]
 
     def close(self) -> None:
         """Stop worker threads and close the render window."""
         self.batch.close()
+
+
+def _is_recorded() -> bool:
+    """Return True if Gymnasium's RecordVideo, which does not say so, has asked for a picture."""
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None:
+        if frame.f_code is RecordVideo._capture_frame.__code__:
+            return True
+        frame = frame.f_back
+    return False
 
 
 class RecordMovements(RecordVideo[Any, Any]):

@@ -219,6 +219,15 @@ def test_each_frame_of_a_movement_of_one_or_several_steps_is_recorded_once(env_i
     assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == pytest.approx(expected, abs=1)
 
 
+def test_gymnasium_records_two_frames_of_a_movement_and_a_warning_says_so(make, tmp_path):
+    pytest.importorskip("moviepy")
+    env = gym.wrappers.RecordVideo(make(side=64), str(tmp_path / "videos"), episode_trigger=lambda _: True)
+    with pytest.warns(UserWarning, match="RecordMovements"):
+        moved(env, AROUND)
+    env.close()
+    assert frames_of(tmp_path / "videos" / "rl-video-episode-0.mp4") == 2
+
+
 def in_a_thread(function):
     results = []
     thread = threading.Thread(target=lambda: results.append(function()))
