@@ -165,11 +165,11 @@ def measure_curves(problems: list[BenchmarkProblem]) -> pd.DataFrame:
         points.append(("plan_motion", taken, len(solved) / len(plans), float(np.median(solved))))
         print(points[-1], file=sys.stderr)
     for checks in CHECKS:
-        lines = benchmark.measure_planner(f"search{checks}", problems, benchmark_panda(), physics=False)
+        lines = benchmark.measure_planner(f"search{checks}", problems, benchmark_panda())
         jerk = lines[lines.solved].jerk.median()
         points.append(("search", lines.milliseconds.median(), lines.solved.mean(), jerk))
     # A path is found or not: the curve is the share of those that took less than a time.
-    lines = benchmark.measure_planner("ompl", problems, benchmark_panda(), physics=False)
+    lines = benchmark.measure_planner("ompl", problems, benchmark_panda())
     for limit in LIMITS:
         found = lines[lines.solved & (lines.milliseconds <= limit)]
         if len(found):

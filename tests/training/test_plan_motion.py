@@ -24,7 +24,13 @@ from viapoint.training.evaluation import evaluate_methods
 from viapoint.training.planning import movements, ompl_paths, refine
 from viapoint.training.planning import plan_motion as module
 from viapoint.training.planning.baselines import make_method
-from viapoint.training.planning.benchmark import DATA, benchmark_panda, benchmark_problems, read_problems
+from viapoint.training.planning.benchmark import (
+    DATA,
+    benchmark_panda,
+    benchmark_planner,
+    benchmark_problems,
+    read_problems,
+)
 from viapoint.training.planning.motion_plan import execute_plans
 from viapoint.training.planning.rrt_connect import _shift, clear_path, points_on
 from viapoint.training.planning.search import registered_task
@@ -475,6 +481,8 @@ def test_the_benchmark_is_that_of_the_literature() -> None:
         if plan.reason.startswith(("the start", "the goal", "the arm")):
             faults.append(each.name)
     assert faults == ["table_pick 41"]
+    for number in (7, 13):  # as many plans as the name says
+        assert benchmark_planner(f"search{number}")(arm, problems[0]).source.endswith(str(number))
 
 
 def test_first_problems_of_the_benchmark() -> None:

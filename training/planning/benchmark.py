@@ -235,11 +235,12 @@ def benchmark_planner(name: str) -> Planner:
     if checks is None:
         raise ValueError(unknown_name("planner", name, [*settings, "ompl", "searchN"]))
     number = whole_number("N of searchN", int(checks[1]), 1, MOST_CANDIDATES)
-    half = number // 2  # Number of plans with one via-point around the best of the others
+    each = number // 8  # Number of plans of each of four rounds around the best of the others
 
     def searched(arm: Arm, problem: BenchmarkProblem) -> MotionPlan:
         task = Task.of(arm=arm, n_obstacles=(0, 32))
-        search = GeometrySearch(task, number - half, refinements=4, per_round=max(half // 4, 1))
+        rounds = 4 if each else 0
+        search = GeometrySearch(task, number - rounds * each, refinements=rounds, per_round=max(each, 1))
         scene = resting(problem.start[None], problem.goal[None], pack([problem.obstacles]))
         return search.plan_scene(scene, shortest=True)
 
@@ -247,12 +248,7 @@ def benchmark_planner(name: str) -> Planner:
 
 
 def measure_planner(
-    name: str,
-    problems: Sequence[BenchmarkProblem],
-    arm: Arm,
-    *,
-    physics: bool = True,
-    progress: Progress | None = None,
+    name: str, problems: Sequence[BenchmarkProblem], arm: Arm, *, progress: Progress | None = None
 ) -> pd.DataFrame:
     """Return one line for each problem: what a planner found, how long it took, and what MuJoCo says of it."""
     planner = benchmark_planner(name)
@@ -285,9 +281,8 @@ def measure_planner(
         )
         if progress is not None:
             progress(name, number + 1, len(problems))
-    if physics:
-        for row in succeeding(plans):
-            lines[row]["physics"] = True
+    for row in succeeding(plans):
+        lines[row]["physics"] = True
     return pd.DataFrame(lines)
 
 

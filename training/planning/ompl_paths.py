@@ -15,9 +15,7 @@ import numpy as np
 
 from viapoint import primitives
 from viapoint.envs.arms.arm import Arm
-from viapoint.envs.arms.kinematics import Chain, Spheres
 from viapoint.envs.common.arrays import Float
-from viapoint.envs.geometry.clearance import memory
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import Obstacles
 from viapoint.envs.plans import Plan, SpaceName
@@ -25,7 +23,7 @@ from viapoint.envs.spaces import space_of
 from viapoint.training.planning.motion_plan import MotionPlan
 from viapoint.training.planning.movements import Setting, arm_setting
 from viapoint.training.planning.plan_motion import checked_motion, clearance_of
-from viapoint.training.planning.rrt_connect import VIA_COUNTS, keeps_margin, points_on
+from viapoint.training.planning.rrt_connect import VIA_COUNTS, check_of, keeps_margin, points_on
 
 # Required clearances of a path in each attempt, until one can be made smooth, [m]
 MARGINS = (0.010, 0.004, 0.001, 0.001)
@@ -109,7 +107,7 @@ def _path(setting: Setting, ends: Float, obstacles: Obstacles, margin: float) ->
             one, other = joints(first), joints(second)
             count = max(2, int(np.ceil(np.abs(other - one).max() / CHECK_SPACING)) + 1)
             line = np.ascontiguousarray(np.linspace(one, other, count))
-            return bool(_line_is_clear(setting.chain, setting.spheres, line, obstacles, margin))
+            return bool(_line_is_clear(setting, line, obstacles, margin))
 
     space = base.RealVectorStateSpace(number)
     bounds = base.RealVectorBounds(number)
@@ -139,10 +137,10 @@ def _path(setting: Setting, ends: Float, obstacles: Obstacles, margin: float) ->
 
 
 @compiled
-def _line_is_clear(chain: Chain, spheres: Spheres, line: Float, obstacles: Obstacles, margin: float) -> bool:
-    """Return True if all configurations of shape (T, J) have more than a margin in scene 0."""
-    placed = memory(chain, spheres)
+def _line_is_clear(setting: Setting, line: Float, obstacles: Obstacles, margin: float) -> bool:
+    """Return True if all configurations of shape (T, J) keep a margin in scene 0."""
+    check = check_of(setting, obstacles, margin)
     clear = 0
-    while clear < len(line) and keeps_margin(chain, spheres, line[clear], obstacles, margin, placed):
+    while clear < len(line) and keeps_margin(check, line[clear]):
         clear += 1
     return clear == len(line)

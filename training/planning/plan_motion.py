@@ -22,7 +22,7 @@ from viapoint.envs.arms.inverse_kinematics import (
     inverse_kinematics,
     nearest_goals,
 )
-from viapoint.envs.arms.kinematics import Spheres, motion_torques, slowdowns, torques
+from viapoint.envs.arms.kinematics import motion_torques, slowdowns, torques
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, whole_number
@@ -59,9 +59,8 @@ from viapoint.training.planning.rrt_connect import VIA_COUNTS, clear_path, point
 # Once enough movements are free, more seeds are tried around the one with the least jerk: MORE for each doubling of its
 # relative jerk cost beyond ROUGH, and at most MOST_MORE.
 ROUGH, MORE, MOST_MORE = 1.4, 8, 16
-# Spread of the first random seeds around the straight line, and of later ones, [rad]
-SPREADS = 0.8, 1.0
-HAND_SPREADS = 0.15, 0.3  # Spreads of the same seeds in hand space, [m]
+# Spread of the first random seeds around the straight line, and of later ones, [rad] and [m]
+SPREADS = {"joints": (0.8, 1.0), "hand": (0.15, 0.3)}
 NARROW = 8  # Number of seeds with the first spread
 # Number of seeds after which a path is looked for, where none became free, and of seeds along this path
 EARLY, ALONG = 4, 4
@@ -108,14 +107,12 @@ class _Problem(NamedTuple):
     names: Sequence[str] = ()  # Names of the obstacles, empty for those without
 
     def setting(self, near: float = np.inf) -> Setting:
-        """Return arm and space; in the plane without spheres that are farther than `near` from all obstacles, [m]."""
+        """Return arm and space; in the plane without spheres that are farther than `near` from all obstacles, [m].
+
+        The margin is not for the arm itself: parts of some arms are always near one another.
+        """
         found = arm_setting(self.arm, self.space.of_hand, self.obstacles, room=-RANGE_TOLERANCE, near=near)
         return found._replace(spheres=found.spheres._replace(self_allowance=self.margin))
-
-    @property
-    def spheres(self) -> Spheres:
-        """Spheres of the arm. The margin is not for the arm itself: parts of some arms are always near one another."""
-        return self.arm.spheres._replace(self_allowance=self.margin)
 
     @property
     def in_motion(self) -> bool:
@@ -425,7 +422,7 @@ def _goals_of_poses(problem: _Problem, poses: list[Pose]) -> Float:
             fault = error
             continue
         many = problem.obstacles.take(np.zeros(len(joints), np.int64))
-        rows, own = row_clearances(arm.chain, problem.spheres, joints, many, problem.margin + SPARE)
+        rows, own = row_clearances(arm.chain, problem.setting().spheres, joints, many, problem.margin + SPARE)
         apart = np.minimum(own, rows[:, resting].min(axis=1, initial=np.inf))
         free = apart >= problem.margin
         if free.any():
@@ -449,7 +446,7 @@ def _fault(problem: _Problem) -> tuple[str, float]:
     resting = ~problem.obstacles.velocity[0].any(axis=-1)
     both = problem.obstacles.take([0, 0])
     most = problem.margin + SPARE
-    rows, own = row_clearances(arm.chain, problem.spheres, joints, both, most)
+    rows, own = row_clearances(arm.chain, problem.setting().spheres, joints, both, most)
     for end, name in enumerate(("start", "goal")):
         beyond = np.maximum(arm.joint_range[:, 0] - joints[end], joints[end] - arm.joint_range[:, 1])
         worst = int(beyond.argmax())
@@ -567,7 +564,7 @@ def _search(
     way = problem.goal - problem.start
     straight = np.arange(1, n_via + 1)[:, None] / (n_via + 1) * way
     unit = unit_of_jerk(way, problem.space.of_hand)
-    near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
+    near, far = SPREADS[problem.space.name]
     tables = movement_table(n_via), fine_table(n_via)
     setting = problem.setting(kept + NEAR)  # clearances below NEAR are right
     best, least = None, np.inf
@@ -652,7 +649,7 @@ def _search_around(
         found = None
         if len(path):
             vias = problem.space.coordinates(points_on(path, problem.given.shape[1]))[1:-1]
-            near = HAND_SPREADS[0] if problem.space.of_hand else SPREADS[0]
+            near, _ = SPREADS[problem.space.name]
             away = problem.generator.uniform(-near, near, (ALONG, *vias.shape))
             away[0] = 0.0
             along = problem._replace(given=vias + away)
