@@ -7,7 +7,6 @@ it.
 from __future__ import annotations
 
 import functools
-import threading
 import time
 from typing import Any
 
@@ -30,18 +29,11 @@ MARGINS = (0.010, 0.004, 0.001, 0.001)
 ROOM = 0.7  # Greatest of these clearances, as a share of that of the ends
 PATIENCE = 1.0  # Time limit for each path, [s]
 CHECK_SPACING = 0.05  # Spacing of collision checks along a line, [rad]
-FIRST = threading.Lock()  # of the import, which several threads may ask for
-
-
-def import_ompl() -> Any:
-    """Import the library `ompl`; ValueError if it is not installed."""
-    with FIRST:
-        return _ompl()
 
 
 @functools.cache
-def _ompl() -> Any:
-    """Return the library with its random generator set, which it allows only once."""
+def import_ompl() -> Any:
+    """Import the library `ompl`, and set its random generator, which it allows only once; ValueError without it."""
     try:
         import ompl.base
         import ompl.geometric
