@@ -1,6 +1,7 @@
 """Laws of planning around known obstacles, also with the library OMPL."""
 
 import dataclasses
+import functools
 import itertools
 import json
 import re
@@ -226,11 +227,11 @@ def test_parts_of_the_arm_that_nothing_comes_near_change_no_plan(monkeypatch) ->
     # A bar at the height of the links, which pass above the others
     high = ve.Box((0.03, 0.03, 0.02), position=(0.0, 0.15, 0.15))
     scenes = [pack([[*unpack(each, 0), high]]) for each in obstacles[:4]] + obstacles[4:]
-    given = task.arm, starts, goals, scenes
-    plans = plan_motions(*given)
+    planned = functools.partial(plan_motions, task.arm, starts, goals, scenes, time_limit=30.0)
+    plans = planned()
     whole = module._Problem.setting
     monkeypatch.setattr(module._Problem, "setting", lambda problem, near=0.0: whole(problem))
-    for plan, other in zip(plans, plan_motions(*given), strict=True):
+    for plan, other in zip(plans, planned(), strict=True):
         assert np.allclose(plan.waypoints, other.waypoints, atol=1e-4)
         assert plan.clearance == pytest.approx(other.clearance, abs=1e-5)
 
