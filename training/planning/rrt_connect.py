@@ -32,7 +32,7 @@ VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # Numbers of points of a path t
 
 
 class Check(NamedTuple):
-    """What a check of configurations needs."""
+    """Arm, obstacles, margin and memory of a check of configurations."""
 
     setting: Setting  # Arm, and ranges of its joints
     obstacles: Obstacles  # Obstacles of one scene, at rest
@@ -43,7 +43,7 @@ class Check(NamedTuple):
 
 @compiled
 def check_of(setting: Setting, obstacles: Obstacles, margin: float) -> Check:
-    """Return what a check needs, with memory."""
+    """Return a check with its memory."""
     here = np.empty(len(setting.joint_range))
     return Check(setting, obstacles, margin, here, memory(setting.chain, setting.spheres))
 
