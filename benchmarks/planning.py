@@ -40,7 +40,7 @@ UNSOLVABLE = "table_pick 41"
 """Problem with a goal in contact, which tables leave out, too."""
 EVERY, PATIENCE = 4, 0.5
 """Step between the problems of the curves, and of the comparison with the least jerk in a longer time, [s]."""
-PLANNERS = ("straight", "plan_motion", "paths", "plan_motion+ompl", "search512", "ompl")
+PLANNERS = ("straight", "plan_motion", "paths", "search512", "ompl")
 LIMITS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 """Time limits of plan_motion, [ms]."""
 CHECKS = (16, 64, 256, 1024, 4096, 16384)
@@ -107,7 +107,7 @@ def quality(problems: list[BenchmarkProblem], lines: pd.DataFrame) -> str:
     arm, ratios = benchmark_panda(), []
     for problem, jerk in zip(problems[::EVERY], lines.jerk[::EVERY], strict=True):
         best = plan_motion(
-            arm, problem.start, problem.goal, problem.obstacles, enough=10**5, time_limit=PATIENCE, ompl=False
+            arm, problem.start, problem.goal, problem.obstacles, enough=10**5, time_limit=PATIENCE
         )
         ratios.append(jerk / min(best.jerk, jerk))
     found = pd.Series(ratios)
@@ -157,7 +157,6 @@ def measure_curves(problems: list[BenchmarkProblem]) -> pd.DataFrame:
                 seeds=10**5,
                 enough=10**5,
                 time_limit=1e-3 * limit,
-                ompl=False,
             )
             for each, scene in zip(problems, scenes, strict=True)
         ]
@@ -166,11 +165,11 @@ def measure_curves(problems: list[BenchmarkProblem]) -> pd.DataFrame:
         points.append(("plan_motion", taken, len(solved) / len(plans), float(np.median(solved))))
         print(points[-1], file=sys.stderr)
     for checks in CHECKS:
-        lines = benchmark.measure_planner(f"search{checks}", problems, benchmark_panda(), physics=False)
+        lines = benchmark.measure_planner(f"search{checks}", problems, benchmark_panda())
         jerk = lines[lines.solved].jerk.median()
         points.append(("search", lines.milliseconds.median(), lines.solved.mean(), jerk))
     # A path is found or not: the curve is the share of those that took less than a time.
-    lines = benchmark.measure_planner("ompl", problems, benchmark_panda(), physics=False)
+    lines = benchmark.measure_planner("ompl", problems, benchmark_panda())
     for limit in LIMITS:
         found = lines[lines.solved & (lines.milliseconds <= limit)]
         if len(found):

@@ -90,52 +90,38 @@ class Sight(NamedTuple):
     @classmethod
     def of(cls, observation: Mapping[str, Any], task: Task) -> Sight:
         """Return the readings of B observations, parts of shape (B, .) each."""
+        sensor, spheres = task.sensor, task.arm.spheres
+        assert sensor is not None
         parts = {name: np.asarray(part, np.float64) for name, part in observation.items()}
         ranges, joints = parts["ranges"], parts["joints"]
         points = parts["points"].reshape(*ranges.shape, 3)
-        eyes = parts["eyes"].reshape(len(joints), -1, 3) if "eyes" in parts else None
-        ends = [parts["hand"], parts["goal"]]
-        if task.space_name == "joints":
-            ends = [joints, parts["goal_joints"]]
-        return _sight(task, joints, ranges, points, ends, eyes)
+        rotation, origin = (part[:, None] for part in sensor.pose(task.arm, joints))
+        if "eyes" in parts:
+            origin = parts["eyes"].reshape(len(joints), -1, 3)
+            rays = points.reshape(*origin.shape[:2], -1, 3) - origin[:, :, None]
+            rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-9)
+            rotation = np.concatenate((rotation, _axes(rays[:, 1:], sensor.directions)), axis=1)
+        eyes = np.repeat(origin, sensor.n_rays, axis=1)
+        hit = ranges < sensor.range - ROUNDING
+        if task.space_name == "hand":
+            free = np.stack((parts["hand"], parts["goal"]), axis=1)
+            radius = np.full(2, float(spheres.radius[-1]))
+        else:
+            ends = joints, parts["goal_joints"]
+            free = np.concatenate([sphere_centres(task.arm.chain, spheres, each) for each in ends], axis=1)
+            radius = np.tile(spheres.radius, 2)
+        return cls(origin, rotation, ranges, points, eyes, hit, free, radius)
 
     @classmethod
     def of_scenes(cls, scenes: Scenes, task: Task) -> Sight:
         """Return the readings at the beginning of B scenes."""
         assert task.sensor is not None
         found = task.sensor.read(task.arm, scenes.start, scenes.obstacles)
-        ends = [scenes.start, scenes.goal]
+        observation = {"joints": scenes.start, "goal_joints": scenes.goal}
+        observation |= {"ranges": found.ranges, "points": found.points}
         if task.space_name == "hand":
-            ends = [task.arm.hand(joints) for joints in ends]
-        return _sight(task, scenes.start, found.ranges, found.points, ends)
-
-
-def _sight(
-    task: Task, joints: Float, ranges: Float, points: Float, ends: list[Float], eyes: Float | None = None
-) -> Sight:
-    """Return the readings of a sensor.
-
-    The arm is at `joints`, shape (B, J). Both ends are joint positions in joint space, and places of the hand in hand
-    space. Rays begin at `eyes`, shape (B, looks, 3), at the present place of the sensor by default.
-    """
-    sensor, spheres = task.sensor, task.arm.spheres
-    assert sensor is not None
-    rotation, origin = (part[:, None] for part in sensor.pose(task.arm, joints))
-    if eyes is not None:
-        origin = eyes
-        rays = points.reshape(*eyes.shape[:2], -1, 3) - eyes[:, :, None]
-        rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-9)
-        rotation = np.concatenate((rotation, _axes(rays[:, 1:], sensor.directions)), axis=1)
-    eyes = np.repeat(origin, sensor.n_rays, axis=1)
-    hit = ranges < sensor.range - ROUNDING
-    if task.space_name == "hand":
-        free = np.stack(ends, axis=1)
-        radius = np.full(2, float(spheres.radius[-1]))
-    else:
-        centres = [sphere_centres(task.arm.chain, spheres, each) for each in ends]
-        free = np.concatenate(centres, axis=1)
-        radius = np.tile(spheres.radius, 2)
-    return Sight(origin, rotation, ranges, points, eyes, hit, free, radius)
+            observation |= {"hand": task.arm.hand(scenes.start), "goal": task.arm.hand(scenes.goal)}
+        return cls.of(observation, task)
 
 
 def _axes(rays: Float, directions: Float) -> Float:

@@ -31,8 +31,8 @@ from viapoint.envs.task import MOST_OBSTACLES, Task
 from viapoint.training.checks import unknown_name
 from viapoint.training.planning.candidates import MOST_CANDIDATES
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
-from viapoint.training.planning.ompl_paths import import_ompl
-from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
+from viapoint.training.planning.ompl_paths import import_ompl, ompl_motion
+from viapoint.training.planning.plan_motion import plan_motion
 from viapoint.training.planning.search import GeometrySearch
 
 DATA = files("viapoint.training.planning") / "data"
@@ -214,7 +214,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def benchmark_planner(name: str) -> Planner:
-    """Return a planner by its name: straight, plan_motion, paths, plan_motion+ompl, ompl, or searchN.
+    """Return a planner by its name: straight, plan_motion, paths, ompl, or searchN.
 
     `paths` is plan_motion without random seeds.
 
@@ -223,13 +223,11 @@ def benchmark_planner(name: str) -> Planner:
     """
     settings: dict[str, dict[str, Any]] = {
         "straight": {"time_limit": 0.0},
-        "plan_motion": {"ompl": False},
-        "paths": {"ompl": False, "seeds": 0},
-        "plan_motion+ompl": {"time_limit": 10.0},
+        "plan_motion": {},
+        "paths": {"seeds": 0},
     }
-    if "ompl" in name:
-        import_ompl()
     if name == "ompl":
+        import_ompl()  # an error where it is not installed
         return lambda arm, each: ompl_motion(arm, each.start, each.goal, pack([each.obstacles]))
     if name in settings:
         return lambda arm, each: plan_motion(arm, each.start, each.goal, each.obstacles, **settings[name])
@@ -237,11 +235,12 @@ def benchmark_planner(name: str) -> Planner:
     if checks is None:
         raise ValueError(unknown_name("planner", name, [*settings, "ompl", "searchN"]))
     number = whole_number("N of searchN", int(checks[1]), 1, MOST_CANDIDATES)
-    half = number // 2  # Number of plans with one via-point around the best of the others
+    each = number // 8  # Number of plans of each of four rounds around the best of the others
 
     def searched(arm: Arm, problem: BenchmarkProblem) -> MotionPlan:
         task = Task.of(arm=arm, n_obstacles=(0, 32))
-        search = GeometrySearch(task, number - half, refinements=4, per_round=max(half // 4, 1))
+        rounds = 4 if each else 0
+        search = GeometrySearch(task, number - rounds * each, refinements=rounds, per_round=max(each, 1))
         scene = resting(problem.start[None], problem.goal[None], pack([problem.obstacles]))
         return search.plan_scene(scene, shortest=True)
 
@@ -249,12 +248,7 @@ def benchmark_planner(name: str) -> Planner:
 
 
 def measure_planner(
-    name: str,
-    problems: Sequence[BenchmarkProblem],
-    arm: Arm,
-    *,
-    physics: bool = True,
-    progress: Progress | None = None,
+    name: str, problems: Sequence[BenchmarkProblem], arm: Arm, *, progress: Progress | None = None
 ) -> pd.DataFrame:
     """Return one line for each problem: what a planner found, how long it took, and what MuJoCo says of it."""
     planner = benchmark_planner(name)
@@ -287,9 +281,8 @@ def measure_planner(
         )
         if progress is not None:
             progress(name, number + 1, len(problems))
-    if physics:
-        for row in succeeding(plans):
-            lines[row]["physics"] = True
+    for row in succeeding(plans):
+        lines[row]["physics"] = True
     return pd.DataFrame(lines)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.arrays import Bool, Float, Int, Observation, Single
-from viapoint.envs.geometry.clearance import place_group
+from viapoint.envs.geometry.clearance import place, place_group
 from viapoint.envs.geometry.compiled import compiled
 from viapoint.envs.geometry.obstacles import ABSENT, Obstacles
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT
@@ -22,13 +22,13 @@ from viapoint.envs.sensors import Sensor
 from viapoint.envs.task import Task
 from viapoint.training.planning.beliefs import Sight, fitted_boxes, thick_points
 from viapoint.training.planning.candidates import candidate_actions
-from viapoint.training.planning.movements import INSTANTS, Setting, memory_of
+from viapoint.training.planning.movements import INSTANTS, Setting, joints_at, memory_of, place_hand
 from viapoint.training.planning.problem import (
     Moves,
     Numbers,
     Problem,
+    movement_of,
     moves_of,
-    place_at,
     setting_of,
     worth_of,
 )
@@ -110,9 +110,13 @@ def _centres(setting: Setting, moves: Moves, instants: Int, some: Int, centre: S
     for b in range(number):
         for h in range(plans):
             for k in range(len(instants)):
-                if not place_at(setting, moves, b, h, instants[k], position, joints, placed):
+                if not joints_at(setting, movement_of(moves, b, h), instants[k], position, joints):
                     inside[b, h] = False
                     break
+                if setting.hand_alone:
+                    place_hand(position, placed)
+                else:
+                    place(setting.chain, setting.spheres, joints, placed)
                 for group in range(len(spheres.link)):
                     place_group(spheres, group, placed)
                 for i in range(len(some)):

@@ -55,6 +55,17 @@ NEAR = 0.05
 # Angle that a straight elbow turns when the hand is 0.3 mm from its place, the usual error of tracking, [rad]
 ELBOW_ROOM = 0.04
 
+# Jerk cost of a quintic segment in unit time, as a quadratic form of position, velocity and acceleration at its ends
+JERK_SQUARE = np.array(
+    [
+        [720.0, 360.0, 60.0, -720.0, 360.0, -60.0],
+        [360.0, 192.0, 36.0, -360.0, 168.0, -24.0],
+        [60.0, 36.0, 9.0, -60.0, 24.0, -3.0],
+        [-720.0, -360.0, -60.0, 720.0, -360.0, 60.0],
+        [360.0, 168.0, 24.0, -360.0, 192.0, -36.0],
+        [-60.0, -24.0, -3.0, 60.0, -36.0, 9.0],
+    ]
+)
 # Nodes and weights of Gauss-Legendre quadrature in [-1, 1]
 NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(3)
 
@@ -169,7 +180,7 @@ def _setting(arm: Arm, of_hand: bool, wanted: tuple[bool, ...], room: float) -> 
 
 
 @functools.cache
-def movement_table(n_via: int) -> MovementTable:
+def movement_table(n_via: int, number_of_instants: int = INSTANTS) -> MovementTable:
     """Return the table of movements through some via-points; more than three are passed at even times."""
     times: Float = np.arange(1, n_via + 1)[None] / (n_via + 1)
     if n_via == 1:
@@ -179,13 +190,12 @@ def movement_table(n_via: int) -> MovementTable:
         times = np.stack((first, second), axis=-1)[second - first > 0.14]
     elif n_via == 3:
         times = np.array(list(itertools.combinations(np.linspace(0.1, 0.9, 13), 3)))
-    return table_with(np.diff(times, prepend=0.0, append=1.0))
+    return table_with(np.diff(times, prepend=0.0, append=1.0), number_of_instants)
 
 
-@functools.cache
 def fine_table(n_via: int) -> MovementTable:
     """Return the same table at many instants, for the last check of a movement."""
-    return table_with(movement_table(n_via).durations, FINE_INSTANTS)
+    return movement_table(n_via, FINE_INSTANTS)
 
 
 def table_with(durations: Float, number_of_instants: int = INSTANTS) -> MovementTable:
@@ -251,50 +261,37 @@ def _unit_movements(durations: Float, number_of_instants: int) -> tuple[Float, F
 def _coefficients(durations: Float, coefficients: Float) -> None:
     """Fill in the polynomials of the segments of each unit movement, shape (segments, 6, columns).
 
-    Velocity v and acceleration a at the via-points are those for which jerk and snap are continuous.
+    Velocity v and acceleration a at the via-points are those of the least jerk cost: jerk and snap are continuous.
     """
     segments = len(durations)
-    vias, columns = segments - 1, segments + 2
-    knots = np.zeros((columns, segments + 1, 3))  # position, velocity and acceleration
+    columns = segments + 2
+    # Position, velocity and acceleration of one knot after another; the latter two are unknown at via-points.
+    knots = np.zeros((columns, 3 * (segments + 1)))
     for column in range(segments):
-        knots[column, column + 1, 0] = 1.0
-    knots[segments, 0, 1] = 1.0
-    knots[segments + 1, 0, 2] = 1.0
-    if vias:
-        # Negative snap times T^4 and jerk times T^3 at the end of a segment, then at its begin, by x, vT and aT^2 at
-        # both ends: the derivatives of the jerk cost by v and a, so that the matrix is symmetric.
-        ends = np.array(
-            [
-                [[360.0, 168.0, 24.0, -360.0, 192.0, -36.0], [-60.0, -24.0, -3.0, 60.0, -36.0, 9.0]],
-                [[-360.0, -192.0, -36.0, 360.0, -168.0, 24.0], [-60.0, -36.0, -9.0, 60.0, -24.0, 3.0]],
-            ]
-        )
-        matrix = np.zeros((2 * vias, 2 * vias))
-        right = np.zeros((columns, 2 * vias))
-        for via in range(vias):
-            for side in range(2):
-                segment = via + side
-                length, sign = durations[segment], 1.0 - 2.0 * side
-                for row in range(2):
-                    for part in range(6):
-                        knot, order = segment + part // 3, part % 3
-                        weight = sign * ends[side, row, part] * length ** (order - 4 + row)
-                        if order > 0 and 0 < knot < segments:
-                            matrix[2 * via + row, 2 * (knot - 1) + order - 1] += weight
-                        else:
-                            for column in range(columns):
-                                right[column, 2 * via + row] -= weight * knots[column, knot, order]
+        knots[column, 3 * (column + 1)] = 1.0
+    knots[segments, 1] = 1.0
+    knots[segments + 1, 2] = 1.0
+    number = 2 * (segments - 1)
+    unknown = np.empty(number, np.int64)
+    for i in range(number):
+        unknown[i] = 3 * (i // 2) + 4 + i % 2
+    square = _jerk_square(durations)
+    matrix = np.empty((number, number))
+    motion = np.zeros((columns, number))
+    for i in range(number):
+        for j in range(number):
+            matrix[i, j] = square[unknown[i], unknown[j]]
         for column in range(columns):
-            motion = right[column]
-            solve_symmetric(matrix.copy(), motion, 2 * vias)
-            for via in range(vias):
-                knots[column, via + 1, 1] = motion[2 * via]
-                knots[column, via + 1, 2] = motion[2 * via + 1]
+            for given in range(knots.shape[1]):
+                motion[column, i] -= square[unknown[i], given] * knots[column, given]
+    for column in range(columns):
+        solve_symmetric(matrix.copy(), motion[column], number)
+        for i in range(number):
+            knots[column, unknown[i]] = motion[column, i]
     for segment in range(segments):
         t = durations[segment]
         for column in range(columns):
-            x, v, a = knots[column, segment]
-            end, rate, bend = knots[column, segment + 1]
+            x, v, a, end, rate, bend = knots[column, 3 * segment : 3 * segment + 6]
             way = end - x
             coefficients[segment, 0, column] = x
             coefficients[segment, 1, column] = v
@@ -305,6 +302,21 @@ def _coefficients(durations: Float, coefficients: Float) -> None:
             coefficients[segment, 3, column] = 0.5 * third / t**3
             coefficients[segment, 4, column] = 0.5 * fourth / t**4
             coefficients[segment, 5, column] = 0.5 * fifth / t**5
+
+
+@compiled
+def _jerk_square(durations: Float) -> Float:
+    """Return the matrix of the jerk cost by x, v and a of all knots, shape (3 (segments + 1), 3 (segments + 1))."""
+    size = 3 * (len(durations) + 1)
+    square = np.zeros((size, size))
+    power = np.empty(5)
+    for segment in range(len(durations)):
+        for exponent in range(5):
+            power[exponent] = durations[segment] ** (exponent - 5)
+        for i in range(6):
+            for j in range(6):
+                square[3 * segment + i, 3 * segment + j] += JERK_SQUARE[i, j] * power[i % 3 + j % 3]
+    return square
 
 
 @inner

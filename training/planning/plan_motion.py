@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viapoint import primitives
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import (
     RANGE_TOLERANCE,
@@ -23,7 +22,7 @@ from viapoint.envs.arms.inverse_kinematics import (
     inverse_kinematics,
     nearest_goals,
 )
-from viapoint.envs.arms.kinematics import Spheres, motion_torques, slowdowns, torques
+from viapoint.envs.arms.kinematics import motion_torques, slowdowns, torques
 from viapoint.envs.arms.registry import arm_of
 from viapoint.envs.common.arrays import Float, norm
 from viapoint.envs.common.validation import as_real_array, finite_array, number_of_at_least, whole_number
@@ -47,7 +46,6 @@ from viapoint.training.planning.movements import (
     movement_table,
     table_with,
 )
-from viapoint.training.planning.ompl_paths import import_ompl, path_around
 from viapoint.training.planning.refine import (
     SMOOTH,
     Found,
@@ -61,9 +59,8 @@ from viapoint.training.planning.rrt_connect import VIA_COUNTS, clear_path, point
 # Once enough movements are free, more seeds are tried around the one with the least jerk: MORE for each doubling of its
 # relative jerk cost beyond ROUGH, and at most MOST_MORE.
 ROUGH, MORE, MOST_MORE = 1.4, 8, 16
-# Spread of the first random seeds around the straight line, and of later ones, [rad]
-SPREADS = 0.8, 1.0
-HAND_SPREADS = 0.15, 0.3  # Spreads of the same seeds in hand space, [m]
+# Spread of the first random seeds around the straight line, and of later ones, [rad] and [m]
+SPREADS = {"joints": (0.8, 1.0), "hand": (0.15, 0.3)}
 NARROW = 8  # Number of seeds with the first spread
 # Number of seeds after which a path is looked for, where none became free, and of seeds along this path
 EARLY, ALONG = 4, 4
@@ -89,10 +86,6 @@ LONGER = 1.3
 SPARE = 1e-3  # Clearance that movements keep beyond the margin where their ends have it, [m]
 COARSE = 0.01  # Excess of an arm's spheres above which a contact may be one of the spheres only, [m]
 ROUNDING = 1e-6  # Rounding error of clearances, [m]
-# Required clearances of a path of OMPL in each attempt, until one can be made smooth, [m]
-OMPL_MARGINS = (0.010, 0.004, 0.001, 0.001)
-OMPL_ROOM = 0.7  # Greatest of these clearances, as a share of that of the ends
-OMPL_PATIENCE = 1.0  # Time limit for each path of OMPL as a baseline, [s]
 GOALS = 8  # Greatest number of configurations that are tried for a pose
 
 
@@ -114,14 +107,12 @@ class _Problem(NamedTuple):
     names: Sequence[str] = ()  # Names of the obstacles, empty for those without
 
     def setting(self, near: float = np.inf) -> Setting:
-        """Return arm and space; in the plane without spheres that are farther than `near` from all obstacles, [m]."""
+        """Return arm and space; in the plane without spheres that are farther than `near` from all obstacles, [m].
+
+        The margin is not for the arm itself: parts of some arms are always near one another.
+        """
         found = arm_setting(self.arm, self.space.of_hand, self.obstacles, room=-RANGE_TOLERANCE, near=near)
         return found._replace(spheres=found.spheres._replace(self_allowance=self.margin))
-
-    @property
-    def spheres(self) -> Spheres:
-        """Spheres of the arm. The margin is not for the arm itself: parts of some arms are always near one another."""
-        return self.arm.spheres._replace(self_allowance=self.margin)
 
     @property
     def in_motion(self) -> bool:
@@ -163,7 +154,6 @@ def plan_motion(
     space: SpaceName | None = None,
     velocity: Any = None,
     acceleration: Any = None,
-    ompl: bool = True,
     rng: np.random.Generator | int | None = None,
 ) -> MotionPlan:
     """Plan a minimum-jerk movement through via-points from a start to a goal around obstacles.
@@ -193,8 +183,6 @@ def plan_motion(
         space: `joints` or `hand`; that of the arm by default.
         velocity: Initial velocity, shape (D,); 0 by default.
         acceleration: Initial acceleration, shape (D,); 0 by default.
-        ompl: True to follow a path of OMPL's RRT-Connect where nothing else is found, if the extra `planning` is
-            installed.
         rng: Random generator of the seeds, or its seed; 0 by default.
 
     Returns:
@@ -273,7 +261,7 @@ def plan_motion(
             now = time.perf_counter()
             share = now + (until - now) / (len(goals) - rank)
             few = number if np.isinf(least) else min(number, NARROW)
-            plans.append(_plan(problem._replace(goal=each), few, share, paths, ompl))
+            plans.append(_plan(problem._replace(goal=each), few, share, paths))
     plans += straight
     best = max(plans, key=_merit)
     return dataclasses.replace(best, milliseconds=1e3 * (time.perf_counter() - began))
@@ -296,11 +284,10 @@ def plan_motions(
 ) -> list[MotionPlan]:
     """Plan N movements on threads; the other arguments are those of :func:`plan_motion`.
 
-    Each movement is planned as :func:`plan_motion` plans it alone, except where the time limit is reached, or a path of
-    OMPL is followed: all threads have its random generator in common. The `reason` of each plan without success begins
-    with the number of its problem, such as `problem 3: `, from 0. A problem with an argument that is not allowed, or a
-    pose out of reach, is refused: its plan has the source `refused` and no waypoints, and raises UnsafePlanError when
-    it is executed or exported, also with `force=True`.
+    Each movement is planned as :func:`plan_motion` plans it alone, except where the time limit is reached. The `reason`
+    of each plan without success begins with the number of its problem, such as `problem 3: `, from 0. A problem with
+    an argument that is not allowed, or a pose out of reach, is refused: its plan has the source `refused` and no
+    waypoints, and raises UnsafePlanError when it is executed or exported, also with `force=True`.
 
     Args:
         arm: Arm, or name of one.
@@ -381,40 +368,6 @@ def checked_motion(
     return _known(problem, movement, source, 0.0 if shortest else 1.0, _fault(problem)[0])
 
 
-def ompl_motion(
-    arm: Arm, start: Float, goal: Float, obstacles: Obstacles, *, space: SpaceName = "joints"
-) -> MotionPlan:
-    """Return the smooth movement along a path of RRT-Connect, or the one with the most clearance if none is free.
-
-    It is the minimum-jerk movement through as few points of the path as stay clear. OMPL has one random generator for
-    all its planners, so that results depend on those before. Start and goal are coordinates of the space in which the
-    movement is smooth; the path is one of joints. Obstacles are at rest.
-    """
-    where = space_of(arm, space)
-
-    def smooth(configurations: Float) -> MotionPlan:
-        points = where.coordinates(configurations)
-        plan = Plan(points, np.asarray(primitives.passage_durations(points, 1.0)))
-        return checked_motion(arm, space, plan, obstacles, "ompl", shortest=True)
-
-    ends = np.ascontiguousarray(where.joints(np.stack((start, goal))))
-    best = smooth(ends)
-    setting = arm_setting(arm, where.of_hand, obstacles)
-    nearest = _clearance_of(setting, ends, obstacles, OMPL_MARGINS[0])
-    for most in OMPL_MARGINS:
-        margin = min(most, OMPL_ROOM * nearest)
-        path = path_around(setting, ends, obstacles, margin, OMPL_PATIENCE)
-        if path is None:
-            continue
-        for count in VIA_COUNTS:
-            plan = smooth(points_on(path, count))
-            if plan.clearance > best.clearance:
-                best = plan
-            if plan.success and plan.clearance >= 0.5 * margin:
-                return plan
-    return best
-
-
 @functools.lru_cache(maxsize=64)
 def _warm_up(arm: Arm, of_hand: bool, n_via: int) -> None:
     """Make tables, and load or compile the machine code, so that no time limit is spent on them."""
@@ -469,7 +422,7 @@ def _goals_of_poses(problem: _Problem, poses: list[Pose]) -> Float:
             fault = error
             continue
         many = problem.obstacles.take(np.zeros(len(joints), np.int64))
-        rows, own = row_clearances(arm.chain, problem.spheres, joints, many, problem.margin + SPARE)
+        rows, own = row_clearances(arm.chain, problem.setting().spheres, joints, many, problem.margin + SPARE)
         apart = np.minimum(own, rows[:, resting].min(axis=1, initial=np.inf))
         free = apart >= problem.margin
         if free.any():
@@ -493,7 +446,7 @@ def _fault(problem: _Problem) -> tuple[str, float]:
     resting = ~problem.obstacles.velocity[0].any(axis=-1)
     both = problem.obstacles.take([0, 0])
     most = problem.margin + SPARE
-    rows, own = row_clearances(arm.chain, problem.spheres, joints, both, most)
+    rows, own = row_clearances(arm.chain, problem.setting().spheres, joints, both, most)
     for end, name in enumerate(("start", "goal")):
         beyond = np.maximum(arm.joint_range[:, 0] - joints[end], joints[end] - arm.joint_range[:, 1])
         worst = int(beyond.argmax())
@@ -534,12 +487,10 @@ def _fault(problem: _Problem) -> tuple[str, float]:
     return "", max(problem.margin, min(most, nearest - ROUNDING))
 
 
-def _plan(
-    problem: _Problem, number: int, until: float, paths: bool = False, ompl: bool = False
-) -> MotionPlan:
+def _plan(problem: _Problem, number: int, until: float, paths: bool = False) -> MotionPlan:
     """Return the best movement to one goal, after a search with up to a number of random seeds until some time, [s].
 
-    With `paths`, those that are found by trees are followed where the first seeds fail, in the end also one of OMPL.
+    With `paths`, those that are found by trees are followed where the first seeds fail.
     """
     fault, kept = _fault(problem)
     straight = _straight(problem)
@@ -562,7 +513,7 @@ def _plan(
         tried += more
         if found is None and follows and time.perf_counter() < until:
             problem = problem._replace(given=problem.given[:0])
-            found, more = _search_around(problem, kept, duration, number, until, ompl)
+            found, more = _search_around(problem, kept, duration, number, until)
             tried += more
         if found is not None:
             best = found
@@ -613,7 +564,7 @@ def _search(
     way = problem.goal - problem.start
     straight = np.arange(1, n_via + 1)[:, None] / (n_via + 1) * way
     unit = unit_of_jerk(way, problem.space.of_hand)
-    near, far = HAND_SPREADS if problem.space.of_hand else SPREADS
+    near, far = SPREADS[problem.space.name]
     tables = movement_table(n_via), fine_table(n_via)
     setting = problem.setting(kept + NEAR)  # clearances below NEAR are right
     best, least = None, np.inf
@@ -668,7 +619,7 @@ def _search(
     return _known(problem, movement, name, problem.least, clearance=known), tried
 
 
-def _clearance_of(setting: Setting, joints: Float, obstacles: Obstacles, most: float) -> float:
+def clearance_of(setting: Setting, joints: Float, obstacles: Obstacles, most: float) -> float:
     """Return the least clearance of configurations, shape (N, J), among obstacles of one scene, at most `most`, [m]."""
     many = obstacles.take([0] * len(joints))
     rows, own = row_clearances(setting.chain, setting.spheres, joints, many, most)
@@ -676,7 +627,7 @@ def _clearance_of(setting: Setting, joints: Float, obstacles: Obstacles, most: f
 
 
 def _search_around(
-    problem: _Problem, kept: float, duration: float, number: int, until: float, ompl: bool
+    problem: _Problem, kept: float, duration: float, number: int, until: float
 ) -> tuple[MotionPlan | None, int]:
     """Return the best movement along a clear path or from random seeds, and the number of seeds.
 
@@ -685,7 +636,7 @@ def _search_around(
     """
     ends = np.ascontiguousarray(problem.space.joints(np.stack((problem.start, problem.goal))))
     setting = problem.setting()
-    room = max(_clearance_of(setting, ends, problem.obstacles, kept + ROOM) - kept, 0.0)
+    room = max(clearance_of(setting, ends, problem.obstacles, kept + ROOM) - kept, 0.0)
     tried = free = 0
     best = None
     for attempt in range(PATH_ATTEMPTS):
@@ -698,13 +649,13 @@ def _search_around(
         found = None
         if len(path):
             vias = problem.space.coordinates(points_on(path, problem.given.shape[1]))[1:-1]
-            near = HAND_SPREADS[0] if problem.space.of_hand else SPREADS[0]
+            near, _ = SPREADS[problem.space.name]
             away = problem.generator.uniform(-near, near, (ALONG, *vias.shape))
             away[0] = 0.0
             along = problem._replace(given=vias + away)
             found, more = _search(along, kept, duration, number, until, early=0, source="path")
             tried += more
-            found = found or _along(problem, kept, duration, until, path, "path")
+            found = found or _along(problem, kept, duration, until, path)
         if found is None and attempt == len(PATHS) - 1:
             found, more = _search(problem, kept, duration, number, until, first=EARLY)
             tried += more
@@ -714,16 +665,7 @@ def _search_around(
         if best is None or (found.success, -found.jerk) > (best.success, -best.jerk):
             best = found
         if free >= problem.enough + (best.jerk > JAGGED):
-            return best, tried
-    patience = until - time.perf_counter()
-    if best is None and ompl and patience > 0.0:
-        try:
-            import_ompl()  # the time of the first import does not count
-        except ValueError:
-            return None, tried
-        other = path_around(setting, ends, problem.obstacles, kept, patience)
-        if other is not None:
-            best = _along(problem, kept, duration, until, other, "ompl")
+            break
     return best, tried
 
 
@@ -749,9 +691,7 @@ def _refined(
     )  # fmt: skip
 
 
-def _along(
-    problem: _Problem, kept: float, duration: float, until: float, path: Float, source: str
-) -> MotionPlan | None:
+def _along(problem: _Problem, kept: float, duration: float, until: float, path: Float) -> MotionPlan | None:
     """Return a movement along a path of joints, with as many via-points as it needs; None if there is none.
 
     Fewer points of a free movement often make a smoother one.
@@ -777,7 +717,7 @@ def _along(
             if other is not None and other[2] < cost:
                 found = other
         movement, clearance, _ = found
-        return _known(problem, movement, source, problem.least, clearance=clearance)
+        return _known(problem, movement, "path", problem.least, clearance=clearance)
     return None
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from viapoint.envs.common.arrays import Bool, Float, Int, norm
-from viapoint.envs.geometry.clearance import Placed, place
 from viapoint.envs.geometry.compiled import compiled, inlined, inner
 from viapoint.envs.geometry.obstacles import Obstacles, no_obstacles, obstacles_from_rows
 from viapoint.envs.outcome import SETTLING, straight_jerk_cost
@@ -28,9 +27,7 @@ from viapoint.training.planning.movements import (
     arm_setting,
     best_times,
     jerk_cost,
-    joints_at,
     movement_table,
-    place_hand,
     products,
     shortest_duration,
     table_with,
@@ -120,27 +117,6 @@ class Moves(NamedTuple):
 def movement_of(moves: Moves, b: int, h: int) -> Movement:
     """Return one of the plans; for kernels, as elsewhere Numba counts references to each array."""
     return Movement(moves.table, moves.times[b, h], moves.start[b], moves.offsets[b, h], moves.duration[b, h])
-
-
-@inner
-def place_at(
-    setting: Setting,
-    moves: Moves,
-    b: int,
-    h: int,
-    instant: int,
-    position: Float,
-    joints: Float,
-    placed: Placed,
-) -> bool:
-    """Place the arm at an instant of a plan, and return True within reach and joint ranges."""
-    if not joints_at(setting, movement_of(moves, b, h), instant, position, joints):
-        return False
-    if setting.hand_alone:
-        place_hand(position, placed)
-    else:
-        place(setting.chain, setting.spheres, joints, placed)
-    return True
 
 
 def moves_of(task: Task, problem: Problem, actions: Numbers, *, exact: bool = False) -> Moves:

@@ -7,11 +7,12 @@ RRT-Connect (J. J. Kuffner and S. M. LaValle, RRT-Connect: An efficient approach
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from viapoint.envs.arms.inverse_kinematics import descend
-from viapoint.envs.arms.kinematics import Chain, Spheres, tool_position
+from viapoint.envs.arms.kinematics import tool_position
 from viapoint.envs.common.arrays import Float, Int, norm
 from viapoint.envs.geometry.clearance import Placed, memory, obstacle_clearance, place, self_clearance
 from viapoint.envs.geometry.compiled import clock, compiled, inlined, inner, kernel, rotated
@@ -28,6 +29,23 @@ MOST_NODES, MOST_SAMPLES = 20_000, 300_000  # Greatest numbers of nodes of a tre
 SHORTCUTS = 200  # Number of shortcuts that are tried
 LESS = 0.95  # Length of a shortcut that is worth a check, as a share of the way that it replaces
 VIA_COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # Numbers of points of a path that are tried as via-points
+
+
+class Check(NamedTuple):
+    """Arm, obstacles, margin and memory of a check of configurations."""
+
+    setting: Setting  # Arm, and ranges of its joints
+    obstacles: Obstacles  # Obstacles of one scene, at rest
+    margin: float  # Least clearance that is kept, [m]
+    here: Float  # Memory for a configuration, shape (J,)
+    placed: Placed  # Memory for the places of the arm's parts
+
+
+@compiled
+def check_of(setting: Setting, obstacles: Obstacles, margin: float) -> Check:
+    """Return a check with its memory."""
+    here = np.empty(len(setting.joint_range))
+    return Check(setting, obstacles, margin, here, memory(setting.chain, setting.spheres))
 
 
 @compiled
@@ -51,9 +69,8 @@ def clear_path(
     """
     until = clock() + patience
     low, high = setting.joint_range[:, 0], setting.joint_range[:, 1]
-    placed = memory(setting.chain, setting.spheres)
+    check = check_of(setting, obstacles, margin)
     joints = len(low)
-    here = np.empty(joints)
     target = np.empty(joints)
     # Both trees: their nodes, the node from which each was reached, and how many there are.
     node = np.empty((2, MOST_NODES, joints))
@@ -67,24 +84,20 @@ def clear_path(
         one = int(count[0] > count[1])  # the smaller tree grows
         other = 1 - one
         if rng.uniform(0.0, 1.0) < SHIFTED:
-            _shift(setting, node[one, int(rng.uniform(0.0, count[one]))], rng, target, placed)
+            _shift(setting, node[one, int(rng.uniform(0.0, count[one]))], rng, target, check.placed)
         else:
             for j in range(joints):
                 target[j] = rng.uniform(low[j], high[j])
-        if _grow(setting, node[one], parent[one], count, one, target, obstacles, margin, here, placed) < 0.0:
+        if _grow(check, node[one], parent[one], count, one, target) < 0.0:
             continue
         reached = node[one, count[one] - 1]
         left = 1.0
         while left > 0.0 and count[other] < MOST_NODES:
-            left = _grow(
-                setting, node[other], parent[other], count, other, reached, obstacles, margin, here, placed
-            )
+            left = _grow(check, node[other], parent[other], count, other, reached)
         if left == 0.0:
             path = np.empty((count[0] + count[1] + SHORTCUTS, joints))
             length = _join(node, parent, count, path)
-            length = _shorten(
-                setting, path, length, obstacles, margin, rng, here, placed, np.empty((2, joints))
-            )
+            length = _shorten(check, path, length, rng, np.empty((2, joints)))
             return path[:length]
     return np.empty((0, joints))
 
@@ -107,20 +120,9 @@ def _shift(setting: Setting, node: Float, rng: np.random.Generator, target: Floa
 
 
 @inner
-def _grow(
-    setting: Setting,
-    node: Float,
-    parent: Int,
-    count: Int,
-    tree: int,
-    target: Float,
-    obstacles: Obstacles,
-    margin: float,
-    here: Float,
-    placed: Placed,
-) -> float:
+def _grow(check: Check, node: Float, parent: Int, count: Int, tree: int, target: Float) -> float:
     """Add a node to a tree, one step from its nearest node to a target; return the way that is left, -1 in contact."""
-    sliding, new = setting.chain.sliding, count[tree]
+    sliding, new = check.setting.chain.sliding, count[tree]
     nearest, least = 0, np.inf
     for each in range(new):
         square = 0.0
@@ -135,7 +137,7 @@ def _grow(
     share = min(1.0, STEP / max(way, 1e-9))
     for j in range(len(target)):
         node[new, j] = node[nearest, j] + share * (target[j] - node[nearest, j])
-    if not line_is_clear(setting, node[nearest], node[new], obstacles, margin, here, placed):
+    if not _line_is_clear(check, node[nearest], node[new]):
         return -1.0
     parent[new] = nearest
     count[tree] += 1
@@ -143,33 +145,24 @@ def _grow(
 
 
 @inner
-def keeps_margin(
-    chain: Chain, spheres: Spheres, joints: Float, obstacles: Obstacles, margin: float, placed: Placed
-) -> bool:
-    """Return True if a configuration keeps a margin from the obstacles of scene 0, and from itself."""
-    place(chain, spheres, joints, placed)
-    if obstacle_clearance(spheres, placed, obstacles, 0, 0.0, margin, margin) < margin:
+def keeps_margin(check: Check, joints: Float) -> bool:
+    """Return True if a configuration keeps the margin from the obstacles, and from itself."""
+    spheres, placed, margin = check.setting.spheres, check.placed, check.margin
+    place(check.setting.chain, spheres, joints, placed)
+    if obstacle_clearance(spheres, placed, check.obstacles, 0, 0.0, margin, margin) < margin:
         return False
     return self_clearance(spheres, placed, margin, margin) >= margin
 
 
 @inner
-def line_is_clear(
-    setting: Setting,
-    first: Float,
-    last: Float,
-    obstacles: Obstacles,
-    margin: float,
-    here: Float,
-    placed: Placed,
-) -> bool:
-    """Return True if the arm keeps a margin on the straight way from one configuration, which is clear, to another.
+def _line_is_clear(check: Check, first: Float, last: Float) -> bool:
+    """Return True if the arm keeps the margin on the straight way from one configuration, which is clear, to another.
 
     The end is looked at first, then the middle, the quarters, and so on.
     """
-    way = 0.0
+    way, here = 0.0, check.here
     for j in range(len(here)):
-        way = max(way, setting.reach[j] * abs(last[j] - first[j]))
+        way = max(way, check.setting.reach[j] * abs(last[j] - first[j]))
     count = 1
     while count * SPACING < way:
         count *= 2
@@ -179,7 +172,7 @@ def line_is_clear(
         for k in range(begin, count + 1, stride):
             for j in range(len(here)):
                 here[j] = first[j] + k / count * (last[j] - first[j])
-            if not keeps_margin(setting.chain, setting.spheres, here, obstacles, margin, placed):
+            if not keeps_margin(check, here):
                 return False
         stride = begin
         begin //= 2
@@ -223,17 +216,7 @@ def _join(node: Float, parent: Int, count: Int, path: Float) -> int:
 
 
 @inner
-def _shorten(
-    setting: Setting,
-    path: Float,
-    length: int,
-    obstacles: Obstacles,
-    margin: float,
-    rng: np.random.Generator,
-    here: Float,
-    placed: Placed,
-    points: Float,
-) -> int:
+def _shorten(check: Check, path: Float, length: int, rng: np.random.Generator, points: Float) -> int:
     """Put clear straight lines in place of ways around, and return the new number of corners of a path.
 
     First the lines go from one random point of the path to another, for which `points` is memory, shape (2, J), and
@@ -246,7 +229,7 @@ def _shorten(
         first, last = int(min(one, other)), int(max(one, other))
         if first == last:
             continue
-        for j in range(len(here)):
+        for j in range(path.shape[1]):
             for point, corner, share in (
                 (0, first, min(one, other) - first),
                 (1, last, max(one, other) - last),
@@ -258,16 +241,14 @@ def _shorten(
             way += _distance(path[corner], path[corner + 1])
         if _distance(begin, end) > LESS * way:
             continue
-        if line_is_clear(setting, begin, end, obstacles, margin, here, placed):
+        if _line_is_clear(check, begin, end):
             length = _move(path, length, last + 1, first + 3)
             _copy(begin, path[first + 1])
             _copy(end, path[first + 2])
     corner = 0
     while corner + 2 < length:
         last = length - 1
-        while last > corner + 1 and not line_is_clear(
-            setting, path[corner], path[last], obstacles, margin, here, placed
-        ):
+        while last > corner + 1 and not _line_is_clear(check, path[corner], path[last]):
             last -= 1
         length = _move(path, length, last, corner + 1)
         corner += 1
