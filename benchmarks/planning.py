@@ -40,7 +40,7 @@ UNSOLVABLE = "table_pick 41"
 """Problem with a goal in contact, which tables leave out, too."""
 EVERY, PATIENCE = 4, 0.5
 """Step between the problems of the curves, and of the comparison with the least jerk in a longer time, [s]."""
-PLANNERS = ("straight", "plan_motion", "paths", "search512", "ompl")
+PLANNERS = ("straight", "plan_motion", "paths", "plan_motion+ompl", "search512", "ompl")
 LIMITS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 """Time limits of plan_motion, [ms]."""
 CHECKS = (16, 64, 256, 1024, 4096, 16384)
@@ -107,7 +107,7 @@ def quality(problems: list[BenchmarkProblem], lines: pd.DataFrame) -> str:
     arm, ratios = benchmark_panda(), []
     for problem, jerk in zip(problems[::EVERY], lines.jerk[::EVERY], strict=True):
         best = plan_motion(
-            arm, problem.start, problem.goal, problem.obstacles, enough=10**5, time_limit=PATIENCE
+            arm, problem.start, problem.goal, problem.obstacles, enough=10**5, time_limit=PATIENCE, ompl=False
         )
         ratios.append(jerk / min(best.jerk, jerk))
     found = pd.Series(ratios)
@@ -157,6 +157,7 @@ def measure_curves(problems: list[BenchmarkProblem]) -> pd.DataFrame:
                 seeds=10**5,
                 enough=10**5,
                 time_limit=1e-3 * limit,
+                ompl=False,
             )
             for each, scene in zip(problems, scenes, strict=True)
         ]

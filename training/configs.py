@@ -396,7 +396,7 @@ class EvaluateConfig(AgentConfig):
     refine: tuple[int, ...] = ()  # Numbers of proposals that the planner refines, one further row each.
     scenes: str = "test"
     """Scene set: validation, test, hard, uniform, or an .npz file of scenes; motionbenchmaker for the problems of that
-    benchmark, on which planners are measured: straight, plan_motion, paths, ompl, search512."""
+    benchmark, on which planners are measured: straight, plan_motion, paths, plan_motion+ompl, ompl, search512."""
     problems: Path | None = None
     """Folder of MotionBenchMaker's own files, in place of the problems that are shipped; with --arm, for the joints of
     that arm, by their names."""

@@ -107,6 +107,7 @@ ENCLOSED = {
     "start": (-0.2, 0.3),
     "goal": (0.2, 0.3),
     "obstacles": [ve.Box((a, b, 0.04), position=(x, y, 0.0)) for a, b, x, y in SIDES],
+    "ompl": False,
     "time_limit": 2.0,
 }
 REASONS = [
@@ -159,7 +160,7 @@ def test_movements_that_begin_in_motion_are_executed_as_planned(name: str) -> No
     rng = np.random.default_rng(0)
     for _ in range(6):
         velocity, acceleration = rng.uniform(-0.3, 0.3, (2, len(ends[0])))
-        given = {"velocity": velocity, "acceleration": acceleration}
+        given = {"velocity": velocity, "acceleration": acceleration, "ompl": False}
         plan = plan_motion(name, *ends, [bar], **given)
         done = plan.execute()
         assert plan.success
@@ -227,7 +228,7 @@ def test_parts_of_the_arm_that_nothing_comes_near_change_no_plan(monkeypatch) ->
     # A bar at the height of the links, which pass above the others
     high = ve.Box((0.03, 0.03, 0.02), position=(0.0, 0.15, 0.15))
     scenes = [pack([[*unpack(each, 0), high]]) for each in obstacles[:4]] + obstacles[4:]
-    planned = functools.partial(plan_motions, task.arm, starts, goals, scenes, time_limit=30.0)
+    planned = functools.partial(plan_motions, task.arm, starts, goals, scenes, time_limit=30.0, ompl=False)
     plans = planned()
     whole = module._Problem.setting
     monkeypatch.setattr(module._Problem, "setting", lambda problem, near=0.0: whole(problem))
@@ -675,8 +676,8 @@ def test_it_solves_scenes_of_all_bands_and_stands_in_the_table():
 
 def test_where_there_is_no_way_it_gives_up(monkeypatch):
     pytest.importorskip("ompl")
-    monkeypatch.setattr(ompl_paths, "MARGINS", ompl_paths.MARGINS[:1])
-    monkeypatch.setattr(ompl_paths, "PATIENCE", 0.05)
+    monkeypatch.setattr(module, "OMPL_MARGINS", module.OMPL_MARGINS[:1])
+    monkeypatch.setattr(module, "OMPL_PATIENCE", 0.05)
     simulation = SceneSimulation(PLANE, 1)
     given = {name: ENCLOSED[name] for name in ("start", "goal", "obstacles")}
     scenes = draw_given(given, simulation.task.sampler(), [np.random.default_rng(0)])
@@ -699,16 +700,19 @@ def test_plans_are_as_clear_as_they_are_said_to_be(env_id):
 
 
 def test_where_no_seed_is_free_a_path_is_followed(monkeypatch):
-    """Of several paths, it is the one with the smoothest movement."""
+    """That of compiled trees, of several the one with the smoothest movement, and that of OMPL where they find none."""
+    pytest.importorskip("ompl")
     arm = benchmark_panda()
     problem = next(each for each in benchmark_problems() if each.name == "bookshelf_thin 20")
     given = {"start": problem.start, "goal": problem.goal, "obstacles": problem.obstacles}
     given |= {"arm": arm, "seeds": 0, "n_via": 1, "time_limit": 20.0}
-    plan = plan_motion(**given)
+    plan = plan_motion(**given, ompl=False)
     assert (plan.success, plan.source) == (True, "path")
-    assert plan_motion(**given, enough=4).jerk < plan.jerk
+    assert plan_motion(**given, ompl=False, enough=4).jerk < plan.jerk
     monkeypatch.setattr(module, "clear_path", lambda *_: np.empty((0, 7)))
-    assert not plan_motion(**given).success
+    plan = plan_motion(**given)
+    assert (plan.success, plan.source) == (True, "ompl")
+    assert not plan_motion(**given, ompl=False).success
 
 
 def test_movements_along_paths_are_smoother_than_those_through_their_points() -> None:

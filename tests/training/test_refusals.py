@@ -370,7 +370,7 @@ COMMANDS = [
     (f"evaluate --baselines straight {PLANE}", "(first, or as --agent NAME)"),
     ("plan --position 0.4 0.3 0.3 --rate 0", "--rate must be"),
     ("plan --position 0.4 0.3 0.3 --scene full/notes.txt", "notes.txt: "),
-    ("evaluate --scenes motionbenchmaker --baselines nothing", "paths, ompl, searchN"),
+    ("evaluate --scenes motionbenchmaker --baselines nothing", "plan_motion+ompl"),
     ("evaluate --scenes motionbenchmaker --baselines", "at least one planner"),
     ("evaluate --problems nowhere", "nowhere"),
     ("evaluate --problems . --scenes hard", "not both"),

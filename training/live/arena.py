@@ -32,8 +32,7 @@ from viapoint.training.paper.movements import TARGETS, rows_of_lights
 from viapoint.training.planning.baselines import AgentMethod
 from viapoint.training.planning.candidates import candidate_actions
 from viapoint.training.planning.motion_plan import MotionPlan
-from viapoint.training.planning.ompl_paths import ompl_motion
-from viapoint.training.planning.plan_motion import SEEDS, checked_motion, plan_motion
+from viapoint.training.planning.plan_motion import SEEDS, checked_motion, ompl_motion, plan_motion
 from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import (
     CLEARANCE_MARGIN,
@@ -421,7 +420,7 @@ def _planned(arena: Arena, state: State, time_limit: float) -> Proposal:
         seeds: Any = SEEDS
         if last is not None and len(last.waypoints) == number + 2 and time_limit == TIME_LIMIT:
             seeds = last.waypoints[None, 1:-1]
-        limits: Any = {"time_limit": time_limit, "duration": state.duration}
+        limits: Any = {"time_limit": time_limit, "duration": state.duration, "ompl": False}
         motion = plan_motion(*problem, n_via=number, seeds=seeds, space=task.space_name, **limits)
     seconds = time.perf_counter() - begin
     if state.duration is not None:  # or the shortest that the limits allow; as it is if that fails
@@ -558,7 +557,7 @@ def _plan_on(
     number = int(np.clip(task.n_via, 1, 3))
     motion = plan_motion(
         task.arm, problem.start[0], goal, problem.obstacles, n_via=number, velocity=problem.velocity[0],
-        acceleration=problem.acceleration[0], time_limit=TIME_LIMIT, space=task.space_name,
+        acceleration=problem.acceleration[0], time_limit=TIME_LIMIT, space=task.space_name, ompl=False,
     )  # fmt: skip
     return _execute_plan(env, motion) if motion.success else env.execute_actions(search(observation))
 

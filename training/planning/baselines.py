@@ -25,8 +25,8 @@ from viapoint.training.planning.cautious import (
     CautiousSearch,
 )
 from viapoint.training.planning.motion_plan import MotionPlan
-from viapoint.training.planning.ompl_paths import import_ompl, ompl_motion
-from viapoint.training.planning.plan_motion import plan_motion
+from viapoint.training.planning.ompl_paths import import_ompl
+from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
 from viapoint.training.planning.predictions import PREDICTIONS, PredictedSearch
 from viapoint.training.planning.rrt_connect import VIA_COUNTS
 from viapoint.training.planning.search import GeometrySearch, registered_task

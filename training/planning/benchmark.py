@@ -31,8 +31,8 @@ from viapoint.envs.task import MOST_OBSTACLES, Task
 from viapoint.training.checks import unknown_name
 from viapoint.training.planning.candidates import MOST_CANDIDATES
 from viapoint.training.planning.motion_plan import MotionPlan, execute_plans
-from viapoint.training.planning.ompl_paths import import_ompl, ompl_motion
-from viapoint.training.planning.plan_motion import plan_motion
+from viapoint.training.planning.ompl_paths import import_ompl
+from viapoint.training.planning.plan_motion import ompl_motion, plan_motion
 from viapoint.training.planning.search import GeometrySearch
 
 DATA = files("viapoint.training.planning") / "data"
@@ -214,7 +214,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def benchmark_planner(name: str) -> Planner:
-    """Return a planner by its name: straight, plan_motion, paths, ompl, or searchN.
+    """Return a planner by its name: straight, plan_motion, paths, plan_motion+ompl, ompl, or searchN.
 
     `paths` is plan_motion without random seeds.
 
@@ -223,11 +223,13 @@ def benchmark_planner(name: str) -> Planner:
     """
     settings: dict[str, dict[str, Any]] = {
         "straight": {"time_limit": 0.0},
-        "plan_motion": {},
-        "paths": {"seeds": 0},
+        "plan_motion": {"ompl": False},
+        "paths": {"ompl": False, "seeds": 0},
+        "plan_motion+ompl": {"time_limit": 10.0},
     }
+    if "ompl" in name:
+        import_ompl()
     if name == "ompl":
-        import_ompl()  # an error where it is not installed
         return lambda arm, each: ompl_motion(arm, each.start, each.goal, pack([each.obstacles]))
     if name in settings:
         return lambda arm, each: plan_motion(arm, each.start, each.goal, each.obstacles, **settings[name])

@@ -115,7 +115,7 @@ class MotionPlan:
     """Jerk cost relative to that of the straight movement of the same duration; 1 where nothing moves, and NaN for a
     movement that begins in motion and ends where it began."""
     source: str
-    """Origin of the via-points: `straight`, `straight, refined`, `given`, `random`, `path`, or another planner;
+    """Origin of the via-points: `straight`, `straight, refined`, `given`, `random`, `path`, `ompl`, or another planner;
     `refused` where there is no movement."""
     reason: str = ""
     """Reason why there is no success; empty for success."""

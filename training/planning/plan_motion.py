@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from viapoint import primitives
 from viapoint.envs.arms.arm import Arm
 from viapoint.envs.arms.inverse_kinematics import (
     RANGE_TOLERANCE,
@@ -46,6 +47,7 @@ from viapoint.training.planning.movements import (
     movement_table,
     table_with,
 )
+from viapoint.training.planning.ompl_paths import import_ompl, path_around
 from viapoint.training.planning.refine import (
     SMOOTH,
     Found,
@@ -86,6 +88,10 @@ LONGER = 1.3
 SPARE = 1e-3  # Clearance that movements keep beyond the margin where their ends have it, [m]
 COARSE = 0.01  # Excess of an arm's spheres above which a contact may be one of the spheres only, [m]
 ROUNDING = 1e-6  # Rounding error of clearances, [m]
+# Required clearances of a path of OMPL in each attempt, until one can be made smooth, [m]
+OMPL_MARGINS = (0.010, 0.004, 0.001, 0.001)
+OMPL_ROOM = 0.7  # Greatest of these clearances, as a share of that of the ends
+OMPL_PATIENCE = 1.0  # Time limit for each path of OMPL as a baseline, [s]
 GOALS = 8  # Greatest number of configurations that are tried for a pose
 
 
@@ -154,6 +160,7 @@ def plan_motion(
     space: SpaceName | None = None,
     velocity: Any = None,
     acceleration: Any = None,
+    ompl: bool = True,
     rng: np.random.Generator | int | None = None,
 ) -> MotionPlan:
     """Plan a minimum-jerk movement through via-points from a start to a goal around obstacles.
@@ -183,6 +190,8 @@ def plan_motion(
         space: `joints` or `hand`; that of the arm by default.
         velocity: Initial velocity, shape (D,); 0 by default.
         acceleration: Initial acceleration, shape (D,); 0 by default.
+        ompl: True to follow a path of OMPL's RRT-Connect where nothing else is found, if the extra `planning` is
+            installed.
         rng: Random generator of the seeds, or its seed; 0 by default.
 
     Returns:
@@ -261,7 +270,7 @@ def plan_motion(
             now = time.perf_counter()
             share = now + (until - now) / (len(goals) - rank)
             few = number if np.isinf(least) else min(number, NARROW)
-            plans.append(_plan(problem._replace(goal=each), few, share, paths))
+            plans.append(_plan(problem._replace(goal=each), few, share, paths, ompl))
     plans += straight
     best = max(plans, key=_merit)
     return dataclasses.replace(best, milliseconds=1e3 * (time.perf_counter() - began))
@@ -284,10 +293,11 @@ def plan_motions(
 ) -> list[MotionPlan]:
     """Plan N movements on threads; the other arguments are those of :func:`plan_motion`.
 
-    Each movement is planned as :func:`plan_motion` plans it alone, except where the time limit is reached. The `reason`
-    of each plan without success begins with the number of its problem, such as `problem 3: `, from 0. A problem with
-    an argument that is not allowed, or a pose out of reach, is refused: its plan has the source `refused` and no
-    waypoints, and raises UnsafePlanError when it is executed or exported, also with `force=True`.
+    Each movement is planned as :func:`plan_motion` plans it alone, except where the time limit is reached, or a path of
+    OMPL is followed: all threads have its random generator in common. The `reason` of each plan without success begins
+    with the number of its problem, such as `problem 3: `, from 0. A problem with an argument that is not allowed, or a
+    pose out of reach, is refused: its plan has the source `refused` and no waypoints, and raises UnsafePlanError when
+    it is executed or exported, also with `force=True`.
 
     Args:
         arm: Arm, or name of one.
@@ -366,6 +376,40 @@ def checked_motion(
     table = table_with(durations[None] / duration, FINE_INSTANTS)
     movement = problem.movement(waypoints[1:-1] - waypoints[0], table, 0, duration)
     return _known(problem, movement, source, 0.0 if shortest else 1.0, _fault(problem)[0])
+
+
+def ompl_motion(
+    arm: Arm, start: Float, goal: Float, obstacles: Obstacles, *, space: SpaceName = "joints"
+) -> MotionPlan:
+    """Return the smooth movement along a path of RRT-Connect, or the one with the most clearance if none is free.
+
+    It is the minimum-jerk movement through as few points of the path as stay clear. OMPL has one random generator for
+    all its planners, so that results depend on those before. Start and goal are coordinates of the space in which the
+    movement is smooth; the path is one of joints. Obstacles are at rest.
+    """
+    where = space_of(arm, space)
+
+    def smooth(configurations: Float) -> MotionPlan:
+        points = where.coordinates(configurations)
+        plan = Plan(points, np.asarray(primitives.passage_durations(points, 1.0)))
+        return checked_motion(arm, space, plan, obstacles, "ompl", shortest=True)
+
+    ends = np.ascontiguousarray(where.joints(np.stack((start, goal))))
+    best = smooth(ends)
+    setting = arm_setting(arm, where.of_hand, obstacles)
+    nearest = _clearance_of(setting, ends, obstacles, OMPL_MARGINS[0])
+    for most in OMPL_MARGINS:
+        margin = min(most, OMPL_ROOM * nearest)
+        path = path_around(setting, ends, obstacles, margin, OMPL_PATIENCE)
+        if path is None:
+            continue
+        for count in VIA_COUNTS:
+            plan = smooth(points_on(path, count))
+            if plan.clearance > best.clearance:
+                best = plan
+            if plan.success and plan.clearance >= 0.5 * margin:
+                return plan
+    return best
 
 
 @functools.lru_cache(maxsize=64)
@@ -487,10 +531,12 @@ def _fault(problem: _Problem) -> tuple[str, float]:
     return "", max(problem.margin, min(most, nearest - ROUNDING))
 
 
-def _plan(problem: _Problem, number: int, until: float, paths: bool = False) -> MotionPlan:
+def _plan(
+    problem: _Problem, number: int, until: float, paths: bool = False, ompl: bool = False
+) -> MotionPlan:
     """Return the best movement to one goal, after a search with up to a number of random seeds until some time, [s].
 
-    With `paths`, those that are found by trees are followed where the first seeds fail.
+    With `paths`, those that are found by trees are followed where the first seeds fail, in the end also one of OMPL.
     """
     fault, kept = _fault(problem)
     straight = _straight(problem)
@@ -513,7 +559,7 @@ def _plan(problem: _Problem, number: int, until: float, paths: bool = False) -> 
         tried += more
         if found is None and follows and time.perf_counter() < until:
             problem = problem._replace(given=problem.given[:0])
-            found, more = _search_around(problem, kept, duration, number, until)
+            found, more = _search_around(problem, kept, duration, number, until, ompl)
             tried += more
         if found is not None:
             best = found
@@ -619,7 +665,7 @@ def _search(
     return _known(problem, movement, name, problem.least, clearance=known), tried
 
 
-def clearance_of(setting: Setting, joints: Float, obstacles: Obstacles, most: float) -> float:
+def _clearance_of(setting: Setting, joints: Float, obstacles: Obstacles, most: float) -> float:
     """Return the least clearance of configurations, shape (N, J), among obstacles of one scene, at most `most`, [m]."""
     many = obstacles.take([0] * len(joints))
     rows, own = row_clearances(setting.chain, setting.spheres, joints, many, most)
@@ -627,7 +673,7 @@ def clearance_of(setting: Setting, joints: Float, obstacles: Obstacles, most: fl
 
 
 def _search_around(
-    problem: _Problem, kept: float, duration: float, number: int, until: float
+    problem: _Problem, kept: float, duration: float, number: int, until: float, ompl: bool
 ) -> tuple[MotionPlan | None, int]:
     """Return the best movement along a clear path or from random seeds, and the number of seeds.
 
@@ -636,7 +682,7 @@ def _search_around(
     """
     ends = np.ascontiguousarray(problem.space.joints(np.stack((problem.start, problem.goal))))
     setting = problem.setting()
-    room = max(clearance_of(setting, ends, problem.obstacles, kept + ROOM) - kept, 0.0)
+    room = max(_clearance_of(setting, ends, problem.obstacles, kept + ROOM) - kept, 0.0)
     tried = free = 0
     best = None
     for attempt in range(PATH_ATTEMPTS):
@@ -655,7 +701,7 @@ def _search_around(
             along = problem._replace(given=vias + away)
             found, more = _search(along, kept, duration, number, until, early=0, source="path")
             tried += more
-            found = found or _along(problem, kept, duration, until, path)
+            found = found or _along(problem, kept, duration, until, path, "path")
         if found is None and attempt == len(PATHS) - 1:
             found, more = _search(problem, kept, duration, number, until, first=EARLY)
             tried += more
@@ -665,7 +711,16 @@ def _search_around(
         if best is None or (found.success, -found.jerk) > (best.success, -best.jerk):
             best = found
         if free >= problem.enough + (best.jerk > JAGGED):
-            break
+            return best, tried
+    patience = until - time.perf_counter()
+    if best is None and ompl and patience > 0.0:
+        try:
+            import_ompl()  # the time of the first import does not count
+        except ValueError:
+            return None, tried
+        other = path_around(setting, ends, problem.obstacles, kept, patience)
+        if other is not None:
+            best = _along(problem, kept, duration, until, other, "ompl")
     return best, tried
 
 
@@ -691,7 +746,9 @@ def _refined(
     )  # fmt: skip
 
 
-def _along(problem: _Problem, kept: float, duration: float, until: float, path: Float) -> MotionPlan | None:
+def _along(
+    problem: _Problem, kept: float, duration: float, until: float, path: Float, source: str
+) -> MotionPlan | None:
     """Return a movement along a path of joints, with as many via-points as it needs; None if there is none.
 
     Fewer points of a free movement often make a smoother one.
@@ -717,7 +774,7 @@ def _along(problem: _Problem, kept: float, duration: float, until: float, path: 
             if other is not None and other[2] < cost:
                 found = other
         movement, clearance, _ = found
-        return _known(problem, movement, "path", problem.least, clearance=clearance)
+        return _known(problem, movement, source, problem.least, clearance=clearance)
     return None
 
 
