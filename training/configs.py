@@ -295,6 +295,8 @@ class TrainConfig(Config):
         if self.task.stepwise and self.algo not in STEP_PRESETS:
             known = ", ".join(STEP_PRESETS)
             raise ValueError(f"{self.algo} decides on whole movements; algo for {self.env} is one of {known}")
+        if self.algo in ("viaq", "viarank") and self.algo != usual_algorithm(self.task):
+            raise ValueError(f"no {self.algo} for {self.env}: viaq needs the obstacles, and viarank a sensor")
         share = self.stop_when_stalled
         if share is None:
             return

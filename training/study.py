@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
@@ -30,7 +30,7 @@ from viapoint.envs.task import Task
 from viapoint.training import files
 from viapoint.training.agents.model_io import check_arguments, check_hyperparameters, load_model, untrained
 from viapoint.training.checks import check_env_kwargs, check_folder, check_whole, named_path, unknown_name
-from viapoint.training.configs import StudyConfig, TrainConfig
+from viapoint.training.configs import Algorithm, StudyConfig, TrainConfig
 from viapoint.training.evaluation import across_seeds, evaluate_methods, wilson
 from viapoint.training.extras import explain_import_error
 from viapoint.training.planning.baselines import Method, agent_method, factory, make_method
@@ -48,7 +48,7 @@ Names = list[str] | tuple[str, ...]
 Numbers = list[int] | tuple[int, ...]
 # Fields of a training that an agent may set
 TRAINING_FIELDS = {each.name for each in dataclasses.fields(TrainConfig)}
-TRAINING_FIELDS -= {"env", "seed", "out", "resume", "progress"}
+TRAINING_FIELDS -= {"env", "arm", "seed", "out", "resume", "progress"}  # the arm is that of the scenes
 MEASURED = ("test", "hard", "uniform")  # Sets by default; models are selected on `validation`
 
 RETRIES = 2  # Number of times that a trial whose worker died is begun again
@@ -197,8 +197,14 @@ def _study(
 ) -> Study:
     """Return a study; the fields are those of the file."""
     known = {}
+    used = ["tune", "study.json", "results.csv", "results.md"]  # Names in the folder of the study
     for env, fields in _entries(environments or {}):
         fields = {"scenes": scenes, "n_scenes": n_scenes, **fields}
+        if files.folder_name(env) in used:
+            raise ValueError(
+                f"environments.{env}: there is {files.folder_name(env)!r} already; give another name"
+            )
+        used.append(files.folder_name(env))
         known[env] = _made(f"environments.{env}", _environment, fields, env, folder)
     found: list[Trial] = []
     rows: set[str] = set()
@@ -278,6 +284,9 @@ def _environment(
             raise ValueError(f"{unknown_name('scenes', each, SETS)}; or the path of a file of scenes")
     if not places:
         raise ValueError(f"none of {', '.join(scenes)} is shipped for {env.env_id}")
+    names = [Path(each).stem for each in places]
+    if len(set(names)) < len(names):
+        raise ValueError(f"scenes must have different names, got {', '.join(names)}")
     return dataclasses.replace(env, scenes=tuple(places))
 
 
@@ -291,12 +300,16 @@ def _agent(
     untrained: bool = False,
     **training: Any,
 ) -> list[Trial]:
-    """Return a trial for each seed of an agent whose configuration is allowed in its environment."""
+    """Return a trial for each seed of an agent whose configuration is allowed in its environment.
+
+    A row that begins with the name of an algorithm, such as `sac` or `sac-large`, is of this algorithm.
+    """
+    word = row.partition("-")[0]
+    if word in get_args(Algorithm) and training.setdefault("algo", word) != word:
+        raise ValueError(f"a row of this name is trained with {word}, got algo {training['algo']}")
     for name, numbers in (("checks", checks), ("refine", refine)):
         for number in numbers:
             check_whole(name, number)
-    if (any(checks) or refine) and training.get("algo", "viaq") != "viaq":
-        raise ValueError(f"checks and refine are for the proposals of viaq, got algo {training['algo']}")
     if refine and env.task.replanning:
         raise ValueError(f"refine is for tasks with one decision for a movement, {env.env_id} has several")
     if not seeds or len(set(seeds)) < len(seeds):
@@ -307,6 +320,8 @@ def _agent(
     for trial in trials:
         config = trial.config(Path())
         check_hyperparameters(config.algorithm, config.hyperparameters)
+        if (any(checks) or refine) and config.algorithm != "viaq":
+            raise ValueError(f"checks and refine are for the proposals of viaq, got algo {config.algorithm}")
     return trials
 
 

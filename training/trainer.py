@@ -235,6 +235,7 @@ class RunCallback(CallbackList):
             self._validation = scenes_for("validation", self.config.task, self.config.eval_scenes)
         self.interrupted = False  # True once Ctrl-C was pressed
         self.stopped = False  # True once a callback of the user has asked for the end of the training
+        self._collected = False  # True once experience was collected, in this part of the run
 
     @property
     def seconds(self) -> float:
@@ -269,6 +270,11 @@ class RunCallback(CallbackList):
         if self.interrupted or self.stopped or self.run.stalled:
             self.run.checkpoint(self.model, self.seconds)
             raise _TrainingEnds
+        if self.model.use_sde and self._collected:
+            # This noise was drawn before the checkpoint. It is drawn anew, as it is when a run goes on from there.
+            policy: Any = getattr(self.model, "actor", self.model.policy)
+            policy.reset_noise(self.model.n_envs)
+        self._collected = True
         super()._on_rollout_start()
 
     def _on_training_end(self) -> None:

@@ -40,6 +40,7 @@ from viapoint.envs.geometry.obstacles import quaternions_of
 
 HOMES = 64  # Number of random configurations among which a home is looked for
 INSET = 0.1  # Least distance of home from the joint limits, as a share of the ranges
+FLUSH = 1e-7  # Distance of bodies that counts as contact, as it may be a rounding error, [m]
 LEAST_GAP = 0.002  # Distance of bodies at home below which another home is looked for, [m]
 DEFAULT_VELOCITY_LIMIT = 2.0  # Velocity limit of joints without one, [rad/s] or [m/s]
 WEIGHTS, ACCELERATION, LEAST_TORQUE = 3.0, 5.0, 1.0
@@ -346,9 +347,13 @@ def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
         joint.name = joint.name or f"unnamed_{number}"
     while True:
         try:
-            return spec.compile()
+            model = spec.compile()
+            break
         except ValueError as error:
             notes.append(_leave_out(spec, str(error)))
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+        model.opt.gravity[:] = 0.0
+    return model
 
 
 def _leave_out(spec: mujoco.MjSpec, fault: str) -> str:
@@ -391,6 +396,7 @@ def _joint_names(joints: Any) -> Names:
     """Return different names of joints."""
     names = tuple(joints) if isinstance(joints, Iterable) and not isinstance(joints, str) else ()
     are_strings = all(isinstance(each, str) for each in names)
+    names = tuple(map(str, names))  # those of NumPy's arrays are of a class of their own
     if not are_strings or not MIN_JOINTS <= len(set(names)) == len(names):
         raise ValueError(
             f"joints must be {MIN_JOINTS} or more different names, in order from the base to the tool, got {joints!r}"
@@ -530,8 +536,16 @@ def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[Pair], notes: l
     """Return the home configuration, shape (J,), in which some pairs of bodies do not touch."""
     model, joints = parsed.model, parsed.joints
     low, high = ranges.T
+    numbers = [model.joint(name).id for name in joints]
+    endless = (model.jnt_limited[numbers] == 0) & (model.jnt_type[numbers] == MOVES[0])
+
+    def within(configuration: Float) -> Float:
+        """Return a configuration with continuous joints at the equivalent within their ranges."""
+        outside = endless & ((configuration < low) | (configuration > high))
+        return np.where(outside, low + np.mod(configuration - low, 2.0 * np.pi), configuration)
+
     if given is not None:
-        home = _per_joint("home", given, joints)
+        home = within(_per_joint("home", given, joints))
         outside = ", ".join(itertools.compress(joints, (home < low) | (home > high)))
         if outside:
             raise ValueError(f"home is outside the range of {outside}")
@@ -543,7 +557,7 @@ def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[Pair], notes: l
     candidates = {"zeros": np.zeros(len(joints)), "the middle of the ranges": 0.5 * (low + high)}
     if model.nkey:
         address = [int(model.joint(name).qposadr[0]) for name in joints]
-        candidates = {"the file's keyframe": model.key_qpos[0, address].copy(), **candidates}
+        candidates = {"the file's keyframe": within(model.key_qpos[0, address]), **candidates}
     refused = ""
     for origin, configuration in candidates.items():
         if not ((configuration >= low) & (configuration <= high)).all():
@@ -661,7 +675,9 @@ def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> dict[Pa
         carries = first > 0 and first in ancestors(model, second)
         if parsed.links[second] - parsed.links[first] == 1 and carries:
             found[first, second] = "consecutive links"
-        elif excluded or not collide or parsed.named((first, second)) in silent:
+        elif (
+            excluded or not collide or frozenset((model.body(first).name, model.body(second).name)) in silent
+        ):
             found[first, second] = "excluded in the file"
     return found
 
@@ -770,7 +786,7 @@ def _distances(parsed: Parsed, joints: Float, pairs: Sequence[Pair]) -> dict[Pai
         first, second = pair
         for one, other in itertools.product(parsed.geoms[first], parsed.geoms[second]):
             away = mujoco.mj_geomDistance(parsed.model, parsed.moved, one, other, 0.1, None)
-            found[pair] = min(found[pair], away)
+            found[pair] = min(found[pair], 0.0 if abs(away) < FLUSH else away)
     return found
 
 
@@ -821,7 +837,8 @@ def _set(element: ET.Element, **values: Any) -> None:
 
 def _moments(given: Float) -> Float:
     """Return principal moments of inertia of which none exceeds the sum of the others, as some of flat bodies do."""
-    moments = np.maximum(given, MIN_INERTIA)
+    # Thin rods have one that is nearly 0, and the others are equal.
+    moments = np.maximum(given, max(MIN_INERTIA, INERTIA_MARGIN * given.max()))
     largest = int(moments.argmax())
     moments[largest] = min(moments[largest], (1.0 - INERTIA_MARGIN) * (moments.sum() - moments[largest]))
     return moments

@@ -49,6 +49,8 @@ def register_arm(arm: Arm) -> None:
 def arm_of(arm: Any) -> Arm:
     """Return an arm as it is, the arm of a name, or that of an MJCF or URDF file; a task keeps the path of the file.
 
+    A process reads a file again only where its time has changed; changes of files that it includes do not count.
+
     Raises:
         ValueError: There is no such arm, or the file cannot be read.
 

@@ -34,6 +34,16 @@ WARNING = "warning: "  # Beginning of notes that are told as warnings, too
 MASSES_GUESSED = "that of its geoms, as if of water"  # End of notes on masses that the file lacks
 OBJECT = re.compile(rb"(?m)^[og]\b.*$")  # Line of an OBJ file that begins an object or a group
 LEFT_OUT = ("transmission", "gazebo")  # Elements that MuJoCo does not need
+# How many numbers attributes have, by the elements
+NUMBERS = {
+    "origin": {"xyz": 3, "rpy": 3},
+    "axis": {"xyz": 3},
+    "box": {"size": 3},
+    "cylinder": {"radius": 1, "length": 1},
+    "sphere": {"radius": 1},
+    "mesh": {"scale": 3},
+}
+OPTIONAL = ("origin", "mesh")  # Elements whose attributes may be missing
 
 Packages = tuple[str | Path, ...]  # Folders in which packages are looked for
 Find = Callable[[str], Path]  # Function that returns the place of a mesh
@@ -80,10 +90,11 @@ def read_urdf(path: Path, packages: Packages, visual: bool = False) -> Urdf:
     for element in (*root.findall("link"), *root.findall("joint")):
         name = element.get("name", "")
         try:
+            if not visual:
+                _remove(element, "visual")
+            _check_numbers(element)
             if element.tag == "link":
                 _mend_inertia(element, notes)
-                if not visual:
-                    _remove(element, "visual")
                 _prepare_link(element, find, assets, left_out)
             else:
                 velocity[name] = _prepare_joint(element, notes)
@@ -117,7 +128,9 @@ def _root(path: Path) -> ET.Element:
     Raises:
         ValueError: The file is no XML.
     """
-    content = path.read_bytes()
+    content = re.sub(
+        rb"\sxmlns=(\"[^\"]*\"|'[^']*')", b"", path.read_bytes()
+    )  # tags would begin with the namespace
     try:
         return ET.fromstring(content)
     except ET.ParseError as error:
@@ -125,6 +138,25 @@ def _root(path: Path) -> ET.Element:
     with suppress(ET.ParseError):
         return ET.fromstring(re.sub(rb"(</?|\s)[\w.-]+:([\w.-]+)(?=[\s=/>])", rb"\1\2", content))
     raise ValueError(f"{path} is not XML: {fault}")
+
+
+def _check_numbers(element: ET.Element) -> None:
+    """Check the numbers of a link or joint; MuJoCo's messages do not name it.
+
+    Raises:
+        ValueError: Some are missing, too few, too many, or not finite.
+    """
+    for part in element.iter():
+        for name, count in NUMBERS.get(part.tag, {}).items():
+            text = part.get(name, None if part.tag in OPTIONAL else "")
+            if text is None:
+                continue
+            try:
+                numbers = list(map(float, text.split()))
+            except ValueError:
+                numbers = []
+            if len(numbers) != count or not np.isfinite(numbers).all():
+                raise ValueError(f"{name} of its {part.tag} must have {count} finite numbers, got {text!r}")
 
 
 def _check_tree(root: ET.Element) -> None:
@@ -169,6 +201,8 @@ def _prepare_joint(joint: ET.Element, notes: list[str]) -> float:
     if kind in SEVERAL_WAYS:
         joint.set("type", "fixed")
         notes.append(f"fixed: {name}, which is {kind}")
+    elif kind not in (*MOVING, "fixed"):
+        raise ValueError(f"its type must be {', '.join((*MOVING, *SEVERAL_WAYS))} or fixed, got {kind!r}")
     if kind not in MOVING:
         return 0.0
     given = {} if limit is None else limit.attrib
@@ -215,7 +249,8 @@ def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
         inertia = inertial.find("inertia")
         if inertia is None:
             inertia = ET.SubElement(inertial, "inertia", ixx="nan")
-        xx, xy, xz, yy, yz, zz = entries = [float(inertia.get(each, 0.0)) for each in INERTIA]
+        inertia.attrib.update({each: inertia.get(each, "0") for each in INERTIA})
+        xx, xy, xz, yy, yz, zz = entries = [float(inertia.attrib[each]) for each in INERTIA]
         matrix = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
         if not np.isfinite(entries).all() or np.linalg.eigvalsh(matrix)[0] < 0.0:
             moment = f"{0.4 * value * BALL**2:g}"
@@ -225,7 +260,7 @@ def _mend_inertia(link: ET.Element, notes: list[str]) -> None:
 
 def _prepared(geometry: ET.Element | None, find: Find, assets: dict[str, bytes]) -> str:
     """Make the path of a mesh absolute, and return what is wrong with a geometry, empty for nothing."""
-    if geometry is None:
+    if geometry is None or not len(geometry):
         return "no geometry"
     for element in geometry:
         sizes = " ".join(element.get(name, "") for name in ("size", "radius", "length")).split()

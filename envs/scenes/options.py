@@ -184,8 +184,7 @@ def _end(name: str, value: Any, sampler: SceneSampler, obstacles: Obstacles, nea
     if sampler.task.space_name == "joints":
         array = finite_array(label, value, (joints,), (number, joints))
         array = np.broadcast_to(array, (number, joints))
-        if name == "goal":
-            array = nearest_goals(sampler.task.arm, array, near)
+        array = nearest_goals(sampler.task.arm, array, near if name == "goal" else array)
         return np.array(array, order="C")
     array = finite_array(label, value, (2,), (3,), (number, 2), (number, 3))
     height = sampler.room.foot[2]

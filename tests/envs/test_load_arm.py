@@ -439,6 +439,31 @@ def test_limits_that_the_file_lacks_are_chosen_and_told():
     assert any("continuous" in note for note in endless.notes)
 
 
+ON_PEDESTAL = """
+    <mujoco><option><flag gravity="disable"/></option><worldbody>
+      <geom type="box" size=".1 .1 {0}" pos="0 0 {0}"/>
+      <body name="turret" pos="0 0 {1}"><joint name="a" axis="0 0 1" limited="false"/>
+        <inertial pos="0 0 .1" mass="1" diaginertia=".01 .01 1e-9"/><geom type="cylinder" size=".04 .1" pos="0 0 .1"/>
+        <body pos="0 0 .2"><joint name="b" axis="0 1 0" range="-90 90"/>
+          <geom type="capsule" fromto="0 0 .05 0 0 .3" size=".02" mass="1"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("half", [0.05, 0.1, 0.15])
+def test_an_arm_of_rods_on_a_pedestal_loads_wherever_its_first_joint_is(half):
+    names = np.array(["a", "b"])
+    arm = load_arm(
+        ON_PEDESTAL.format(half, 2.0 * half),
+        joints=names,
+        home=(7.0, 0.5),
+        velocity_limit=1.0,
+        torque_limit=9.0,
+    )
+    assert ("base_0", "turret", "in contact at home") in arm.left_out  # whatever the rounding error is
+    np.testing.assert_allclose(arm.home, (7.0 - 2.0 * np.pi, 0.5))
+    assert not torques(arm.chain, arm.home, np.zeros(2), np.zeros(2)).any()  # there is no gravity
+    assert {type(name) for name in arm.joint_names} == {str}
+
+
 def test_bodies_that_never_touch_are_left_out_and_others_are_not(arm):
     """The geoms of the file decide, as MuJoCo sees them, not the spheres around them."""
     model = mujoco.MjModel.from_xml_string(TEXT)
@@ -576,6 +601,10 @@ def test_a_joint_without_limits_is_told(crane, limit):
         (LIMIT, '<limit lower="2" upper="1" effort', "tilt"),
         (LIMIT, '<limit lower="low" upper="2" effort', "low"),
         ('radius="0.04"', 'radius="thin"', "thin"),
+        ('radius="0.04" ', "", "post"),
+        ('xyz="0.4 0 0"', 'xyz="0.4 0 nan"', "tilt"),
+        ('xyz="0.4 0 0"', 'xyz="0.4 0"', "tilt"),
+        ('"tilt" type="revolute"', '"tilt" type="Revolute"', "tilt"),
         ('mass value="3"', 'mass value="heavy"', "heavy"),
         (MESH, "package://elsewhere/wrist.obj", "elsewhere"),
         (MESH, "missing.stl", "missing.stl"),
@@ -607,14 +636,14 @@ def test_urdf_files_at_fault_are_refused_and_the_fault_is_named(crane, old, new,
     ],
 )
 def test_pairs_of_an_srdf_of_the_same_robot_beside_it_are_not_compared(crane, robot, files, note):
-    path = written(crane)
+    path = written(crane, ('"base"', '"world"'))
     (crane / "srdf").mkdir()
+    pairs = "".join(f'<disable_collisions link1="wrist" link2="{link}"/>' for link in ("post", "world"))
     for file in files:
-        (crane / file).write_text(
-            f'<robot name="{robot}"><disable_collisions link1="wrist" link2="post" reason="Never"/></robot>'
-        )
+        (crane / file).write_text(f'<robot name="{robot}">{pairs}</robot>')
     arm = load_arm(path)
-    assert (("post", "wrist", "excluded in the file") in arm.left_out) == (note.startswith("those"))
+    for link in ("post", "base_0"):  # a name of MuJoCo's own is changed
+        assert ((link, "wrist", "excluded in the file") in arm.left_out) == (note.startswith("those"))
     assert note in "\n".join(arm.notes)
 
 
@@ -847,12 +876,6 @@ def test_starts_and_goals_are_reached_whichever_way_the_axes_point(axes):
         scenes = env.batch.scenes
         assert not env.step(np.zeros(env.action_space.shape, np.float32))[4]["is_success"]
         assert row_clearances(arm.chain, arm.spheres, scenes.goal, scenes.obstacles, 1.0)[0].min() > 0.0
-
-
-def test_planar_joints_of_a_urdf_are_fixed(crane):
-    arm = load_arm(written(crane, ('"tilt" type="revolute"', '"tilt" type="planar"')))
-    assert arm.joint_names == ("lift", "turn")
-    assert "fixed: tilt, which is planar" in arm.notes
 
 
 def test_urdf_files_with_odd_parts_load(crane):

@@ -706,7 +706,7 @@ def test_it_learns_to_revise_plans(tmp_path) -> None:
     env = ViaVecEnv(SENSED, 32, seed=0, **LOOKING)
     own = {"candidates": 64, "refinements": 0, "caution": 0.0, "effort": 0.05}
     small = {"explore_candidates": 24, "labels": 12, "policy_kwargs": own}
-    agent = ViaRank("ViaRankPolicy", env, seed=0, gradient_steps=8, **small).learn(256)
+    agent = ViaRank("ViaRankPolicy", env, seed=1, gradient_steps=8, **small).learn(256)
     agent.save(tmp_path / "agent.zip")
     again = ViaRank.load(tmp_path / "agent.zip")
     settings = {"env": SENSED, "env_kwargs": LOOKING, "scenes": "validation", "n_scenes": 50}

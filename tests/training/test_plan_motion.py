@@ -255,12 +255,14 @@ def test_goals_of_continuous_joints_are_taken_modulo_a_turn() -> None:
     wide = ve.load_arm(text, velocity_limit=3.0, home=arm.home, joint_range=[(-6.0, 6.0)] * 6)
     assert wide.continuous == arm.joint_names
     start = arm.home + 3.0 * np.eye(6)[0]
+    here = arm.home + 5.0 * np.eye(6)[0]  # within its range, where the arm is
+    assert np.array_equal(plan_motion(wide, here, here - 0.1).waypoints[0], here)
     for each, way in ((wide, 2.0 * np.pi - 6.0), (arm, -6.0)):
         end = plan_motion(each, start, start - 6.0 * np.eye(6)[0], time_limit=0.0).waypoints[-1]
         assert np.allclose(end - start, way * np.eye(6)[0])
         env = gym.make("viapoint/Reach-v0", arm=each, decide_at=("target",)).unwrapped  # as in environments
         goal = start - 6.0 * np.eye(6)[0]
-        env.reset(options={"start": start, "goal": goal})
+        env.reset(options={"start": start + 2.0 * np.pi * np.eye(6)[0], "goal": goal})
         assert np.allclose(env.scenes.goal[0], end)
         env.reset(options={"start": start, "goal": start + 0.1, "jumps": [[0.1, *goal]]})
         assert np.allclose(env.scenes.jumps[0, 0, 1:], end)
@@ -595,7 +597,9 @@ SHELF = {
 def test_problems_are_read_from_the_original_files(tmp_path) -> None:
     folder, names = tmp_path / "cage_panda", [f"panda_joint{j}" for j in range(1, 8)]
     goal = [j / 10 for j in range(1, 8)]
-    write_problem(folder, 7, [SHELF], names, [0, 0, 0, -1, 0, 1, 0], goal)
+    write_problem(
+        folder, 7, [SHELF], names, [0, 0, 0, -1, 0, 1, "1e-05"], goal
+    )  # as PyYAML reads such numbers
     for name in ("request0007_more.yaml", "scene_sensed0007.yaml", "scene0008.yaml"):
         (folder / name).touch()
     [problem], [fault] = read_problems(tmp_path)
@@ -654,7 +658,7 @@ def test_narrow_passages_that_a_search_finds_are_planned() -> None:
 
 def test_without_the_library_its_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl.base", None)
-    ompl_paths.import_ompl.cache_clear()
+    ompl_paths._ompl.cache_clear()
     with pytest.raises(ValueError, match=r"pip install '\.\[planning\]'"):
         make_method("ompl", PLANE)
 

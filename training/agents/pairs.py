@@ -53,7 +53,15 @@ class Pairs(NamedTuple):
     inside: Tensor  # True for movements within reach and joint ranges, shape (B, H)
 
 
-def pairs_of(task: Task, problem: Problem, moves: Moves, instants: Int, until: Float | None = None) -> Pairs:
+def pairs_of(
+    task: Task,
+    problem: Problem,
+    moves: Moves,
+    instants: Int,
+    until: Float | None = None,
+    *,
+    exact: bool = False,
+) -> Pairs:
     """Return the nearest pairs of H movements in each of B problems.
 
     Args:
@@ -62,12 +70,14 @@ def pairs_of(task: Task, problem: Problem, moves: Moves, instants: Int, until: F
         moves: Movements.
         instants: Instants that are looked at, some of 0 to INSTANTS - 1 in increasing order.
         until: Time after which instants do not count, shape (B, H), [s]; the first instant always counts.
+        exact: True for movements as they are executed, see :func:`~viapoint.training.planning.problem.moves_of`.
     """
     obstacles = problem.obstacles
     columns = np.array([task.shapes.index(kind) if kind in task.shapes else 0 for kind in KINDS])
     number, plans = moves.duration.shape
     late = np.full((number, plans), np.inf) if until is None else until
-    given = Given(setting_of(task, obstacles), moves, obstacles, *bounding_boxes(obstacles))
+    setting = setting_of(task, obstacles, exact=exact)
+    given = Given(setting, moves, obstacles, *bounding_boxes(obstacles))
     features = np.zeros((number, plans, NEAREST, LENGTHS + len(task.shapes)), np.float32)
     gaps = np.full((number, plans, NEAREST), NOWHERE)
     least = np.full((number, plans), CLEAR)

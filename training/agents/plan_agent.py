@@ -25,10 +25,11 @@ from viapoint.envs.geometry.obstacles import no_obstacles
 from viapoint.envs.task import Task
 from viapoint.training.agents.agent import Agent, checked_observation
 from viapoint.training.agents.model_io import LIMITS, check_arguments, check_same_task
+from viapoint.training.agents.pairs import pairs_of
 from viapoint.training.checks import unknown_name
 from viapoint.training.planning.candidates import MOST_CANDIDATES, candidate_actions, normal_steps
-from viapoint.training.planning.problem import Numbers, Problem
-from viapoint.training.planning.search import CLEARANCE_MARGIN, plan_clearances
+from viapoint.training.planning.movements import FINE_INSTANTS
+from viapoint.training.planning.problem import Numbers, Problem, moves_of
 from viapoint.training.vec_env import check_spaces, check_unwrapped
 
 N_ELITES = 8  # Number of candidates around which each round of refinement samples
@@ -137,9 +138,7 @@ class PlanPolicy(BasePolicy):
         first, count = 0, 1
         while rows.size and first < order.shape[1]:
             some = order[rows, first : first + count]
-            alone = problem.take(rows)._replace(obstacles=no_obstacles(len(rows)))
-            looked_at = actions[rows[:, None], some]
-            within = plan_clearances(self.task, alone, looked_at, CLEARANCE_MARGIN, 0.0, exact=True) > 0.0
+            within = self._within_reach(problem.take(rows), actions[rows[:, None], some])
             found = within.any(axis=1)
             best[rows[found]] = some[found, within[found].argmax(axis=1)]
             rows = rows[~found]
@@ -147,6 +146,13 @@ class PlanPolicy(BasePolicy):
             # Candidates of a round are close together: where the best is out of reach, so are many of the next.
             count = LOOKED_AT
         return best
+
+    def _within_reach(self, problem: Problem, actions: Numbers) -> NDArray[np.bool_]:
+        """Return True, shape (B, H), for actions (B, H, m) with movements within reach and clear of the arm itself."""
+        alone = problem._replace(obstacles=no_obstacles(len(actions)))
+        moves = moves_of(self.task, alone, actions, exact=True)
+        pairs = pairs_of(self.task, alone, moves, np.arange(FINE_INSTANTS), exact=True)
+        return np.asarray(pairs.inside & (pairs.self_clearance > 0.0))
 
     @abstractmethod
     def decide(self, observation: Observation) -> Numbers:

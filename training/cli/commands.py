@@ -28,7 +28,7 @@ from viapoint.training.configs import AgentConfig, EvaluateConfig, PlayConfig, R
 from viapoint.training.evaluation import evaluate as measure
 from viapoint.training.files import BadFileError, read_json, versions, write_json
 from viapoint.training.planning import benchmark
-from viapoint.training.planning.baselines import Method, PlannerMethod, agent_method, make_method
+from viapoint.training.planning.baselines import PLANNERS, Method, agent_method, make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.report import scene_progress
 from viapoint.training.rollout import whole_task
@@ -205,7 +205,7 @@ def record_dataset(
     """
     import minari
 
-    if isinstance(method, PlannerMethod):
+    if method.name.rpartition(":")[2] in PLANNERS:
         raise ValueError(f"movements of {method.name} are no actions; those of an agent or search512 are")
     folder = dataset_folder(dataset_id)
     if folder.exists():

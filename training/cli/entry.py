@@ -111,6 +111,10 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
     if command not in COMMANDS:
         raise ValueError(f"{checks.unknown_name('command', command, COMMANDS)} (viapoint --help)")
     kind = kinds[command]
+    flags = [word.partition("=")[0] for word in options if word.startswith("--")]
+    for flag in flags:
+        if flags.count(flag) > 1:
+            raise ValueError(f"{flag} is there twice; all its values follow one of them")
     if issubclass(kind, configs.AgentConfig):
         options = _agent_first(options)
     settings: dict[str, Any] = {"prog": f"viapoint {command}", "registry": configs.REGISTRY}
@@ -156,7 +160,10 @@ def _complaint(text: str, command: str, kind: type[Any]) -> str:
     said = re.sub(rf"^Error parsing ({kind.__name__}: )?", "", said)
     said = re.sub("( Argument helptext: .*)? For full helptext, .*", "", said)
     for each in dataclasses.fields(kind):
-        said = re.sub(rf"^{each.name}\b", f"--{each.name.replace('_', '-')}", said)
+        if re.match(rf"(--)?{each.name.replace('_', '[-_]')}\b", said):
+            said = re.sub(rf"^{each.name}\b", f"--{each.name.replace('_', '-')}", said)
+            numbers = "whole numbers" if "int" in str(each.type) else "numbers"
+            said = said.replace("Could not find valid parse for arguments:", f"must be {numbers}, got")
     return f"{said} (viapoint {command} --help)"
 
 

@@ -170,7 +170,8 @@ def _positions(name: str, there: Mapping[str, Any], joints: Sequence[str]) -> Fl
             raise ValueError(
                 f"joint {joint!r} of the arm is not among those of the {name}: {', '.join(there)}"
             )
-    return finite_array(name, [there[joint] for joint in joints], (len(joints),))
+    # PyYAML takes numbers such as 1e-05 for texts.
+    return finite_array(name, np.array([there[joint] for joint in joints], np.float64), (len(joints),))
 
 
 def _shapes_of(objects: list[Mapping[str, Any]], base: Float) -> Iterator[Shape]:
@@ -202,7 +203,7 @@ def _matrix(pose: Mapping[str, Any] | None) -> Float:
     matrix = np.eye(4)
     if pose:
         x, y, z, w = pose["orientation"]
-        quaternion = np.array((w, x, y, z))
+        quaternion = np.array((w, x, y, z), np.float64)
         matrix[:3, :3] = frame_matrices(quaternion / np.linalg.norm(quaternion))
         matrix[:3, 3] = pose["position"]
     return matrix

@@ -121,6 +121,14 @@ class _Problem(NamedTuple):
         return found._replace(spheres=found.spheres._replace(self_allowance=self.margin))
 
     @property
+    def room(self) -> Float:
+        """Factor on the spread of seeds in each coordinate, shape (D,), which is less for short slides."""
+        if self.space.of_hand:
+            return np.ones(len(self.start))
+        half = 0.5 * np.ptp(self.arm.joint_range, axis=1)
+        return np.where(self.arm.chain.sliding, np.minimum(half, 1.0), 1.0)
+
+    @property
     def in_motion(self) -> bool:
         """True if the movement begins in motion."""
         return bool(self.velocity.any() or self.acceleration.any())
@@ -251,7 +259,7 @@ def plan_motion(
         names=[shape.name for shape in shapes],
     )
     if not where.of_hand:
-        problem = problem._replace(start=nearest_goals(arm, problem.start, arm.home))
+        problem = problem._replace(start=nearest_goals(arm, problem.start, problem.start))
     goals = _goals(problem, goal)
     number = -(-number // len(goals))  # rounded up
     until = time.perf_counter() + time_limit
@@ -611,6 +619,7 @@ def _search(
     straight = np.arange(1, n_via + 1)[:, None] / (n_via + 1) * way
     unit = unit_of_jerk(way, problem.space.of_hand)
     near, far = SPREADS[problem.space.name]
+    room = problem.room
     tables = movement_table(n_via), fine_table(n_via)
     setting = problem.setting(kept + NEAR)  # clearances below NEAR are right
     best, least = None, np.inf
@@ -632,7 +641,7 @@ def _search(
                 seeds[k] = given[tried + k] - problem.start
                 continue
             rank = tried + k - len(given) + first
-            away = problem.generator.uniform(-1.0, 1.0, straight.shape)
+            away = room * problem.generator.uniform(-1.0, 1.0, straight.shape)
             if best is not None and (free >= enough or rank % 2):  # what is free is seldom alone
                 seeds[k] = best[0].offsets[:n_via] + near * away
             else:
@@ -696,7 +705,7 @@ def _search_around(
         if len(path):
             vias = problem.space.coordinates(points_on(path, problem.given.shape[1]))[1:-1]
             near, _ = SPREADS[problem.space.name]
-            away = problem.generator.uniform(-near, near, (ALONG, *vias.shape))
+            away = problem.room * problem.generator.uniform(-near, near, (ALONG, *vias.shape))
             away[0] = 0.0
             along = problem._replace(given=vias + away)
             found, more = _search(along, kept, duration, number, until, early=0, source="path")
