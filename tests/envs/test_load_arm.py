@@ -272,10 +272,7 @@ def test_of_two_tools_of_which_one_carries_the_other_the_outer_one_is_taken_with
         load_arm(changed((HAND_OF_TEXT, outer)))
 
 
-def test_without_velocity_limits_a_warning_names_the_default():
-    with pytest.warns(UserWarning, match="2 rad/s"):
-        arm = ur5e(changed(("ur5e-like", "other")), velocity_limit=None)
-    np.testing.assert_array_equal(arm.velocity_limit, 2.0)
+def test_a_file_may_hold_velocity_limits():
     custom = '<custom><numeric name="velocity_limit" data="1 2 3 4 5 6"/></custom><worldbody>'
     arm = ur5e(changed(("<worldbody>", custom)), velocity_limit=None)
     np.testing.assert_array_equal(arm.velocity_limit, np.arange(1.0, 7.0))
@@ -711,6 +708,7 @@ def test_the_second_time_an_arm_comes_from_the_cache(cache, monkeypatch):
     text = changed(("ur5e-like", "other"))
     with pytest.warns(UserWarning, match="2 rad/s"):
         first = ur5e(text, **changes)
+    np.testing.assert_array_equal(first.velocity_limit, 2.0)
     monkeypatch.setattr(load, "_load", None)  # would fail
     with pytest.warns(UserWarning, match="2 rad/s"):
         second = ur5e(text, **changes)

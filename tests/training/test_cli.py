@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 import warnings
-from importlib.metadata import version
 from pathlib import Path
 
 import gymnasium as gym
@@ -59,12 +58,6 @@ def test_the_help_fits_a_screen(words, capsys):
     assert set(cli.COMMANDS) <= {line.partition("  ")[2].partition(" ")[0] for line in lines}
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 80
-
-
-def test_the_version_is_that_of_the_package(capsys):
-    with pytest.raises(SystemExit) as end:
-        run("--version")
-    assert (end.value.code, capsys.readouterr().out) == (0, f"viapoint {version('viapoint')}\n")
 
 
 def test_output_that_nobody_reads_ends_the_command_without_a_word():

@@ -25,9 +25,7 @@ from viapoint.training.scene_sets import (
 )
 
 FILES = sorted(shipped_path(PLANE).parent.glob("*.npz"))
-SHIPPED = {
-    f"{path.stem} {name}": frozen for path in FILES for name, frozen in make.shipped_sets(path).items()
-}
+SHIPPED = {f"{path.stem} {name}": each for path in FILES for name, each in make.shipped_sets(path).items()}
 
 
 @pytest.fixture(scope="module")

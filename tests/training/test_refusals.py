@@ -350,6 +350,8 @@ COMMANDS = [
     ("train --env viapoint/PlanarObstacle-v0", "did you mean 'viapoint/PlanarObstacles-v0'"),
     ("train --algo dqn", "('viaq', 'viarank', 'sac', 'td3', 'ppo', 'tqc')"),
     ("train --n-timesteps -5", "--n-timesteps must be a whole number, from 1"),
+    ("train --env-kwargs n_via=2 --env-kwargs timing=learned", "--env-kwargs is there twice"),
+    ("fit movements.csv --n-via 1.5", "--n-via: must be whole numbers"),
     ("train --n-timesteps 1e5", "--n-timesteps: must be a whole number, got '1e5'"),
     ("train --n-timesteps 16 --n-envs 16 --out=", "--out: must be a path, got ''"),
     ("train --env-kwargs n_vias=2 --out full", "did you mean 'n_via'"),

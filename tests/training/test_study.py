@@ -144,15 +144,9 @@ def test_a_search_writes_its_best_settings_and_a_command_for_them(ray, tmp_path)
     assert not lines
 
 
-def test_names_that_end_alike_have_folders_of_their_own():
-    environments = {name: {"id": PLANE} for name in (PLANE, "my/PlanarObstacles-v0")}
-    trials = Study.from_dict({**GIVEN, "environments": environments}).trials
-    assert len({trial.folder(Path("out")) for trial in trials}) == len(trials)
-
-
 def test_grids_and_checks_make_rows():
     grid = {"hyperparameters.batch_size": [64, 128], "env_kwargs.n_via": [1, 2]}
-    given = {"environments": [PLANE], "seeds": [3], "agents": {"sac": {"algo": "sac", "grid": grid}}}
+    given = {"environments": [PLANE], "seeds": [3], "agents": {"sac": {"grid": grid}}}
     trials = Study.from_dict(given).trials
     assert [trial.row for trial in trials] == [
         f"sac-batch_size={size}-n_via={number}" for size in (64, 128) for number in (1, 2)
@@ -161,7 +155,7 @@ def test_grids_and_checks_make_rows():
     assert config.folder == Path("out/PlanarObstacles-v0/sac-batch_size=128-n_via=2/seed-3")
     assert config.hyperparameters == {"batch_size": 128}
     assert config.env_kwargs == {"n_via": 2}
-    assert config.seed == 3
+    assert (config.seed, config.algorithm) == (3, "sac")  # as the row says
 
 
 def test_the_examples_of_the_page_and_of_the_function_run(ray):
@@ -190,10 +184,13 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
         {"environments": {"a": {"id": "CartPole-v1"}}},
         {"environments": {"a": {"id": PLANE, "env_kwargs": {"num_envs": 3}}}},
         {"environments": {"../a": {"id": PLANE}}},
+        *({"environments": {name: {"id": PLANE}, "a-b": {"id": PLANE}}} for name in ("a/b", "results.csv")),
+        *({"agents": {"sac-1": {name: value}}} for name, value in (("algo", "viaq"), ("arm", "panda"))),
+        {"agents": {"a": {"algo": "viarank"}}},
         {"seed": [0]},
         {"seeds": [0, 0]},
         {"n_scenes": 0},
-        {"scenes": ["tset"]},
+        *({"scenes": names} for names in (["tset"], ["test", "test"])),
         *({"agents": {"viaq": {"checks": checks}}} for checks in ([-1], 16)),
         {"agents": {"sac": {"algo": "sac", "checks": [16]}}},
         *({"agents": {"viaq": {"hyperparameters": {name: 0}}}} for name in ("batchsize", "batch_size")),

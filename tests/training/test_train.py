@@ -34,7 +34,7 @@ TINY = {
     "sac": {**OFF_POLICY, "buffer_size": 96},
     "td3": {**OFF_POLICY, "buffer_size": 400},
     "ppo": {"n_steps": 2, "batch_size": 16, "n_epochs": 2},
-    "tqc": OFF_POLICY,
+    "tqc": {**OFF_POLICY, "use_sde": True},
 }
 STEPS = 192
 
