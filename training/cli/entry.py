@@ -111,9 +111,11 @@ def parse(words: Sequence[str], usual: Any = None) -> Any:
     if command not in COMMANDS:
         raise ValueError(f"{checks.unknown_name('command', command, COMMANDS)} (viapoint --help)")
     kind = kinds[command]
-    flags = [word.partition("=")[0] for word in options if word.startswith("--")]
-    for flag in flags:
-        if flags.count(flag) > 1:
+    flags = [word.partition("=")[0].replace("_", "-") for word in options if word.startswith("--")]
+    for each in dataclasses.fields(kind):
+        flag = f"--{each.name.replace('_', '-')}"
+        several = isinstance(each.default, tuple) or each.default_factory is dict
+        if several and flags.count(flag) > 1:  # the last one alone would count
             raise ValueError(f"{flag} is there twice; all its values follow one of them")
     if issubclass(kind, configs.AgentConfig):
         options = _agent_first(options)
