@@ -258,7 +258,7 @@ def plan_motion(
         generator=rng,
         names=[shape.name for shape in shapes],
     )
-    if not where.of_hand:
+    if not where.of_hand:  # a start outside the range of a continuous joint is turned into it, others stay
         problem = problem._replace(start=nearest_goals(arm, problem.start, problem.start))
     goals = _goals(problem, goal)
     number = -(-number // len(goals))  # rounded up
