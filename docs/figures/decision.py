@@ -73,7 +73,7 @@ def decide(agent: str) -> Decision:
     with torch.no_grad():
         actions, merits = policy.propose(problem)
         margin = policy.critic(policy.inputs(problem, actions)).margin[0].numpy()
-    checked = np.argsort(-merits[0])[:CHECKS].tolist()
+    checked = [int(row) for row in policy._promising(merits, CHECKS)[0]]
     clearance = plan_clearances(task, problem, actions[:, checked], most=1.0, least=-1.0)[0]
     ends = [np.broadcast_to(end, (len(actions[0]), 2)) for end in (problem.start, problem.goal)]
     plans = task.action.decode(actions[0], *ends)

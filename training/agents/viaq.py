@@ -172,14 +172,26 @@ class ViaQPolicy(PlanPolicy):
         if not self.checks and not self.refine:
             first = self.best_within_reach(problem, actions, values)
             return np.asarray(actions[np.arange(len(first)), first])
-        if self.replanning:  # the action that keeps the plan is always checked, and first
-            values[:, 0] = np.inf
-        best = np.argsort(-values, axis=1, kind="stable")[:, : max(self.checks, self.refine)]
-        checked = np.take_along_axis(actions, best[..., None], axis=1)
+        count = min(max(self.checks, self.refine), values.shape[1])
+        promising = self._promising(values, count)
+        checked = np.take_along_axis(actions, promising[..., None], axis=1)
         if self.refine:
             refined = refined_actions(self.task, problem, self._apart(actions, values, self.refine))
             checked = np.concatenate((checked, refined), axis=1)
         return best_of(self.task, problem, checked, merits(self.task, problem, checked))
+
+    def _promising(self, values: Numbers, count: int) -> NDArray[np.intp]:
+        """Return indices of candidates to check, shape (B, count), for ranking criteria of shape (B, N).
+
+        Refined candidates resemble each other, so at least half of the checks go to the best Sobol points.
+        """
+        if self.replanning:  # the action that keeps the plan is always checked, and first
+            values = np.concatenate((np.full_like(values[:, :1], np.inf), values[:, 1:]), axis=1)
+        refined = min(count // 2, values.shape[1] - self.candidates)
+        spread = min(count - refined, self.candidates)
+        first = np.argsort(-values[:, : self.candidates], axis=1, kind="stable")[:, :spread]
+        last = np.argsort(-values[:, self.candidates :], axis=1, kind="stable")[:, :refined]
+        return np.concatenate((first, last + self.candidates), axis=1)
 
     def _apart(self, actions: Numbers, values: Numbers, count: int) -> Numbers:
         """Return the best candidates that are APART from each other, shape (B, count, m).
