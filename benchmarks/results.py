@@ -101,7 +101,8 @@ class Config:
     or obstacles on reaches of their own; other numbers stay."""
     runs: Path = Path("runs/sb3")
     """Folder of trainings, which get a row each: those of benchmarks/sb3.py, viaq and viarank with other seeds, such as
-    `PlanarSensed-viarank-1`, and viarank with other beliefs, such as `PlanarSensed-fitted`."""
+    `PlanarSensed-viarank-1`, with more via-points, such as `PlanarObstacles-2via-0`, and viarank with other beliefs,
+    such as `PlanarSensed-fitted`."""
     reaches: Path = Path("runs/reaches")
     """Folder of trainings among obstacles on reaches of their own, such as `PlanarMovingObstacles-0` for seed 0."""
     looks: Path = Path("runs/looks")
@@ -149,7 +150,9 @@ def runs_of(folder: Path, short: str, settings: dict[str, Any]) -> list[dict[str
         method = f"{run.config.algorithm.upper()}, {agent.num_timesteps:,} of {run.curve[-1]['decisions']:,}"
         last = path.name.rpartition("-")[2]
         if run.config.algorithm in ("viaq", "viarank"):
-            method = f"agent, seed {last}" if last.isdigit() else f"{last}:agent"
+            n_via = run.config.env_kwargs.get("n_via", 1)
+            method = "agent" if last == "0" else f"agent, seed {last}" if last.isdigit() else f"{last}:agent"
+            method += f", {n_via} via-points" if n_via > 1 else ""
         rows.append({**evaluate(agent, **settings, baselines=[]).rows[0], "method": method})
     return rows
 

@@ -172,8 +172,7 @@ class ViaQPolicy(PlanPolicy):
         if not self.checks and not self.refine:
             first = self.best_within_reach(problem, actions, values)
             return np.asarray(actions[np.arange(len(first)), first])
-        count = min(max(self.checks, self.refine), values.shape[1])
-        promising = self._promising(values, count)
+        promising = self._promising(values, max(self.checks, self.refine))
         checked = np.take_along_axis(actions, promising[..., None], axis=1)
         if self.refine:
             refined = refined_actions(self.task, problem, self._apart(actions, values, self.refine))
@@ -183,15 +182,15 @@ class ViaQPolicy(PlanPolicy):
     def _promising(self, values: Numbers, count: int) -> NDArray[np.intp]:
         """Return indices of candidates to check, shape (B, count), for ranking criteria of shape (B, N).
 
-        Refined candidates resemble each other, so at least half of the checks go to the best Sobol points.
+        Refined candidates resemble each other, so they take turns with the best Sobol points.
         """
         if self.replanning:  # the action that keeps the plan is always checked, and first
-            values = np.concatenate((np.full_like(values[:, :1], np.inf), values[:, 1:]), axis=1)
-        refined = min(count // 2, values.shape[1] - self.candidates)
-        spread = min(count - refined, self.candidates)
-        first = np.argsort(-values[:, : self.candidates], axis=1, kind="stable")[:, :spread]
-        last = np.argsort(-values[:, self.candidates :], axis=1, kind="stable")[:, :refined]
-        return np.concatenate((first, last + self.candidates), axis=1)
+            values[:, 0] = np.inf
+        rank = np.empty_like(values)
+        for part in (slice(self.candidates), slice(self.candidates, None)):
+            order = np.argsort(-values[:, part], axis=1, kind="stable")
+            rank[:, part] = order.argsort(axis=1)
+        return np.argsort(rank, axis=1, kind="stable")[:, :count]
 
     def _apart(self, actions: Numbers, values: Numbers, count: int) -> Numbers:
         """Return the best candidates that are APART from each other, shape (B, count, m).
@@ -309,13 +308,6 @@ class ViaQ(PlanAlgorithm):
             tau=tau,
             **kwargs,
         )
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        before = self._last_obs
-        prepared = super()._setup_learn(*args, **kwargs)
-        if self._last_obs is not before:  # the environment was reset
-            self.replay_buffer.begin()  # the running episodes are others
-        return prepared
 
     def _task_of(self, env: VecEnv) -> Task:
         task = super()._task_of(env)
@@ -512,7 +504,6 @@ class OutcomeReplayBuffer(DictReplayBuffer):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._begins = False
         self.elapsed = np.full((self.buffer_size, self.n_envs), np.inf, dtype=np.float32)
         self.outcomes = np.full(
             (self.buffer_size, self.n_envs, len(Outcomes._fields)), np.nan, dtype=np.float32
@@ -524,24 +515,15 @@ class OutcomeReplayBuffer(DictReplayBuffer):
         self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]
     ) -> None:
         """Add one transition of each environment."""
-        before = self._clearance_before()
+        before = self.outcomes[self.pos - 1, :, Outcomes._fields.index("clearance")]
         for i, info in enumerate(infos):
             self.elapsed[self.pos, i] = info.get(ELAPSED, np.inf)
-            self.outcomes[self.pos, i] = outcome_of(info, float(reward[i]), before[i])
+            first = info.get("time") == info.get(ELAPSED)  # nothing was decided before in this episode
+            so_far = np.nan if first else before[i]
+            self.outcomes[self.pos, i] = outcome_of(info, float(reward[i]), so_far)
         for seen in (self.plans, self.next_plans):
             seen.known[self.pos] = False
         super().add(obs, next_obs, action, reward, done, infos)
-
-    def begin(self) -> None:
-        """Mark the beginning of new episodes in all environments, after a reset."""
-        self._begins = True
-
-    def _clearance_before(self) -> Single:
-        """Return the clearance terms summed over each running episode, shape (N,); NaN at its first decision."""
-        last = self.pos - 1  # in a new buffer, a row of NaN
-        over = (self.dones[last] > 0.5) | self._begins
-        self._begins = False
-        return np.where(over, np.nan, self.outcomes[last, :, Outcomes._fields.index("clearance")])
 
     def sample_outcomes(self, batch_size: int) -> OutcomeSamples:
         """Return `batch_size` decisions, sampled with replacement."""
