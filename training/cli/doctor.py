@@ -3,20 +3,18 @@
 import subprocess
 import sys
 
-from viapoint.training.extras import PACKAGES
-
 LIMIT = 180.0  # Time limit of a check, [s]; the first one compiles machine code
 VERSIONS = "import sys, {0}; print(sys.version[:7], *(f'{{m.__name__}} {{m.__version__}}' for m in ({0})))"
 ENV = "import gymnasium as g, viapoint.envs as v; e = g.make(v.ENV_IDS[1], render_mode='rgb_array'); e.reset(seed=0); "
 STEP = ENV + "print(f'{e.step(0 * e.action_space.sample())[4][\"duration\"]:.3f} s of movement')"
 AGENT = "from viapoint.training import load_agent; print(load_agent('viapoint/PlanarObstacles-v0').env_id)"
-EXTRAS = "from viapoint.training.extras import is_installed as f; "
-EXTRAS += "print(*(n if f(n) else f'(no {{n}}: extra {{e}})' for n, e in {}))"
+EXTRAS = "from viapoint.training.extras import PACKAGES, is_installed; "
+EXTRAS += "print(*(n if is_installed(n) else f'(no {n}: extra {e})' for n, e in PACKAGES.items()))"
 CHECKS = {  # Script that fails, or prints what it found, and remedy, by the name of what is checked
     "packages": (VERSIONS.format("numpy, gymnasium, mujoco, numba"), "pip install . in a clone"),
     "MuJoCo": (STEP, "pip install 'mujoco>=4'"),
     "agents": (AGENT, "the planner works without them"),
-    "extras": (EXTRAS.format((*PACKAGES.items(),)), ""),
+    "extras": (EXTRAS, ""),
     "pictures": (ENV + "print(*e.render().shape)", "on Debian: apt-get install libegl1 libgl1"),
 }
 
