@@ -1,16 +1,18 @@
 """Speed of the core: ratios of measurements that alternate within one run, and times of single operations on one core.
 
-python benchmarks/speed.py
+python benchmarks/speed.py    # prints the numbers, and writes them to docs/speed.csv
 """
 
 from __future__ import annotations
 
+import csv
 import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -26,20 +28,31 @@ from viapoint.training.planning.problem import Problem
 from viapoint.training.planning.search import GeometrySearch, plan_clearances, registered_task
 from viapoint.training.vec_env import ViaVecEnv
 
+FILE = Path("docs/speed.csv")
+"""File of the numbers."""
+IDS = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
+"""Environments in the plane and in space."""
 REPEATS = 7
 CANDIDATES = 256
 """Random movements of a scene that are checked together."""
 
 
 def main() -> None:
-    """Measure and print everything; takes about two minutes."""
+    """Measure, print and write everything; takes about three minutes."""
     torch.set_num_threads(1)
-    for env_id, number in (("viapoint/PlanarObstacles-v0", 512), ("viapoint/PandaObstacles-v0", 256)):
+    rows: list[tuple[str, str]] = []
+
+    def show(what: str, value: float) -> None:
+        rows.append((what, f"{value:.3g}"))
+        print(f"{what:75s} {value:8.3g}", flush=True)
+
+    for env_id, number in zip(IDS, (512, 256), strict=True):
         inside, drawing = step_shares(env_id, number)
         show(f"{env_id}, {number}: share of a step that is MuJoCo's", inside)
         show(f"{env_id}, {number}: share of a step that draws scenes", drawing)
-    show("ViaVecEnv, relative to make_vec_env of 64 (PlanarObstacles)", adapter())
-    for env_id in ("viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"):
+    for env_id in IDS:
+        show(f"{env_id}, 64: ViaVecEnv, times as fast as make_vec_env", adapter(env_id))
+    for env_id in IDS:
         check, search = planning(env_id)
         show(f"{env_id}: check of a random movement [us]", check * 1e6)
         show(f"{env_id}: search with 512 checks, one scene [ms]", search * 1e3)
@@ -52,14 +65,10 @@ def main() -> None:
     )
     show("make, reset and first step of a Panda, compiled [s]", timed_process(first))
     with tempfile.TemporaryDirectory() as folder:
-        show(
-            "the same on a fresh machine, kernels compiled [s]", timed_process(first, NUMBA_CACHE_DIR=folder)
-        )
-
-
-def show(what: str, value: float) -> None:
-    """Print one line."""
-    print(f"{what:70s} {value:8.3g}", flush=True)
+        fresh = timed_process(first, NUMBA_CACHE_DIR=folder)
+        show("the same on a fresh machine, kernels compiled [s]", fresh)
+    with FILE.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([("measurement", "value"), *rows])
 
 
 def step_shares(env_id: str, number: int) -> tuple[float, float]:
@@ -100,10 +109,10 @@ def watch(kind: Any, name: str, spent: dict[str, float], key: str) -> Callable[[
     return lambda: setattr(kind, name, plain)
 
 
-def adapter() -> float:
-    """Return how many times as fast as Stable-Baselines3's own vector environment ours is."""
-    ours: Any = ViaVecEnv("viapoint/PlanarObstacles-v0", 64, seed=0)
-    theirs: Any = make_vec_env("viapoint/PlanarObstacles-v0", 64, seed=0)
+def adapter(env_id: str) -> float:
+    """Return how many times as fast as Stable-Baselines3's own vector environment ours is, on all cores."""
+    ours: Any = ViaVecEnv(env_id, 64, seed=0)
+    theirs: Any = make_vec_env(env_id, 64, seed=0)
     rng = np.random.default_rng(0)
     times = {0: 1e9, 1: 1e9}
     for each in (ours, theirs):
