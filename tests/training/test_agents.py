@@ -519,7 +519,7 @@ def test_without_terms_only_the_sum_is_learned_from(small):
     model.learn(64)
     model.replay_buffer.outcomes[:] = np.nan
     before = model.policy.critic.pairs.layers[0].weight.clone()
-    losses = model._losses(model.replay_buffer.sample_outcomes(16))
+    losses = model._losses(model.replay_buffer.sample_places(16))
     assert losses["reward"].item() > 0.0
     assert all(loss.item() == 0.0 for name, loss in losses.items() if name != "reward")
     model.train(20, 16)
@@ -545,10 +545,9 @@ def test_a_clearance_that_is_predicted_too_high_weighs_more(small):
 
 def effort_loss(model, ended, success=1.0):
     np.random.seed(0)  # noqa: NPY002 - of the replay buffer
-    batch = model.replay_buffer.sample_outcomes(64)
-    outcomes = batch.outcomes._replace(success=np.full_like(batch.ended, success))
-    some = batch._replace(ended=np.full_like(batch.ended, ended), outcomes=outcomes)
-    return model._losses(some)["effort"].item()
+    buffer = model.replay_buffer
+    buffer.dones[:], buffer.outcomes[..., viaq.Outcomes._fields.index("success")] = ended, success
+    return model._losses(buffer.sample_places(64))["effort"].item()
 
 
 def test_what_follows_counts_only_where_an_episode_goes_on(small):

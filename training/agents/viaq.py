@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils._pytree import tree_leaves, tree_map
 
-from viapoint.envs.common.arrays import Float, Observation, Single, norm
+from viapoint.envs.common.arrays import Float, Observation, norm
 from viapoint.envs.outcome import SETTLING
 from viapoint.envs.plans import turned
 from viapoint.envs.rewards import CLEARANCE_RANGE, CLEARANCE_UNIT, TERMS
@@ -318,7 +318,7 @@ class ViaQ(PlanAlgorithm):
         return task
 
     def _sampled_losses(self, batch_size: int) -> dict[str, Tensor]:
-        losses = self._losses(self.replay_buffer.sample_outcomes(batch_size))
+        losses = self._losses(self.replay_buffer.sample_places(batch_size))
         return {f"{name}_loss": loss for name, loss in losses.items()}
 
     def _after_update(self) -> None:
@@ -327,18 +327,19 @@ class ViaQ(PlanAlgorithm):
             polyak_update(self.policy.critic.parameters(), target.parameters(), self.tau)
             target.pairs.largest.copy_(self.policy.critic.pairs.largest)
 
-    def _losses(self, batch: OutcomeSamples) -> dict[str, Tensor]:
-        """Return the losses of the predictions of the critic by name."""
-        policy, critic = self.policy, self.policy.critic
+    def _losses(self, at: At) -> dict[str, Tensor]:
+        """Return the losses of the predictions of the critic for stored decisions by name."""
+        policy, critic, buffer = self.policy, self.policy.critic, self.replay_buffer
         device = policy.device
-        inputs = self.replay_buffer.plans(batch.at, self._inputs).to(device)
+        inputs = buffer.plans(at, self._inputs).to(device)
         critic.pairs.note_sizes(inputs.pairs)
         values = Values(*(each[:, 0] for each in critic(inputs)))
-        following = self._following(batch.at)
-        ended = torch.from_numpy(batch.ended).to(device)
+        following = self._following(at)
+        ended = torch.from_numpy(buffer.dones[at] * (1.0 - buffer.timeouts[at])).to(device)
         goes_on = (1.0 - ended) * self.gamma if following is not None else torch.zeros_like(ended)
-        known = torch.from_numpy(np.isfinite(batch.outcomes.success)).to(device)
-        outcomes = Outcomes(*(torch.from_numpy(each).nan_to_num().to(device) for each in batch.outcomes))
+        reported = torch.from_numpy(buffer.outcomes[at].T).to(device)
+        outcomes = Outcomes(*reported.nan_to_num())
+        known = torch.isfinite(reported[0])
         contact, arrival, effort = outcomes.contact, outcomes.success, outcomes.effort_terms
         if following is not None:
             arrival = torch.where(ended > 0.5, arrival, self.gamma * torch.sigmoid(following.arrival))
@@ -355,7 +356,7 @@ class ViaQ(PlanAlgorithm):
             "effort": 10.0 * _mean(_smooth_l1(values.effort_terms, effort, beta=0.1), effort_counts),
         }
         if not bool(known.all()):
-            target = torch.from_numpy(batch.reward).to(device)
+            target = torch.from_numpy(buffer.rewards[at]).to(device)
             if following is not None:
                 target = target + goes_on * critic.value(following).detach()
             losses["reward"] = _mean(_smooth_l1(critic.value(values), target, beta=0.2), ~known)
@@ -463,15 +464,6 @@ class Outcomes(NamedTuple):
     effort_terms: Array  # Sum of the terms for smoothness and duration
 
 
-class OutcomeSamples(NamedTuple):
-    """Sampled decisions, all fields of shape (B,)."""
-
-    at: At
-    ended: Single
-    reward: Single
-    outcomes: Outcomes
-
-
 class SeenPlans:
     """Critic's inputs for stored decisions, computed once for each of them, as many updates learn from it.
 
@@ -525,16 +517,10 @@ class OutcomeReplayBuffer(DictReplayBuffer):
             seen.known[self.pos] = False
         super().add(obs, next_obs, action, reward, done, infos)
 
-    def sample_outcomes(self, batch_size: int) -> OutcomeSamples:
-        """Return `batch_size` decisions, sampled with replacement."""
+    def sample_places(self, batch_size: int) -> At:
+        """Return the places of `batch_size` decisions, sampled with replacement."""
         rows = np.random.randint(0, self.size(), size=batch_size)  # noqa: NPY002 - as SB3
-        at = rows, np.random.randint(0, self.n_envs, size=batch_size)  # noqa: NPY002
-        return OutcomeSamples(
-            at,
-            np.asarray(self.dones[at] * (1.0 - self.timeouts[at]), dtype=np.float32),
-            self.rewards[at],
-            Outcomes(*self.outcomes[at].T),
-        )
+        return rows, np.random.randint(0, self.n_envs, size=batch_size)  # noqa: NPY002
 
 
 def outcome_of(info: Mapping[str, Any], reward: float, before: float = np.nan) -> tuple[float, ...]:
