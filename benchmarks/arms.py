@@ -251,7 +251,7 @@ def page_table(found: pd.DataFrame) -> str:
         table = rows[[*columns, "median", "slow"]].copy()
         table.insert(0, "file", files)
         table.columns = pd.Index(heads)
-        digits = ("", ".0f", ".1f", ".1f", ".0f", ".0f", ".0f", ".2f", ".0f", ".1f", ".0f")
+        digits = ("", ".0f", ".1f", ".1f", ".0f", ".0f", ".0f", ".2g", ".0f", ".1f", ".0f")
         text = table.to_markdown(index=False, floatfmt=digits, missingval="")
         text = re.sub(r"\bnan\b", "   ", text)
         parts.append(f"### {PROJECTS[project]}\n\n{text}\n")
