@@ -62,7 +62,7 @@ LEAST_EXCESS = 0.001  # Excess of capsules below which they are not split, [m]
 # Distance of bodies in other configurations at which their capsules are split, too, and least excess for that, [m]
 PASSING, WORTH = 0.005, 0.004
 SHORT = 1e-5  # Length of a capsule that is written as a sphere around it, [m]
-MIN_INERTIA = 1e-12  # Least principal moment of inertia of a body, [kg m^2]
+MIN_INERTIA = 1e-12  # Least principal moment of inertia of a body, [kg m^2], and mass of one that stands for a joint
 INERTIA_MARGIN = 2e-5  # Relative margin of the triangle inequality of principal moments
 # Transmissions of actuators that drive a joint directly
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -92,6 +92,10 @@ class Parsed(NamedTuple):
     def named(self, pair: Pair) -> frozenset[str]:
         """Return the names of a pair of bodies."""
         return frozenset(self.names[body] for body in pair)
+
+    def link_below(self, body: int) -> int:
+        """Return the link that carries the one of a body: the one before the first joint of its carrier."""
+        return self.carriers.index(self.carriers[self.links[body] - 1])
 
 
 class View(NamedTuple):
@@ -576,17 +580,18 @@ def _home(parsed: Parsed, ranges: Float, given: Any, pairs: list[Pair], notes: l
 def _parse(model: mujoco.MjModel, joints: Names, tool: Tool, notes: list[str]) -> Parsed:
     """Return the arm of a model: the bodies that its joints move, and what they stand on."""
     carriers = [int(model.joint(name).bodyid[0]) for name in joints]
+    numbers = [model.joint(name).id for name in joints]
     for i in range(1, len(joints)):
-        if carriers[i - 1] not in ancestors(model, carriers[i]):
+        # Joints of one body move it one after another, in the order of the file.
+        in_order = carriers[i - 1] == carriers[i] and numbers[i - 1] < numbers[i]
+        if not in_order and carriers[i - 1] not in ancestors(model, carriers[i]):
             raise ValueError(
-                "the joints must each be on a body of its own, in order from the base, but "
-                f"{joints[i - 1]!r} does not carry {joints[i]!r}: split their body in the file, or change joints="
+                f"joints must be in order from the base, but {joints[i - 1]!r} does not carry {joints[i]!r}"
             )
+    last_link = {body: link for link, body in enumerate(carriers, start=1)}
     moves_with = np.zeros(model.nbody, int)
     for body in range(1, model.nbody):
-        moves_with[body] = moves_with[model.body_parentid[body]]
-        if body in carriers:
-            moves_with[body] = carriers.index(body) + 1
+        moves_with[body] = last_link.get(body, moves_with[model.body_parentid[body]])
     if moves_with[tool.body] != len(joints):
         raise ValueError(f"the tool does not move with the last joint, {joints[-1]!r}")
     rest = mujoco.MjData(model)
@@ -673,7 +678,7 @@ def _excluded(parsed: Parsed, never_touch: Iterable[tuple[str, str]]) -> dict[Pa
             collide = collide or bool(bits or spare[a] or spare[b] or frozenset((a, b)) in explicit)
         excluded = (min(first, second) << 16) + max(first, second) in model.exclude_signature
         carries = first > 0 and first in ancestors(model, second)
-        if parsed.links[second] - parsed.links[first] == 1 and carries:
+        if carries and parsed.links[first] == parsed.link_below(second):
             found[first, second] = "consecutive links"
         elif (
             excluded or not collide or frozenset((model.body(first).name, model.body(second).name)) in silent
@@ -799,29 +804,35 @@ def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[Fi
     for body, link in parsed.links.items():
         parent, axes, start = next(root.iter("worldbody")), np.eye(3), origin
         # A body hangs on the body with the joint that moves it, which comes before it in the file.
-        above = link - 1 if body in parsed.carriers else link
+        above = parsed.link_below(body) if body in parsed.carriers else link
         if above:
             before = parsed.carriers[above - 1]
             parent = written[before]
             axes = rest.xmat[before].reshape(3, 3)
             start = rest.xpos[before]
         turn = rest.xmat[body].reshape(3, 3)
-        written[body] = ET.SubElement(parent, "body", name=parsed.names[body])
-        _set(written[body], pos=axes.T @ (rest.xpos[body] - start), quat=quaternions_of(axes.T @ turn))
-        if link and model.body_mass[body] > 0.0:
-            inertial = ET.SubElement(written[body], "inertial")
-            _set(inertial, mass=model.body_mass[body], diaginertia=_moments(model.body_inertia[body]))
-            _set(inertial, pos=model.body_ipos[body], quat=model.body_iquat[body])
-        if body in parsed.carriers:
-            name = parsed.joints[link - 1]
+        element = ET.SubElement(parent, "body", name=parsed.names[body])
+        _set(element, pos=axes.T @ (rest.xpos[body] - start), quat=quaternions_of(axes.T @ turn))
+        for index in range(above, link):
+            name = parsed.joints[index]
             joint = int(model.joint(name).id)
             dof = model.jnt_dofadr[joint]
             kind = "hinge" if model.jnt_type[joint] == MOVES[0] else "slide"
-            added = ET.SubElement(written[body], "joint", name=name, type=kind)
+            added = ET.SubElement(element, "joint", name=name, type=kind)
             # Point and axis at 0 in the frame of the body, whatever the reference of the joint is.
             _set(added, pos=turn.T @ (rest.xanchor[joint] - rest.xpos[body]), axis=turn.T @ rest.xaxis[joint])
-            _set(added, range=ranges[link - 1], armature=model.dof_armature[dof])
+            _set(added, range=ranges[index], armature=model.dof_armature[dof])
             _set(added, damping=model.dof_damping[dof].flat[0])
+            if index < link - 1:  # several joints of one body: all but the last one get a body that weighs nothing
+                element.set("name", f"{parsed.names[body]} after {name}")
+                inertial = ET.SubElement(element, "inertial")
+                _set(inertial, pos=np.zeros(3), mass=MIN_INERTIA, diaginertia=np.full(3, MIN_INERTIA))
+                element = ET.SubElement(element, "body", name=parsed.names[body])
+        if link and model.body_mass[body] > 0.0:
+            inertial = ET.SubElement(element, "inertial")
+            _set(inertial, mass=model.body_mass[body], diaginertia=_moments(model.body_inertia[body]))
+            _set(inertial, pos=model.body_ipos[body], quat=model.body_iquat[body])
+        written[body] = element
         for capsule in fits.get(body, []):
             _add_capsule(written[body], model, capsule)
     site = ET.SubElement(written[parsed.tool.body], "site", name="hand")

@@ -102,6 +102,22 @@ def test_it_is_the_arm_of_the_file(arm):
     check_contact_implies_overlap(arm)
 
 
+@pytest.mark.parametrize("left_out", [None, 3, 4])
+def test_joints_of_one_body_move_it_one_after_another(tmp_path, left_out):
+    joints = [name for i, name in enumerate(JOINTS) if i != left_out]
+    home = [position for i, position in enumerate(HOME) if i != left_out]
+    arm = ur5e(SHARED, joints=joints, home=home)
+    check_it_is_the_arm_of(SHARED, arm)
+    check_contact_implies_overlap(arm)
+    write_arm(tmp_path / "arm.xml", arm)
+    again = load_arm(tmp_path / "arm.xml")
+    assert again.xml == arm.xml
+    assert again.left_out == arm.left_out
+    # MuJoCo lets bodies pass through those that carry them.
+    pairs = {frozenset((one, other)) for one, other, *_ in arm.left_out}
+    assert frozenset(("forearm", "wrist_2")) in pairs
+
+
 def test_its_file_its_text_and_its_specification_are_the_same_arm():
     spec = mujoco.MjSpec.from_string(TEXT)
     same = ur5e(str(UR5E)), ur5e(UR5E), ur5e(), ur5e(spec)
@@ -283,6 +299,11 @@ LEFT = re.sub(r'name="(\w+)"', r'name="left_\1"', ONE)
 TWO = TEXT.replace(END, f'<body name="left" pos="0 1 0">{LEFT}</body>{END}')
 """Two arms side by side."""
 SLIDING = f'<body><joint type="slide" limited="false"/>{HAND_OF_TEXT}<geom size=".01"/></body>'
+# The fourth joint moves the body of the fifth one
+SHARED = without(
+    r'<joint name="wrist_1" class="wrist"/>((?s:.*?))<joint name="wrist_2"',
+    r'\1<joint name="wrist_1" class="wrist" axis="0.6 0 0.8" pos=".02 0 .01"/><joint name="wrist_2"',
+)
 REFUSED = [
     ({"file": 5}, TypeError), ({"file": None}, TypeError), ({"file": b"arm.xml"}, TypeError),
     ({"file": ""}, ValueError), ({"file": "none.xml"}, ValueError),
@@ -290,6 +311,7 @@ REFUSED = [
     *[({"joints": joints}, ValueError) for joints in (
         5, "elbow", JOINTS[:1], (*JOINTS[:5], "wrist_4"), (*JOINTS[:5], JOINTS[0]), (JOINTS[1], JOINTS[0], *JOINTS[2:]),
     )],
+    ({"file": SHARED, "joints": (*JOINTS[:3], "wrist_2", "wrist_1", "wrist_3")}, ValueError),
     *[({"home": home}, ValueError) for home in (HOME[:3], (7.0, *HOME[1:]), "up", (np.nan, *HOME[1:]))],
     *[({"origin": origin}, ValueError) for origin in ("base", (0, 0), (0.0, 0.0, np.nan))],
     *[({"joint_range": ranges}, ValueError) for ranges in (
@@ -309,8 +331,6 @@ REFUSED = [
         ('<joint name="elbow" range', '<joint name="elbow" type="ball" range'), (r"<geom[^>]*/>", ""),
         (r"<geom type[^>]*/>", ""),  # bodies without mass
         (r"(?s).{20}$", ""),  # no XML
-        (r'<joint name="wrist_1" class="wrist"/>((?s:.*?))<joint name="wrist_2"',
-         r'\1<joint name="wrist_1" class="wrist" axis="0 1 0"/><joint name="wrist_2"'),  # two in one body
     )],
 ]  # fmt: skip
 
