@@ -11,7 +11,7 @@ from gymnasium import spaces
 from viapoint.envs.common.arrays import Float, Observation
 from viapoint.envs.geometry.obstacles import POSE_SIZE, Obstacles, observation_rows
 from viapoint.envs.plans import Motion, NominalPlan
-from viapoint.envs.scenes.scene import FARTHEST, FASTEST
+from viapoint.envs.scenes.scene import FASTEST
 from viapoint.envs.sensors import Looks
 
 if TYPE_CHECKING:
@@ -41,28 +41,29 @@ class ObservationLayout:
     def bounds(self) -> dict[str, tuple[Float, Float]]:
         """Lower and upper bounds of the parts."""
         task, sensor = self.task, self.task.sensor
+        farthest = task.arm.farthest
         low, high = task.arm.joint_range.T
         joints = low - BEYOND_LIMIT, high + BEYOND_LIMIT  # MuJoCo's joint limits are soft
-        found = {"joints": joints, "hand": _box(FARTHEST, 3), "goal": _box(FARTHEST, 3)}
+        found = {"joints": joints, "hand": _box(farthest, 3), "goal": _box(farthest, 3)}
         if task.space_name == "joints":
             found["goal_joints"] = joints
         if sensor is not None:
-            farthest = sensor.range + FARTHEST + float(np.abs(sensor.position).max())
+            seen = sensor.range + farthest + float(np.abs(sensor.position).max())
             number = sensor.looks * sensor.n_rays  # all looks that are remembered
             found["ranges"] = np.zeros(number), np.full(number, sensor.range)
-            found["points"] = _box(farthest, 3 * number)
+            found["points"] = _box(seen, 3 * number)
             if sensor.looks > 1:
-                found["eyes"] = _box(FARTHEST, 3 * sensor.looks)
+                found["eyes"] = _box(farthest, 3 * sensor.looks)
         elif self.n_rows:
             kinds = np.zeros(len(task.shapes))
-            pose = [FARTHEST] * 3 + [1.0] * 6
-            sizes = [FARTHEST] * 3
+            pose = [farthest] * 3 + [1.0] * 6
+            sizes = [farthest] * 3
             lowest = np.concatenate((kinds, -np.array(pose), np.zeros(3), [-FASTEST] * 3, [0.0]))
             highest = np.concatenate((kinds + 1.0, pose, sizes, [FASTEST] * 3, [1.0]))
             found["obstacles"] = np.tile(lowest, self.n_rows), np.tile(highest, self.n_rows)
         if not task.whole_movement:
             dimension = task.space.dimension
-            place = joints if task.space_name == "joints" else _box(FARTHEST, dimension)
+            place = joints if task.space_name == "joints" else _box(farthest, dimension)
             found["command"] = place
             found["velocity"] = _box(2.0 * max(task.steering.top_speed), dimension)
             found["acceleration"] = _box(task.steering.greatest_acceleration, dimension)

@@ -26,6 +26,7 @@ VIEWS, ROOM = 48, 0.0015
 COVERED = "covered"  # Custom number in models of which this holds: those whose capsules cover other geoms
 COMPARED = 100_000  # Number of configurations in which bodies that never touch are looked for
 SAMPLED = 64  # Configurations at which the greatest inertia of the joints is looked for
+FARTHEST = 2.0  # Least bound of the coordinates of obstacles, [m]
 OBSTACLE_COLOUR = (0.83, 0.52, 0.30, 1.0)  # Colour of obstacles in pictures
 WAITING = (0.0, 0.0, -10.0)  # Place of obstacles that are absent, [m]
 
@@ -91,6 +92,13 @@ class Arm:
     def __deepcopy__(self, memo: object) -> Arm:
         """Return the arm itself, which never changes, so that copies of a task are equal to it."""
         return self
+
+    @property
+    def farthest(self) -> float:
+        """Greatest distance of hand and obstacles from the origin along an axis: 2, or what the arm can reach, [m]."""
+        lengths = np.linalg.norm((*self.chain.origin, self.chain.tool_origin), axis=1)
+        slides = np.abs(self.joint_range[self.chain.sliding]).max(axis=1)
+        return max(FARTHEST, float(lengths.sum() + slides.sum()))
 
     def report(self) -> str:
         """Return what the arm is, and what was chosen for it, as a text of several lines."""

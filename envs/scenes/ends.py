@@ -36,6 +36,7 @@ class Setting(NamedTuple):
     joint_range: Float  # Ranges of the joints, shape (J, 2), [rad] or [m]
     inner_range: Float  # Ranges of the joints at ends, shape (J, 2), [rad] or [m]
     home: Float  # Shape (J,), [rad] or [m]
+    farthest: float  # Greatest coordinate of obstacles, [m]
     bearing: float  # Bearing of the tool at home, seen from the axis of the first joint, [rad]
     plane: bool  # True for an arm of two joints in the plane
     of_hand: bool  # True if movements are planned in hand space, False for joint space

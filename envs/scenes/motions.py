@@ -32,7 +32,7 @@ MET_AT = (0.35, 0.65)  # Share of the duration of a reach after which an obstacl
 MEETING = (0.25, 0.6)  # Time at which an obstacle is where it was drawn, relative to the centre duration
 # Least clearance of the start at first, of the goal while movements may end, and of targets that appear, [m]
 MARGIN = 0.015
-FARTHEST = 1.5  # Greatest coordinate of a moving obstacle at the beginning, [m]
+NEAR = 0.75  # Greatest coordinate of a moving obstacle at the beginning, as a share of that of obstacles
 BEGINNING, BEGINNING_TIMES = 0.2, 3
 """Time that the start stays free, relative to the centre duration, and number of times at which this is checked."""
 # Time until which the goal stays free, relative to the longest duration, and number of times
@@ -121,7 +121,7 @@ def _course_fits(draft: Draft, duration: float, scene: int, row: int) -> bool:
     """Return True if an obstacle leaves the start free at first, and the goal at first and while movements may end."""
     shortest, longest = draft.setting.relative_durations
     x, y, z = draft.scenes.obstacles.centre[scene, row]
-    if max(abs(x), abs(y), abs(z)) > FARTHEST:
+    if max(abs(x), abs(y), abs(z)) > NEAR * draft.setting.farthest:
         return False
     for k in range(BEGINNING_TIMES):
         time = duration * BEGINNING * k / (BEGINNING_TIMES - 1)

@@ -38,7 +38,7 @@ from viapoint.envs.scenes.motions import (
     draw_jumps,
     numbers_of_jumps,
 )
-from viapoint.envs.scenes.scene import ENDS, FARTHEST, MOST_JUMPS, NEVER, Scenes, extents, resting
+from viapoint.envs.scenes.scene import ENDS, MOST_JUMPS, NEVER, Scenes, extents, resting
 from viapoint.envs.sensors import VIEW_MARGIN
 
 if TYPE_CHECKING:
@@ -101,6 +101,7 @@ class SceneSampler:
         bare = self.room.most == 0 or "obstacles" in given
         builds = [self._bare if bare else self._any_family(rng) for rng in generators]
         pending = np.arange(number)
+        farthest = self.task.arm.farthest
         for attempt in range(ATTEMPTS):
             for i in map(int, pending):
                 rng = generators[i]
@@ -112,7 +113,7 @@ class SceneSampler:
             draw_ends(draft, pending, found)
             obstacles = draft.scenes.obstacles.take(pending)
             if "obstacles" not in given:  # what is drawn can be given back
-                found &= np.maximum(*extents(obstacles)).max(axis=1, initial=0.0) <= FARTHEST
+                found &= np.maximum(*extents(obstacles)).max(axis=1, initial=0.0) <= farthest
             found[found] = self._change(draft, pending[found], generators, given)
             if self.task.sensor is not None:
                 found &= self.sensor_clearances(draft.scenes.take(pending)) >= VIEW_MARGIN
@@ -126,7 +127,7 @@ class SceneSampler:
             )
         raise RuntimeError(
             f"no scene of the families {', '.join(self.task.families)} with {self.room.fewest} to {self.room.most} "
-            f"obstacles, within {FARTHEST:g} m, was found in {ATTEMPTS} attempts for the arm {self.task.arm.name!r}; "
+            f"obstacles, within {farthest:.3g} m, was found in {ATTEMPTS} attempts for the arm {self.task.arm.name!r}; "
             "allow fewer obstacles or other families, or give other ends or jumps"
         )
 
@@ -257,6 +258,7 @@ def _setting_of(task: Task, plane: bool) -> Setting:
         joint_range=arm.joint_range,
         inner_range=inner,
         home=arm.home,
+        farthest=arm.farthest,
         bearing=math.atan2(away[1], away[0]),
         plane=plane,
         of_hand=task.space_name == "hand",

@@ -21,7 +21,6 @@ ENDS = ("start", "goal")  # Names of the ends of a movement
 NEVER = 1e9  # Time of a change that does not happen, [s]
 ROUNDING = 1e-9  # Rounding error of times, [s]
 LEAST_APART = 0.02  # Least difference of start and goal in the joint that moves most, [rad] or [m]
-FARTHEST = 2.0  # Greatest coordinate of an obstacle's centre, and greatest size, [m]; half-spaces have none
 FASTEST = 1.0  # Greatest speed of an obstacle, [m/s]
 # Time between two points of a reach, [s]: in the physics, obstacles move straight between them
 CHORD = 0.04
@@ -198,7 +197,7 @@ def check_scenes(
     Raises:
         ValueError: A scene is impossible; the message names the scene, the fault and what is allowed.
     """
-    _check_obstacles(scenes, names)
+    _check_obstacles(scenes, arm.farthest, names)
     everywhere = np.ones(len(scenes.start), bool)
     for name in ends:
         check_end(arm, name, getattr(scenes, name), scenes.obstacles, everywhere, names)
@@ -236,13 +235,13 @@ def extents(obstacles: Obstacles) -> tuple[Float, Float]:
     return largest * obstacles.present, away * obstacles.present
 
 
-def _check_obstacles(scenes: Scenes, names: Sequence[Sequence[str]]) -> None:
-    """Check sizes, places and courses of obstacles."""
+def _check_obstacles(scenes: Scenes, farthest: float, names: Sequence[Sequence[str]]) -> None:
+    """Check sizes, places and courses of obstacles, of which half-spaces have no place."""
     obstacles, turn_time = scenes.obstacles, scenes.turn_time
     present = obstacles.present
     largest, away = extents(obstacles)
-    _refuse(largest > FARTHEST, f"must be at most {FARTHEST:g} m large", largest, names)
-    _refuse(away > FARTHEST, f"must be at most {FARTHEST:g} m from the origin along each axis", away, names)
+    _refuse(largest > farthest, f"must be at most {farthest:.3g} m large", largest, names)
+    _refuse(away > farthest, f"must be at most {farthest:.3g} m from the origin along each axis", away, names)
     for velocity in (obstacles.velocity, scenes.turn_velocity):
         speed = norm(velocity)
         _refuse(present & (speed > FASTEST), f"must be at most {FASTEST:g} m/s fast", speed, names)

@@ -911,3 +911,18 @@ def test_urdf_files_with_odd_parts_load(crane):
         assert told in notes
     for link in ("post", "boom", "wrist"):
         assert f"inertia of {link}" in notes
+
+
+@pytest.mark.parametrize("place", [(3.0, 0.0, 0.0), (0.0, -2.5, 1.5)])
+def test_scenes_move_with_the_arm_and_are_observed_there(place):
+    found = []
+    for origin in (np.zeros(3), np.negative(place)):
+        envs = gym.make_vec("viapoint/Obstacles-v0", num_envs=4, arm=ur5e(origin=origin)).unwrapped
+        observation, _ = envs.reset(seed=0)
+        np.testing.assert_allclose(observation["hand"], envs.task.arm.hand(envs.scenes.start), atol=1e-6)
+        found.append(envs.scenes)
+    near, far = found
+    np.testing.assert_allclose(near.start, far.start, atol=1e-9)
+    np.testing.assert_allclose(near.goal, far.goal, atol=1e-9)
+    moved = (far.obstacles.centre - near.obstacles.centre)[near.obstacles.present]
+    np.testing.assert_allclose(moved, np.broadcast_to(place, moved.shape), atol=1e-9)
