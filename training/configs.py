@@ -490,6 +490,7 @@ class PlanConfig(Config):
     base: str = ""  # Body that the chain begins at, where a file has two arms.
     packages: tuple[Path, ...] = ()  # Folders for package:// in a URDF.
     velocity_limit: float | None = None  # Velocity limit of joints, [rad/s], slides [m/s]; else the file's.
+    torque_limit: float | None = None  # Torque limit of joints, [N m], slides [N]; else the file's.
     n_via: int = 2  # Number of via-points, 1 to 3.
     margin: float = 0.0  # Least clearance, [m].
     duration: float | None = None  # Duration, [s]; by default the shortest that the limits allow.
