@@ -34,7 +34,7 @@ from viapoint.envs.arms.choices import (
 from viapoint.envs.arms.kinematics import torques
 from viapoint.envs.arms.stored import cached_arm, read_arm
 from viapoint.envs.arms.urdf import MASSES_GUESSED, WARNING, Packages, Urdf, read_urdf
-from viapoint.envs.common.arrays import Float, frame_matrices
+from viapoint.envs.common.arrays import Float, frame_matrices, norm
 from viapoint.envs.common.validation import finite_array, number_of_at_least
 from viapoint.envs.geometry.obstacles import quaternions_of
 
@@ -736,13 +736,14 @@ def _fitted(
         fits[body] = []
         for geom in geoms:
             fits[body] += cover_geom(parsed.model, geom, tolerance)
+    compared = dict.fromkeys(fits, 0)  # Numbers of capsules of each body, the first ones, that were compared before
     while True:
         xml = _write(parsed, ranges, origin, fits)
         capsules = mujoco.MjModel.from_xml_string(xml)
         coarse = set()
         for view in views:
             at_home = view is views[0]
-            for pair, (body, index) in _close_capsules(parsed, capsules, fits, view):
+            for pair, (body, index) in _close_capsules(parsed, capsules, fits, view, compared):
                 excess = fits[body][index].excess
                 if excess >= (LEAST_EXCESS if at_home else WORTH):
                     coarse.add((body, index))
@@ -754,21 +755,36 @@ def _fitted(
                     )
         if not coarse:
             return xml, max(capsule.excess for some in fits.values() for capsule in some)
+        compared = {body: len(some) for body, some in fits.items()}
         for body, index in sorted(coarse, reverse=True):
             fits[body] += split(parsed.model, fits[body].pop(index))
+            compared[body] -= 1
 
 
 def _close_capsules(
-    parsed: Parsed, model: mujoco.MjModel, fits: dict[int, list[FittedCapsule]], view: View
+    parsed: Parsed,
+    model: mujoco.MjModel,
+    fits: dict[int, list[FittedCapsule]],
+    view: View,
+    compared: dict[int, int],
 ) -> Iterator[tuple[Pair, tuple[int, int]]]:
-    """Yield pairs of bodies that are apart, though capsules of them are not, with body and index of the coarser one."""
+    """Yield pairs of bodies that are apart, though capsules of them are not, with body and index of the coarser one.
+
+    Of two capsules, one is new: it is not among those that were compared before.
+    """
     data = mujoco.MjData(model)
     move(data, parsed.joints, view.configuration)
     begin = {body: int(model.body(parsed.names[body]).geomadr[0]) for body in fits}
     for pair, distance in view.distances.items():
         first, second = pair
         least = min(LEFT_SHARE * distance, LEFT_MOST)
-        for i, j in itertools.product(range(len(fits[first])), range(len(fits[second]))):
+        some = slice(begin[first], begin[first] + len(fits[first]))
+        others = slice(begin[second], begin[second] + len(fits[second]))
+        apart = norm(data.geom_xpos[some, None] - data.geom_xpos[others])
+        apart -= model.geom_rbound[some, None] + model.geom_rbound[others]  # of spheres around the capsules
+        near = apart < least
+        near[: compared[first], : compared[second]] = False
+        for i, j in np.argwhere(near).tolist():
             geoms = begin[first] + i, begin[second] + j
             if mujoco.mj_geomDistance(model, data, *geoms, 0.01, None) < least:
                 is_first = fits[first][i].excess >= fits[second][j].excess
