@@ -19,7 +19,8 @@ from viapoint.training.planning.export import read_motion, write_motion
 from viapoint.training.planning.plan_motion import plan_motion
 from viapoint.training.planning.search import registered_task
 
-LOADING = ("tool", "joints", "base", "packages", "velocity_limit", "torque_limit")  # Flags that are arguments of load_arm
+# Flags that are arguments of load_arm
+LOADING = ("tool", "joints", "base", "packages", "velocity_limit", "torque_limit")
 
 
 def run(config: PlanConfig) -> None:
