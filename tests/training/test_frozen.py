@@ -14,15 +14,7 @@ from viapoint.training import scene_sets
 from viapoint.training.planning.baselines import make_method
 from viapoint.training.planning.search import registered_task
 from viapoint.training.rollout import SceneSimulation
-from viapoint.training.scene_sets import (
-    BANDS,
-    SETS,
-    drawn,
-    load,
-    scenes_for,
-    shipped_path,
-    shipped_set,
-)
+from viapoint.training.scene_sets import BANDS, SETS, drawn, load, scenes_for, shipped_path, shipped_set
 
 FILES = sorted(shipped_path(PLANE).parent.glob("*.npz"))
 SHIPPED = {f"{path.stem} {name}": each for path in FILES for name, each in make.shipped_sets(path).items()}
