@@ -32,6 +32,9 @@ from viapoint.envs.task import Task
 SINGLE_METADATA: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
 LEAST_SHARE = 4  # Fewest environments for which a thread is worth its while
 
+OF_STATES = ("space_name", "n_via", "timing", "decide_at", "n_obstacles", "shapes")
+"""Fields of a task in which environments must agree to continue from the state of one another."""
+
 
 class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
     """Reaching around obstacles by via-points, `num_envs` times.
@@ -359,6 +362,7 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """
         self._check_running()
         return {
+            "task": {name: str(getattr(self.task, name)) for name in OF_STATES},
             "generators": [generator.bit_generator.state for generator in self.generators],
             "scenes": as_dict(self.scenes),
             "episodes": _together([each.state() for each in self._episodes]),
@@ -372,8 +376,12 @@ class ReachVectorEnv(gym.vector.VectorEnv[Any, Any, Any], EzPickle):
         """Continue from a state of environments of the same task and number, whatever its number of threads was.
 
         Raises:
-            ValueError: The state is one of another number of environments or joints.
+            ValueError: The state is one of another task, or of another number of environments or joints.
         """
+        for name, value in state.get("task", {}).items():
+            own = str(getattr(self.task, name))
+            if own != value:
+                raise ValueError(f"state must be one of a task with {name} {own}, got {value}")
         number, joints = np.shape(state["scenes"]["start"])
         if (number, joints) != (self.num_envs, len(self.task.arm.home)):
             raise ValueError(

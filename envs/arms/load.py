@@ -52,6 +52,7 @@ LEAST_TOLERANCE = 0.005  # Least tolerance of fitted capsules, [m]
 STUCK = 100.0  # Damping beyond which a joint hardly moves: torque at full speed over the limit
 # Greatest range of a hinge, [rad], and length of an arm, [m], that are not taken for degrees or millimetres
 MOST_TURNS, LONGEST = 8.0 * np.pi, 20.0
+FAR_TOO_LONG = 100.0  # Distance of joints above which an arm is refused, [m]
 # Names of files that do not tell the arm; it gets the name of the model
 GENERIC_NAMES = ("arm", "model", "robot", "scene")
 MIN_JOINTS = 2  # Least number of joints
@@ -61,6 +62,7 @@ LEFT_SHARE, LEFT_MOST = 0.25, 0.002
 LEAST_EXCESS = 0.001  # Excess of capsules below which they are not split, [m]
 # Distance of bodies in other configurations at which their capsules are split, too, and least excess for that, [m]
 PASSING, WORTH = 0.005, 0.004
+ROUNDED = 1e-3  # Relative error of limits that are written with three digits
 SHORT = 1e-5  # Length of a capsule that is written as a sphere around it, [m]
 MIN_INERTIA = (
     1e-12  # Least principal moment of inertia of a body, [kg m^2], and mass of one that stands for a joint
@@ -233,6 +235,10 @@ def _load(
         notes.append(f"{WARNING}damping of {some} is left out: it takes {STUCK:g} times the torque limit")
         whole.dof_damping[dofs[stuck]] = 0.0
     parsed = _parse(whole, names, chosen, notes)
+    places = parsed.rest.xpos[parsed.carriers]
+    length = float(np.linalg.norm(places - places[0], axis=1).max())
+    if length > FAR_TOO_LONG:  # to cover it within millimetres takes forever
+        raise ValueError(f"the arm is {length:.3g} m long; lengths are metres, and these may be millimetres")
     low, high = ranges.T
     drawn = np.random.default_rng(0).uniform(low, high, (NEAR_LOOKED_AT, len(names)))
     exclude = _excluded(parsed, urdf.never_touch)
@@ -452,14 +458,14 @@ def _ranges(model: mujoco.MjModel, joints: Names, given: Any, notes: list[str]) 
 
 
 def _given_limits(name: str, given: Any, own: Float, joints: Names, notes: list[str]) -> Float:
-    """Return given limits of joints, shape (J,); a note tells those above the file's own, which are 0 for none."""
+    """Return given limits of joints, shape (J,); a note tells those above the arm's own, which are 0 for none."""
     limits = _per_joint(name, given, joints)
     if not (limits > 0.0).all():
         raise ValueError(f"{name} must be positive, got {limits}")
-    above = (own > 0.0) & (limits > own)
+    above = (own > 0.0) & (limits > (1.0 + ROUNDED) * own)
     if above.any():
         some = ", ".join(itertools.compress(joints, above))
-        notes.append(f"{WARNING}{name} is greater than that in the file, {own[above]}, of {some}")
+        notes.append(f"{WARNING}{name} is greater than the arm's own, {own[above]}, of {some}")
     return limits
 
 
@@ -476,15 +482,20 @@ def _torques(
         if model.jnt_actfrclimited[joint]:
             own = _symmetric_limit(model.jnt_actfrcrange[joint])
             found[i] = min(found[i], own) if found[i] > 0.0 else own
-    if given is not None:
-        return _given_limits("torque_limit", given, found, joints, notes)
     known = known_limits(KNOWN_TORQUES, arm, len(joints))
+    if given is not None:
+        return _given_limits("torque_limit", given, _or_known(found, known), joints, notes)
     needed: Any = 0.0
     if known is None and (found <= 0.0).any():
         inertia, weight = greatest_loads(mujoco.MjData(model), joints, ranges)
         needed = np.maximum(ACCELERATION * inertia, WEIGHTS * weight).clip(LEAST_TORQUE)
     how = f"{WEIGHTS:g} times what the arm's weight needs, at least enough for {ACCELERATION:g} rad/s^2 (slides m/s^2)"
     return _completed("torque", joints, found, known, needed, f"{how}; give torque_limit", notes)
+
+
+def _or_known(limits: Float, known: Float | None) -> Float:
+    """Return limits of which missing ones, which are 0, are those of a known arm, if it is one."""
+    return limits if known is None else np.where(limits > 0.0, limits, known)
 
 
 def _completed(
@@ -531,10 +542,10 @@ def _velocities(
                 f"the file's custom numbers velocity_limit are {len(own)}, and the arm has {len(joints)} joints; give "
                 "velocity_limit="
             )
-    if given is not None:
-        return _given_limits("velocity_limit", given, found, joints, notes)
-    how = f"{DEFAULT_VELOCITY_LIMIT:g} rad/s (slides m/s); give velocity_limit="
     known = known_limits(KNOWN_VELOCITIES, arm, len(joints))
+    if given is not None:
+        return _given_limits("velocity_limit", given, _or_known(found, known), joints, notes)
+    how = f"{DEFAULT_VELOCITY_LIMIT:g} rad/s (slides m/s); give velocity_limit="
     return _completed("velocity", joints, found, known, DEFAULT_VELOCITY_LIMIT, how, notes)
 
 
@@ -642,7 +653,7 @@ def _note_rest(model: mujoco.MjModel, joints: Names, tool: Tool, bodies: list[in
         named = ", ".join(model.joint(index).name for index in fixed)
         notes.append(f"fixed: {named}, neither a hinge nor a slide")
     if (collides & ground).any():
-        notes.append("left out: planes and height fields of the file; a floor is an obstacle, HalfSpace")
+        notes.append(f"{WARNING}left out: planes and height fields; give a floor as an obstacle, HalfSpace")
     numbers = [model.joint(name).id for name in joints]
     forces = {
         "springs": model.jnt_stiffness[numbers],

@@ -256,7 +256,8 @@ def _check_obstacles(scenes: Scenes, farthest: float, names: Sequence[Sequence[s
     _refuse(late, f"must end its reach within {LATEST:g} s", begin + duration, names)
     time = np.where(reaches & (duration > 0.0), duration, np.inf)
     mean = norm(scenes.reach[..., 2:]) / time
-    speed = MINIMUM_JERK_PEAK * mean
+    # Other movements of the obstacle come on top.
+    speed = MINIMUM_JERK_PEAK * mean + np.maximum(norm(obstacles.velocity), norm(scenes.turn_velocity))
     _refuse(reaches & (speed > FASTEST), f"must reach with at most {FASTEST:g} m/s", speed, names)
     peak = MINIMUM_JERK_ACCELERATION * mean / time
     longer = f"must have a longer duration in reaches, with at most {MOST_ACCELERATION:g} m/s^2"

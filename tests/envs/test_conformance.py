@@ -127,6 +127,8 @@ def test_episodes_go_on_with_another_number_of_threads(env_id):
     first.reset(seed=4)
     action = np.tile(actions_for(first, 1)[0], (9, 1))
     first.step(action)
+    with pytest.raises(ValueError, match="n_via"):
+        gym.make_vec(env_id, num_envs=9, n_via=3).unwrapped.restore(first.unwrapped.state())
     for source, target in ((first, second), (second, first)):
         target.unwrapped.restore(source.unwrapped.state())
         with pytest.raises(ValueError, match="9 environments"):

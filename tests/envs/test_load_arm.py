@@ -316,6 +316,7 @@ REFUSED = [
     *[({"torque_limit": limit}, ValueError) for limit in (-1.0, [1e-3] * 6, "strong")],
     *[({"tolerance": tolerance}, ValueError) for tolerance in (0.0, "fine", np.nan)],
     ({"file": near_arm(1e-4), "home": None, **THREE}, ValueError),  # bodies too close at home
+    ({"file": near_arm(0.02).replace('pos="0 0 0.5"', 'pos="0 0 500"'), "home": None, **THREE}, ValueError),
     ({"file": "<?xml version='1.0'?><robot name='r'><link name='a'/></robot>"}, ValueError),  # text of a URDF
     ({"file": changed((END, END + '<custom><numeric name="velocity_limit" data="3 3"/></custom>')),
       "velocity_limit": None}, ValueError),
@@ -546,7 +547,7 @@ def test_urdf_files_are_arms(crane):
     np.testing.assert_allclose(arm.joint_range, [(0.0, 0.4), (-np.pi, np.pi), (-1.0, 2.0)], atol=1e-5)
     assert "wrist" in arm.group_names
     assert "lift: 0 to 0.4 m, at most 0.3 m/s and 900 N" in arm.report()
-    with pytest.warns(UserWarning, match=r"greater than that in the file, \[0.3\], of lift"):
+    with pytest.warns(UserWarning, match=r"greater than the arm's own, \[0.3\], of lift"):
         load_arm(written(crane), velocity_limit=1.0)
     joints = (0.2, np.pi / 2, 0.0)
     np.testing.assert_allclose(arm.hand(joints), (0.1, 0.65, 0.52), atol=1e-5)
@@ -743,6 +744,8 @@ def test_what_a_user_hardly_means_is_told():
     folded = (*HOME[:2], 3.1, *HOME[3:])
     with pytest.warns(UserWarning, match="in contact at the given home"):
         ur5e(TEXT, home=folded)
+    with pytest.warns(UserWarning, match=r"own, \[3.14"):  # degrees per second
+        ur5e(TEXT, velocity_limit=180.0)
     with pytest.warns(UserWarning, match="degrees"):
         ur5e(TEXT, joint_range=[(-170.0, 170.0)] * 6)
     with pytest.warns(UserWarning, match="wall; give them as obstacles"):
@@ -816,7 +819,7 @@ PINCH = gripper(2, "bar").replace("</body>", '<site name="pinch"/></body>', 1)
         ([(SHOULDER, MOBILE + SHOULDER), ("</body>\n  </worldbody>", "</body></body></worldbody>")], "fixed: turn, x"),
         ([(END, WALL.format("<freejoint/>"))], "left out, not part of the arm: wall"),
         ([("<worldbody>", TORSO), (END, "</body>" + END)], "fixed: ball"),
-        ([(END, f'<geom type="plane" size="1 1 1"/>{END}')], "left out: planes"),
+        ([(END, f'<geom type="plane" size="1 1 1"/>{END}')], "warning: left out: planes"),
     ],
 )  # fmt: skip
 def test_what_is_not_part_of_the_arm_is_fixed_or_left_out_and_told(changes, note):

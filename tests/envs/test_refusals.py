@@ -326,6 +326,7 @@ IN_THE_PLANE = [
     )),
     {**ENDS, "start": (0.0, 0.02)},
 ]  # fmt: skip
+SWIFT = {"obstacles": [ve.Cylinder(0.03, 0.04, position=(0.3, 0.35, 0.0), velocity=(0.9, 0.0, 0.0))]}
 REACHES = [  # too short or long, too fast, not finite, of an obstacle that is not there, of another shape
     [[0.0, 0.0, 0.1, 0.0, 0.0]], [[0.0, 1e-9, 0.0, 0.0, 0.0]], [[0.0, -1.0, 0.1, 0.0, 0.0]],
     [[0.0, 0.1, 0.4, 0.0, 0.0]], [[0.0, 1e9, 0.1, 0.0, 0.0]], [[np.nan, 1.0, 0.1, 0.0, 0.0]],
@@ -335,6 +336,7 @@ SCENES = [
     *((PANDA, {}, {**ends, **options}) for options in IN_SPACE for ends in ({}, PANDA_ENDS)),
     *((MOVING, {}, options) for options in IN_THE_PLANE),
     *((MOVING, {"courses": "reaches"}, {**ENDS, **POST, "reaches": reaches}) for reaches in REACHES),
+    (MOVING, {"courses": "reaches"}, {**ENDS, **SWIFT, "reaches": [[0.0, 0.8, 0.35, 0.0, 0.0]]}),
     (PANDA, OTHER_SHAPES, {**PANDA_ENDS, "obstacles": [ve.PointCloud(CUBE, 0.02, position=(0.2, 0.7, 0.4))]}),
     (PANDA, OTHER_SHAPES, {**PANDA_ENDS, "obstacles": [ve.ConvexMesh.hull(CUBE)]}),
     ("viapoint/PlanarSensed-v0", {}, {"obstacles": [post(0.03, 0.0, 0.05)]}),  # contains the sensor

@@ -510,9 +510,11 @@ def test_files_hold_the_movement(tmp_path, file) -> None:
     (tmp_path / file).write_text(f"{text}\n", encoding="utf-8-sig")  # as a spreadsheet may save it
     names, again = read_motion(tmp_path / file)
     assert names == PANDA.joint_names
-    for one, other in zip(written, again, strict=True):
+    for one, other in zip(written[:4], again[:4], strict=True):
         assert np.allclose(one, other, rtol=1e-9, atol=1e-8)
-    assert np.allclose(again.torque, torques(PANDA.chain, again.position, again.velocity, again.acceleration))
+    own = torques(PANDA.chain, again.position, again.velocity, again.acceleration)
+    assert np.allclose(again.torque, own) if file == "plan.csv" else np.isnan(again.torque).all()
+    assert "effort" not in text  # controllers of positions refuse it
     plan = plan_motion(PANDA, PANDA.home, GOAL, duration=3.0 + 1e-11)
     write_motion(plan, tmp_path / file)  # the last two instants would be the same in the file
     assert len(read_motion(tmp_path / file)[1].time) == 301

@@ -364,7 +364,7 @@ COMMANDS = [
     ("evaluate", "--env"),
     ("plan --position 0.4 0.3", "--position needs 3 numbers for panda, x y z, got 2"),
     ("plan --goal 0.4 0.3", "--goal needs 7 numbers"),
-    ("plan --arm panda --velocity-limit 0.3 --position 0.4 0.3 0.3", "--velocity-limit"),
+    ("plan --arm panda --velocity-limit 0 --position 0.4 0.3 0.3", "--velocity-limit"),
     ("plan --arm nowhere.xml --position 0.4 0.3 0.3", "nowhere.xml"),
     ("plan --arm panda --goal 0 0 0 -1 0 1 0 --quaternion 0 1 0 0", "--quaternion"),
     ("evaluate --baselines straight --agent", "--agent needs a name"),

@@ -70,7 +70,7 @@ def _check_replaceable(path: Path) -> None:
 
 def _arm_for(config: PlanConfig) -> Arm:
     """Return the arm of a name or of a file."""
-    given = {name: getattr(config, name) for name in LOADING if getattr(config, name)}
+    given = {name: getattr(config, name) for name in LOADING if getattr(config, name) not in ("", (), None)}
     if not given and (config.arm in arm_names() or not Path(config.arm).expanduser().is_file()):
         return arm_of(config.arm)
     if config.arm in arm_names():

@@ -17,7 +17,7 @@ from viapoint.training.planning.motion_plan import JointMotion, MotionPlan
 
 PARTS = JointMotion._fields[1:]  # Quantities of a table, each of which has a column for each joint
 # Names of the same quantities in a point of `trajectory_msgs/JointTrajectory`
-ROS_PARTS = ("positions", "velocities", "accelerations", "effort")
+ROS_PARTS = ("positions", "velocities", "accelerations")
 
 
 def write_motion(
@@ -27,7 +27,7 @@ def write_motion(
 
     A `.csv` file has the columns `time` [s] and, for each joint, `position:NAME`, `velocity:NAME`, `acceleration:NAME`
     and `torque:NAME`, in rad or m and their derivatives, and N m or N. A `.yaml` file is a message
-    `trajectory_msgs/JointTrajectory` of ROS 2.
+    `trajectory_msgs/JointTrajectory` of ROS 2, without torques (`effort`), which controllers of positions refuse.
 
     Args:
         plan: Plan.
@@ -56,6 +56,8 @@ def write_motion(
 def read_motion(path: str | Path) -> tuple[tuple[str, ...], JointMotion]:
     """Return the names of the joints and the movement of a file of :func:`write_motion`; ValueError for other files.
 
+    A message of ROS 2 has no torques: they are NaN.
+
     Example:
         >>> from viapoint.envs import arm_of
         >>> from viapoint.training import plan_motion, read_motion, write_motion
@@ -73,7 +75,10 @@ def read_motion(path: str | Path) -> tuple[tuple[str, ...], JointMotion]:
         if not (np.diff(finite_array("time", time, (len(time),))) > 0.0).all():
             raise ValueError("its times do not increase")
         shape = (len(time), len(names))
-        return names, JointMotion(time, *(finite_array("motion", part, shape) for part in parts))
+        motion = [finite_array("motion", part, shape) for part in parts]
+        if form == "yaml":
+            motion.append(np.full(shape, np.nan))
+        return names, JointMotion(time, *motion)
     except (KeyError, IndexError, TypeError, ValueError, yaml.YAMLError) as error:
         wanted = _columns(("NAME",)) if form == "csv" else ("joint_names", *ROS_PARTS, "time_from_start")
         fault = f"{type(error).__name__}: {' '.join(str(error).split())[:80]}"
@@ -117,7 +122,7 @@ def _message(names: tuple[str, ...], motion: JointMotion) -> str:
     points = []
     for time, *values in zip(*motion, strict=True):
         point: dict[str, Any] = {}
-        for name, value in zip(ROS_PARTS, values, strict=True):
+        for name, value in zip(ROS_PARTS, values, strict=False):
             point[name] = [float(f"{number:.12g}") for number in value]
         # Whole nanoseconds, which carry over into seconds.
         seconds, rest = divmod(round(1e9 * float(time)), 1_000_000_000)
