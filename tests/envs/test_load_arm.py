@@ -822,6 +822,7 @@ PINCH = gripper(2, "bar").replace("</body>", '<site name="pinch"/></body>', 1)
         ([(END, f'<geom type="plane" size="1 1 1"/>{END}')], "warning: left out: planes"),
     ],
 )  # fmt: skip
+@pytest.mark.filterwarnings("ignore:left out")
 def test_what_is_not_part_of_the_arm_is_fixed_or_left_out_and_told(changes, note):
     arm = load_arm(changed(*changes))
     assert arm.joint_names == JOINTS
