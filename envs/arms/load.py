@@ -64,9 +64,8 @@ LEAST_EXCESS = 0.001  # Excess of capsules below which they are not split, [m]
 PASSING, WORTH = 0.005, 0.004
 ROUNDED = 1e-3  # Relative error of limits that are written with three digits
 SHORT = 1e-5  # Length of a capsule that is written as a sphere around it, [m]
-MIN_INERTIA = (
-    1e-12  # Least principal moment of inertia of a body, [kg m^2], and mass of one that stands for a joint
-)
+# Least principal moment of inertia of a body, [kg m^2], and mass of a body that stands for a joint, [kg]
+MIN_INERTIA = 1e-12
 INERTIA_MARGIN = 2e-5  # Relative margin of the triangle inequality of principal moments
 # Transmissions of actuators that drive a joint directly
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -749,9 +748,8 @@ def _fitted(
         fits[body] = []
         for geom in geoms:
             fits[body] += cover_geom(parsed.model, geom, tolerance)
-    compared = dict.fromkeys(
-        fits, 0
-    )  # Numbers of capsules of each body, the first ones, that were compared before
+    # Numbers of capsules of each body, the first ones, that were compared before
+    compared = dict.fromkeys(fits, 0)
     while True:
         xml = _write(parsed, ranges, origin, fits)
         capsules = mujoco.MjModel.from_xml_string(xml)
@@ -854,9 +852,8 @@ def _write(parsed: Parsed, ranges: Float, origin: Float, fits: dict[int, list[Fi
             _set(added, pos=turn.T @ (rest.xanchor[joint] - rest.xpos[body]), axis=turn.T @ rest.xaxis[joint])
             _set(added, range=ranges[index], armature=model.dof_armature[dof])
             _set(added, damping=model.dof_damping[dof].flat[0])
-            if (
-                index < link - 1
-            ):  # several joints of one body: all but the last one get a body that weighs nothing
+            # Of several joints of one body, all but the last get a body of their own, which weighs nothing.
+            if index < link - 1:
                 element.set("name", f"{parsed.names[body]} after {name}")
                 inertial = ET.SubElement(element, "inertial")
                 _set(inertial, pos=np.zeros(3), mass=MIN_INERTIA, diaginertia=np.full(3, MIN_INERTIA))
