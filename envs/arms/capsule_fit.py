@@ -143,14 +143,15 @@ def _simple_hull(model: mujoco.MjModel, geom: int) -> tuple[Float, float, float]
     box = np.block([[np.eye(3), -corners.max(axis=0)[:, None]], [-np.eye(3), corners.min(axis=0)[:, None]]])
     planes = np.concatenate((box, hull.equations))
     chosen = np.concatenate((np.arange(6), np.arange(6, len(planes), len(planes) // BEGIN)))
+    body = ConvexMesh.hull(corners)
     while True:
         around = HalfspaceIntersection(planes[chosen], corners.mean(axis=0)).intersections
+        # A sharp corner may be far from the hull, though no plane of the hull is far below it.
+        beyond = body.distance(around)
         highest = np.array([(planes[:, :3] @ point + planes[:, 3]).argmax() for point in around])
-        height = (planes[highest, :3] * around).sum(axis=1) + planes[highest, 3]
-        added = np.setdiff1d(highest[height > DETAIL], chosen)
+        added = np.setdiff1d(highest[beyond > DETAIL], chosen)
         if not added.size:
-            beyond = float(ConvexMesh.hull(corners).distance(around).max())
-            return around, radius, larger + max(beyond, 0.0)
+            return around, radius, larger + max(float(beyond.max()), 0.0)
         chosen = np.concatenate((chosen, added))
 
 

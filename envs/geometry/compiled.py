@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -23,6 +24,7 @@ COMPILED: dict[str, Any] = {"nogil": True, "_nrt": True, "no_cfunc_wrapper": Tru
 KERNEL: dict[str, Any] = {**COMPILED, "error_model": "numpy", "_nrt": False}
 """Options of functions that make no arrays. Without `_nrt`, Numba does not count references to arrays, which takes 5 ns
 for each array and call. Divisions by zero give infinity instead of an exception."""
+SOURCES = set[str]()  # Files with compiled functions
 INNER: dict[str, Any] = {"no_cpython_wrapper": True}  # Further options of functions that Python never calls
 
 
@@ -33,6 +35,7 @@ def _for_types(made: Any) -> Any:
     """
     if not hasattr(made, "_compiler"):  # Numba is switched off
         return made
+    SOURCES.add(made.py_func.__code__.co_filename)
     fold = made._compiler.fold_argument_types
     type_of = cast("Any", typeof)
     unliteral = cast("Any", types.unliteral)
@@ -80,6 +83,7 @@ def inlined(function: Function) -> Function:
 
     A call with packed obstacles passes 150 numbers, which takes longer than a distance.
     """
+    SOURCES.add(function.__code__.co_filename)
     return cast("Function", njit(inline="always", **KERNEL)(function))
 
 
@@ -130,12 +134,16 @@ _read_index: Callable[[Any], Any] = IndexDataCacheFile._load_index
 
 
 def _index(cache: Any) -> Any:
-    """Return the index of machine code on disk, an empty one where it names records that are in other modules now.
+    """Return the index of machine code on disk, an empty one where it may be of an earlier version of the package.
 
-    Otherwise functions that were compiled before an update of the package would end with Numba's ImportError.
+    Numba itself looks at the file of a function, but not at those of the functions that it calls, which may have
+    changed, or be in other modules now.
     """
+    written = Path(cache._index_path)
+    files = (Path(file) for file in SOURCES)
+    newest = max((file.stat().st_mtime for file in files if file.is_file()), default=0.0)
     try:
-        return _read_index(cache)
+        return _read_index(cache) if written.is_file() and written.stat().st_mtime > newest else {}
     except (ImportError, AttributeError):
         return {}
 

@@ -37,8 +37,8 @@ def mesh_distance(
     """Return the signed distance of a point from a convex mesh, and its gradient; a lower bound beyond `limit`.
 
     Inside, the distance is the greatest height above the plane of a face, and negative. Outside, the nearest point is
-    on a triangle whose plane is below the point. `bound` is the radius of a sphere around the origin that contains
-    the mesh.
+    on a triangle whose plane is below the point, but for rounding. `bound` is the radius of a sphere around the origin
+    that contains the mesh.
     """
     away = math.sqrt(x * x + y * y + z * z) - bound
     if away > max(limit, 0.0):
@@ -55,17 +55,18 @@ def mesh_distance(
         return highest, nx, ny, nz
     least = FAR * FAR
     dx, dy, dz = 0.0, 0.0, 0.0
+    below = -DENT * bound
     for face in range(meshes.first[index], meshes.first[index + 1]):
         height = _height(meshes, face, x, y, z)
-        if height > 0.0 and height * height < least:  # others cannot have the nearest point
+        if height > below and height * height < least:  # others cannot have the nearest point
             gx, gy, gz = _from_triangle(meshes, face, height, x, y, z)
             square = gx * gx + gy * gy + gz * gz
             if square < least:
                 least = square
                 dx, dy, dz = gx, gy, gz
     distance = math.sqrt(least)
-    if distance < TINY:  # on the surface the gradient of the distance is the normal
-        return highest, nx, ny, nz
+    if distance <= -below:  # on the surface, where rounding has no direction, the gradient is the normal
+        return distance, nx, ny, nz
     return distance, dx / distance, dy / distance, dz / distance
 
 

@@ -157,6 +157,17 @@ def test_hulls_are_closed_and_convex_and_look_outwards(flat, rng):
         np.testing.assert_allclose(mesh.distance(mesh.vertices), 0.0, atol=1e-9)
 
 
+def test_points_of_a_mesh_are_on_its_surface_where_many_faces_are_in_one_plane_but_for_rounding(rng):
+    grid = np.stack(np.meshgrid(*[np.linspace(-size, size, 5) for size in (0.05, 0.03, 0.1)]), axis=-1)
+    for _ in range(10):
+        turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        points = np.float32(grid.reshape(-1, 3) @ turn.T + rng.normal(size=3))
+        outside = np.abs(grid.reshape(-1, 3) / (0.05, 0.03, 0.1)).max(axis=1) == 1.0
+        distance = ve.ConvexMesh.hull(points).distance(points)
+        np.testing.assert_allclose(distance[outside], 0.0, atol=1e-6)
+        assert (distance[~outside] < -0.01).all()
+
+
 def test_a_covering_cloud_contains_the_spheres_of_its_points(rng):
     points = rng.normal(size=(500, 3)) * 0.2
     cloud = ve.PointCloud.covering(points, spacing=0.1, radius=0.01)
