@@ -60,10 +60,13 @@ from viapoint.training.planning.rrt_connect import VIA_COUNTS, clear_path, point
 
 # Once enough movements are free, more seeds are tried around the one with the least jerk: MORE for each doubling of its
 # relative jerk cost beyond ROUGH, and at most MOST_MORE.
-ROUGH, MORE, MOST_MORE = 1.4, 8, 16
+ROUGH, MORE, MOST_MORE = 1.3, 24, 12
 # Spread of the first random seeds around the straight line, and of later ones, [rad] and [m]
 SPREADS = {"joints": (0.8, 1.0), "hand": (0.15, 0.3)}
-NARROW = 8  # Number of seeds with the first spread
+NARROW, CLOSE = (
+    8,
+    0.4,
+)  # Number of seeds with the first spread, and the share of it for those around the best movement
 # Number of seeds after which a path is looked for, where none became free, and of seeds along this path
 EARLY, ALONG = 4, 4
 # Paths that are looked for in turn: clearances beyond what movements keep, as shares of those of the ends up to ROOM,
@@ -643,12 +646,13 @@ def _search(
             rank = tried + k - len(given) + first
             away = room * problem.generator.uniform(-1.0, 1.0, straight.shape)
             if best is not None and (free >= enough or rank % 2):  # what is free is seldom alone
-                seeds[k] = best[0].offsets[:n_via] + near * away
+                seeds[k] = best[0].offsets[:n_via] + CLOSE * near * away
             else:
                 spread = 0.0 if rank == 0 else near if rank < NARROW else far
                 seeds[k] = straight + spread * away
-        wanted = max(enough - free, 1)
-        done, found = _refined(problem, setting, kept, tables, seeds, duration, until, enough=wanted)
+        done, found = _refined(
+            problem, setting, kept, tables, seeds, duration, until, known=least, enough=max(enough - free, 1)
+        )
         for k in range(done):
             clearance = float(found.clearance[k])
             movement = problem.movement(found.vias[k], tables[1], int(found.times[k]), duration)
@@ -743,6 +747,7 @@ def _refined(
     until: float,
     *,
     smooth: float = SMOOTH,
+    known: float = math.inf,
     enough: int = 1,
 ) -> tuple[int, Found]:
     """Refine seeds, shape (S, K, D); see :func:`~viapoint.training.planning.refine.refine_seeds`."""
@@ -751,7 +756,7 @@ def _refined(
     endless = np.full(seeds.shape[1:], np.inf)
     return refine_seeds(
         setting, *tables, problem.start, fixed, seeds, np.stack((-endless, endless)), duration,
-        problem.obstacles, kept, unit, smooth, enough, until - time.perf_counter(),
+        problem.obstacles, kept, unit, smooth, known, enough, until - time.perf_counter(),
     )  # fmt: skip
 
 
@@ -839,7 +844,7 @@ def _timed(problem: _Problem, movement: Movement, least: float | None) -> tuple[
     kind = "velocity" if limits.velocity > limits.torque else "torque"
     share = max(limits)
     worst = shares.max(axis=0).argmax()
-    when = f"in {factor * duration:.2f} s; the shortest duration is {needed * duration:.2f} s"
+    when = f"in {factor * duration:.2f} s; this movement takes {needed * duration:.2f} s or more"
     if limits.torque > 1.0:
         at_rest = np.abs(torques(arm.chain, motion.position, np.zeros(1), np.zeros(1))) / arm.torque_limit
         if at_rest.max() > 1.0:

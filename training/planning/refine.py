@@ -460,6 +460,7 @@ def refine_seeds(
     margin: float,
     unit: float,
     smooth: float,
+    known: float,
     enough: int,
     patience: float,
 ) -> tuple[int, Found]:
@@ -478,6 +479,8 @@ def refine_seeds(
         margin: Least clearance of movements that count as free, [m].
         unit: Unit of jerk costs in unit time.
         smooth: Jerk cost in this unit with which a movement that was polished once is smooth enough.
+        known: Jerk cost of the best known movement, in unit time. A movement that costs as much after it was polished
+            once hardly ever becomes better, and is polished no more.
         enough: Number of free movements after which to stop.
         patience: Time after which no further refinement begins, [s]; with up to three via-points each takes less than a
             millisecond.
@@ -543,7 +546,7 @@ def refine_seeds(
             _copy(trial, offsets[stage])
             times[stage], cost = other, less
             weight *= HEAVIER
-            if little or cost < smooth * unit:
+            if little or cost < smooth * unit or cost >= known:
                 break
         while stage >= 0:
             movement = Movement(fine, times[stage], start, offsets[stage], duration)

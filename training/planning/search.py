@@ -241,7 +241,7 @@ def refined_actions(task: Task, problem: Problem, actions: Numbers) -> Numbers:
         bounds = np.stack((middle - room, middle + room))
         _, better = refine_seeds(
             setting, table, fine, start, fixed, seeds, bounds, moves.duration[b, 0], problem.obstacles.take([b]),
-            CLEARANCE_MARGIN, unit_of_jerk(line, setting.of_hand), SMOOTH, len(seeds), np.inf,
+            CLEARANCE_MARGIN, unit_of_jerk(line, setting.of_hand), SMOOTH, np.inf, len(seeds), np.inf,
         )  # fmt: skip
         waypoints = np.zeros((len(seeds), number + 2, len(start)))
         waypoints[:, 1:-1] = better.vias
