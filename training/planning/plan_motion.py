@@ -60,13 +60,11 @@ from viapoint.training.planning.rrt_connect import VIA_COUNTS, clear_path, point
 
 # Once enough movements are free, more seeds are tried around the one with the least jerk: MORE for each doubling of its
 # relative jerk cost beyond ROUGH, and at most MOST_MORE.
-ROUGH, MORE, MOST_MORE = 1.3, 24, 12
+ROUGH, MORE, MOST_MORE = 1.3, 16, 12
 # Spread of the first random seeds around the straight line, and of later ones, [rad] and [m]
 SPREADS = {"joints": (0.8, 1.0), "hand": (0.15, 0.3)}
-NARROW, CLOSE = (
-    8,
-    0.4,
-)  # Number of seeds with the first spread, and the share of it for those around the best movement
+NARROW = 8  # Number of seeds with the first spread
+CLOSE = 0.3  # Share of the first spread for every second seed around the best movement
 # Number of seeds after which a path is looked for, where none became free, and of seeds along this path
 EARLY, ALONG = 4, 4
 # Paths that are looked for in turn: clearances beyond what movements keep, as shares of those of the ends up to ROOM,
@@ -646,7 +644,7 @@ def _search(
             rank = tried + k - len(given) + first
             away = room * problem.generator.uniform(-1.0, 1.0, straight.shape)
             if best is not None and (free >= enough or rank % 2):  # what is free is seldom alone
-                seeds[k] = best[0].offsets[:n_via] + CLOSE * near * away
+                seeds[k] = best[0].offsets[:n_via] + (1.0 if rank % 2 else CLOSE) * near * away
             else:
                 spread = 0.0 if rank == 0 else near if rank < NARROW else far
                 seeds[k] = straight + spread * away
