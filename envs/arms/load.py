@@ -62,6 +62,8 @@ LEFT_SHARE, LEFT_MOST = 0.25, 0.002
 LEAST_EXCESS = 0.001  # Excess of capsules below which they are not split, [m]
 # Distance of bodies in other configurations at which their capsules are split, too, and least excess for that, [m]
 PASSING, WORTH = 0.005, 0.004
+# Share of configurations in which bodies may be apart though their capsules are not
+WRONG = 0.125
 ROUNDED = 1e-3  # Relative error of limits that are written with three digits
 SHORT = 1e-5  # Length of a capsule that is written as a sphere around it, [m]
 # Least principal moment of inertia of a body, [kg m^2], and mass of a body that stands for a joint, [kg]
@@ -738,7 +740,7 @@ def _fitted(
     """Return the text of the arm's model, and the greatest excess of its capsules, [m].
 
     Capsules of bodies that are apart at home must be apart there, too: those that are not are split. So are those of
-    pairs with room between them in other configurations, as far as that is worth it.
+    bodies with room between them in other configurations, until this goes wrong in few of these.
 
     Raises:
         ValueError: Bodies are too close at home for that.
@@ -753,25 +755,24 @@ def _fitted(
     while True:
         xml = _write(parsed, ranges, origin, fits)
         capsules = mujoco.MjModel.from_xml_string(xml)
-        coarse = set()
-        for view in views:
-            at_home = view is views[0]
-            for pair, (body, index) in _close_capsules(parsed, capsules, fits, view, compared):
-                excess = fits[body][index].excess
-                if excess >= (LEAST_EXCESS if at_home else WORTH):
-                    coarse.add((body, index))
-                elif at_home:
-                    raise ValueError(
-                        f"the bodies {' and '.join(parsed.names[each] for each in pair)} are "
-                        f"{1e3 * view.distances[pair]:.2g} mm apart at home, too close for the capsules around them: "
-                        "give another home, or exclude their contact in the file"
-                    )
+        at_home, *passing = (list(_close_capsules(parsed, capsules, fits, view, compared)) for view in views)
+        coarse = {part for _, part, excess in at_home if excess >= LEAST_EXCESS}
+        for pair, _, excess in at_home:
+            if excess < LEAST_EXCESS:
+                raise ValueError(
+                    f"the bodies {' and '.join(parsed.names[each] for each in pair)} are "
+                    f"{1e3 * views[0].distances[pair]:.2g} mm apart at home, too close for the capsules around them: "
+                    "give another home, or exclude their contact in the file"
+                )
+        wrong = [{part for _, part, excess in some if excess >= WORTH} for some in passing]
+        if sum(map(bool, wrong)) > WRONG * len(wrong):
+            coarse = coarse.union(*wrong)
+            compared = {body: len(some) for body, some in fits.items()}
         if not coarse:
             return xml, max(capsule.excess for some in fits.values() for capsule in some)
-        compared = {body: len(some) for body, some in fits.items()}
         for body, index in sorted(coarse, reverse=True):
             fits[body] += split(parsed.model, fits[body].pop(index))
-            compared[body] -= 1
+            compared[body] -= index < compared[body]
 
 
 def _close_capsules(
@@ -780,10 +781,10 @@ def _close_capsules(
     fits: dict[int, list[FittedCapsule]],
     view: View,
     compared: dict[int, int],
-) -> Iterator[tuple[Pair, tuple[int, int]]]:
-    """Yield pairs of bodies that are apart, though capsules of them are not, with body and index of the coarser one.
+) -> Iterator[tuple[Pair, tuple[int, int], float]]:
+    """Yield pairs of bodies that are apart though their capsules are not: pair, and the coarser capsule of the two.
 
-    Of two capsules, one is new: it is not among those that were compared before.
+    It is told by body and index, and by its excess, [m]. One of the two was not among those that were compared before.
     """
     data = mujoco.MjData(model)
     move(data, parsed.joints, view.configuration)
@@ -800,8 +801,9 @@ def _close_capsules(
         for i, j in np.argwhere(near).tolist():
             geoms = begin[first] + i, begin[second] + j
             if mujoco.mj_geomDistance(model, data, *geoms, 0.01, None) < least:
-                is_first = fits[first][i].excess >= fits[second][j].excess
-                yield pair, ((first, i) if is_first else (second, j))
+                parts = (first, i), (second, j)
+                part = max(parts, key=lambda part: fits[part[0]][part[1]].excess)
+                yield pair, part, fits[part[0]][part[1]].excess
 
 
 def _apart(parsed: Parsed, pairs: list[Pair], configurations: Float) -> list[Pair]:
