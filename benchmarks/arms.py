@@ -33,7 +33,7 @@ BEGIN, END = "<!-- table -->", "<!-- end of table -->"
 STRAIGHT, PROBLEMS = 50, 100
 """Numbers of straight movements without obstacles, and of problems with 1 to 16 obstacles."""
 PROJECTS = {
-    "menagerie": "MuJoCo Menagerie 75df466 (each folder has its licence)",
+    "menagerie": "MuJoCo Menagerie a03e87b (each folder has its licence)",
     "erd": "example-robot-data 6.0.0 (BSD-3-Clause)",
     "bullet": "bulletphysics/bullet3 6c888f4 (zlib; folders have their own licences)",
     "urdfs": "Daniella1/urdf_files_dataset 81f4cda (MIT; folders have their own licences)",
