@@ -29,13 +29,13 @@ ROOT = Path(__file__).parents[2]
 IN_PLANE, IN_SPACE = "viapoint/PlanarObstacles-v0", "viapoint/PandaObstacles-v0"
 STILLS = {
     "planar_reach.png": ("viapoint/PlanarReach-v0", 0, 1.0),
-    "planar_obstacles.png": (IN_PLANE, 9, 1.0),
-    "planar_whole_arm.png": ("viapoint/PlanarWholeArm-v0", 0, 1.0),
+    "planar_obstacles.png": (IN_PLANE, 2, 1.0),
+    "planar_whole_arm.png": ("viapoint/PlanarWholeArm-v0", 5, 1.0),
     "planar_target_jump.png": ("viapoint/PlanarTargetJump-v0", 0, 1.0),
     "planar_moving_obstacles.png": ("viapoint/PlanarMovingObstacles-v0", 0, 1.0),
     "panda_reach.png": ("viapoint/PandaReach-v0", 0, 0.6),
     "panda_moving_obstacles.png": ("viapoint/PandaMovingObstacles-v0", 4, 0.7),
-    "panda_sensed.png": ("viapoint/PandaSensed-v0", 6, 0.6),
+    "panda_sensed.png": ("viapoint/PandaSensed-v0", 2, 0.6),
 }
 """Tasks of the pictures of single movements, which of the scenes that show something, and the moment, as a share of the
 duration: at the end, the hand of an arm in space hides the goal."""
