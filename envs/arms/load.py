@@ -53,6 +53,7 @@ STUCK = 100.0  # Damping beyond which a joint hardly moves: torque at full speed
 # Greatest range of a hinge, [rad], and length of an arm, [m], that are not taken for degrees or millimetres
 MOST_TURNS, LONGEST = 8.0 * np.pi, 20.0
 FAR_TOO_LONG = 100.0  # Distance of joints above which an arm is refused, [m]
+ENDLESS = 1e3  # Range of a joint above which it counts as unlimited, [rad] and [m]
 # Names of files that do not tell the arm; it gets the name of the model
 GENERIC_NAMES = ("arm", "model", "robot", "scene")
 MIN_JOINTS = 2  # Least number of joints
@@ -218,6 +219,7 @@ def _load(
     whole: mujoco.MjModel, name: str, known_as: str, urdf: Urdf, notes: list[str], given: Mapping[str, Any]
 ) -> Arm:
     """Return the arm of a model and the given arguments; see :func:`load_arm`."""
+    whole.jnt_limited[np.ptp(whole.jnt_range, axis=1) > ENDLESS] = 0
     chosen = choose_tool(whole, given["tool"], given["base"], notes)
     notes.insert(0, f"tool: {chosen.name!r}")
     names = given["joints"] or _usual_joints(whole, chosen, given["base"], notes)
@@ -448,11 +450,15 @@ def _ranges(model: mujoco.MjModel, joints: Names, given: Any, notes: list[str]) 
         ranges = finite_array("joint_range", given, (len(joints), 2))
         if (ranges[:, 0] >= ranges[:, 1]).any():
             raise ValueError(f"joint_range must be pairs in increasing order, got {given!r}")
+        if (np.ptp(ranges, axis=1) > ENDLESS).any():
+            raise ValueError(f"joint_range must span at most {ENDLESS:g} rad or m, got {given!r}")
         return ranges
     endless = model.jnt_limited[numbers] == 0
     some = ", ".join(itertools.compress(joints, endless))
     if (endless & (kinds == MOVES[1])).any():
-        raise ValueError(f"slides need limits, but {some} has none; give a range in the file, or joint_range")
+        raise ValueError(
+            f"slides need limits, but {some} has none below {ENDLESS:g} m; give a range in the file, or joint_range"
+        )
     if some:
         notes.append(f"range of {some}, continuous: +-pi")
     return np.where(endless[:, None], (-np.pi, np.pi), model.jnt_range[numbers])

@@ -603,6 +603,15 @@ def test_a_joint_without_limits_is_told(crane, limit):
         assert load_arm(written(crane, (LIMIT, limit))).continuous == ("turn", "tilt")
 
 
+def test_ranges_without_end_in_practice_are_none(crane):
+    """As for a mobile base: to check a movement of a thousand kilometres takes forever."""
+    wide = '<limit lower="-1e6" upper="1e6" effort'
+    arm = load_arm(written(crane, (LIMIT, wide), ('<limit lower="0" upper="0.4" effort', wide)))
+    assert (arm.joint_names, arm.continuous) == (("turn", "tilt"), ("turn", "tilt"))
+    with pytest.raises(ValueError, match="joint_range"):
+        load_arm(written(crane), joint_range=[(0.0, 0.4), (-1.0, 1.0), (-1e6, 1e6)])
+
+
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
