@@ -454,11 +454,13 @@ def _ranges(model: mujoco.MjModel, joints: Names, given: Any, notes: list[str]) 
             raise ValueError(f"joint_range must span at most {ENDLESS:g} rad or m, got {given!r}")
         return ranges
     endless = model.jnt_limited[numbers] == 0
-    some = ", ".join(itertools.compress(joints, endless))
-    if (endless & (kinds == MOVES[1])).any():
+    some = ", ".join(itertools.compress(joints, endless & (kinds == MOVES[1])))
+    if some:
         raise ValueError(
-            f"slides need limits, but {some} has none below {ENDLESS:g} m; give a range in the file, or joint_range"
+            f"slides need limits of at most {ENDLESS:g} m, and {some} has none; give a range in the file, or "
+            "joint_range, or joints= without it"
         )
+    some = ", ".join(itertools.compress(joints, endless))
     if some:
         notes.append(f"range of {some}, continuous: +-pi")
     return np.where(endless[:, None], (-np.pi, np.pi), model.jnt_range[numbers])
