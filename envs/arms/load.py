@@ -748,7 +748,7 @@ def _fitted(
     """Return the text of the arm's model, and the greatest excess of its capsules, [m].
 
     Capsules of bodies that are apart at home must be apart there, too: those that are not are split. So are those of
-    bodies with room between them in other configurations, until this goes wrong in few of these.
+    bodies with room between them in other configurations, while there are such in more than WRONG of these.
 
     Raises:
         ValueError: Bodies are too close at home for that.
